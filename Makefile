@@ -95,8 +95,7 @@ wheel: | $(RUN)
 	@$(WHEEL)/bin/pip install --quiet --disable-pip-version-check build
 	@BATCHPID_REQUIRE_NATIVE=1 $(WHEEL)/bin/python -m build --outdir dist .
 	@$(WHEEL)/bin/pip install --quiet --disable-pip-version-check dist/*.whl
-	@cd $(WHEEL) && bin/batchpid inspect panda --engine sapien | grep "native calls into SAPIEN"
-	@cd $(WHEEL) && bin/batchpid demo --num-envs 2 --seconds 1.5 > demo.txt
+	@cd $(WHEEL) && bin/batchpid demo --num-envs 2 --seconds 1.5 --force | grep "native calls into SAPIEN"
 	@ls dist
 
 clean:

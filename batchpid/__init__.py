@@ -26,7 +26,7 @@ Params say how to control, a state is carried from step to step, and every array
   :mod:`batchpid.metrics`, gains per unit of inertia in :mod:`batchpid.law.computed_torque`, errors
   in :mod:`batchpid.errors`.
 
-Requires NumPy alone; JAX, PyYAML and ruckig are imported on first use.
+Requires NumPy alone; JAX and PyYAML are imported on first use.
 """
 
 from batchpid import motors

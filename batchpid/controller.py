@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document
-from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
+from batchpid.arrays.records import frozen
 from batchpid.backends import JAXBackend, NumPyBackend, declined
 from batchpid.checks.validate import (
     choice,

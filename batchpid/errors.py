@@ -108,9 +108,11 @@ class MissingDependencyError(BatchPIDError, ImportError):
         self.package = package
         self.purpose = purpose
         self.extra = extra
-        wanted = package if extra is None else f"batchpid[{extra}]"
+        # Extras come from a checkout, as long as batchpid is on no index.
+        wanted = package if extra is None else f".[{extra}]"
+        place = "" if extra is None else " in the checkout of batchpid"
         super().__init__(
-            f"{purpose} needs the package {package!r}; install it with: pip install '{wanted}'"
+            f"{purpose} needs the package {package!r}; install it with: pip install '{wanted}'{place}"
         )
 
     def __reduce__(self) -> tuple[Any, ...]:

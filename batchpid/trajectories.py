@@ -5,12 +5,9 @@ A move from x0 to x1 is x(t) = x0 + (x1 - x0) s(t), with s from 0 to 1::
 
     minimum jerk    s = 10 (t/T)^3 - 15 (t/T)^4 + 6 (t/T)^5                 rests at both ends, in acceleration too
     trapezoidal     s'' = +a, 0, -a                                         the fastest within v and a
-    jerk limited    s''' = +j, 0, -j                                        the fastest within v, a and j
 
 The first is T. Flash and N. Hogan, The coordination of arm movements, J. Neurosci. 5(7), 1985; the
-second B. Siciliano et al., Robotics: Modelling, Planning and Control (2009), section 4.2; the third
-is computed by the ``ruckig`` library (L. Berscheid and T. Kroeger, Jerk-limited real-time
-trajectory generation, RSS 2021).
+second B. Siciliano et al., Robotics: Modelling, Planning and Control (2009), section 4.2.
 """
 
 from __future__ import annotations
@@ -24,7 +21,8 @@ from numpy.typing import ArrayLike
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.display import array_summary
 from batchpid.checks.validate import at_least, broadcast, entries, positive, read_array, time_step
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.errors import InvalidArgumentError
+from batchpid.task_space.rotations import multiply
 
 _PEAK_VELOCITY = 15 / 8  # of the minimum-jerk s, times T
 _PEAK_ACCELERATION = 10 / math.sqrt(3)  # times T^2
@@ -157,6 +155,76 @@ def minimum_jerk(
     return _trajectory(time, x0, way, s, rate, acceleration, done=tau >= 1 - _ROUNDING)
 
 
+def straight_line(start: ArrayLike, target: ArrayLike, dt: float, *, duration: float) -> Trajectory:
+    """Return the minimum-jerk move of a tool between two poses: on a straight line, while it turns
+    about one axis (slerp; K. Shoemake, Animating rotation with quaternion curves, 1985).
+
+    ``np.hstack(path[1:])`` are the setpoints of ``OperationalSpace(..., twist=True,
+    acceleration=True)``.
+
+    Parameters
+    ----------
+    start, target
+        Poses (7,): x, y, z [m], qw, qx, qy, qz. Of the two ways round, the shorter one is taken.
+    dt, duration
+        Time of a tick and of the move [s].
+
+    Returns
+    -------
+    Trajectory
+        Poses (ticks, 7); twists (ticks, 6) [m/s, rad/s] and their derivatives, in the world's axes.
+    """
+    first, last = (broadcast(name, x, (7,)) for name, x in (("start", start), ("target", target)))
+    q0, q1 = (pose[3:] / np.linalg.norm(pose[3:]) for pose in (first, last))
+    turn = multiply(q1, q0 * np.array([1, -1, -1, -1]))
+    turn = turn if turn[0] >= 0 else -turn
+    sine = np.linalg.norm(turn[1:])
+    angle = 2 * np.arctan2(sine, turn[0])
+    axis = turn[1:] / max(sine, 1e-300)  # a turn by 0 needs none
+    way = np.concatenate([last[:3] - first[:3], angle * axis])
+    s = minimum_jerk([0.0], [1.0], dt, duration=duration)
+    half = s.position * angle / 2
+    q = multiply(np.concatenate([np.cos(half), np.sin(half) * axis], 1), q0)
+    position = np.concatenate([first[:3] + s.position * way[:3], q], 1)
+    return Trajectory(s.time, position, s.velocity * way, s.acceleration * way)
+
+
+def sine(
+    center: ArrayLike,
+    amplitude: ArrayLike,
+    dt: float,
+    *,
+    frequency: float,
+    duration: float,
+    fade: float = 1.0,
+) -> Trajectory:
+    """Return oscillations about ``center`` that grow from rest within ``fade`` [s].
+
+    ``x(t) = center + a(t) sin(2 pi f t)``, where a(t) rises to the amplitude as a minimum-jerk
+    move: the first setpoint has no jump of position, rate or acceleration.
+
+    Parameters
+    ----------
+    center, amplitude
+        (joints,) or (envs, joints) [rad or m].
+    dt, duration
+        Time of a tick and of the trajectory [s].
+    frequency
+        f [Hz].
+    """
+    low, way = _move(center, np.add(center, amplitude))
+    time = _ticks(dt, np.array(positive("duration", duration, "s")))
+    growth = minimum_jerk([0.0], [1.0], dt, duration=positive("fade", fade, "s"))
+    growth = growth.hold(duration)
+    a, rate, change = (part[: len(time), 0] for part in growth[1:])
+    w = 2 * np.pi * positive("frequency", frequency, "Hz")
+    sin, cos = np.sin(w * time), np.cos(w * time)
+    # Products of the growth and the wave, and their derivatives.
+    rows = (a * sin, rate * sin + w * a * cos, (change - w**2 * a) * sin + 2 * w * rate * cos)
+    shares = [row[(...,) + (None,) * way.ndim] for row in rows]
+    return Trajectory(time, low + shares[0] * way, shares[1] * way, shares[2] * way)
+
+
 def trapezoidal(
     start: ArrayLike,
     target: ArrayLike,
@@ -209,76 +277,6 @@ def trapezoidal(
     rate = np.minimum(np.minimum(as_ * t, as_ * left), peak)
     acceleration = np.where(t < ramp, as_, np.where(left < ramp, -as_, 0.0))
     return _trajectory(time, x0, way, s, rate, acceleration, done=left <= _ROUNDING * total)
-
-
-def jerk_limited(
-    start: ArrayLike,
-    target: ArrayLike,
-    dt: float,
-    *,
-    max_velocity: ArrayLike,
-    max_acceleration: ArrayLike,
-    max_jerk: ArrayLike,
-    start_velocity: ArrayLike = 0.0,
-    start_acceleration: ArrayLike = 0.0,
-) -> Trajectory:
-    """Return the fastest move to rest at ``target`` within limits of velocity, acceleration and
-    jerk, by ``ruckig``.
-
-    The joints of an env arrive together; the move may begin in motion. Shapes as in
-    :func:`trapezoidal`; every limit is finite.
-
-    Raises
-    ------
-    MissingDependencyError
-        Without the ``ruckig`` package.
-    InvalidArgumentError
-        Naming the argument and joint; also where ruckig finds no such move, e.g. from beyond a
-        limit.
-    """
-    try:
-        import ruckig
-    except ImportError:
-        raise MissingDependencyError("ruckig", "jerk_limited()") from None
-    x0, way = _move(start, target)
-    asked = {
-        "current_position": x0,
-        "target_position": x0 + way,
-        "current_velocity": _limits("start_velocity", start_velocity, way, low=-math.inf),
-        "current_acceleration": _limits(
-            "start_acceleration", start_acceleration, way, low=-math.inf
-        ),
-        "max_velocity": _limits("max_velocity", max_velocity, way),
-        "max_acceleration": _limits("max_acceleration", max_acceleration, way),
-        "max_jerk": _limits("max_jerk", max_jerk, way),
-    }
-    joints = way.shape[-1]
-    rows = {name: value.reshape(-1, joints) for name, value in asked.items()}
-    # ruckig plans one env at a time, and knows the joints of it that have to arrive together.
-    planner, plans = ruckig.Ruckig(joints, time_step("dt", dt)), []
-    for env in range(way.size // joints):
-        inputs, plan = ruckig.InputParameter(joints), ruckig.Trajectory(joints)
-        for name, table in rows.items():
-            setattr(inputs, name, table[env].tolist())
-        try:
-            planner.calculate(inputs, plan)
-        except ruckig.RuckigError:
-            remedy = "begin within the limits, or widen them"
-            raise InvalidArgumentError(
-                "start", "allows no jerk-limited move", env=env, remedy=remedy
-            ) from None
-        plans.append(plan)
-    durations = np.array([plan.duration for plan in plans])
-    time = _ticks(dt, durations)
-    table = np.array(
-        [[plan.at_time(min(t, plan.duration)) for plan in plans] for t in time.tolist()]
-    )
-    arrived = time[:, None, None] >= (1 - _ROUNDING) * durations[:, None]
-    position, velocity, acceleration = (
-        np.where(arrived, rest, table[:, :, k]).reshape(len(time), *way.shape)
-        for k, rest in enumerate((rows["target_position"], np.zeros(()), np.zeros(())))
-    )
-    return Trajectory(time, position, velocity, acceleration)
 
 
 def _trajectory(

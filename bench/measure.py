@@ -38,7 +38,7 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.protocol import EnginePack, load_engine
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.loop import Loop
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"
@@ -161,7 +161,7 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     loop.reset(
         np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, robot.dof))
     )
-    loop.ticks[0].command.setpoint[...] = workload.target
+    loop.arrays.command.setpoint[...] = workload.target
     spent = dict.fromkeys(("read", "control", "passive", "write", "step", "waiting"), 0.0)
     for group in loop.groups:
         group.execute_in_numpy()

@@ -76,8 +76,10 @@ def _mujoco_batch(workload: Workload) -> Case:
     import mujoco
     import mujoco.batch
 
+    from batchpid.sim import to_urdf
+
     robot, settings = workload.robot, workload.robot.settings
-    spec = mujoco.MjSpec.from_string(robot.urdf)
+    spec = mujoco.MjSpec.from_string(to_urdf(robot).text)
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])

@@ -13,10 +13,9 @@ import pytest
 from workload import Workload
 
 import batchpid as bp
-from batchpid.motors import advance_effort, advance_measurement, discretise
-from batchpid.native.compiled import compiled_stages
+from batchpid.motors import advance_effort, advance_measurement, command_limits, discretise
 from batchpid.sim import Robot
-from batchpid.sim.loop.numpy_executor import NoiseBlocks
+from batchpid.sim.loop.model_functions import NoiseBlocks
 
 ENVS, JOINTS, STEPS, TICKS = 16, 9, 512, 10
 EFFECTS = {
@@ -85,16 +84,14 @@ def test_all_effects(benchmark, most):
     actuators = bp.make_actuators(JOINTS, **EFFECTS)
     start = bp.motors.init(actuators, qpos, 1 / 2000)
     k = discretise(actuators, start, 1 / 2000, ENVS)
-    stages, noise = compiled_stages(k, qpos.shape), NoiseBlocks()
+    noise = NoiseBlocks()
 
     def run():
         state = start
         for _ in range(steps):
-            state, measured, rate = advance_measurement(
-                k, state, qpos, qvel, noise(k, state, qpos), stages
-            )
-            limits = stages.limits(k, measured, rate)
-            state, delivered = advance_effort(k, state, effort, qpos, qvel, stages)
+            state, measured, rate = advance_measurement(k, state, qpos, qvel, noise(k, state, qpos))
+            limits = command_limits(k, measured, rate)
+            state, delivered = advance_effort(k, state, effort, qpos, qvel)
         return measured, delivered, limits
 
     measured, delivered, (_, most) = benchmark.pedantic(run, rounds=100, warmup_rounds=1)

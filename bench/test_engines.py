@@ -23,7 +23,7 @@ mujoco_batch = pytest.importorskip("mujoco.batch")
 from batchpid.sim import MujocoSolver, Robot, Runner  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
-from batchpid.sim.options import default_params  # noqa: E402
+from batchpid.sim.options.options import default_params  # noqa: E402
 
 TICKS, ROUNDS, SUBSTEPS = 20, 5, 20
 GAINS = ("tutorial", "tuned")
@@ -46,7 +46,7 @@ def bare_engine(robot: Robot, num_envs: int, ticks: int) -> float:
     """
     options: dict[str, Any] = {"ground": robot.has_ground, "engine": "mujoco"}
     spec = SceneSpec(
-        robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
+        robot.tables, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
     )
     built = robot_model(spec)
     batch = mujoco_batch.Batch(built.model, num_envs, nthread=1, persistent=True)

@@ -4,7 +4,8 @@ in the same motion.
 The peer steps the same compiled model from the same state, and gets the efforts that the closed
 loop applied at each sim step. Robots of the package example-robot-data are measured where it is
 installed, or where the variable EXAMPLE_ROBOT_DATA names its folder ``robots``; a quadruped of
-boxes always is. Processor time, in one process.
+boxes always is. MotrixSim, where installed (``pip install motrixsim``), steps the exported MJCF
+under the same efforts. Processor time, in one process, on one thread.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ mujoco_batch = pytest.importorskip("mujoco.batch")
 
 from batchpid import PIDParams  # noqa: E402
 from batchpid.sim import MujocoSolver, Robot, Runner  # noqa: E402
+from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 
@@ -112,7 +114,7 @@ def bare_engine(
     options = {"fixed_base": False, "engine": "mujoco"}
     built = robot_model(
         SceneSpec(
-            robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
+            robot.tables, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
         )
     )
     batch = mujoco_batch.Batch(built.model, num_envs, nthread=1, persistent=True)
@@ -123,6 +125,30 @@ def bare_engine(
         applied[:, built.qvel] = row
         batch.step()
     return (time.process_time() - began) / (len(efforts) * num_envs), qpos[:, built.qpos]
+
+
+def motrix(robot: Robot, num_envs: int, start: np.ndarray, efforts: np.ndarray) -> float:
+    """Return the processor time of an env step of MotrixSim under ``efforts`` (steps, dof)."""
+    import motrixsim
+
+    model = motrixsim.load_mjcf_str(to_mjcf(robot, None, 1 / 2000).text)
+    data = motrixsim.SceneData(model, batch=[num_envs])
+    qpos = np.array(data.dof_pos)
+    qpos[:, :3] = start[:3]
+    # MotrixSim writes a quaternion with its real part last.
+    qpos[:, 3:7] = np.roll(start[3:7], -1)
+    columns = [model.get_joint(name).dof_pos_index for name in robot.joint_names]
+    qpos[:, columns] = robot.start
+    data.set_dof_pos(qpos, model)
+    began = time.process_time()
+    for row in efforts:
+        data.actuator_ctrls = np.tile(row, (num_envs, 1))
+        motrixsim.step(model, data)
+    seconds = time.process_time() - began
+    # Contacts differ between the engines, but in this time no robot falls.
+    assert (data.dof_pos[:, 2] > 0.8 * start[2]).all()
+    assert not (data.dof_pos == qpos).all(), "the robots did not move"
+    return seconds / (len(efforts) * num_envs)
 
 
 @pytest.mark.parametrize("name", [*FILES, "boxes"])
@@ -156,3 +182,7 @@ def test_standing_robots(benchmark, report, compare, most, name, tmp_path):
     ratio = statistics.median(bare / ours for ours, bare in rows)
     benchmark.extra_info["over mujoco.batch without control"] = round(ratio, 3)
     compare(name, f"closed loop, {num_envs} envs", "mujoco.batch without control", ratio)
+    if importlib.util.find_spec("motrixsim"):
+        ours = statistics.median(ours for ours, _ in rows)
+        theirs = motrix(robot, num_envs, start, efforts)
+        compare(name, f"closed loop, {num_envs} envs", "MotrixSim without control", theirs / ours)

@@ -51,7 +51,7 @@ def step_alone(robot: Robot, efforts: NDArray[Any]) -> tuple[float, NDArray[Any]
     options |= {"fixed_base": robot.fixed_base}
     built = robot_model(
         SceneSpec(
-            robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
+            robot.tables, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
         )
     )
     steps, num_envs, _ = efforts.shape

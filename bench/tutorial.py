@@ -8,12 +8,13 @@ Runner does not use this module.
 
 from __future__ import annotations
 
+import re
 import tempfile
 from typing import Any
 
 import numpy as np
 
-from batchpid.sim import Robot
+from batchpid.sim import Robot, to_urdf
 from batchpid.sim.engine.sapien.user_content import HeadlessScene
 
 
@@ -58,7 +59,8 @@ class TutorialLoop:
         loader = self.scene.create_urdf_loader()
         loader.fix_root_link = True
         with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
-            file.write(robot.urdf)
+            # Without visuals, which need a render device.
+            file.write(re.sub(r"<visual>.*?</visual>", "", to_urdf(robot).text, flags=re.DOTALL))
             file.flush()
             self.robot: Any = loader.load(file.name)
         self._gains = (

@@ -85,7 +85,7 @@ class Workload:
             "ground": collisions,
         }
         spec = SceneSpec(
-            robot.urdf,
+            robot.tables,
             robot.ignored_pairs,
             robot.joints,
             TIMESTEP,

@@ -21,8 +21,9 @@ from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.law.params import FIELDS as PARAMS
 from batchpid.motors.actuators import FIELDS as ACTUATORS
+from batchpid.sim.options.groups import DEFAULT_ENGINE
+from batchpid.sim.options.options import GROUPS, OPTIONS, RunnerKeywords
 from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE, OPTIONS, RunnerKeywords
 
 DOCS = Path(__file__).parent
 
@@ -72,7 +73,8 @@ def options() -> str:
         declared(RunnerKeywords, Field),
     )
     rows = [("option", "range", "default", "kept in", "flag", "meaning"), ("---",) * 6]
-    for (name,), text in attributes(RunnerKeywords):
+    texts = [text for group in (RunnerKeywords, *GROUPS) for text in attributes(group)]
+    for (name,), text in texts:
         kept, flag = (
             OPTIONS[name].kept,
             f"`--{'no-' * (defaults[name] is True)}{name}`" if OPTIONS[name].flag else "",

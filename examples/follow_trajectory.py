@@ -1,5 +1,4 @@
-"""Follow a trajectory: to the tutorial's pose and back along a step, a trapezoid, minimum jerk, or
-limited jerk.
+"""Follow a trajectory: to the tutorial's pose and back along a step, a trapezoid, and minimum jerk.
 
     python examples/follow_trajectory.py
 
@@ -10,23 +9,16 @@ is to follow.
 
 import numpy as np
 
-from batchpid.errors import MissingDependencyError
 from batchpid.sim import Robot, Runner
-from batchpid.trajectories import Trajectory, jerk_limited, minimum_jerk, trapezoidal
+from batchpid.trajectories import Trajectory, minimum_jerk, trapezoidal
 
 DT = 0.01  # a tick: 20 sim steps [s]
 
 
 def profiles(start, target, velocity, acceleration) -> dict[str, Trajectory]:
-    """Return the same move as four profiles, held at the end for 1 s or longer."""
+    """Return the same move as three profiles, held at the end for 1 s or longer."""
     limits = {"max_velocity": velocity, "max_acceleration": acceleration}
     moves = {"trapezoidal": trapezoidal(start, target, DT, **limits)}
-    try:
-        moves["jerk limited"] = jerk_limited(
-            start, target, DT, **limits, max_jerk=10 * acceleration
-        )
-    except MissingDependencyError as error:
-        print(error)
     moves["minimum jerk"] = minimum_jerk(start, target, DT, **limits)
     last = max(move.time[-1] for move in moves.values())
     still = np.broadcast_to(target, (1, len(target)))

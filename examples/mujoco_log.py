@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from batchpid.sim import Robot
+from batchpid.sim import Robot, to_urdf
 from batchpid.sim.identification import excite
 
 
@@ -133,7 +133,7 @@ def _model(robot: Robot, truth: Truth, names: tuple[str, ...], timestep: float) 
     """Return MuJoCo's model of the robot: no contact, and only the joints ``names`` move."""
     import mujoco
 
-    spec = mujoco.MjSpec.from_string(robot.urdf)
+    spec = mujoco.MjSpec.from_string(to_urdf(robot).text)
     spec.option.timestep = timestep
     spec.compiler.fusestatic = False  # so that the tool link, which carries the payload, stays
     for index, name in enumerate(robot.joint_names):

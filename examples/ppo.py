@@ -7,6 +7,7 @@ one.
 """
 
 from collections import deque, namedtuple
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -98,6 +99,33 @@ def init_agent(key, observations, actions, log_std):
     }
 
 
+class Policy(NamedTuple):
+    """Policy without exploration; ``features`` maps observations to inputs of the network."""
+
+    layers: Any
+    normalizer: Normalizer
+    features: Callable[[Any], Any]
+
+    def __call__(self, observation):
+        """Return the actions (envs, actions)."""
+        return np.asarray(mlp(self.layers, self.normalizer(self.features(observation))))
+
+    def save(self, path):
+        """Write the policy to a file, .npz."""
+        weights = {
+            f"layer{k}_{j}": x for k, pair in enumerate(self.layers) for j, x in enumerate(pair)
+        }
+        np.savez(path, **weights, **self.normalizer._asdict())
+
+    @classmethod
+    def load(cls, path, features=lambda observation: observation):
+        """Return the policy in a file that :meth:`save` wrote."""
+        with np.load(path) as file:
+            count = sum(name.startswith("layer") for name in file) // 2
+            layers = [(file[f"layer{k}_0"], file[f"layer{k}_1"]) for k in range(count)]
+            return cls(layers, Normalizer(*(file[name] for name in Normalizer._fields)), features)
+
+
 def log_prob(agent, observation, action):
     """Return the log density of ``action`` under the policy."""
     mean, std = mlp(agent["actor"], observation), jnp.exp(agent["log_std"])
@@ -165,7 +193,7 @@ def update(agent, optimizer_state, batch, last_value, key, optimizer, config):
 
 
 def train(envs, config, scores, features=lambda observation: observation, shaping=None):
-    """Return the policy without exploration, and the learning curve: rows of env steps, seconds and
+    """Return the :class:`Policy`, and the learning curve: rows of env steps, seconds and
     means of scores.
 
     ``scores`` names entries of the info, whose values at the ends of episodes are shown.
@@ -212,4 +240,4 @@ def train(envs, config, scores, features=lambda observation: observation, shapin
                 f"{name} {mean:.3f}" for name, mean in zip(scores, means, strict=True)
             )
             print(f"{curve[-1][0]:9,} steps {curve[-1][1]:6.1f} s   {told}", flush=True)
-    return lambda raw: np.asarray(mlp(agent["actor"], normalizer(features(raw)))), np.array(curve)
+    return Policy(agent["actor"], normalizer, features), np.array(curve)

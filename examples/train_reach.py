@@ -31,6 +31,8 @@ class Config(ppo.Config):
     episode: int = 150  # Steps of an episode, 50 a second.
     shaping: float = 10.0  # Weight of the potential that shapes the reward.
     picture: Path | None = None  # Learning curve to draw: .png or .svg.
+    out: Path | None = None  # Policy to write: .npz.
+    policy: Path | None = None  # Policy to evaluate in place of a training: .npz.
 
 
 def make_envs(config):
@@ -104,7 +106,10 @@ def draw(curve, config):
 def main(config: Config):
     """Train, evaluate, and draw the learning curve."""
     envs = make_envs(config)
-    act, curve = ppo.train(envs, config, SCORES, features, shaping(envs, config))
+    if config.policy is None:
+        act, curve = ppo.train(envs, config, SCORES, features, shaping(envs, config))
+    else:
+        act, curve = ppo.Policy.load(config.policy, features), None
     success, error = evaluate(envs, act, config)
     envs.close()
     print(
@@ -112,7 +117,9 @@ def main(config: Config):
         end=" ",
     )
     print(f"the worst joint within {np.median(error):.4f} rad (median)")
-    if config.picture is not None:
+    if config.out is not None:
+        act.save(config.out)
+    if config.picture is not None and curve is not None:
         print("picture:", plots.save(draw(curve, config), config.picture))
 
 

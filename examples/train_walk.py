@@ -40,6 +40,7 @@ class Config(ppo.Config):
     timestep: float = 1 / 500  # Time step of law and physics [s].
     picture: Path | None = None  # Learning curve to draw: .png or .svg.
     record: Path | None = None  # Recording of the evaluation: .h5.
+    out: Path | None = None  # Policy to write: .npz.
 
 
 def make_envs(config, num_envs, episode):
@@ -91,6 +92,8 @@ def main(config: Config):
     """Train, evaluate, and draw the learning curve."""
     envs = make_envs(config, config.num_envs, config.episode)
     act, curve = ppo.train(envs, config, SCORES)
+    if config.out is not None:
+        act.save(config.out)
     envs.close()
     forward, along, fell = evaluate(act, config)
     walks = ~fell & (np.abs(forward - config.speed) <= MARGIN * config.speed)

@@ -10,21 +10,21 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from batchpid.sim.command import CommandSpec
+from batchpid.sim.diagnosis.loop_stability import StabilityWarning
+from batchpid.sim.diagnosis.run_checks import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.observation import Observation, Rollout, RunInfo
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.groups import Controller, Ray
+from batchpid.sim.options.options import RunnerKeywords, RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.ray_options import Ray
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
 from batchpid.sim.robot.findings import Finding, RepairWarning
-from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.run_checks import MovingSetpointWarning, SetpointWarning
-from batchpid.sim.runner_keywords import Controller, RunnerKeywords
+from batchpid.sim.signals.command import CommandSpec
+from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContact, MissedContactWarning
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
     from batchpid.sim.engine.physics import MujocoSolver, Physics
     from batchpid.sim.robot.urdf_export import to_urdf
-    from batchpid.sim.runner import Runner
+    from batchpid.sim.runner.runner import Runner
     from batchpid.sim.workers.pool import RecoveryWarning
 
 __all__ = [
@@ -76,7 +76,7 @@ __all__ = [
 _LOADED_LATE = {
     "MujocoSolver": "batchpid.sim.engine.physics",
     "Physics": "batchpid.sim.engine.physics",
-    "Runner": "batchpid.sim.runner",
+    "Runner": "batchpid.sim.runner.runner",
     "RecoveryWarning": "batchpid.sim.workers.pool",
     "to_mjcf": "batchpid.sim.engine.mujoco.mjcf_export",
     "to_urdf": "batchpid.sim.robot.urdf_export",

@@ -60,12 +60,12 @@ RARE = {
             "docs/sim-to-real.md",
             "docs/runner.md",
             "docs/controllers.md",
-            "docs/view.md",
+            "docs/files.md",
             "docs/task-space.md",
         ),
-        *("docs/moving-setpoints.md", "docs/it-does-not-settle.md"),
+        *("docs/moving-setpoints.md", "docs/choosing-gains.md"),
     ),
-    "sh": ("docs/two-engines.md", "docs/view.md", "docs/deploy.md", "docs/sim-to-real.md"),
+    "sh": ("docs/performance.md", "docs/files.md", "docs/deploy.md", "docs/sim-to-real.md"),
 }
 ONLY_PARSED = ("tune", "identify")
 

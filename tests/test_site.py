@@ -104,8 +104,9 @@ def test_the_tables_of_fields_are_those_of_the_code():
 
 
 LONGER = {
+    "README.md": 180,
     "tutorial.md": 200,
-    "choosing-gains.md": 155,
+    "choosing-gains.md": 170,
     "task-space.md": 160,
     "reliability.md": 230,
     "robots.md": 206,

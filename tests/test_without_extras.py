@@ -95,6 +95,10 @@ def test_each_command_and_program_runs_or_names_its_extra(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     for words, status, errors in json.loads(done.stdout):
         extra = "jax" if "jax" in words else NEEDED.get(words[0])
-        remedy = f"install it with: pip install 'batchpid[{extra}]'\n" if extra else ""
+        remedy = (
+            f"install it with: pip install '.[{extra}]' in the checkout of batchpid\n"
+            if extra
+            else ""
+        )
         assert (status or 0) == (2 if extra else 0), (words, errors)
         assert errors.endswith(remedy), (words, errors)

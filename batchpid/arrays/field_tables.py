@@ -1,12 +1,11 @@
-"""Declared fields: unit, bounds and neutral value of an option, in the annotation of its argument.
+"""Declared fields: unit, bounds and neutral value of an option, in its annotation.
 
 Params, actuators, guards, params of operational-space control, randomizations and options of a
-runner declare each option once, as an annotated argument. The checks of options and leaves, the
-keys of files, the neutral values, the bounds of a randomization and the tables of the guides
-(docs/tables.py) come from these annotations::
+runner declare each option once. The checks of options and leaves, the keys of files, the neutral
+values, the bounds of a randomization and the tables of the guides (docs/tables.py) come from these
+annotations::
 
-    def make_guard(joints: int, *, rate: Annotated[Array, Field("rad/s or m/s", math.inf,
-    above=True)] = None, ...)
+    rate: Annotated[Array, Field("rad/s or m/s", math.inf, above=True)] = None
 """
 
 from __future__ import annotations
@@ -25,8 +24,6 @@ from typing import (
     get_type_hints,
 )
 
-import numpy as np
-
 from batchpid.arrays.array_types import Array, Kind
 from batchpid.checks.validate import (
     AxisKind,
@@ -38,7 +35,6 @@ from batchpid.checks.validate import (
     is_traced,
     number,
 )
-from batchpid.errors import InvalidArgumentError
 
 T = TypeVar("T")
 
@@ -57,6 +53,8 @@ class Field(NamedTuple):
     """Largest value."""
     group: str = ""
     """Name of the group of fields to which it belongs, such as "motor"; see :func:`in_group`."""
+    default: object = None
+    """Default of the option."""
 
     def checked(
         self,
@@ -96,21 +94,13 @@ def declared(owner: Callable[..., object], kind: type[T]) -> dict[str, T]:
     class, by name.
     """
     hints = get_type_hints(owner, include_extras=True).items()
-    found = ((name, each) for name, hint in hints for each in getattr(hint, "__metadata__", ()))
-    return {name: each for name, each in found if isinstance(each, kind)}
+    metadata = ((name, one) for name, hint in hints for one in getattr(hint, "__metadata__", ()))
+    return {name: one for name, one in metadata if isinstance(one, kind)}
 
 
 def in_group(fields: Mapping[str, Field], group: str) -> dict[str, Field]:
     """Return the fields that belong to ``group``."""
     return {name: field for name, field in fields.items() if field.group == group}
-
-
-FREE = Field(low=-math.inf)
-"""Field without bounds."""
-WHOLE = ("max_delay", "seed")
-"""Leaves with one value for all joints."""
-TABLES = ("limit_positions", "limit_efforts")
-"""Leaves with a table for each joint (1 | envs, joints, points)."""
 
 
 def plain(name: str, kind: Kind, value: Any) -> Any:
@@ -123,11 +113,11 @@ def plain(name: str, kind: Kind, value: Any) -> Any:
     has another type.
     """
     kind, *metadata = get_args(kind) if get_origin(kind) is Annotated else (kind,)
-    bounds = next((each for each in metadata if isinstance(each, Field)), FREE)
+    bounds = next((one for one in metadata if isinstance(one, Field)), Field(low=-math.inf))
     if get_origin(kind) is Literal:
         return choice(name, value, get_args(kind))
     if NoneType in get_args(kind):
-        kinds = [each for each in get_args(kind) if each is not NoneType]
+        kinds = [one for one in get_args(kind) if one is not NoneType]
         if value is None or len(kinds) > 1:
             return value
         (kind,) = kinds
@@ -136,32 +126,3 @@ def plain(name: str, kind: Kind, value: Any) -> Any:
     if kind is int:
         return integer(name, value, int(bounds.low), int(bounds.high))
     return number(name, value, bounds.low, bounds.high, bounds.unit) if kind is float else value
-
-
-def check_leaves(
-    owner: str,
-    leaves: Any,
-    fields: Mapping[str, Field],
-    num_envs: int,
-    joint_names: Sequence[str] | None,
-) -> None:
-    """Check the leaves of a named tuple that may have been edited by hand.
-
-    Raises InvalidArgumentError if a leaf has a wrong shape, or values out of the bounds of
-    ``fields``. A leaf has one row or ``num_envs`` rows, and one column per joint. A leaf without a
-    field may hold any numbers.
-    """
-    for name, leaf in leaves._asdict().items():
-        if leaf is None or isinstance(leaf, tuple) or name in WHOLE:
-            continue
-        joints = leaves.num_joints if joint_names is None else len(joint_names)
-        shape = leaf.shape[:2] if name in TABLES else leaf.shape
-        if shape not in ((1, joints), (num_envs, joints)):
-            remedy = "give one row, or one row per env" + (
-                f", of {', '.join(joint_names)}" if joint_names else ""
-            )
-            problem = f"has shape {leaf.shape}, not {(1, joints)} or {(num_envs, joints)}"
-            raise InvalidArgumentError(f"{owner}.{name}", problem, remedy=remedy)
-        if not is_traced(leaf):
-            least = leaf.min(2) if name in TABLES else np.asarray(leaf)
-            fields.get(name, FREE).checked(f"{owner}.{name}", least, joint_names, infinite=True)

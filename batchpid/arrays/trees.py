@@ -67,7 +67,7 @@ def flatten(
     if not isinstance(tree, Mapping | tuple | list):
         return {name or "state": read(tree)}
     named: Document = {}
-    for key, part in _parts(tree).items():
+    for key, part in parts(tree).items():
         named |= flatten(part, separator, read, f"{name}{separator}{key}" if name else key)
     return named
 
@@ -82,14 +82,14 @@ def unflatten(
         return None
     if not isinstance(like, Mapping | tuple | list):
         return named[name or "state"]
-    parts = [
+    rebuilt = [
         unflatten(part, named, separator, f"{name}{separator}{key}" if name else key)
-        for key, part in _parts(like).items()
+        for key, part in parts(like).items()
     ]
-    return _rebuilt(like, parts)
+    return _rebuilt(like, rebuilt)
 
 
-def _parts(tree: Pytree) -> Document:
+def parts(tree: Pytree) -> Document:
     """Return the parts of a mapping, tuple or list by name."""
     if isinstance(tree, Mapping):
         return {str(key): part for key, part in tree.items()}

@@ -7,12 +7,10 @@ raises :class:`batchpid.InvalidArgumentError` where the value is invalid.
 from __future__ import annotations
 
 import difflib
-import functools
-import inspect
 import math
 import os
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar
 
@@ -154,15 +152,6 @@ def file_path(argument: str, value: Any, suffixes: Collection[str] = ()) -> Path
             remedy=f"end it in {' or '.join(suffixes)}",
         )
     return path
-
-
-def identifier(argument: str, value: Any) -> str:
-    """Return a name that is an identifier of Python."""
-    if not isinstance(value, str) or not value.isidentifier():
-        raise InvalidArgumentError(
-            argument, "cannot be a name in Python", value=value, remedy="use letters, digits and _"
-        )
-    return value
 
 
 def is_traced(value: Any) -> bool:
@@ -375,20 +364,6 @@ def check_keywords(owner: str, given: Collection[str], known: Collection[str]) -
             near = difflib.get_close_matches(name, known, 1)
             remedy = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(known)}"
             raise InvalidArgumentError(name, f"is not an argument of {owner}", remedy=remedy)
-
-
-def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate ``function``, which is called with the ``**options`` of others, to check the names
-    of its keywords.
-    """
-    known = tuple(inspect.signature(function).parameters)
-
-    @functools.wraps(function)
-    def checked(*args: P.args, **options: P.kwargs) -> R:
-        check_keywords(function.__name__, options, known)
-        return function(*args, **options)
-
-    return checked
 
 
 def _scalar(argument: str, value: Any, unit: str) -> float:

@@ -13,16 +13,17 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Document
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.choices import MeasuredRate
+from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.trees import is_leaf, leaves, parts, structure
 from batchpid.checks.validate import choice, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.c_rigid_body import rigid_body
-from batchpid.export.c_step import Dialect, Value, helpers, statements
+from batchpid.export.c_step import Dialect, helpers, statements
 from batchpid.export.differences import Exported, check_one_env
 from batchpid.law import pid
 from batchpid.law.coefficients import Coefficients, discretise
@@ -30,9 +31,8 @@ from batchpid.law.computed_torque import advance_with_mass_matrix, check_gain_un
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState
 from batchpid.motors import guard as guard_model
-from batchpid.motors.guard import Guard, GuardState, check_guard
-from batchpid.native.symbols import Symbol
-from batchpid.native.tracing import trace
+from batchpid.motors.guard import Guard, GuardState
+from batchpid.native.tracing import trace_trees
 from batchpid.task_space.rigid_tree import RigidTree
 
 RATES = {
@@ -100,122 +100,125 @@ class Header:
         tree: RigidTree | None,
     ) -> None:
         check_one_env(params)
-        time_step("dt", dt)
-        joints = params.num_joints
-        unnamed = [f"joint {at}" for at in range(joints)]
-        labels = unnamed if joint_names is None else names("joint_names", joint_names, joints)
-        if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
-            remedy = "use letters, digits and _"
-            raise InvalidArgumentError(
-                "prefix", "cannot be a name in C", value=prefix, remedy=remedy
-            )
-        params.check(1, labels)
-        check_gain_units(params)
-        if guard is not None:
-            check_guard(guard, 1, labels)
-        measures = isinstance(params.measurement_rate, MeasuredRate)
-        if inputs is None:
-            inputs = ("measurement_rate", "feedforward") if measures else ("feedforward",)
-        chosen = {choice("inputs", each, RATES) for each in inputs}
-        if measures and "measurement_rate" not in chosen:
-            remedy = "add it, or use params.replace(measurement_rate='difference')"
-            raise InvalidArgumentError(
-                "inputs", "lack measurement_rate, which the params use", remedy=remedy
-            )
-        if tree is not None:
-            instance("tree", tree, RigidTree, "use robot.kinematic_tree()")
-            if list(tree.joint_names) != list(labels):
-                problem = f"has the joints {', '.join(tree.joint_names)}, not {', '.join(labels)}"
-                raise InvalidArgumentError(
-                    "tree", problem, remedy="pass joint_names=, in the tree's order"
-                )
         self.params = params
-        self.dt = float(dt)
+        self.dt = time_step("dt", dt)
         self.guard = guard
         self.tree = tree
-        self.labels = labels
+        joints = params.num_joints
+        self.joints = [f"joint {at}" for at in range(joints)]
+        if joint_names is not None:
+            self.joints = names("joint_names", joint_names, joints)
+        if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
+            problem, remedy = "cannot be a name in C", "use letters, digits and _"
+            raise InvalidArgumentError("prefix", problem, value=prefix, remedy=remedy)
+        params.check(1, self.joints)
+        check_gain_units(params)
+        if guard is not None:
+            guard.check(1, self.joints)
+        if tree is not None:
+            self._check_tree(tree)
         self.names = Dialect(prefix, np.dtype(params.dtype), joints)
-        rates = [each for each in RATES if each in chosen]
         matrix = [] if params.gain_units is None else ["mass_matrix"]
-        self.given = ["setpoint", "measurement", *rates, *matrix]
+        self.inputs = ["setpoint", "measurement", *self._optional(inputs), *matrix]
         """Inputs of a step, in their order."""
         # init runs on a measurement of NaN: what is NaN afterwards is a copy of the measurement.
         nan = np.full((1, joints), math.nan, params.dtype)
-        started: Document = pid.init(params, nan).leaves()
-        if guard is not None:
-            started |= {"guarded_setpoint": nan, "guarded_rate": 0 * np.ones_like(nan)}
-        self.started = started
+        held = None if guard is None else GuardState(nan, np.zeros_like(nan))
+        self.state = pid.init(params, nan), held
         """State after init; NaN where it is the measurement."""
+
+    def _check_tree(self, tree: RigidTree) -> None:
+        instance("tree", tree, RigidTree, "use robot.kinematic_tree()")
+        if list(tree.joint_names) != self.joints:
+            joints = ", ".join(self.joints)
+            problem = f"has the joints {', '.join(tree.joint_names)}, not {joints}"
+            remedy = "pass joint_names=, in the tree's order"
+            raise InvalidArgumentError("tree", problem, remedy=remedy)
+
+    def _optional(self, inputs: Sequence[str] | None) -> list[str]:
+        """Return the optional inputs of a step, in the order of RATES."""
+        measures = isinstance(self.params.measurement_rate, MeasuredRate)
+        if inputs is None:
+            inputs = ("measurement_rate", "feedforward") if measures else ("feedforward",)
+        chosen = {choice("inputs", name, RATES) for name in inputs}
+        if measures and "measurement_rate" not in chosen:
+            remedy = "add it, or use params.replace(measurement_rate='difference')"
+            problem = "lack measurement_rate, which the params use"
+            raise InvalidArgumentError("inputs", problem, remedy=remedy)
+        return [name for name in RATES if name in chosen]
 
     def text(self) -> str:
         """Return the header."""
-        k = discretise(self.params, self.dt)
-        limits = self.guard if self.guard is not None else Guard()
-        constants = [leaf for leaf in (*k, *limits) if isinstance(leaf, np.ndarray)]
-        labels = [f"k_{name}" for name, leaf in k._asdict().items() if isinstance(leaf, np.ndarray)]
-        labels += [f"guard_{name}" for name, leaf in limits._asdict().items() if leaf is not None]
-        given, kept = self.given, list[str]()
+        constants = discretise(self.params, self.dt), self.guard or Guard()
+        trees = constants, self.state, (...,) * len(self.inputs)
+        traced = trace_trees(self._step, *map(structure, trees), dtype=self.params.dtype)
+        k, limits = constants
+        labels = [f"k_{name}" for name, leaf in parts(k).items() if is_leaf(leaf)]
+        labels += [f"guard_{name}" for name in limits.leaves()]
+        fields = self._fields()
+        read = [f"{label}[j]" for label in labels]
+        read += [self.names.number(literal) for literal in traced.literals]
+        state = [f"state->{name}[j]" for name in fields]
+        arguments = [f"{name}[j]" for name in self.inputs]
+        body = statements(
+            self.names, traced, [*read, *state, *arguments], len(read), [*state, "effort[j]"]
+        )
+        tables = [
+            self.names.table(label, leaf[0])
+            for label, leaf in zip(labels, leaves(constants), strict=True)
+            if re.search(rf"\b{label}\b", body)
+        ]
+        return self._frame("".join(tables), body, fields)
 
-        def step(*symbols: Symbol) -> list[Any]:
-            rest = iter(symbols)
-            law, limit = (
-                [next(rest) if isinstance(x, np.ndarray) else x for x in leaves]
-                for leaves in (k, limits)
-            )
-            state = {name: next(rest) for name in self.started}
-            new, effort = self._step(
-                Coefficients(*law), Guard(*limit), state, dict(zip(given, rest, strict=True))
-            )
-            kept[:] = new
-            return [*new.values(), effort]
-
-        traced = trace(step, len(constants), len(self.started) + len(given), self.params.dtype)
-        values = [Value(f"{label}[j]", label) for label in labels]
-        values += [Value(self.names.number(each)) for each in traced.literals]
-        read = [Value(f"state->{name}[j]", f"state->{name}") for name in self.started]
-        read += [Value(f"{name}[j]", name) for name in given]
-        results = [*(f"state->{name}[j]" for name in kept), "effort[j]"]
-        body = "".join(statements(self.names, traced, values, read, results))
-        used = [at for at, label in enumerate(labels) if re.search(rf"\b{label}\b", body)]
-        tables = "".join(self.names.table(labels[at], constants[at][0]) for at in used)
-        return self._frame(tables + body, body)
+    def _fields(self) -> Document:
+        """Return the initial state of law and guard by the names of the fields in C."""
+        law, held = self.state
+        guarded = {} if held is None else held._asdict()
+        return law.leaves() | {f"guarded_{name}": leaf for name, leaf in guarded.items()}
 
     def _step(
-        self, k: Coefficients, guard: Guard, state: Document, given: Document
-    ) -> tuple[Any, Any]:
-        """Return the new state, by name, and the effort: the control step of one robot."""
-        new: Document = {}
-        setpoint, rate = given["setpoint"], given.get("setpoint_rate")
-        if self.guard is not None:
-            before = GuardState(state["guarded_setpoint"], state["guarded_rate"])
-            after, changed = guard_model.advance(guard, before, setpoint, self.dt)
-            new = {"guarded_setpoint": after.setpoint, "guarded_rate": after.rate}
-            setpoint, xp = after.setpoint, setpoint.__array_namespace__()
-            rate = None if rate is None else xp.where(changed, after.rate, rate)
-        arguments = (
-            PIDState(**{name: leaf for name, leaf in state.items() if name in PIDState._fields}),
-            setpoint,
-            given["measurement"],
-        )
-        optional = given.get("measurement_rate"), rate, given.get("feedforward")
-        if "mass_matrix" in given:
-            law, terms = advance_with_mass_matrix(k, *arguments, given["mass_matrix"], *optional)
+        self,
+        constants: tuple[Coefficients, Guard],
+        state: tuple[PIDState, GuardState | None],
+        inputs: Sequence[Array],
+    ) -> list[Array]:
+        """Return the leaves of the new state, and the effort: the control step of one robot."""
+        k, limits = constants
+        law, held = state
+        named = dict(zip(self.inputs, inputs, strict=True))
+        setpoint, rate = named["setpoint"], named.get("setpoint_rate")
+        if held is not None:
+            held, changed = guard_model.advance(limits, held, setpoint, self.dt)
+            setpoint = held.setpoint
+            if rate is not None:
+                rate = namespace(rate).where(changed, held.rate, rate)
+        optional = named.get("measurement_rate"), rate, named.get("feedforward")
+        measurement = named["measurement"]
+        if "mass_matrix" in named:
+            law, terms = advance_with_mass_matrix(
+                k,
+                law,
+                setpoint,
+                measurement,
+                named["mass_matrix"],
+                *optional[:2],
+                None,
+                optional[2],
+            )
         else:
-            law, terms = pid.advance(k, *arguments, *optional)
-        return {**law.leaves(), **new}, terms.effort
+            law, terms = pid.advance(k, law, setpoint, measurement, *optional)
+        return [*leaves((law, held)), terms.effort]
 
     def extent(self, name: str) -> str:
         """Return the number of entries of an input."""
-        return (
-            f"{self.names.size} * {self.names.size}" if name == "mass_matrix" else self.names.size
-        )
+        n = self.names.size
+        return f"{n} * {n}" if name == "mass_matrix" else n
 
-    def _frame(self, code: str, body: str) -> str:
+    def _frame(self, tables: str, body: str, state: Document) -> str:
         """Return the whole header around the code of a step."""
         p = self.names.prefix
         t = self.names.type
         n = self.names.size
-        given = self.given
         units = {
             "setpoint": "r [rad or m]",
             "measurement": "y [rad or m]",
@@ -223,26 +226,24 @@ class Header:
             **RATES,
         }
         arguments = "".join(
-            f",\n    const {t} {name}[{self.extent(name)}] /* {units[name]} */" for name in given
+            f",\n    const {t} {name}[{self.extent(name)}] /* {units[name]} */"
+            for name in self.inputs
         )
         functions = "".join(helpers(self.names, body))
-        functions += "" if self.tree is None else rigid_body(self.names, self.tree)
-        passed = "".join(f", {name}" for name in given)
-        pointers = "".join(f"const {t} *{name}, " for name in given)
-        fields = "".join(f"  {t} {name}[{n}];\n" for name in self.started) or "  char unused;\n"
-        every, kept = (
-            self._started(self.started),
-            self._started({k: v for k, v in self.started.items() if k != "integral"}),
-        )
-        names = ["state", *given]
+        if self.tree is not None:
+            functions += rigid_body(self.names, self.tree)
+        passed = "".join(f", {name}" for name in self.inputs)
+        pointers = "".join(f"const {t} *{name}, " for name in self.inputs)
+        fields = "".join(f"  {t} {name}[{n}];\n" for name in state) or "  char unused;\n"
+        every = self._started(state)
+        lasting = self._started({name: leaf for name, leaf in state.items() if name != "integral"})
         unused = "".join(
-            f"  (void){name};\n" for name in names if not re.search(rf"\b{name}\b", body)
+            f"  (void){name};\n"
+            for name in ("state", *self.inputs)
+            if not re.search(rf"\b{name}\b", body)
         )
-        joints = (
-            "".join(f" *   {at}: {label}\n" for at, label in enumerate(self.labels))
-            .replace("*/", "* /")
-            .replace("/*", "/ *")
-        )
+        lines = "".join(f" *   {at}: {joint}\n" for at, joint in enumerate(self.joints))
+        joints = lines.replace("*/", "* /").replace("/*", "/ *")
         return f"""/* PID control of one robot, generated by batchpid. Do not edit.
  *
  * Call {p}_init once at the first measurement, then {p}_step every {self.dt!r} s; {p}_reset restarts
@@ -273,13 +274,13 @@ static inline void {p}_init({p}_state *state, const {t} measurement[{n}]) {{
 
 /* Restart from a measurement; the integral is kept. */
 static inline void {p}_reset({p}_state *state, const {t} measurement[{n}]) {{
-{kept}}}
+{lasting}}}
 
 /* Advance the law by one time step and write the efforts [N m or N]. */
 static inline void {p}_step(
     {p}_state *state{arguments},
     {t} effort[{n}]) {{
-{code}{unused}}}
+{tables}{body}{unused}}}
 
 #ifdef __cplusplus
 }}
@@ -300,22 +301,16 @@ class {p}_controller {{
 
     def _started(self, leaves: Document) -> str:
         """Return the statements that start ``leaves`` of the state."""
+        unused = "  (void)state;\n  (void)measurement;\n"
         lines = []
         for name, leaf in leaves.items():
             numbers = [
-                None if math.isnan(each) else self.names.number(each) for each in leaf[0].tolist()
+                "measurement[j]" if math.isnan(number) else self.names.number(number)
+                for number in leaf[0].tolist()
             ]
-            if len(set(numbers)) == 1:
-                lines.append(f"    state->{name}[j] = {numbers[0] or 'measurement[j]'};\n")
-            else:
-                table = ", ".join(map(str, numbers))
-                lines.append(
-                    f"    static const {self.names.type} {name}[{self.names.size}] = {{{table}}};\n"
-                )
-                lines.append(f"    state->{name}[j] = {name}[j];\n")
-        loop = (
-            f"  for (int j = 0; j < {self.names.size}; ++j) {{\n{''.join(lines)}  }}\n"
-            if lines
-            else ""
-        )
-        return f"{loop}  (void)state;\n  (void)measurement;\n"
+            value = numbers[0]
+            if len(set(numbers)) > 1:
+                value = f"{name}[j]"
+                lines.append(f"  {self.names.table(name, leaf[0])}")
+            lines.append(f"    state->{name}[j] = {value};\n")
+        return "".join([self.names.loop, *lines, "  }\n", unused]) if lines else unused

@@ -1,10 +1,10 @@
 """Rigid-body functions of a robot in C: mass matrix, bias and gravity, with the robot's constants
 as tables.
 
-The algorithms are the same as in :mod:`batchpid.task_space.tree_dynamics`: composite rigid bodies
-and recursive Newton-Euler, in the axes of the world and about its origin (R. Featherstone, Rigid
-Body Dynamics Algorithms, Springer, 2008, sections 5.3 and 6.2). The sums of a joint run over its
-ancestors alone, so the last bits differ from NumPy's.
+The efforts of velocities and accelerations are computed by the recursive Newton-Euler algorithm, in
+the axes of the world and about its origin (R. Featherstone, Rigid Body Dynamics Algorithms,
+Springer, 2008, section 5.3); the bias is that of no acceleration, and a row of the mass matrix that
+of a unit acceleration (section 6.1). The last bits differ from NumPy's.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ def rigid_body(c: Dialect, tree: RigidTree) -> str:
     t = c.type
     n = c.size
     f = c.suffix
+    zero, one = c.number(0.0), c.number(1.0)
     # A joint's rotation is linear in 1, sin q and 1 - cos q, so that three constant matrices a
     # joint are enough.
     rotations = {"turn": bodies.at_zero, "sine": bodies.sine, "cosine": bodies.cosine}
@@ -31,15 +32,17 @@ def rigid_body(c: Dialect, tree: RigidTree) -> str:
         c.table(f"k_{name}", leaf[:, :, :3].reshape(-1, 9)) for name, leaf in rotations.items()
     )
     poses += c.table("k_place", bodies.at_zero[..., 3]) + c.table("k_slide", bodies.slide[..., 3])
-    poses += c.table("k_center", bodies.center)
-    poses += c.table("k_tensor", bodies.tensor.reshape(-1, 9)) + _integers(
-        c, "slides", bodies.slides[:, 0]
-    )
-    above, masses = _integers(c, "above", tree.body_parents), c.table("k_mass", bodies.mass[:, 0])
+    poses += c.table("k_center", bodies.center) + c.table("k_tensor", bodies.tensor.reshape(-1, 9))
+    poses += _integers(c, "slides", bodies.slides[:, 0])
+    above = _integers(c, "above", tree.body_parents)
+    coupling = _integers(c, "leader", tree.coupling.leader)
+    coupling += c.table("multiplier", tree.coupling.multiplier)
     fall = ", ".join(map(c.number, bodies.gravity.tolist()))
+    tables = above + coupling + c.table("k_mass", bodies.mass[:, 0])
+    tables += c.table("k_armature", np.asarray(tree.armature))
+    tables += f"  static const {t} gravity[3] = {{{fall}}};\n"
     # Everything is about the world's origin: sums over bodies then need no shift from one to the
-    # next. The mass matrix is that of composite bodies, the bias recursive Newton-Euler
-    # (Featherstone 2008, ch. 5 and 6).
+    # next.
     return f"""/* Bodies at a pose, in the axes of the world. */
 typedef struct {{
   {t} turn[{n}][9], place[{n}][3];      /* axes (rows of a matrix) and origin */
@@ -62,7 +65,7 @@ static inline void {p}_rotate(const {t} *turn, const {t} *a, {t} *out) {{
 
 static inline void {p}_place(const {t} *qpos, {p}_bodies *b) {{
 {above}{poses}  for (int j = 0; j < {n}; ++j) {{
-    const {t} sine = sin{f}(qpos[j]), rest = {c.number(1.0)} - cos{f}(qpos[j]);
+    const {t} sine = sin{f}(qpos[j]), rest = {one} - cos{f}(qpos[j]);
     const int up = above[j];
     {t} turn[9], place[3], mixed[9];
     for (int i = 0; i < 9; ++i) turn[i] = k_turn[j][i] + sine * k_sine[j][i] + rest * k_cosine[j][i];
@@ -73,7 +76,7 @@ static inline void {p}_place(const {t} *qpos, {p}_bodies *b) {{
         b->turn[j][3 * i + k] = up < 0 ? turn[3 * i + k] : {p}_dot(b->turn[up] + 3 * i, column);
       }}
       b->place[j][i] = up < 0 ? place[i] : {p}_dot(b->turn[up] + 3 * i, place) + b->place[up][i];
-      b->linear[j][i] = b->angular[j][i] = {c.number(0.0)};
+      b->linear[j][i] = b->angular[j][i] = {zero};
     }}
     for (int i = 0; i < 3; ++i) (slides[j] ? b->linear[j] : b->angular[j])[i] = b->turn[j][3 * i];
     if (!slides[j]) {p}_add_cross(b->place[j], b->angular[j], b->linear[j]);
@@ -89,140 +92,82 @@ static inline void {p}_place(const {t} *qpos, {p}_bodies *b) {{
   }}
 }}
 
-/* Mass matrix [kg m^2 or kg] at qpos [rad or m], by rows, with the armature of the motors. */
-static inline void {p}_mass_matrix(const {t} qpos[{n}], {t} matrix[{n} * {n}]) {{
-{above}{masses}{c.table("k_armature", np.asarray(tree.armature))}  {p}_bodies b;
-  {t} mass[{n}], moment[{n}][3], tensor[{n}][9]; /* of all that a joint moves, about the world's origin */
-  {p}_place(qpos, &b);
-  for (int j = 0; j < {n}; ++j) {{
-    const {t} *center = b.center[j];
-    mass[j] = k_mass[j];
-    for (int i = 0; i < 3; ++i) {{
-      moment[j][i] = k_mass[j] * center[i];
-      for (int k = 0; k < 3; ++k) {{
-        const {t} square = i == k ? {p}_dot(center, center) : {c.number(0.0)};
-        tensor[j][3 * i + k] = b.tensor[j][3 * i + k] + k_mass[j] * (square - center[i] * center[k]);
-      }}
-    }}
-  }}
-  for (int i = 0; i < {n} * {n}; ++i) matrix[i] = {c.number(0.0)};
-  for (int j = {n} - 1; j >= 0; --j) {{
-    {t} linear[3], angular[3], change[3] = {{{c.number(0.0)}, {c.number(0.0)}, {c.number(0.0)}}};
-    if (above[j] >= 0) {{
-      mass[above[j]] += mass[j];
-      for (int i = 0; i < 3; ++i) moment[above[j]][i] += moment[j][i];
-      for (int i = 0; i < 9; ++i) tensor[above[j]][i] += tensor[j][i];
-    }}
-    {p}_add_cross(b.angular[j], moment[j], change);
-    for (int i = 0; i < 3; ++i) linear[i] = mass[j] * b.linear[j][i] + change[i];
-    {p}_rotate(tensor[j], b.angular[j], angular);
-    {p}_add_cross(moment[j], b.linear[j], angular);
-    for (int i = j; i >= 0; i = above[i]) {{
-      matrix[{n} * i + j] = matrix[{n} * j + i] = {p}_dot(b.linear[i], linear) + {p}_dot(b.angular[i], angular);
-    }}
-    matrix[{n} * j + j] += k_armature[j];
-  }}
-{_folded_matrix(c, tree)}}}
-
-/* Efforts [N m or N] that cancel gravity and Coriolis and centrifugal forces, at qpos [rad or m] and qvel. */
-static inline void {p}_bias(const {t} qpos[{n}], const {t} qvel[{n}], {t} bias[{n}]) {{
-{above}{masses}  static const {t} gravity[3] = {{{fall}}};
-  {p}_bodies b;
-  {t} v[{n}][3], w[{n}][3], dv[{n}][3], dw[{n}][3]; /* velocity and acceleration at the world's origin */
+/* Efforts [N m or N] at velocities and accelerations of the joints, under a share of gravity, with the armature. */
+static inline void {p}_efforts(const {p}_bodies *b, const {t} *qvel, const {t} *qacc, {t} share, {t} *effort) {{
+{tables}  {t} v[{n}][3], w[{n}][3], dv[{n}][3], dw[{n}][3]; /* velocity and acceleration at the world's origin */
   {t} force[{n}][3], torque[{n}][3];
-  {p}_place(qpos, &b);
   for (int j = 0; j < {n}; ++j) {{
     const int up = above[j];
-    const {t} *center = b.center[j];
+    const {t} *center = b->center[j];
     {t} linear[3], angular[3], spin[3], rate[3];
     for (int i = 0; i < 3; ++i) {{
-      linear[i] = b.linear[j][i] * qvel[j];
-      angular[i] = b.angular[j][i] * qvel[j];
-      v[j][i] = (up < 0 ? {c.number(0.0)} : v[up][i]) + linear[i];
-      w[j][i] = (up < 0 ? {c.number(0.0)} : w[up][i]) + angular[i];
-      dv[j][i] = up < 0 ? {c.number(0.0)} : dv[up][i];
-      dw[j][i] = up < 0 ? {c.number(0.0)} : dw[up][i];
+      linear[i] = b->linear[j][i] * qvel[j];
+      angular[i] = b->angular[j][i] * qvel[j];
+      v[j][i] = (up < 0 ? {zero} : v[up][i]) + linear[i];
+      w[j][i] = (up < 0 ? {zero} : w[up][i]) + angular[i];
+      dv[j][i] = (up < 0 ? {zero} : dv[up][i]) + b->linear[j][i] * qacc[j];
+      dw[j][i] = (up < 0 ? {zero} : dw[up][i]) + b->angular[j][i] * qacc[j];
     }}
     {p}_add_cross(w[j], linear, dv[j]);
     {p}_add_cross(v[j], angular, dv[j]);
     {p}_add_cross(w[j], angular, dw[j]);
     for (int i = 0; i < 3; ++i) {{
       rate[i] = v[j][i];
-      force[j][i] = dv[j][i] - gravity[i];
+      force[j][i] = dv[j][i] - share * gravity[i];
     }}
     {p}_add_cross(w[j], center, rate);
     {p}_add_cross(dw[j], center, force[j]);
     {p}_add_cross(w[j], rate, force[j]);
     for (int i = 0; i < 3; ++i) force[j][i] *= k_mass[j];
-    {p}_rotate(b.tensor[j], dw[j], torque[j]);
-    {p}_rotate(b.tensor[j], w[j], spin);
+    {p}_rotate(b->tensor[j], dw[j], torque[j]);
+    {p}_rotate(b->tensor[j], w[j], spin);
     {p}_add_cross(w[j], spin, torque[j]);
     {p}_add_cross(center, force[j], torque[j]);
   }}
   for (int j = {n} - 1; j >= 0; --j) {{
-    bias[j] = {p}_dot(b.linear[j], force[j]) + {p}_dot(b.angular[j], torque[j]);
+    effort[j] = {p}_dot(b->linear[j], force[j]) + {p}_dot(b->angular[j], torque[j]) + k_armature[j] * qacc[j];
     for (int i = 0; i < 3 && above[j] >= 0; ++i) {{
       force[above[j]][i] += force[j][i];
       torque[above[j]][i] += torque[j][i];
     }}
   }}
-{_folded_bias(c, tree)}}}
+  for (int j = 0; j < {n}; ++j) {{ /* followers act through their leaders */
+    if (leader[j] == j) continue;
+    effort[leader[j]] += multiplier[j] * effort[j];
+    effort[j] = {zero};
+  }}
+}}
+
+/* Mass matrix [kg m^2 or kg] at qpos [rad or m], by rows, with the armature of the motors. */
+static inline void {p}_mass_matrix(const {t} qpos[{n}], {t} matrix[{n} * {n}]) {{
+{coupling}  const {t} still[{n}] = {{{zero}}};
+  {p}_bodies b;
+  {p}_place(qpos, &b);
+  for (int i = 0; i < {n}; ++i) {{ /* a row is the effort of a unit acceleration; the matrix is symmetric */
+    {t} unit[{n}];
+    for (int j = 0; j < {n}; ++j) unit[j] = leader[j] == i ? multiplier[j] : {zero};
+    {p}_efforts(&b, still, unit, {zero}, matrix + {n} * i);
+    if (leader[i] != i) matrix[{n} * i + i] = {one};
+  }}
+}}
+
+/* Efforts [N m or N] that cancel gravity and Coriolis and centrifugal forces, at qpos [rad or m] and qvel. */
+static inline void {p}_bias(const {t} qpos[{n}], const {t} qvel[{n}], {t} bias[{n}]) {{
+  const {t} still[{n}] = {{{zero}}};
+  {p}_bodies b;
+  {p}_place(qpos, &b);
+  {p}_efforts(&b, qvel, still, {one}, bias);
+}}
 
 /* Efforts [N m or N] that hold the robot at qpos [rad or m]. */
 static inline void {p}_gravity(const {t} qpos[{n}], {t} bias[{n}]) {{
-  const {t} still[{n}] = {{{c.number(0.0)}}};
+  const {t} still[{n}] = {{{zero}}};
   {p}_bias(qpos, still, bias);
 }}
 
 """
 
 
-def _folded_matrix(c: Dialect, tree: RigidTree) -> str:
-    """Return the lines that reduce ``matrix`` to the leaders of coupled joints:
-    :meth:`Coupling.mass_matrix`.
-    """
-    n = c.size
-    lines = f"""  for (int j = 0; j < {n}; ++j) {{
-    for (int i = 0; i < {n} && leader[j] != j; ++i) matrix[{n} * leader[j] + i] += multiplier[j] * matrix[{n} * j + i];
-  }}
-  for (int j = 0; j < {n}; ++j) {{
-    for (int i = 0; i < {n} && leader[j] != j; ++i) matrix[{n} * i + leader[j]] += multiplier[j] * matrix[{n} * i + j];
-  }}
-  for (int j = 0; j < {n}; ++j) {{
-    if (leader[j] == j) continue;
-    for (int i = 0; i < {n}; ++i) matrix[{n} * j + i] = matrix[{n} * i + j] = {c.number(0.0)};
-    matrix[{n} * j + j] = {c.number(1.0)};
-  }}
-"""
-    return _folded(c, tree, lines)
-
-
-def _folded_bias(c: Dialect, tree: RigidTree) -> str:
-    """Return the lines that reduce ``bias`` to the leaders of coupled joints:
-    :meth:`Coupling.efforts`.
-    """
-    lines = f"""  for (int j = 0; j < {c.size}; ++j) {{
-    if (leader[j] == j) continue;
-    bias[leader[j]] += multiplier[j] * bias[j];
-    bias[j] = {c.number(0.0)};
-  }}
-"""
-    return _folded(c, tree, lines)
-
-
-def _folded(c: Dialect, tree: RigidTree, lines: str) -> str:
-    """Return ``lines`` after the tables of the coupling that they need; no lines without
-    followers.
-    """
-    if tree.coupling.is_identity:
-        return ""
-    return (
-        _integers(c, "leader", tree.coupling.leader)
-        + c.table("multiplier", tree.coupling.multiplier)
-        + lines
-    )
-
-
 def _integers(c: Dialect, name: str, values: object) -> str:
-    numbers = ", ".join(str(int(each)) for each in np.asarray(values))
+    numbers = ", ".join(str(int(value)) for value in np.asarray(values))
     return f"  static const int {name}[{c.size}] = {{{numbers}}};\n"

@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,8 +46,8 @@ _EXPRESSIONS = {
 """Elementwise operations in C. A mask is 1 or 0. A NaN propagates through max and min, as in
 NumPy.
 """
-_ACROSS = ("row_minimum", "matrix_vector")
-"""Operations that combine the joints."""
+_ACROSS = {"row_minimum": "{0}", "matrix_vector": "{0}{1}"}
+"""Operations that combine the joints, and their operands."""
 
 
 class Dialect(NamedTuple):
@@ -75,6 +74,11 @@ class Dialect(NamedTuple):
         """Name of the constant with the number of joints."""
         return f"{self.prefix.upper()}_JOINTS"
 
+    @property
+    def loop(self) -> str:
+        """Beginning of a loop over the joints."""
+        return f"  for (int j = 0; j < {self.size}; ++j) {{\n"
+
     def number(self, value: float) -> str:
         """Return a number of the dtype as a literal that reads back as the same number."""
         if math.isinf(value):
@@ -88,131 +92,88 @@ class Dialect(NamedTuple):
         return f"  static const {self.type} {name}{size} = {self._braces(rows)};\n"
 
     def _braces(self, values: Array) -> str:
-        return (
-            "{"
-            + ", ".join(
-                self._braces(row) if row.ndim else self.number(float(row)) for row in values
-            )
-            + "}"
-        )
-
-
-class Value(NamedTuple):
-    """Value of the law for each joint: an expression for joint ``j``, and whether it is an array of
-    temporaries.
-    """
-
-    text: str
-    array: str | None = None
-    """Name of the array, for operations across joints."""
+        if not values.ndim:
+            return self.number(float(values))
+        return f"{{{', '.join(map(self._braces, values))}}}"
 
 
 def statements(
-    c: Dialect, traced: Trace, constants: list[Value], read: list[Value], results: list[str]
-) -> Iterator[str]:
-    """Yield the statements of a step: loops over the joints, with the operations across joints
+    c: Dialect, traced: Trace, names: list[str], constants: int, places: list[str]
+) -> str:
+    """Return the statements of a step: loops over the joints, with the operations across joints
     between them.
+
+    ``names`` are expressions of the trace's constants, of which there are ``constants``, and of its
+    inputs, for joint ``j``. The results are written to ``places``.
     """
-    operations, ends = _unrolled(traced, len(constants), len(read))
-    values = dict(enumerate([*constants, *read]))
-    starts = [0, *(at for at, each in enumerate(operations) if each[0] in _ACROSS), len(operations)]
-    loop_of = {
-        each[1]: sum(start <= at for start in starts[1:]) for at, each in enumerate(operations)
-    }
-    last = len(starts) - 2
-    shared = (
-        {  # temporaries that a later loop or an operation across joints reads
-            operand
-            for at, (name, _, operands) in enumerate(operations)
-            for operand in operands
-            if operand in loop_of
-            and (name in _ACROSS or loop_of[operand] < sum(start <= at for start in starts[1:]))
-        }
-        | {end for end in ends if loop_of.get(end, last) < last}
-    )
-    arrays = sorted(shared | {each[1] for each in operations if each[0] in _ACROSS})
-    if arrays:
-        yield f"  {c.type} {', '.join(f't{at}[{c.size}]' for at in arrays)};\n"
-    for loop, (start, stop) in enumerate(pairwise(starts)):
-        first = operations[start] if start < stop else None
-        if first is not None and first[0] in _ACROSS:
-            yield _across(c, first[0], f"t{first[1]}", [values[each] for each in first[2]])
-            values[first[1]] = Value(f"t{first[1]}[j]", f"t{first[1]}")
-            start += 1
-        if start == stop and loop < last:
-            continue
-        yield f"  for (int j = 0; j < {c.size}; ++j) {{\n"
-        for name, out, operands in operations[start:stop]:
-            texts = [values[each].text for each in operands]
-            keys = {"p": c.prefix, "f": c.suffix, "one": c.number(1.0), "zero": c.number(0.0)}
-            target = f"t{out}[j]" if out in shared else f"const {c.type} t{out}"
-            yield f"    {target} = {_EXPRESSIONS[name].format(*texts, **keys)};\n"
-            values[out] = Value(f"t{out}[j]", f"t{out}") if out in shared else Value(f"t{out}")
-        if loop == last:
-            yield from _stores(c, results, [values[end].text for end in ends])
-        yield "  }\n"
+    operations, ends = _unrolled(traced, constants, len(names) - constants)
+    symbols = {"p": c.prefix, "f": c.suffix, "one": c.number(1.0), "zero": c.number(0.0)}
+    arrays = ", ".join(f"t{out}[{c.size}]" for _, out, _ in operations)
+    lines = [f"  {c.type} {arrays};\n"] if arrays else []
 
+    def text(value: int) -> str:
+        return names[value] if value < len(names) else f"t{value}[j]"
 
-def _stores(c: Dialect, places: list[str], texts: list[str]) -> Iterator[str]:
-    """Yield the statements that write the results; the old state is read before it is
-    overwritten.
-    """
-    for at, (place, text) in enumerate(zip(places, texts, strict=True)):
-        if text.startswith("state->") and text != place:
-            texts[at] = f"old{at}"
-            yield f"    const {c.type} old{at} = {text};\n"
-    yield from (
-        f"    {place} = {text};\n"
-        for place, text in zip(places, texts, strict=True)
-        if place != text
-    )
-
-
-def _across(c: Dialect, name: str, out: str, operands: list[Value]) -> str:
-    """Return the call of an operation across joints."""
-    return (
-        f"  {c.prefix}_{name}({', '.join(each.array or each.text for each in operands)}, {out});\n"
-    )
+    in_loop = False
+    for name, out, operands in operations:
+        texts = [text(operand) for operand in operands]
+        is_across = name in _ACROSS
+        if in_loop == is_across:  # a loop ends before an operation across joints
+            in_loop = not is_across
+            lines.append(c.loop if in_loop else "  }\n")
+        if is_across:
+            whole = ", ".join(part.removesuffix("[j]") for part in (*texts, text(out)))
+            lines.append(f"  {c.prefix}_{name}({whole});\n")
+        else:
+            lines.append(f"    {text(out)} = {_EXPRESSIONS[name].format(*texts, **symbols)};\n")
+    if not in_loop:
+        lines.append(c.loop)
+    results = [text(end) for end in ends]
+    for at, (place, result) in enumerate(zip(places, results, strict=True)):
+        if result.startswith("state->") and result != place:
+            # The old state is read before it is overwritten.
+            lines.append(f"    const {c.type} old{at} = {result};\n")
+            results[at] = f"old{at}"
+    lines += [
+        f"    {place} = {result};\n"
+        for place, result in zip(places, results, strict=True)
+        if place != result
+    ]
+    return "".join([*lines, "  }\n"])
 
 
 def _unrolled(
-    traced: Trace, constants: int, read: int
+    traced: Trace, constants: int, inputs: int
 ) -> tuple[list[tuple[str, int, list[int]]], list[int]]:
     """Return the operations ``(name, value, operands)`` of a trace, each with a new value, and the
     values returned.
 
-    The operations on constants come first. Values below ``constants + read`` are constants and
+    The operations on constants come first. Values below ``constants + inputs`` are constants and
     inputs of a step.
     """
     operations: list[tuple[str, int, list[int]]] = []
-    following = iter(range(constants + read, 10**9))
 
-    def unroll(part: Trace, at: list[int]) -> list[int]:
-        for code, out, *operands in (
-            np.frombuffer(part.operations, np.int32).reshape(-1, 5).tolist()
-        ):
-            name, new = OPERATIONS[code], next(following)
-            operations.append((name, new, [at[each] for each in operands[: _operands(name)]]))
-            at[out] = new
-        return [at[each] for each in np.frombuffer(part.results, np.int32).tolist()]
+    def unroll(part: Trace, first: list[int]) -> list[int]:
+        values = first + [0] * part.registers  # the value in each register
+        rows = np.frombuffer(part.operations, np.int32).reshape(-1, 5).tolist()
+        for code, out, *operands in rows:
+            name = OPERATIONS[code]
+            value = constants + inputs + len(operations)
+            read = [values[operand] for operand in operands[: _operands(name)]]
+            operations.append((name, value, read))
+            values[out] = value
+        return [values[end] for end in np.frombuffer(part.results, np.int32).tolist()]
 
-    fixed = [*range(constants)]
+    fixed = list(range(constants))
     if traced.prelude is not None:
-        fixed += unroll(traced.prelude, fixed + [0] * traced.prelude.registers)
-    first = [*fixed, *range(constants, constants + read)]
-    return operations, unroll(traced, first + [0] * traced.registers)
+        fixed += unroll(traced.prelude, fixed)
+    return operations, unroll(traced, fixed + list(range(constants, constants + inputs)))
 
 
 def _operands(name: str) -> int:
     """Return the number of operands of an operation."""
-    return 1 + max(
-        map(
-            int,
-            re.findall(
-                r"\{(\d)\}", _EXPRESSIONS.get(name, "{1}" if name == "matrix_vector" else "{0}")
-            ),
-        )
-    )
+    expression = _ACROSS.get(name) or _EXPRESSIONS[name]
+    return len(set(re.findall(r"\{\d\}", expression)))
 
 
 def helpers(c: Dialect, body: str) -> Iterator[str]:
@@ -220,7 +181,6 @@ def helpers(c: Dialect, body: str) -> Iterator[str]:
     p = c.prefix
     t = c.type
     n = c.size
-    f = c.suffix
     across = f"{p}_row_minimum(" in body
     for name, sign in (("max", ">"), ("min", "<")):
         if f"{p}_{name}(" in body or (across and name == "min"):
@@ -239,7 +199,7 @@ def helpers(c: Dialect, body: str) -> Iterator[str]:
         yield f"""/* Sums of products in NumPy's order: sequential below eight terms, else eight partial sums. */
 static inline void {p}_matrix_vector(const {t} *a, const {t} *b, {t} *out) {{
   for (int i = 0; i < {n}; ++i, a += {n}) {{
-    {t} sum = -0.0{f};
+    {t} sum = -0.0{c.suffix};
     int k = 0;
     if ({n} >= 8) {{
       {t} s[8];
@@ -250,7 +210,7 @@ static inline void {p}_matrix_vector(const {t} *a, const {t} *b, {t} *out) {{
       sum = ((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7]));
     }}
     for (; k < {n}; ++k) sum += a[k] * b[k];
-    out[i] = 0.0{f} + sum;
+    out[i] = 0.0{c.suffix} + sum;
   }}
 }}
 """

@@ -4,15 +4,17 @@ law.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Array, Float64
+from batchpid.arrays.array_types import Array, Bool, Document, Float64
 from batchpid.checks.validate import at_least, instance, names, read_array, time_step
 from batchpid.errors import InvalidArgumentError
+from batchpid.law.anti_windup import named
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.implicit import as_explicit
 from batchpid.law.params import PIDParams
@@ -59,17 +61,12 @@ class Differences(list[str]):
         """Return the params of the explicit law at this time step."""
         explicit = as_explicit(params, self.dt)
         if explicit is not params:
-            with np.errstate(invalid="ignore"):
-                share = np.where(params.kp > 0, explicit.kp / params.kp, 1.0)[0]
-            text = (
-                f"gains of the explicit law at dt = {self.dt:g} s, for no other step: kp times"
-                f" {self.listed(share)}"
-            )
+            share = explicit.kp[0] / np.where(params.kp[0] > 0, params.kp[0], np.inf)
+            text = f"gains of the explicit law at dt = {self.dt:g} s, for no other step: kp times"
+            text = f"{text} {self.listed(np.where(params.kp[0] > 0, share, 1.0))}"
             if params.ki is not None and np.any(params.ki > 0):
-                text += (
-                    "; the integral takes the setpoint for the beginning of a step, a lead of dt"
-                    " times its rate"
-                )
+                text += "; the integral takes the setpoint for the beginning of a step, a lead of"
+                text += " dt times its rate"
             self.append(f"discretization: {text}")
         return explicit
 
@@ -79,60 +76,66 @@ class Differences(list[str]):
         if params.gain_units is None:
             return params
         if poses is None:
+            problem = "is missing for gains per mass_matrix"
             remedy = "pass inertia=, the diagonal of the mass matrix, or gains in effort units"
-            raise InvalidArgumentError(
-                "inertia", "is missing for gains per mass_matrix", remedy=remedy
-            )
-        scale = poses[0]
-        leaves = {}
-        for name in ("kp", "ki", "kd", "integral_min", "integral_max"):
-            leaf = getattr(params, name)
-            if leaf is not None:
-                leaves[name] = (leaf * scale).astype(params.dtype)
-        text = (
-            f"gains per mass_matrix are efforts at one inertia: {self.listed(scale)} kg m^2 or kg"
-        )
-        ratio = poses / scale
+            raise InvalidArgumentError("inertia", problem, remedy=remedy)
+        ratio = poses / poses[0]
+        text = f"gains per mass_matrix are efforts at one inertia: {self.listed(poses[0])} kg m^2"
+        text += " or kg"
         if len(ratio) > 1:
-            text += (
-                f"; in other poses the inertia is {ratio.min():.3g} to {ratio.max():.3g} times that"
-            )
+            ends = f"{ratio.min():.3g} to {ratio.max():.3g}"
+            text += f"; in other poses the inertia is {ends} times that"
         self.append(f"gain_units: {text}, and joints disturb each other")
-        return params._replace(gain_units=None, **leaves)
+        scaled: Document = {"gain_units": None}
+        for name, leaf in params.leaves().items():
+            if name in ("kp", "ki", "kd", "integral_min", "integral_max"):
+                scaled[name] = (leaf * poses[0]).astype(params.dtype)
+        return params._replace(**scaled)
 
     def value(self, option: str, off: float = 0.0) -> Float64:
         """Return an option of the params (joints,), ``off`` where it is off."""
-        leaf = getattr(self.params, option)
-        return np.full(len(self.joints), off) if leaf is None else np.asarray(leaf, np.float64)[0]
+        return joint_values(getattr(self.params, option), len(self.joints), off)
 
-    def listed(self, values: ArrayLike, where: Any = True) -> str:
+    def ends(self, limit: str) -> tuple[Float64, Float64]:
+        """Return the lower and the upper limit (joints,) of the "effort" or the "integral"."""
+        return self.value(f"{limit}_min", -math.inf), self.value(f"{limit}_max", math.inf)
+
+    @property
+    def limited(self) -> Bool:
+        """Mask of the joints with an effort limit."""
+        low, high = self.ends("effort")
+        return np.isfinite(low) | np.isfinite(high)
+
+    def listed(self, values: ArrayLike, where: ArrayLike = True) -> str:
         """Return one value for each joint of the mask ``where``, as text: one figure where all are
         the same.
         """
         chosen = np.broadcast_to(where, len(self.joints))
-        texts = [
-            (joint, f"{x:.4g}")
-            for joint, x, yes in zip(self.joints, np.asarray(values), chosen, strict=True)
-            if yes
-        ]
-        if chosen.all() and len({text for _, text in texts}) == 1:
-            return texts[0][1]
-        return ", ".join(f"{joint} {text}" for joint, text in texts)
+        texts = [f"{value:.4g}" for value in np.asarray(values)]
+        if chosen.all() and len(set(texts)) == 1:
+            return texts[0]
+        named = [f"{joint} {text}" for joint, text in zip(self.joints, texts, strict=True)]
+        return ", ".join(np.array(named)[chosen])
 
-    def listed_names(self, where: Any) -> str:
+    def listed_names(self, where: Bool) -> str:
         """Return the names of the joints in the mask ``where``, as text."""
-        return ", ".join(joint for joint, yes in zip(self.joints, where, strict=True) if yes)
+        return ", ".join(np.array(self.joints)[where])
 
     def add(
-        self, option: str, problem: str, where: Any, values: Any = None, unit: str = ""
+        self,
+        option: str,
+        problem: str,
+        where: ArrayLike,
+        values: ArrayLike | None = None,
+        unit: str = "",
     ) -> None:
         """Add a difference of ``option``, if any joint is in the mask ``where``, with this law's
         ``values`` there.
         """
         if np.any(where):
-            figures = (
-                "" if values is None else f"; here {self.listed(values, where)} {unit}".rstrip()
-            )
+            figures = ""
+            if values is not None:
+                figures = f"; here {self.listed(values, where)} {unit}".rstrip()
             self.append(f"{option}: {problem}{figures}")
 
     def lack(self, option: str, problem: str, off: float, unit: str = "") -> None:
@@ -140,30 +143,31 @@ class Differences(list[str]):
         values = self.value(option, off)
         self.add(option, problem, values != off, values, unit)
 
+    def lack_weights(self) -> None:
+        """Add the limit of the effort's rate and the weight of the setpoint in P."""
+        text = "the change of the effort is not limited"
+        self.lack("effort_rate_limit", text, math.inf, "N m/s or N/s")
+        text = "P acts on the whole setpoint (b = 1), so steps overshoot more"
+        self.lack("setpoint_weight", text, 1.0)
+
     def opening(self, title: str) -> str:
         """Return the comments that open a file: its title, and the differences."""
-        lines = [
-            f"{title}, generated by batchpid.",
-            *(f"differs: {' '.join(each.split())}" for each in self),
-        ]
-        return "".join(f"# {line}\n" for line in lines)
+        lines = [f"# {title}, generated by batchpid.\n"]
+        lines += [f"# differs: {' '.join(sentence.split())}\n" for sentence in self]
+        return "".join(lines)
+
+
+def joint_values(leaf: Array, joints: int, off: float) -> Float64:
+    """Return a leaf of one env (joints,), ``off`` where it is None."""
+    return np.full(joints, off) if leaf is None else np.asarray(leaf[0], np.float64)
 
 
 def strategies(params: PIDParams) -> list[str]:
     """Return the anti-windup strategy of each joint of params of one env, by the names of
     make_params.
     """
-    return [
-        str(each)
-        for each in np.broadcast_to(params.options()["anti_windup"], (1, params.num_joints))[0]
-    ]
-
-
-def plain(leaf: Array, joint: int) -> float:
-    """Return the number of a joint with the fewest digits that read back as the same number of its
-    dtype.
-    """
-    return float(str(leaf[0, joint]))
+    names = named(params.num_joints, params.tracking_time, params.conditional)
+    return [str(name) for name in names[0]]
 
 
 def _inertia(inertia: ArrayLike, joints: list[str]) -> Float64:

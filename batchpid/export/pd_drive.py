@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.differences import Differences, strategies
+from batchpid.export.differences import Differences, joint_values, strategies
 from batchpid.law.params import PIDParams
 from batchpid.motors.actuators import FIELDS, Actuators
 
@@ -42,7 +42,7 @@ class Drive(Differences):
         self.actuators = instance(
             "actuators", motors, Actuators, "build them with make_actuators()"
         )
-        if motors.num_envs > 1 or motors.num_joints not in (None, len(self.joints)):
+        if motors.num_envs > 1 or motors.num_joints not in (0, len(self.joints)):
             problem = f"are of {motors.num_envs} envs and {motors.num_joints} joints"
             remedy = f"give those of one env and {len(self.joints)} joints"
             raise InvalidArgumentError("actuators", problem, remedy=remedy)
@@ -50,29 +50,23 @@ class Drive(Differences):
 
     def motor(self, effect: str, off: float = 0.0) -> Float64:
         """Return an effect of the actuators (joints,), ``off`` where it is off."""
-        leaf = getattr(self.actuators, effect)
-        return np.full(len(self.joints), off) if leaf is None else np.asarray(leaf[0], np.float64)
+        return joint_values(getattr(self.actuators, effect), len(self.joints), off)
 
     @property
     def integral_limit(self) -> Float64:
         """Symmetric limit of the integral (joints,) [N m or N]; infinite without a limit."""
-        low, high = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
+        low, high = self.ends("integral")
         return np.maximum(np.minimum(-low, high), 0.0)
 
     def lack_motors(self, has: Collection[str]) -> None:
         """Add the effects of the actuators that are on and not in ``has``."""
         for effect, field in EFFECTS.items():
+            values, off = self.motor(effect, field.neutral), field.neutral
             if effect not in has:
-                values, problem = (
-                    self.motor(effect, field.neutral),
-                    _PROBLEMS.get(effect, "none in the target"),
-                )
-                self.add(
-                    effect, problem, values != field.neutral, values, field.unit.removeprefix("1")
-                )
-        self.add(
-            "position_limit", "no limit by position", self.actuators.limit_positions is not None
-        )
+                text = _PROBLEMS.get(effect, "none in the target")
+                self.add(effect, text, values != off, values, field.unit.removeprefix("1"))
+        has_table = self.actuators.limit_positions is not None
+        self.add("position_limit", "no limit by position", has_table)
 
     def compare_integral(self, clamps: ArrayLike) -> None:
         """Add the differences of a target that limits its integral alone, symmetrically.
@@ -80,52 +74,35 @@ class Drive(Differences):
         The target passes the limit by up to one step, except at the joints of the mask ``clamps``.
         """
         integrates, limits = self.value("ki") > 0, self.integral_limit
-        low, high = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
-        ends = [self.value("effort_min", -math.inf), self.value("effort_max", math.inf)]
-        ends += [self.motor(effect, math.inf) for effect in ("effort_limit", "saturation_effort")]
-        winds = np.isfinite(ends).any(0) & (np.array(strategies(self.params)) != "none")
+        low, high = self.ends("integral")
+        passes = np.isfinite(limits) & ~np.asarray(clamps)
+        motors = [self.motor(effect, math.inf) for effect in ("effort_limit", "saturation_effort")]
+        winds = self.limited | np.isfinite(motors).any(0)
+        winds &= np.array(strategies(self.params)) != "none"
         rows = (
             ("anti_windup", "the integral goes on at the effort's limit, up to its own", winds),
             ("integral_limit", "the same in both directions", (-low != high) & clamps),
-            (
-                "integral_limit",
-                "passed by up to one step, ki dt |e|",
-                np.isfinite(limits) & ~np.asarray(clamps),
-            ),
+            ("integral_limit", "passed by up to one step, ki dt |e|", passes),
         )
-        for option, problem, where in rows:
-            self.add(option, problem, integrates & where, limits, "N m or N")
+        for option, text, where in rows:
+            self.add(option, text, integrates & where, limits, "N m or N")
 
     def _compare(self) -> None:
-        params, acts = self.params, self.params.kd is not None
-        excluded = (self.value("integral_min", -math.inf) > 0) | (
-            self.value("integral_max", math.inf) < 0
-        )
-        self.add(
-            "integral_limit",
-            "an integral whose limits exclude 0 begins at 0",
-            excluded & (params.ki is not None),
-        )
-        self.lack(
-            "effort_rate_limit", "the change of the effort is not limited", math.inf, "N m/s or N/s"
-        )
-        self.lack(
-            "setpoint_weight", "P acts on the whole setpoint (b = 1), so steps overshoot more", 1.0
-        )
+        params = self.params
+        low, high = self.ends("integral")
+        excluded = ((low > 0) | (high < 0)) & (params.ki is not None)
+        self.add("integral_limit", "an integral whose limits exclude 0 begins at 0", excluded)
+        self.lack_weights()
         self.lack("deadband", "none: P acts on the whole error", 0.0, "rad or m")
-        self.add(
-            "continuous", "errors are not taken the short way round", params.continuous is not None
-        )
+        turns = params.continuous is not None
+        self.add("continuous", "errors are not taken the short way round", turns)
         self.add("non_finite", "inputs are not checked", params.non_finite is not None)
-        if acts:
-            weight = self.value("setpoint_weight_derivative")
-            has_derivative_weight = params.setpoint_weight_derivative is not None
-            self.add(
-                "setpoint_weight_derivative",
-                "acts on the target's velocity alone (c = 1)",
-                has_derivative_weight,
-                weight,
-            )
-            self.lack("derivative_filter_time", "no filter", 0.0, "s")
-            problem = "the derivative is the simulator's velocity, not a difference"
-            self.add("measurement_rate", problem, params.measurement_rate is None)
+        if params.kd is None:
+            return
+        weight = self.value("setpoint_weight_derivative")
+        has_weight = params.setpoint_weight_derivative is not None
+        text = "acts on the target's velocity alone (c = 1)"
+        self.add("setpoint_weight_derivative", text, has_weight, weight)
+        self.lack("derivative_filter_time", "no filter", 0.0, "s")
+        text = "the derivative is the simulator's velocity, not a difference"
+        self.add("measurement_rate", text, params.measurement_rate is None)

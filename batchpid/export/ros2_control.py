@@ -1,6 +1,6 @@
-"""Gains as parameters of ros2_control: joint_trajectory_controller on effort, or pid_controller.
+"""Gains as parameters of ros2_control: a joint_trajectory_controller on effort.
 
-Both run control_toolbox's PID (ros-controls/control_toolbox 6, src/pid.cpp; ros2_controllers, their
+It runs control_toolbox's PID (ros-controls/control_toolbox 6, src/pid.cpp; ros2_controllers, their
 parameter files). With the error e and its rate e'::
 
     u      = p e + I + d e'
@@ -10,9 +10,9 @@ parameter files). With the error e and its rate e'::
     I     <- I + dt i e unless clamped and e u > 0                     conditional_integration
     I     <- min(max(I, i_clamp_min), i_clamp_max)
 
-I stays where |e| <= error_deadband. The trajectory controller takes e' from the measured velocity
-and the trajectory's, the pid_controller with one interface from successive errors. A derivative
-weight c is ff_velocity_scale = d (c - 1), as kd (c r' - y') = kd (r' - y') + kd (c - 1) r'.
+I stays where |e| <= error_deadband. The controller takes e' from the measured velocity and the
+trajectory's. A derivative weight c is ff_velocity_scale = d (c - 1), as kd (c r' - y') = kd (r' -
+y') + kd (c - 1) r'.
 """
 
 from __future__ import annotations
@@ -23,30 +23,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Bool, Document
-from batchpid.checks.validate import choice
+from batchpid.arrays.array_types import Document
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.differences import Differences, Exported, plain, strategies
+from batchpid.export.differences import Differences, Exported, strategies
 from batchpid.io import documents
-from batchpid.law.params import PIDParams
+from batchpid.law.params import FIELDS, PIDParams
 
-TYPES = {
-    "joint_trajectory_controller": "joint_trajectory_controller/JointTrajectoryController",
-    "pid_controller": "pid_controller/PidController",
-}
-NEUTRAL = {
-    "p": 0.0,
-    "i": 0.0,
-    "d": 0.0,
-    "u_clamp_max": math.inf,
-    "u_clamp_min": -math.inf,
-    "i_clamp_max": math.inf,
-    "i_clamp_min": -math.inf,
-    "antiwindup_strategy": "none",
-    "tracking_time_constant": 0.0,
-    "error_deadband": 0.0,
-}
-"""Gains that both controllers have, with their defaults."""
+TYPE = "joint_trajectory_controller/JointTrajectoryController"
 LEAVES = {
     "p": "kp",
     "i": "ki",
@@ -57,7 +40,7 @@ LEAVES = {
     "i_clamp_min": "integral_min",
     "error_deadband": "deadband",
 }
-"""Gains that are an option of make_params."""
+"""Gains of the controller, and the option of make_params that each is."""
 
 
 def to_ros2_control(
@@ -65,8 +48,7 @@ def to_ros2_control(
     joint_names: Sequence[str],
     dt: float,
     *,
-    controller: str = "joint_trajectory_controller",
-    name: str | None = None,
+    name: str = "joint_trajectory_controller",
     inertia: ArrayLike | None = None,
 ) -> Exported:
     """Return the YAML of a controller manager with one controller, and its differences from the
@@ -80,11 +62,8 @@ def to_ros2_control(
         Names of the joints in the robot's URDF.
     dt
         Time step of the controller manager [s]; its ``update_rate`` is a whole number of hertz.
-    controller
-        ``"joint_trajectory_controller"``, or ``"pid_controller"``: with position and velocity for
-        params with the measured rate, else with the position alone.
     name
-        Of the controller. Default: ``controller``.
+        Of the controller.
     inertia
         Diagonal of the mass matrix (joints,) or (poses, joints) [kg m^2 or kg]: gains per mass
         matrix are converted at the first pose.
@@ -95,167 +74,98 @@ def to_ros2_control(
         Params for several envs, gains per mass matrix without ``inertia``, or limits that the
         target refuses.
     """
-    choice("controller", controller, TYPES)
     law = Differences(params, joint_names, dt, inertia)
-    trajectory = controller == "joint_trajectory_controller"
-    two = trajectory or law.params.measurement_rate is not None
-    gains = _gains(law, trajectory, two)
+    gains = {joint: _gains(law, at) for at, joint in enumerate(law.joints)}
     rate = round(1 / law.dt)
-    if rate < 1:
-        raise InvalidArgumentError(
-            "dt", "is more than a second", value=dt, remedy="use a rate of at least 1 Hz"
-        )
-    law.add(
-        "dtype",
-        f"the target computes in float64, these params are {params.dtype}",
-        params.dtype != np.float64,
-    )
-    _compare(law, two, trajectory)
+    is_narrow = params.dtype != np.float64
+    text = f"the target computes in float64, these params are {params.dtype}"
+    law.add("dtype", text, is_narrow)
+    _compare(law)
     _compare_anti_windup(law)
-    uneven = not math.isclose(rate * law.dt, 1.0, rel_tol=1e-9)
-    law.add(
-        "dt", f"the update rate is a whole number: {rate} Hz instead of {1 / law.dt:.6g} Hz", uneven
-    )
-
-    name = name or controller
-    interfaces = ["position", "velocity"] if two else ["position"]
-    body: Document
-    if trajectory:
-        body = {
-            "joints": law.joints,
-            "command_interfaces": ["effort"],
-            "state_interfaces": interfaces,
-        }
-    else:
-        body = {
-            "dof_names": law.joints,
-            "command_interface": "effort",
-            "reference_and_state_interfaces": interfaces,
-        }
+    text = f"the update rate is a whole number: {rate} Hz instead of {1 / law.dt:.6g} Hz"
+    law.add("dt", text, not math.isclose(rate * law.dt, 1.0, rel_tol=1e-9))
+    body = {
+        "joints": law.joints,
+        "command_interfaces": ["effort"],
+        "state_interfaces": ["position", "velocity"],
+        "gains": gains,
+    }
+    manager = {"update_rate": rate, name: {"type": TYPE}}
     document = {
-        "controller_manager": {
-            "ros__parameters": {"update_rate": rate, name: {"type": TYPES[controller]}}
-        },
-        name: {"ros__parameters": {**body, "gains": gains}},
+        "controller_manager": {"ros__parameters": manager},
+        name: {"ros__parameters": body},
     }
     return Exported(f"{law.opening('PID gains')}{documents.render(document, 'yaml')}", tuple(law))
 
 
-def _gains(law: Differences, trajectory: bool, two: bool) -> dict[str, Document]:
-    """Return the gains of each joint, by name."""
-    params, gains = law.params, {}
-    for at, (joint, strategy) in enumerate(zip(law.joints, strategies(params), strict=True)):
-        entry: Document = dict(NEUTRAL)
-        for key, leaf in LEAVES.items():
-            if (values := getattr(params, leaf)) is not None:
-                entry[key] = plain(values, at)
-        if entry["u_clamp_min"] >= entry["u_clamp_max"]:
-            problem, value = "must be below effort_max for control_toolbox", entry["u_clamp_min"]
-            raise InvalidArgumentError(
-                "effort_min", problem, joint=joint, value=value, remedy="widen the limits"
-            )
-        entry["i_clamp_min"], entry["i_clamp_max"] = (
-            min(entry["i_clamp_min"], 0.0),
-            max(entry["i_clamp_max"], 0.0),
+def _gains(law: Differences, at: int) -> Document:
+    """Return the gains of joint number ``at``, by name."""
+    params, gains = law.params, Document()
+    for key, option in LEAVES.items():
+        leaf = getattr(params, option)
+        gains[key] = FIELDS[option].neutral if leaf is None else documents.plain(leaf[:, at])
+    if gains["u_clamp_min"] >= gains["u_clamp_max"]:
+        problem, value = "must be below effort_max for control_toolbox", gains["u_clamp_min"]
+        raise InvalidArgumentError(
+            "effort_min", problem, joint=law.joints[at], value=value, remedy="widen the limits"
         )
-        if strategy == "back_calculation":
-            entry["tracking_time_constant"] = plain(params.tracking_time, at)
-        entry["antiwindup_strategy"] = (
-            "conditional_integration" if strategy == "conditional" else strategy
-        )
-        if two:
-            weight = params.setpoint_weight_derivative
-            feedforward = "ff_velocity_scale" if trajectory else "feedforward_gain"
-            entry[feedforward] = 0.0 if weight is None else entry["d"] * (plain(weight, at) - 1.0)
-        if params.continuous is not None and not trajectory:
-            entry["angle_wraparound"] = bool(params.continuous[0, at] > 0)
-        gains[joint] = entry
+    gains["i_clamp_min"] = min(gains["i_clamp_min"], 0.0)
+    gains["i_clamp_max"] = max(gains["i_clamp_max"], 0.0)
+    strategy = strategies(params)[at]
+    tracks = strategy == "back_calculation"
+    is_conditional = strategy == "conditional"
+    gains["antiwindup_strategy"] = "conditional_integration" if is_conditional else strategy
+    gains["tracking_time_constant"] = (
+        documents.plain(params.tracking_time[:, at]) if tracks else 0.0
+    )
+    weight = params.setpoint_weight_derivative
+    gains["ff_velocity_scale"] = 0.0
+    if weight is not None:
+        gains["ff_velocity_scale"] = gains["d"] * (documents.plain(weight[:, at]) - 1.0)
     return gains
 
 
-def _compare(law: Differences, two: bool, trajectory: bool) -> None:
+def _compare(law: Differences) -> None:
     """Add the differences between the law and control_toolbox's, but for anti-windup."""
-    acts, limited = law.value("kd") > 0, _limited(law)
-    problem = (
-        "u_clamp limits the PID alone, not its sum with a feedforward such as gravity compensation"
-    )
-    law.add("effort_limit", problem, limited)
-    law.lack(
-        "effort_rate_limit", "the change of the effort is not limited", math.inf, "N m/s or N/s"
-    )
-    law.lack(
-        "setpoint_weight", "P acts on the whole setpoint (b = 1), so steps overshoot more", 1.0
-    )
-    # The weight of a given rate, or of a difference of setpoints.
-    weight = law.value("setpoint_weight_derivative", 1.0 if two else 0.0)
-    problem = "the derivative acts on the whole error (c = 1), so a step of the setpoint kicks it"
-    if two:
-        problem = (
-            "a feedforward of the desired velocity, after u_clamp, which differences of setpoints"
-            " do not enter"
-        )
-    law.add("setpoint_weight_derivative", problem, acts & (weight != 1), weight)
-    filter_time = law.value("derivative_filter_time")
-    law.add("derivative_filter_time", "no filter", acts & (filter_time > 0), filter_time, "s")
-    differences = two and law.params.measurement_rate is None
-    law.add(
-        "measurement_rate",
-        "the derivative is the measured velocity, not a difference",
-        acts & differences,
-    )
+    acts = law.value("kd") > 0
+    text = "u_clamp limits the PID alone, not its sum with a feedforward such as gravity"
+    law.add("effort_limit", f"{text} compensation", law.limited)
+    law.lack_weights()
+    # The weight of a given rate: differences of setpoints do not enter.
+    weight = law.value("setpoint_weight_derivative", 1.0)
+    text = "a feedforward of the desired velocity, after u_clamp, which differences of setpoints"
+    law.add("setpoint_weight_derivative", f"{text} do not enter", acts & (weight != 1), weight)
+    time = law.value("derivative_filter_time")
+    law.add("derivative_filter_time", "no filter", acts & (time > 0), time, "s")
+    text = "the derivative is the measured velocity, not a difference"
+    law.add("measurement_rate", text, acts & (law.params.measurement_rate is None))
     law.lack("deadband", "stops the integral alone, and P acts on the whole error", 0.0, "rad or m")
-    finite = law.params.non_finite is None
-    law.add(
-        "non_finite",
-        "the effort is NaN, or not written, after an input that is not finite",
-        not finite,
-    )
-    turns = law.value("continuous") > 0
-    if trajectory:
-        law.add("continuous", "taken from the type of the joint in robot_description", turns)
-    elif not two:
-        law.add(
-            "continuous",
-            "where the error wraps, the derivative has a spike of kd 2 pi / dt",
-            turns & acts,
-        )
+    text = "the effort is NaN, or not written, after an input that is not finite"
+    law.add("non_finite", text, law.params.non_finite is not None)
+    text = "taken from the type of the joint in robot_description"
+    law.add("continuous", text, law.value("continuous") > 0)
 
 
 def _compare_anti_windup(law: Differences) -> None:
     """Add the differences of the integral's limits and of anti-windup."""
-    low, high = law.value("integral_min", -math.inf), law.value("integral_max", math.inf)
+    low, high = law.ends("integral")
     law.add("integral_min", "0 at most in the target", low > 0, low)
     law.add("integral_max", "0 at least in the target", high < 0, high)
     if law.params.ki is None:
         return
     strategy = np.array(strategies(law.params))
     integrates = law.value("ki") > 0
-    limited = _limited(law)
     back = strategy == "back_calculation"
-    excluded = (law.value("effort_min", -math.inf) > 0) | (law.value("effort_max", math.inf) < 0)
-    problem = (
-        "conditional integration takes the sign of the whole effort, wrong where the limits"
-        " exclude 0"
-    )
-    law.add("anti_windup", problem, (strategy == "conditional") & excluded)
+    low, high = law.ends("effort")
+    text = "conditional integration takes the sign of the whole effort, wrong where the limits"
+    excludes = (low > 0) | (high < 0)
+    law.add("anti_windup", f"{text} exclude 0", (strategy == "conditional") & excludes)
     law.add("anti_windup", "without ki the integral does not track", back & ~integrates)
-    problem = "back-calculation is left out in a step with an error of exactly 0"
-    law.add("anti_windup", problem, limited & back & integrates)
+    text = "back-calculation is left out in a step with an error of exactly 0"
+    law.add("anti_windup", text, law.limited & back & integrates)
     times = law.value("tracking_time", math.inf)
-    law.add(
-        "tracking_time",
-        "shorter than dt, the integral over-corrects",
-        back & (times < law.dt),
-        times,
-        "s",
-    )
-    rate_limited = np.isfinite(law.value("effort_rate_limit", math.inf))
-    problem = "acts on u_clamp alone, not on a limit of the effort's rate"
-    law.add("anti_windup", problem, rate_limited & (strategy != "none"))
-
-
-def _limited(law: Differences) -> Bool:
-    """Return a mask of the joints with an effort limit."""
-    return np.isfinite(law.value("effort_min", -math.inf)) | np.isfinite(
-        law.value("effort_max", math.inf)
-    )
+    text = "shorter than dt, the integral over-corrects"
+    law.add("tracking_time", text, back & (times < law.dt), times, "s")
+    is_slow = np.isfinite(law.value("effort_rate_limit", math.inf))
+    text = "acts on u_clamp alone, not on a limit of the effort's rate"
+    law.add("anti_windup", text, is_slow & (strategy != "none"))

@@ -10,34 +10,231 @@ import os
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from batchpid.arrays.array_types import Document, DType
+from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.field_tables import Field
-from batchpid.checks.validate import choice, file_path
+from batchpid.arrays.records import Record
+from batchpid.checks.validate import choice, file_path, instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 
-T = TypeVar("T")
+R = TypeVar("R", bound=Record)
 
 SUFFIXES = {".yaml": "yaml", ".yml": "yaml", ".json": "json"}
 
 
-class Schema(NamedTuple):
-    """Form of a document: ``format``, ``about``, the keys of ``head``, and ``joints``."""
+class RecordFile(Generic[R]):
+    """Files of one kind of record: a head, and one entry per joint, by name.
 
-    format: str
-    """Its name and version."""
-    content: str
-    """Of the document, as in "params"."""
-    head: tuple[str, ...]
-    """Options for all joints together."""
-    fields: Mapping[str, Field]
-    """Options of a joint."""
-    required: tuple[str, ...] = ()
-    """Options that every joint must have."""
+    The keys of an entry are the options of the record's constructor; a list gives one value per
+    env. Numbers are written with as many digits as it takes to read the same number back. An option
+    left out of a joint is off there.
+
+    Parameters
+    ----------
+    format
+        Name and version of the form, as in "batchpid-params-1".
+    record, make
+        Type of the records, and their constructor.
+    head
+        Options for all joints together.
+    fields
+        Options of a joint.
+    required
+        Options that every joint must have.
+    partial
+        Whether a file may leave joints out, whose options are then off.
+    """
+
+    def __init__(
+        self,
+        format: str,
+        record: type[R],
+        make: Callable[..., R],
+        head: tuple[str, ...],
+        fields: Mapping[str, Field],
+        required: tuple[str, ...] = (),
+        partial: bool = False,
+    ) -> None:
+        self.format = format
+        self.record = record
+        self.make = make
+        self.head = ("dtype", *head)
+        self.fields = fields
+        self.required = required
+        self.partial = partial
+
+    def dumps(
+        self,
+        record: R,
+        joint_names: Sequence[str],
+        about: Mapping[str, object] | None = None,
+        format: str = "yaml",
+    ) -> str:
+        """Return a record as text.
+
+        Parameters
+        ----------
+        joint_names
+            One name per joint.
+        about
+            Kept with the record, e.g. where it comes from: plain numbers, strings, lists,
+            mappings.
+        format
+            "yaml" or "json".
+
+        Raises
+        ------
+        InvalidArgumentError
+            A record of another type, names that do not fit it, or an unknown format.
+        """
+        instance(self.record.NAME, record, self.record, f"build them with {self.make.__name__}")
+        joints = names("joint_names", joint_names, record.num_joints or None)
+        options = record.options()
+        document: Document = {"format": self.format}
+        if about:
+            document["about"] = json.loads(json.dumps(dict(about)))
+        document |= {name: options.pop(name) for name in self.head if name in options}
+        if "dtype" in document:
+            document["dtype"] = str(document["dtype"])
+        return render(document | {"joints": self.entries(options, joints)}, format)
+
+    def loads(self, text: str, joint_names: Sequence[str] | None = None) -> tuple[R, list[str]]:
+        """Return the record in a text, JSON if it begins with a brace and else YAML; otherwise as
+        :meth:`load`.
+        """
+        format = "json" if text.lstrip().startswith("{") else "yaml"
+        return self._built("text", parse("text", text, format), joint_names)
+
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        record: R,
+        joint_names: Sequence[str],
+        about: Mapping[str, object] | None = None,
+    ) -> None:
+        """Write a record to ``path`` (.yaml, .yml or .json), as :meth:`dumps`.
+
+        An existing file is replaced as a whole or not at all.
+        """
+        path = file_path("path", path, SUFFIXES)
+        format = SUFFIXES[path.suffix.lower()]
+        write_atomically(path, self.dumps(record, joint_names, about, format))
+
+    def load(
+        self, path: str | os.PathLike[str], joint_names: Sequence[str] | None = None
+    ) -> tuple[R, list[str]]:
+        """Return the record in a file and its joints' names, in the order of ``joint_names`` if
+        given.
+
+        Nothing in the file is executed, and every value is checked as in the constructor.
+
+        Raises
+        ------
+        InvalidArgumentError
+            Naming the file, joint and key.
+        FileNotFoundError
+            The file does not exist.
+        """
+        return self._built(str(path), read(path), joint_names)
+
+    def load_about(self, path: str | os.PathLike[str]) -> Document:
+        """Return the ``about`` of a file, or an empty dict. Raises as :meth:`load`."""
+        document = read(path)
+        self._joints(str(path), document)
+        return dict(document.get("about", {}))
+
+    def entries(self, options: Document, joint_names: Sequence[str]) -> dict[str, Document]:
+        """Return the entry of each joint, from options (1 | envs, joints)."""
+        return {
+            joint: {name: plain(column[:, at]) for name, column in options.items()}
+            for at, joint in enumerate(joint_names)
+        }
+
+    def arguments(self, source: str, joints: Mapping[str, Document]) -> Document:
+        """Return each option that some joint has, as an array (1 | envs, joints)."""
+        present = {name for options in joints.values() for name in options}
+        return {
+            name: _column(source, name, field, joints)
+            for name, field in self.fields.items()
+            if name in present
+        }
+
+    def _built(
+        self, source: str, document: Any, joint_names: Sequence[str] | None
+    ) -> tuple[R, list[str]]:
+        """Return the record of a document and the names of its joints."""
+        joints = self._joints(source, document)
+        order = list(joints) if joint_names is None else names("joint_names", joint_names)
+        missing, unknown = sorted(set(order) - set(joints)), sorted(set(joints) - set(order))
+        if unknown or (missing and not self.partial):
+            problem = f"does not hold these joints: missing {missing}, unknown {unknown}"
+            remedy = f"the file's joints are {', '.join(joints)}"
+            raise InvalidArgumentError(source, problem, remedy=remedy)
+        chosen = {joint: joints.get(joint, {}) for joint in order}
+        options = self.arguments(source, chosen)
+        options |= {name: value for name, value in document.items() if name in self.head}
+        with named(source):
+            return self.make(len(order), **options, joint_names=order), order
+
+    def _joints(self, source: str, document: Any) -> dict[str, Document]:
+        """Return the joints of a document of this form, with checked keys and types of values."""
+        if not isinstance(document, dict) or document.get("format") != self.format:
+            remedy = f"it must contain 'format: {self.format}'"
+            raise InvalidArgumentError(source, f"holds no {self.record.NAME}", remedy=remedy)
+        for key in document:
+            choice(f"{source}: key", key, ("format", "about", *self.head, "joints"))
+        if not isinstance(document.get("about", {}), dict):
+            raise error(source, "about", "must be a mapping", "use 'key: value', or leave it out")
+        choice(f"{source}: dtype", document.get("dtype", "float64"), ("float32", "float64"))
+        joints = document.get("joints")
+        if not isinstance(joints, dict) or not all(isinstance(name, str) for name in joints or [0]):
+            raise error(source, "joints", "must map names to options", "name the joints")
+        for joint, options in joints.items():
+            if not isinstance(options, dict):
+                remedy = "give e.g. an empty mapping, {}"
+                raise error(source, "joints", "must map options to values", remedy, joint)
+            for name in self.required:
+                if name not in options:
+                    remedy = f"give '{name}: <number>'"
+                    raise error(source, "joints", f"has no {name}", remedy, joint)
+            for name, value in options.items():
+                self.check_option(source, joint, name, value)
+        return joints
+
+    def check_option(self, source: str, joint: str, name: str, value: object) -> None:
+        """Raise InvalidArgumentError for an unknown option, or a value of a wrong type."""
+        if name not in self.fields:
+            remedy = f"use one of {', '.join(self.fields)}"
+            raise error(source, name, "unknown option", remedy, joint)
+        neutral = self.fields[name].neutral
+        kind: type = type(neutral)
+        for entry in value if isinstance(value, list) and value else [value]:
+            if not (is_number(entry) if kind is float else isinstance(entry, kind)):
+                problem = f"is {reprlib.repr(entry)}, which is not a {kind.__name__}"
+                remedy = f"give one, as in '{name}: {neutral}', or a list of one per env"
+                raise error(source, name, problem, remedy, joint)
+
+
+def _column(source: str, name: str, field: Field, joints: Mapping[str, Document]) -> Rows:
+    """Return an option of all joints as an array (1 | envs, joints), neutral where it is left
+    out.
+    """
+    columns: dict[str, list[object]] = {}
+    for joint, options in joints.items():
+        value = options.get(name, field.neutral)
+        columns[joint] = value if isinstance(value, list) else [value]
+    envs = max(map(len, columns.values()))
+    for joint, values in columns.items():
+        if len(values) not in (1, envs):
+            problem = f"has {len(values)} values, others {envs}"
+            raise error(source, name, problem, "give one per env", joint)
+    kind: type = object if isinstance(field.neutral, str) else type(field.neutral)
+    rows = [values * (envs // len(values)) for values in columns.values()]
+    return np.array(rows, dtype=kind).T
 
 
 def read(path: str | os.PathLike[str]) -> Any:
@@ -55,50 +252,6 @@ def read(path: str | os.PathLike[str]) -> Any:
     return parse(str(path), content, SUFFIXES[path.suffix.lower()])
 
 
-def write(path: str | os.PathLike[str], dump: Callable[[str], str]) -> None:
-    """Write the text of ``dump(format)`` to ``path``; an existing file is replaced as a whole or
-    not at all.
-    """
-    path = file_path("path", path, SUFFIXES)
-    write_atomically(path, dump(SUFFIXES[path.suffix.lower()]))
-
-
-def document(
-    schema: Schema, options: Document, joint_names: Sequence[str], about: Mapping[str, Any] | None
-) -> Document:
-    """Return the document of the ``options`` of a constructor: arrays (1 | envs, joints), or one
-    for all joints.
-    """
-    head = {name: options.pop(name) for name in schema.head if name in options}
-    joints = {
-        joint: {name: plain(column[:, index]) for name, column in options.items()}
-        for index, joint in enumerate(joint_names)
-    }
-    kept = {"about": json.loads(json.dumps(dict(about)))} if about else {}
-    head |= {"dtype": str(head["dtype"])} if "dtype" in head else {}
-    return {"format": schema.format, **kept, **head, "joints": joints}
-
-
-def build(
-    source: str,
-    document: Any,
-    schema: Schema,
-    joints: Document,
-    make: Callable[..., T],
-    **options: Any,
-) -> T:
-    """Return the result of the constructor ``make`` for a document's ``joints``, in their order,
-    and its head.
-
-    Errors name the document and the key. ``options`` are further arguments.
-    """
-    given = columns(source, joints, schema) | {
-        name: document[name] for name in schema.head if name in document
-    }
-    with named(source):
-        return make(len(joints), **given, **options, joint_names=list(joints))
-
-
 @contextmanager
 def named(source: str) -> Iterator[None]:
     """Begin the messages of InvalidArgumentErrors from the block with ``source``, a file or a place
@@ -113,21 +266,15 @@ def named(source: str) -> Iterator[None]:
         raise InvalidArgumentError(f"{source}: {error.argument}", error.problem, **facts) from None
 
 
-def parse_text(text: str) -> Any:
-    """Return the document in a text: JSON if it begins with a brace, else YAML."""
-    return parse("text", text, "json" if text.lstrip().startswith("{") else "yaml")
-
-
 def parse(source: str, text: str | bytes, format: str) -> Any:
     """Return the document in a text in ``format``; ``source`` names it in errors."""
     try:
         text = text.decode() if isinstance(text, bytes) else text
         return _parse_json(text) if format == "json" else _parse_yaml(text)
     except Exception as error:  # a damaged text can make the parser raise anything
-        said = " ".join(str(error).split())[:300] or type(error).__name__
-        raise InvalidArgumentError(
-            source, f"cannot be read: {said}", remedy="correct the file"
-        ) from None
+        cause = " ".join(str(error).split())[:300] or type(error).__name__
+        problem = f"cannot be read: {cause}"
+        raise InvalidArgumentError(source, problem, remedy="correct the file") from None
 
 
 def render(document: Document, format: str) -> str:
@@ -139,77 +286,10 @@ def render(document: Document, format: str) -> str:
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
 
 
-def check(source: str, document: Any, schema: Schema) -> dict[str, Document]:
-    """Return the joints of ``document`` if it is of the form ``schema``."""
-    if not isinstance(document, dict) or document.get("format") != schema.format:
-        remedy = f"it must contain 'format: {schema.format}'"
-        raise InvalidArgumentError(source, f"holds no {schema.content}", remedy=remedy)
-    for key in document:
-        choice(f"{source}: key", key, ("format", "about", *schema.head, "joints"))
-    if not isinstance(document.get("about", {}), dict):
-        raise error(source, "about", "must be a mapping", "use 'key: value', or leave it out")
-    choice(f"{source}: dtype", document.get("dtype", "float64"), ("float32", "float64"))
-    joints = document.get("joints")
-    if (
-        not isinstance(joints, dict)
-        or not joints
-        or not all(isinstance(name, str) for name in joints)
-    ):
-        raise error(source, "joints", "must map names to options", "name the joints")
-    for name, options in joints.items():
-        if not isinstance(options, dict):
-            raise error(
-                source,
-                "joints",
-                "must map options to values",
-                "give e.g. an empty mapping, {}",
-                name,
-            )
-        for key in schema.required:
-            if key not in options:
-                raise error(source, "joints", f"has no {key}", f"give '{key}: <number>'", name)
-        for key, value in options.items():
-            if key not in schema.fields:
-                raise error(
-                    source, key, "unknown option", f"use one of {', '.join(schema.fields)}", name
-                )
-            neutral = schema.fields[key].neutral
-            wanted: type = type(neutral)
-            for entry in value if isinstance(value, list) and value else [value]:
-                if not (is_number(entry) if wanted is float else isinstance(entry, wanted)):
-                    problem = f"is {reprlib.repr(entry)}, which is not a {wanted.__name__}"
-                    remedy = f"give one, as in '{key}: {neutral}', or a list of one per env"
-                    raise error(source, key, problem, remedy, name)
-    return joints
-
-
 def is_number(entry: Any) -> bool:
     """Return whether an entry is a number, an infinity included."""
     whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
     return whole or isinstance(entry, float) or entry in ("inf", "-inf")
-
-
-def columns(source: str, joints: dict[str, Document], schema: Schema) -> Document:
-    """Return each option that some joint has, as an array (1 or envs, joints)."""
-    columns: Document = {}
-    for key, field in schema.fields.items():
-        if not any(key in options for options in joints.values()):
-            continue
-        values = {name: options.get(key, field.neutral) for name, options in joints.items()}
-        lists = {
-            name: value if isinstance(value, list) else [value] for name, value in values.items()
-        }
-        envs = max(map(len, lists.values()))
-        for name, value in lists.items():
-            if len(value) not in (1, envs):
-                raise error(
-                    source, key, f"has {len(value)} values, others {envs}", "give one per env", name
-                )
-        dtype: DType = {float: float, bool: bool, str: object}[type(field.neutral)]
-        columns[key] = np.array(
-            [value * (envs // len(value)) for value in lists.values()], dtype=dtype
-        ).T
-    return columns
 
 
 def error(
@@ -219,12 +299,12 @@ def error(
     return InvalidArgumentError(f"{source}: {key}", problem, joint=joint, remedy=remedy)
 
 
-def plain(column: Any) -> Any:
+def plain(column: Rows) -> Any:
     """Return a joint's option as one plain value, or a list of one per env."""
-    # The shortest digits that read back as the same number of its dtype: str(float32) has fewer
-    # than its float.
-    values = [float(str(value)) if isinstance(value, np.floating) else value for value in column]
-    values = [bool(value) if isinstance(value, np.bool_) else value for value in values]
+    values = column.tolist()
+    if column.dtype == np.float32:
+        # The shortest digits that read back as the same number of its dtype: its float has more.
+        values = [float(str(value)) for value in column]
     return values[0] if len(values) == 1 else values
 
 

@@ -1,28 +1,31 @@
 """The parameters of the control law: build, broadcast, validate.
 
-A :class:`PIDParams` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without
-registration. An option that is off is ``None``, which is not a leaf: NumPy skips it and ``jax.jit``
-compiles a law without it. Choices without a number, such as the unit of the gains, are tuples
-without fields (:mod:`batchpid.arrays.choices`): part of the tree's structure, and so static under
-every JAX transform.
+An option that is off is ``None``, which is not a leaf: NumPy skips it and ``jax.jit`` compiles a
+law without it. Choices without a number, such as the unit of the gains, are tuples without fields
+(:mod:`batchpid.arrays.choices`): part of the tree's structure, and so static under every JAX
+transform.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document, DType
-from batchpid.arrays.choices import CHOICES, Everywhere, PerMassMatrix
-from batchpid.arrays.display import array_summary
-from batchpid.arrays.field_tables import Field, check_leaves, declared
-from batchpid.arrays.leaves import LeafBuilder
-from batchpid.checks.validate import is_traced, known_keywords
+from batchpid.arrays.choices import CHOICES, Everywhere, NamedChoice, PerMassMatrix
+from batchpid.arrays.field_tables import Field, declared
+from batchpid.arrays.records import LeafBuilder, Record, with_fields
+from batchpid.checks.validate import choice, is_traced
 from batchpid.errors import InvalidArgumentError
+from batchpid.law import anti_windup as strategies
 
+DEFAULTS = {name: next(iter(chosen)) for name, chosen in CHOICES.items()}
+"""Default of each choice."""
+GAINS = ("kp", "ki", "kd")
+ENDS = ("effort_min", "effort_max", "integral_min", "integral_max")
 PLAIN = (
     "effort_rate_limit",
     "derivative_filter_time",
@@ -33,7 +36,44 @@ PLAIN = (
 """Options that become a leaf without regard to others."""
 
 
-class PIDParams(NamedTuple):
+class _ParamsFields(NamedTuple):
+    kp: Annotated[Array, Field("N m/rad or N/m")]
+    ki: Annotated[Array, Field("N m/(rad s) or N/(m s)")] = None
+    kd: Annotated[Array, Field("N m s/rad or N s/m")] = None
+    effort_min: Annotated[Array, Field("N m or N", -math.inf, low=-math.inf)] = None
+    effort_max: Annotated[Array, Field("N m or N", math.inf, low=-math.inf)] = None
+    effort_rate_limit: Annotated[Array, Field("N m/s or N/s", math.inf, above=True)] = None
+    integral_min: Annotated[Array, Field("N m or N", -math.inf, low=-math.inf)] = None
+    integral_max: Annotated[Array, Field("N m or N", math.inf, low=-math.inf)] = None
+    derivative_filter_time: Annotated[Array, Field("s")] = None
+    setpoint_weight: Annotated[Array, Field("1", 1.0)] = None
+    setpoint_weight_derivative: Annotated[Array, Field("1")] = None
+    deadband: Annotated[Array, Field("rad or m")] = None
+    tracking_time: Annotated[Array, Field("s", math.inf)] = None
+    """inf on a joint without back-calculation."""
+    conditional: Array | NamedChoice | None = None
+    """Conditional integration: Everywhere(), or 1.0 on the joints that have it, 0.0 on the
+    others.
+    """
+    continuous: Annotated[Array, Field(neutral=False)] = None
+    """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
+    non_finite: NamedChoice | None = None
+    """ZeroEffort() or HoldEffort(); off: non-finite values propagate."""
+    measurement_rate: NamedChoice | None = None
+    """MeasuredRate(): whoever runs the law on a robot gives it the measured rate; off: differences
+    of measurements.
+    """
+    gain_units: NamedChoice | None = None
+    """PerMassMatrix(): whoever runs the law on a robot converts to efforts; off: efforts."""
+    discretization: NamedChoice | None = None
+    """ImplicitLaw(): the law acts on the predicted end of the step; off: on its beginning."""
+
+
+FIELDS = declared(_ParamsFields, Field) | {"anti_windup": Field(neutral="none")}
+"""Options of a joint."""
+
+
+class PIDParams(Record, _ParamsFields):
     """Parameters of the law. Every leaf is a float array, (1, joints) or (envs, joints); None is
     off.
 
@@ -42,64 +82,9 @@ class PIDParams(NamedTuple):
     those with another form say so.
     """
 
-    kp: Array
-    ki: Array = None
-    kd: Array = None
-    effort_min: Array = None
-    effort_max: Array = None
-    effort_rate_limit: Array = None
-    integral_min: Array = None
-    integral_max: Array = None
-    derivative_filter_time: Array = None
-    setpoint_weight: Array = None
-    setpoint_weight_derivative: Array = None
-    deadband: Array = None
-    tracking_time: Array = None
-    """inf on a joint without back-calculation."""
-    conditional: Any = None
-    """Conditional integration: Everywhere(), or 1.0 on the joints that have it, 0.0 on the
-    others.
-    """
-    continuous: Array = None
-    """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
-    non_finite: Any = None
-    """ZeroEffort() or HoldEffort(); off: non-finite values propagate."""
-    measurement_rate: Array = None
-    """MeasuredRate(): whoever runs the law on a robot gives it the measured rate; off: differences
-    of measurements.
-    """
-    gain_units: Any = None
-    """PerMassMatrix(): whoever runs the law on a robot converts to efforts; off: efforts."""
-    discretization: Any = None
-    """ImplicitLaw(): the law acts on the predicted end of the step; off: on its beginning."""
-
-    @property
-    def num_joints(self) -> int:
-        """Number of joints."""
-        return int(self.kp.shape[-1])
-
-    @property
-    def num_envs(self) -> int:
-        """Number of envs with separate params; 1 where all envs share them."""
-        return max(leaf.shape[-2] for leaf in self if _is_array(leaf))
-
-    @property
-    def dtype(self) -> DType:
-        """Dtype of every leaf."""
-        return self.kp.dtype
-
-    def for_envs(self, envs: slice | Any) -> PIDParams:
-        """Return the params of some envs (a slice or an index array); shared rows stay shared."""
-        return PIDParams(
-            *(leaf[envs] if _is_array(leaf) and leaf.shape[0] > 1 else leaf for leaf in self)
-        )
-
-    def for_joints(self, joints: Any) -> PIDParams:
-        """Return the params of some joints (an index array or a mask)."""
-        return PIDParams(*(leaf[:, joints] if _is_array(leaf) else leaf for leaf in self))
-
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
+    __slots__ = ()
+    NAME = "params"
+    FIELDS = FIELDS
 
     def options(self) -> Document:
         """Return the options that are on, as arguments of :func:`make_params` that build these
@@ -109,89 +94,67 @@ class PIDParams(NamedTuple):
         is left out.
         """
         options: Document = {}
-        for name, leaf in zip(self._fields, self, strict=True):
-            if name in CHOICES:
-                (options[name],) = (
-                    n for n, chosen in CHOICES[name].items() if type(chosen) is type(leaf)
-                )
-            elif _is_array(leaf) and name != "conditional":
+        for name, leaf in self.leaves().items():
+            if name in FIELDS:
                 options[name] = leaf if is_traced(leaf) else np.array(leaf)
+        for name, chosen in CHOICES.items():
+            kind = type(getattr(self, name))
+            (options[name],) = (text for text, entry in chosen.items() if type(entry) is kind)
         if self.continuous is not None:
             options["continuous"] = options["continuous"] > 0
         if not is_traced(self.tracking_time) and not is_traced(self.conditional):
-            strategy = np.full((1, self.num_joints), "none", dtype=object)
-            if self.tracking_time is not None:
-                strategy = np.where(np.isfinite(self.tracking_time), "back_calculation", strategy)
-            if self.conditional is not None:
-                everywhere = isinstance(self.conditional, Everywhere)
-                strategy = np.where(
-                    everywhere or np.asarray(self.conditional) > 0, "conditional", strategy
-                )
-            options["anti_windup"] = strategy
+            options["anti_windup"] = strategies.named(
+                self.num_joints, self.tracking_time, self.conditional
+            )
         return {**options, "dtype": np.dtype(self.dtype)}
 
-    def replace(self, **options: Any) -> PIDParams:
+    def replace(self, **options: object) -> PIDParams:
         """Return params with some options of :func:`make_params` changed, checked as there."""
-        known = self.options()
+        present = self.options()
         for end in ("effort", "integral"):
             if f"{end}_limit" in options:
-                known.pop(f"{end}_min", None)
-                known.pop(f"{end}_max", None)
+                present.pop(f"{end}_min", None)
+                present.pop(f"{end}_max", None)
         if any(is_traced(value) for value in options.values()):
-            del known["dtype"]
-        if "anti_windup" in options or "anti_windup" not in known:
-            known.pop("tracking_time", None)
-        params = make_params(self.num_joints, **{**known, **options})
-        if (
-            "anti_windup" not in options and "anti_windup" not in known
-        ):  # traced: the leaves are kept
-            kept = {"tracking_time": self.tracking_time, "conditional": self.conditional}
-            cast = {
-                name: leaf.astype(params.dtype) if _is_array(leaf) else leaf
-                for name, leaf in kept.items()
-            }
-            params = params._replace(**cast)
-            params.check(params.num_envs)
+            del present["dtype"]
+        is_read = "anti_windup" in options or "anti_windup" in present
+        if "anti_windup" in options or not is_read:
+            present.pop("tracking_time", None)
+        params = make_params(self.num_joints, **present | options)
+        if is_read:
+            return params
+        # The strategies are traced, and cannot be read: their leaves stay.
+        arrays = self.leaves()
+        for name in ("tracking_time", "conditional"):
+            leaf = arrays[name].astype(params.dtype) if name in arrays else getattr(self, name)
+            params = params._replace(**{name: leaf})
+        params.check(params.num_envs)
         return params
 
     def check(self, num_envs: int, joint_names: Sequence[str] | None = None) -> None:
         """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits
         by hand.
         """
-        check_leaves("params", self, FIELDS, num_envs, joint_names)
-        for name, leaf in zip(self._fields, self, strict=True):
-            if _is_array(leaf) and leaf.dtype != self.dtype:
+        super().check(num_envs, joint_names)
+        for name, leaf in self.leaves().items():
+            if leaf.dtype != self.dtype:
                 problem = f"is {leaf.dtype}, but kp is {self.dtype}"
                 raise InvalidArgumentError(f"params.{name}", problem, remedy="use one dtype")
 
 
-@known_keywords
+@with_fields(FIELDS, **DEFAULTS)
 def make_params(
     joints: int,
-    kp: Annotated[Array, Field("N m/rad or N/m")],
-    ki: Annotated[Array, Field("N m/(rad s) or N/(m s)")] = None,
-    kd: Annotated[Array, Field("N m s/rad or N s/m")] = None,
+    kp: Array,
+    ki: Array = None,
+    kd: Array = None,
     *,
     effort_limit: Array = None,
-    effort_min: Annotated[Array, Field("N m or N", -math.inf, low=-math.inf)] = None,
-    effort_max: Annotated[Array, Field("N m or N", math.inf, low=-math.inf)] = None,
-    effort_rate_limit: Annotated[Array, Field("N m/s or N/s", math.inf, above=True)] = None,
     integral_limit: Array = None,
-    integral_min: Annotated[Array, Field("N m or N", -math.inf, low=-math.inf)] = None,
-    integral_max: Annotated[Array, Field("N m or N", math.inf, low=-math.inf)] = None,
-    derivative_filter_time: Annotated[Array, Field("s")] = None,
-    setpoint_weight: Annotated[Array, Field("1", 1.0)] = None,
-    setpoint_weight_derivative: Annotated[Array, Field("1")] = None,
-    deadband: Annotated[Array, Field("rad or m")] = None,
-    anti_windup: Annotated[str | Sequence[Any], Field(neutral="none")] = "none",
-    tracking_time: Annotated[Array, Field("s", math.inf)] = None,
-    continuous: Annotated[Array, Field(neutral=False)] = None,
-    non_finite: str = "propagate",
-    measurement_rate: str = "difference",
-    gain_units: str = "effort",
-    discretization: str = "explicit",
+    anti_windup: str | Sequence[object] = "none",
     joint_names: Sequence[str] | None = None,
     dtype: DType = None,
+    **options: Array,
 ) -> PIDParams:
     """Build validated :class:`PIDParams`; a number may be a scalar, (joints,) or (envs, joints).
 
@@ -261,58 +224,41 @@ def make_params(
     InvalidArgumentError
         Naming the option, joint, env and value.
     """
-    # The options of one kind are read from the tables of fields, by name; only limits and
-    # anti-windup belong together.
-    given = locals()
-    build = LeafBuilder(joints, joint_names, dtype, given.values())
+    options |= {"kp": kp, "ki": ki, "kd": kd}
+    options |= {"effort_limit": effort_limit, "integral_limit": integral_limit}
+    build = LeafBuilder(joints, joint_names, dtype, options.values())
     if kp is None:
-        raise InvalidArgumentError(
-            "kp", "is missing", remedy="give the proportional gain, 0 for none"
-        )
-    p, i, d = (
-        build.array(name, gain, FIELDS[name]) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd))
-    )
-    options = {name: build.option(name, given[name], FIELDS[name]) for name in PLAIN}
-    chosen = {name: build.choice(name, given[name]) for name in CHOICES}
-    if chosen["discretization"] is not None:
-        _check_implicit(chosen["gain_units"], options["derivative_filter_time"])
-        d = build.array("kd", 0.0, FIELDS["kd"]) if d is None else d
-    effort_ends = build.limits(
-        effort_limit=effort_limit, effort_min=effort_min, effort_max=effort_max
-    )
-    integral_ends = build.limits(
-        integral_limit=integral_limit, integral_min=integral_min, integral_max=integral_max
-    )
+        remedy = "give the proportional gain, 0 for none"
+        raise InvalidArgumentError("kp", "is missing", remedy=remedy)
+    leaves: Document = {name: build.array(name, options[name], FIELDS[name]) for name in GAINS}
+    leaves |= build.options({name: FIELDS[name] for name in PLAIN}, options)
+    for name, chosen in CHOICES.items():
+        leaves[name] = chosen[choice(name, options.get(name, DEFAULTS[name]), chosen)]
+    if leaves["discretization"] is not None:
+        _check_implicit(leaves["gain_units"], leaves["derivative_filter_time"])
+        if kd is None:
+            leaves["kd"] = build.array("kd", 0.0, FIELDS["kd"])
+    effort = build.limits("effort_limit", "effort_min", "effort_max", options)
+    integral = build.limits("integral_limit", "integral_min", "integral_max", options)
     # The joints may have different strategies: each becomes an array of the joints that use it, or
     # None for none.
-    clamp, conditional, back = build.strategies(anti_windup)
-    integral_ends = build.clamped(clamp, integral_ends, effort_ends)
-    names = "kp", "ki", "kd", "effort_min", "effort_max", "integral_min", "integral_max"
-    leaves = map(build.freeze, (p, i, d, *effort_ends, *integral_ends))
+    clamp, conditional, back = strategies.masks(build, anti_windup)
+    if clamp is not None and all(end is None for end in integral):
+        integral = strategies.clamped(clamp, effort)
+    leaves |= dict(zip(ENDS, (*effort, *integral), strict=True))
+    time = strategies.tracking_time(
+        build, options.get("tracking_time"), back, *[leaves[name] for name in GAINS]
+    )
+    is_everywhere = conditional is not None and conditional.all()
     return PIDParams(
-        **dict(zip(names, leaves, strict=True)),
-        tracking_time=build.tracking_time(tracking_time, back, p, i, d),
-        conditional=(
-            Everywhere()
-            if conditional is not None and conditional.all()
-            else build.freeze(conditional)
-        ),
-        continuous=build.mask("continuous", continuous),
-        **options,
-        **chosen,
+        **{name: build.freeze(leaf) if name in FIELDS else leaf for name, leaf in leaves.items()},
+        tracking_time=time,
+        conditional=Everywhere() if is_everywhere else build.freeze(conditional),
+        continuous=build.mask("continuous", options.get("continuous")),
     )
 
 
-FIELDS = declared(make_params, Field)
-"""Options of a joint."""
-
-
-def _is_array(leaf: Array) -> bool:
-    """Return whether an entry of the params is an array, neither off nor a choice."""
-    return leaf is not None and not isinstance(leaf, tuple)
-
-
-def _check_implicit(gain_units: Any, filter_time: Array) -> None:
+def _check_implicit(gain_units: NamedChoice | None, filter_time: Array) -> None:
     """Raise InvalidArgumentError for options that the implicit law does not have."""
     if not isinstance(gain_units, PerMassMatrix):
         problem = "'implicit' predicts accelerations, which needs gain_units 'mass_matrix'"

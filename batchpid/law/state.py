@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from batchpid.arrays.array_types import Array, Document
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.records import Record
 
 
-class PIDState(NamedTuple):
-    """State of the law, arrays (envs, joints); None where no option needs it."""
-
+class _PIDStateFields(NamedTuple):
     integral: Array = None
     """I, in effort units."""
     measurement: Array = None
@@ -27,23 +26,12 @@ class PIDState(NamedTuple):
     origin: Array = None
     """o: where setpoint weighting measures positions from [rad or m]."""
 
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
 
-    def for_envs(self, envs: slice | Any) -> PIDState:
-        """Return the state of some envs (a slice or an index array)."""
-        return PIDState(*(None if leaf is None else leaf[envs] for leaf in self))
+class PIDState(Record, _PIDStateFields):
+    """State of the law, arrays (envs, joints); None where no option needs it."""
 
-    def leaves(self) -> Document:
-        """Return the arrays by name."""
-        return {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
-
-    def matched_to(self, fresh: PIDState) -> PIDState:
-        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the
-        others dropped.
-        """
-        both = zip(self, fresh, strict=True)
-        return PIDState(*(new if new is None or old is None else old for old, new in both))
+    __slots__ = ()
+    NAME = "state"
 
 
 class Terms(NamedTuple):
@@ -74,11 +62,13 @@ class Terms(NamedTuple):
         """Return all terms as new arrays (envs, joints), but for the effort."""
         xp, finite = namespace(*self), self.finite
         zero = xp.zeros_like(self.effort)
-        p, i, d, given, whole = (
-            zero + x if finite is None else xp.where(finite, x, zero) for x in self[:5]
-        )
-        finite = xp.isfinite(self.unsaturated) if finite is None else finite
-        return Terms(p, i, d, given, whole, self.effort, self.effort != self.unsaturated, finite)
+        if finite is None:
+            terms = [zero + term for term in self[:5]]
+            finite = xp.isfinite(self.unsaturated)
+        else:
+            terms = [xp.where(finite, term, zero) for term in self[:5]]
+        saturated = self.effort != self.unsaturated
+        return Terms._make((*terms, self.effort, saturated, finite))
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")

@@ -14,9 +14,7 @@ See docs/actuators.md.
 
 from batchpid.arrays.elementwise import replace_envs as reset
 from batchpid.motors.actuator_dynamics import (
-    STAGES,
     MotorCoefficients,
-    Stages,
     advance_effort,
     advance_measurement,
     command_limits,
@@ -33,22 +31,19 @@ from batchpid.motors.actuator_files import (
     save_actuators,
 )
 from batchpid.motors.actuator_state import ActuatorState
-from batchpid.motors.actuators import DRIVEN, JOINT_SIDE, Actuators, check_actuators, make_actuators
+from batchpid.motors.actuators import DRIVEN, JOINT_SIDE, Actuators, make_actuators
 from batchpid.motors.coupling import Coupling, Follower
 
 __all__ = [
     "DRIVEN",
     "JOINT_SIDE",
-    "STAGES",
     "ActuatorState",
     "Actuators",
     "Coupling",
     "Follower",
     "MotorCoefficients",
-    "Stages",
     "advance_effort",
     "advance_measurement",
-    "check_actuators",
     "command_limits",
     "deliver",
     "discretise",

@@ -30,7 +30,6 @@ commands has a term in :func:`command_limits`, too. Terms may use the operations
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -222,30 +221,13 @@ def measure(
     )
 
 
-class Stages(NamedTuple):
-    """Elementwise parts of a step, functions of coefficients and arrays (envs, joints); a loop may
-    compile them.
-    """
-
-    delivered: Callable[..., tuple[Any]]
-    """Effort of the step before, effort asked for, position and velocity -> effort delivered."""
-    limits: Callable[..., tuple[Any, Any]]
-    """:func:`command_limits`."""
-    play: Callable[..., tuple[Any, Any]]
-    """Encoder's position of the step before, position and velocity -> both behind the backlash."""
-    encode: Callable[..., tuple[Any, Any]]
-    """Position, velocity and the noise of each -> both as measured."""
-
-
 def _motor(k: MotorCoefficients, effort: Array) -> Array:
     """Return s u + b."""
     effort = effort if k.strength is None else k.strength * effort
     return effort if k.bias is None else effort + k.bias
 
 
-def _delivered(
-    k: MotorCoefficients, behind: Any, effort: Array, qpos: Array, qvel: Array
-) -> tuple[Array]:
+def _delivered(k: MotorCoefficients, behind: Any, effort: Array, qpos: Array, qvel: Array) -> Array:
     """Return s u + b within the envelope, after the lag; ``behind`` is the effort of the step
     before, None without.
     """
@@ -254,7 +236,7 @@ def _delivered(
     motor = clip(_motor(k, effort), low, high, xp)
     if k.intake is not None:
         motor = clip(behind + k.intake * (motor - behind), low, high, xp)
-    return (motor,)
+    return motor
 
 
 def command_limits(k: MotorCoefficients, qpos: Array, qvel: Array) -> tuple[Array, Array]:
@@ -296,17 +278,12 @@ def _encode(
     return qpos, qvel
 
 
-STAGES = Stages(_delivered, command_limits, _play, _encode)
-"""Stages for NumPy and JAX, as this module computes them."""
-
-
 def advance_effort(
     k: MotorCoefficients,
     state: ActuatorState,
     effort: Array,
     qpos: Array,
     qvel: Array,
-    stages: Stages = STAGES,
 ) -> tuple[ActuatorState, Any]:
     """Advance the motors with given coefficients, for loops with constant actuators; otherwise as
     :func:`deliver`.
@@ -316,7 +293,7 @@ def advance_effort(
     if k.command is not None:
         command = push_history(command, effort)
         effort = delay.read(command, k.command, None, xp)
-    (motor,) = stages.delivered(k, behind, effort, qpos, qvel)
+    motor = _delivered(k, behind, effort, qpos, qvel)
     return ActuatorState(command, behind if k.intake is None else motor, *state[2:]), motor
 
 
@@ -326,7 +303,6 @@ def advance_measurement(
     qpos: Array,
     qvel: Array,
     drawn: tuple[Array, Array] | None = None,
-    stages: Stages = STAGES,
 ) -> tuple[ActuatorState, Any, Any]:
     """Advance the sensors with given coefficients, for loops with constant actuators; otherwise as
     :func:`measure`.
@@ -336,7 +312,7 @@ def advance_measurement(
     xp = namespace(qpos, qvel)
     command, effort, sensor, encoder, key, step = state
     if k.play is not None:
-        encoder, qvel = stages.play(k, encoder, qpos, qvel)
+        encoder, qvel = _play(k, encoder, qpos, qvel)
         qpos = encoder
     if k.position_delay is not None and k.velocity_delay is not None:
         sensor = push_history(sensor, qpos, qvel)
@@ -347,7 +323,7 @@ def advance_measurement(
     if key is not None:
         drawn = measurement_noise(k, key, step, qpos, xp) if drawn is None else drawn
         step = step + _ONE
-    qpos, qvel = stages.encode(k, qpos, qvel, *(drawn or (None, None)))
+    qpos, qvel = _encode(k, qpos, qvel, *(drawn or (None, None)))
     return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel
 
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from batchpid.arrays.array_types import Array, Document
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import array_summary
+from batchpid.arrays.records import Record
 
 
-class ActuatorState(NamedTuple):
-    """State of actuators and sensors; None where no effect needs it. Every array has the envs as
-    its first axis.
-    """
-
+class _ActuatorStateFields(NamedTuple):
     command: Array = None
     """Efforts asked for, latest first (envs, samples, joints) [N m or N]."""
     effort: Array = None
@@ -23,17 +20,22 @@ class ActuatorState(NamedTuple):
     """
     encoder: Array = None
     """Position of the sensor's side of the play (envs, joints) [rad or m]."""
-    key: Any = None
+    key: Array = None
     """Key of the noise, a hash of seed, env and episode (envs, 2) uint32."""
-    step: Any = None
+    step: Array = None
     """Measurements since the reset (envs,) uint32."""
+
+
+class ActuatorState(Record, _ActuatorStateFields):
+    """State of actuators and sensors; None where no effect needs it. Every array has the envs as
+    its first axis.
+    """
+
+    __slots__ = ()
+    NAME = "state"
 
     def __repr__(self) -> str:
         return array_summary(self._replace(key=None, step=None), "envs", "joints")
-
-    def leaves(self) -> Document:
-        """Return the arrays by name."""
-        return {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
 
     def matched_to(self, fresh: ActuatorState) -> ActuatorState:
         """Return this state with exactly the leaves of ``fresh``: missing ones from there, the
@@ -42,9 +44,11 @@ class ActuatorState(NamedTuple):
         A history that is longer there is continued by its oldest sample. The key is taken from
         ``fresh``.
         """
-        both = zip(self, fresh, strict=True)
-        matched = (new if new is None or old is None else _resized(old, new) for old, new in both)
-        return ActuatorState(*matched)._replace(key=fresh.key)
+        matched = super().matched_to(fresh)
+        histories = {
+            name: _resized(leaf, getattr(fresh, name)) for name, leaf in matched.leaves().items()
+        }
+        return matched._replace(**histories | {"key": fresh.key})
 
 
 def _resized(old: Array, new: Array) -> Array:

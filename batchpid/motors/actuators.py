@@ -1,25 +1,23 @@
 """Parameters of actuators and sensors: build, broadcast, validate.
 
-:class:`Actuators` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without
-registration. An effect that is off is ``None``: it is not a leaf and costs nothing.
-
-Every effect is declared once, by an argument of :func:`make_actuators` with its unit, bounds and
-group.
+An effect that is off is ``None``: it is not a leaf and costs nothing. Every effect is declared
+once, with its unit, bounds and group, as a field of :class:`Actuators`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Array, Document, DType
-from batchpid.arrays.display import span, summary
-from batchpid.arrays.field_tables import WHOLE, Field, check_leaves, declared, in_group
-from batchpid.arrays.leaves import LeafBuilder
-from batchpid.checks.validate import entries, integer, is_traced, known_keywords, number, read_array
+from batchpid.arrays.display import array_summary
+from batchpid.arrays.field_tables import Field, declared, in_group
+from batchpid.arrays.records import LeafBuilder, Record, with_fields
+from batchpid.checks.validate import entries, integer, is_traced, number, read_array
 from batchpid.errors import InvalidArgumentError
 
 MAX_DELAY = 1.0
@@ -28,7 +26,62 @@ TABLE = {"limit_efforts": Field("N m or N", math.inf)}
 """Declared field of the efforts at the points of a position-dependent limit."""
 
 
-class Actuators(NamedTuple):
+class _ActuatorsFields(NamedTuple):
+    command_delay: Annotated[Array, Field("s", high=MAX_DELAY, group="motor")] = None
+    sensor_delay: Annotated[Array, Field("s", high=MAX_DELAY, group="sensor")] = None
+    lag: Annotated[Array, Field("s", group="motor")] = None
+    strength: Annotated[Array, Field("1", 1.0, group="motor")] = None
+    bias: Annotated[Array, Field("N m or N", low=-math.inf, group="motor")] = None
+    saturation_effort: Annotated[Array, Field("N m or N", math.inf, above=True, group="motor")] = (
+        None
+    )
+    no_load_speed: Annotated[Array, Field("rad/s or m/s", math.inf, above=True, group="motor")] = (
+        None
+    )
+    effort_limit: Annotated[Array, Field("N m or N", math.inf, group="motor")] = None
+    limit_positions: Array = None
+    """x_k of the limit that depends on the position (1, joints, points)."""
+    limit_efforts: Array = None
+    """L_k (1, joints, points)."""
+    coulomb: Annotated[Array, Field("N m or N", group="joint")] = None
+    static: Annotated[Array, Field("N m or N", group="joint")] = None
+    stribeck: Annotated[Array, Field("rad/s or m/s", group="joint")] = None
+    load_friction: Annotated[Array, Field("1", high=1.0, group="joint")] = None
+    viscous: Annotated[Array, Field("N m s/rad or N s/m", group="joint")] = None
+    armature: Annotated[Array, Field("kg m^2 or kg", group="joint")] = None
+    position_offset: Annotated[Array, Field("rad or m", low=-math.inf, group="sensor")] = None
+    backlash: Annotated[Array, Field("rad or m", group="sensor")] = None
+    position_resolution: Annotated[Array, Field("rad or m", group="sensor")] = None
+    velocity_resolution: Annotated[Array, Field("rad/s or m/s", group="sensor")] = None
+    position_noise: Annotated[Array, Field("rad or m", group="sensor")] = None
+    velocity_noise: Annotated[Array, Field("rad/s or m/s", group="sensor")] = None
+    continuous: Array = None
+    """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
+    max_delay: Array = None
+    """Length of the histories of delayed signals (1, 1) [s]; None without delays."""
+    seed: Array = None
+    """Of the noise: two words (1, 2) uint32, the lower one first; None without noise."""
+
+
+FIELDS = declared(_ActuatorsFields, Field)
+"""Declared fields of all effects that are one number for each joint."""
+MOTOR_SIDE = in_group(FIELDS, "motor")
+"""Effects between the effort asked for and the effort delivered."""
+JOINT_SIDE = in_group(FIELDS, "joint")
+"""Effects on the joint instead of the signals: :class:`batchpid.sim.Runner` simulates them in the
+robot's joints.
+"""
+DRIVEN = tuple(name for name in JOINT_SIDE if name != "load_friction")
+"""Effects on joints under the engine's drives, whose effort is unknown; friction by load needs the
+effort.
+"""
+SENSOR_SIDE = in_group(FIELDS, "sensor")
+"""Effects between the joint's state and its measurement."""
+DELAYS = ("command_delay", "sensor_delay")
+NOISES = ("position_noise", "velocity_noise")
+
+
+class Actuators(Record, _ActuatorsFields):
     """Parameters of actuators and sensors. Every leaf is a float array, (1, joints) or (envs,
     joints); None is off.
 
@@ -36,81 +89,26 @@ class Actuators(NamedTuple):
     have the meaning and the units of the options of :func:`make_actuators`.
     """
 
-    command_delay: Array = None
-    sensor_delay: Array = None
-    lag: Array = None
-    strength: Array = None
-    bias: Array = None
-    saturation_effort: Array = None
-    no_load_speed: Array = None
-    effort_limit: Array = None
-    limit_positions: Array = None
-    """x_k of the limit that depends on the position (1, joints, points)."""
-    limit_efforts: Array = None
-    """L_k (1, joints, points)."""
-    coulomb: Array = None
-    static: Array = None
-    stribeck: Array = None
-    load_friction: Array = None
-    viscous: Array = None
-    armature: Array = None
-    position_offset: Array = None
-    backlash: Array = None
-    position_resolution: Array = None
-    velocity_resolution: Array = None
-    position_noise: Array = None
-    velocity_noise: Array = None
-    continuous: Array = None
-    """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
-    max_delay: Array = None
-    """Length of the histories of delayed signals (1, 1) [s]; None without delays."""
-    seed: Any = None
-    """Of the noise: two words (1, 2) uint32, the lower one first; None without noise."""
-
-    @property
-    def num_joints(self) -> int | None:
-        """Number of joints; None where every effect is off."""
-        return next((int(leaf.shape[1]) for leaf in self[:-2] if leaf is not None), None)
-
-    @property
-    def num_envs(self) -> int:
-        """Number of envs with separate actuators; 1 where all envs share them."""
-        return max((leaf.shape[0] for leaf in self if leaf is not None), default=1)
+    __slots__ = ()
+    NAME = "actuators"
+    FIELDS = FIELDS
+    TABLES = TABLE | {"limit_positions": Field(low=-math.inf)}
+    WHOLE = ("max_delay", "seed")
 
     @property
     def measures(self) -> bool:
         """True if measurements differ from the joints' true positions or velocities."""
-        return any(getattr(self, name) is not None for name in SENSOR_SIDE)
+        return not SENSOR_SIDE.keys().isdisjoint(self.leaves())
 
     @property
     def delivers(self) -> bool:
         """True if the efforts delivered differ from those asked for."""
-        return any(getattr(self, name) is not None for name in (*MOTOR_SIDE, *TABLE))
+        return not (MOTOR_SIDE | TABLE).keys().isdisjoint(self.leaves())
 
     @property
     def is_ideal(self) -> bool:
         """True if every effect is off."""
-        return not (self.measures or self.delivers) and all(
-            leaf is None for leaf in self.joint_side()
-        )
-
-    def for_envs(self, envs: slice | Any) -> Actuators:
-        """Return the actuators of some envs (a slice or an index array); shared rows stay
-        shared.
-        """
-        return Actuators(
-            *(leaf if leaf is None or leaf.shape[0] == 1 else leaf[envs] for leaf in self)
-        )
-
-    def for_joints(self, joints: Any) -> Actuators:
-        """Return the actuators of some joints (an index array or a mask)."""
-        leaves = self._asdict().items()
-        return Actuators(
-            **{
-                name: leaf if leaf is None or name in WHOLE else leaf[:, joints]
-                for name, leaf in leaves
-            }
-        )
+        return (FIELDS | TABLE).keys().isdisjoint(self.leaves())
 
     def joint_side(self) -> Actuators:
         """Return the friction and reflected inertia alone, which also joints of ideal motors and
@@ -122,7 +120,7 @@ class Actuators(NamedTuple):
         """Return the effects that are on, as arguments of :func:`make_actuators` that build these
         actuators again.
         """
-        options = {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
+        options = self.leaves()
         if self.continuous is not None:
             options["continuous"] = self.continuous > 0
         if self.limit_positions is not None:
@@ -132,73 +130,39 @@ class Actuators(NamedTuple):
         if self.max_delay is not None and not is_traced(self.max_delay):
             options["max_delay"] = float(self.max_delay[0, 0])
         if options:
-            options["dtype"] = next(leaf.dtype for leaf in self if leaf is not None)
+            options["dtype"] = self.dtype
         return options
 
-    def replace(self, **options: Any) -> Actuators:
+    def replace(self, **options: object) -> Actuators:
         """Return actuators with some options of :func:`make_actuators` changed, checked as there.
 
         With other delays max_delay is theirs, unless it is given too.
         """
-        known = self.options()
-        if not options.keys().isdisjoint(("command_delay", "sensor_delay")):
-            known.pop("max_delay", None)
+        present = self.options()
+        if not options.keys().isdisjoint(DELAYS):
+            present.pop("max_delay", None)
         if any(is_traced(value) for value in options.values()):
-            known.pop("dtype", None)
-        if self.num_joints is None and "joints" not in options:
+            present.pop("dtype", None)
+        if not self.num_joints and "joints" not in options:
             remedy = "build them with make_actuators(), or give joints="
             raise InvalidArgumentError("joints", "is not known: every effect is off", remedy=remedy)
-        return make_actuators(**{"joints": self.num_joints, **known, **options})
+        return make_actuators(**{"joints": self.num_joints, **present, **options})
 
     def __repr__(self) -> str:
-        on = {
-            name: leaf
-            for name, leaf in self._asdict().items()
-            if leaf is not None and name != "seed"
-        }
-        sizes = [f"{self.num_envs} envs"] * (self.num_envs > 1) + [
-            f"{self.num_joints} joints"
-        ] * bool(on)
-        return summary(
-            "Actuators",
-            [*sizes, *(f"{name.replace('_', ' ')} {span(leaf)}" for name, leaf in on.items())],
-        )
+        return array_summary(self._replace(seed=None), "envs", "joints")
 
 
-@known_keywords
+@with_fields(FIELDS)
 def make_actuators(
     joints: int,
     *,
-    command_delay: Annotated[Array, Field("s", high=MAX_DELAY, group="motor")] = None,
-    lag: Annotated[Array, Field("s", group="motor")] = None,
-    strength: Annotated[Array, Field("1", 1.0, group="motor")] = None,
-    bias: Annotated[Array, Field("N m or N", low=-math.inf, group="motor")] = None,
-    saturation_effort: Annotated[
-        Array, Field("N m or N", math.inf, above=True, group="motor")
-    ] = None,
-    no_load_speed: Annotated[
-        Array, Field("rad/s or m/s", math.inf, above=True, group="motor")
-    ] = None,
-    effort_limit: Annotated[Array, Field("N m or N", math.inf, group="motor")] = None,
-    position_limit: tuple[Array, Array] | None = None,
-    coulomb: Annotated[Array, Field("N m or N", group="joint")] = None,
-    static: Annotated[Array, Field("N m or N", group="joint")] = None,
-    stribeck: Annotated[Array, Field("rad/s or m/s", group="joint")] = None,
-    load_friction: Annotated[Array, Field("1", high=1.0, group="joint")] = None,
-    viscous: Annotated[Array, Field("N m s/rad or N s/m", group="joint")] = None,
-    armature: Annotated[Array, Field("kg m^2 or kg", group="joint")] = None,
-    sensor_delay: Annotated[Array, Field("s", high=MAX_DELAY, group="sensor")] = None,
-    position_offset: Annotated[Array, Field("rad or m", low=-math.inf, group="sensor")] = None,
-    backlash: Annotated[Array, Field("rad or m", group="sensor")] = None,
-    position_resolution: Annotated[Array, Field("rad or m", group="sensor")] = None,
-    velocity_resolution: Annotated[Array, Field("rad/s or m/s", group="sensor")] = None,
-    position_noise: Annotated[Array, Field("rad or m", group="sensor")] = None,
-    velocity_noise: Annotated[Array, Field("rad/s or m/s", group="sensor")] = None,
+    position_limit: tuple[ArrayLike, ArrayLike] | None = None,
     seed: int = 0,
     max_delay: float | None = None,
     continuous: Array = None,
     joint_names: Sequence[str] | None = None,
     dtype: DType = None,
+    **effects: Array,
 ) -> Actuators:
     """Build validated :class:`Actuators`; a number may be a scalar, (joints,) or (envs, joints).
 
@@ -267,81 +231,63 @@ def make_actuators(
     InvalidArgumentError
         Naming the option, joint, env and value.
     """
-    given = locals()
-    build = LeafBuilder(joints, joint_names, dtype, given.values())
-    leaves: Document = {
-        name: build.option(name, given[name], field) for name, field in FIELDS.items()
-    }
-    longest = (
-        MAX_DELAY
-        if max_delay is None
-        else number("max_delay", max_delay, 0.0, MAX_DELAY, "seconds")
-    )
-    delays = [
-        (name, delay)
-        for name in ("command_delay", "sensor_delay")
-        if (delay := leaves[name]) is not None
-    ]
-    for name, delay in delays:
-        if not is_traced(delay) and (delay > longest).any():
-            remedy = f"use a number from 0 to {longest:g} (seconds)"
-            raise InvalidArgumentError(
-                name, "out of range", value=float(delay.max()), remedy=remedy
-            )
-    if max_delay is None and not any(is_traced(delay) for _, delay in delays):
-        longest = max((float(delay.max()) for _, delay in delays), default=0.0)
-    if (leaves["saturation_effort"] is None) != (leaves["no_load_speed"] is None):
-        missing = "no_load_speed" if leaves["no_load_speed"] is None else "saturation_effort"
-        raise InvalidArgumentError(
-            missing, "is missing", remedy="give both ends of the torque-speed line, or none"
-        )
-    if (static := leaves["static"]) is not None and not is_traced(static):
-        coulomb = 0.0 if leaves["coulomb"] is None else leaves["coulomb"]
-        good = is_traced(coulomb) or (static >= coulomb) | (static == 0)
-        entries(
-            "static",
-            static,
-            good,
-            "is less than coulomb",
-            joint_names,
-            remedy="give at least coulomb, or 0",
-        )
-    if leaves["stribeck"] is not None and static is None:
-        if given["static"] is None:
-            raise InvalidArgumentError(
-                "stribeck", "has no effect without static", remedy="give static, or leave it out"
-            )
+    build = LeafBuilder(joints, joint_names, dtype, effects.values())
+    leaves = build.options(FIELDS, effects)
+    # Friction at rest that is never more than in motion is none, and then no speed ends it.
+    if leaves["static"] is None and effects.get("static") is not None:
         leaves["stribeck"] = None
+    _check_together(leaves, build.names)
     points, efforts = _table(build, position_limit)
-    noisy = leaves["position_noise"] is not None or leaves["velocity_noise"] is not None
+    longest = _longest_delay(leaves, max_delay)
     words = integer("seed", seed, 0, 2**64 - 1)
+    has_noise = any(leaves[name] is not None for name in NOISES)
     return Actuators(
         **leaves,
         limit_positions=points,
         limit_efforts=efforts,
         continuous=build.mask("continuous", continuous),
-        max_delay=build.freeze(np.array([[longest]])) if delays else None,
-        seed=np.array([[words & 0xFFFFFFFF, words >> 32]], np.uint32) if noisy else None,
+        max_delay=None if longest is None else build.freeze(np.array([[longest]])),
+        seed=np.array([[words & 0xFFFFFFFF, words >> 32]], np.uint32) if has_noise else None,
     )
 
 
-FIELDS = declared(make_actuators, Field)
-"""Declared fields of all effects that are one number for each joint."""
-MOTOR_SIDE = in_group(FIELDS, "motor")
-"""Effects between the effort asked for and the effort delivered."""
-JOINT_SIDE = in_group(FIELDS, "joint")
-"""Effects on the joint instead of the signals: :class:`batchpid.sim.Runner` simulates them in the
-robot's joints.
-"""
-DRIVEN = tuple(name for name in JOINT_SIDE if name != "load_friction")
-"""Effects on joints under the engine's drives, whose effort is unknown; friction by load needs the
-effort.
-"""
-SENSOR_SIDE = in_group(FIELDS, "sensor")
-"""Effects between the joint's state and its measurement."""
+def _check_together(leaves: Document, joint_names: Sequence[str] | None) -> None:
+    """Raise InvalidArgumentError for effects that lack another one, or contradict it."""
+    if (leaves["saturation_effort"] is None) != (leaves["no_load_speed"] is None):
+        missing = "no_load_speed" if leaves["no_load_speed"] is None else "saturation_effort"
+        remedy = "give both ends of the torque-speed line, or none"
+        raise InvalidArgumentError(missing, "is missing", remedy=remedy)
+    static, coulomb = leaves["static"], leaves["coulomb"]
+    if static is None:
+        if leaves["stribeck"] is not None:
+            remedy = "give static, or leave it out"
+            raise InvalidArgumentError("stribeck", "has no effect without static", remedy=remedy)
+    elif not is_traced(static) and not is_traced(coulomb):
+        good = (static == 0) | (static >= (0.0 if coulomb is None else coulomb))
+        remedy = "give at least coulomb, or 0"
+        entries("static", static, good, "is less than coulomb", joint_names, remedy=remedy)
 
 
-def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Array, Array]:
+def _longest_delay(leaves: Document, max_delay: float | None) -> float | None:
+    """Return the length of the histories [s]; None without delays.
+
+    Raises InvalidArgumentError for a delay above ``max_delay``.
+    """
+    delays = {name: leaves[name] for name in DELAYS if leaves[name] is not None}
+    longest = MAX_DELAY
+    if max_delay is not None:
+        longest = number("max_delay", max_delay, 0.0, MAX_DELAY, "seconds")
+    most = {name: float(rows.max()) for name, rows in delays.items() if not is_traced(rows)}
+    for name, delay in most.items():
+        if delay > longest:
+            remedy = f"use a number from 0 to {longest:g} (seconds)"
+            raise InvalidArgumentError(name, "out of range", value=delay, remedy=remedy)
+    if max_delay is None and len(most) == len(delays):
+        longest = max(most.values(), default=0.0)
+    return longest if delays else None
+
+
+def _table(build: LeafBuilder, table: object) -> tuple[Array, Array]:
     """Return the positions and efforts of a limit that depends on the position (1 | envs, joints,
     points).
     """
@@ -353,37 +299,26 @@ def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Array, Ar
     )
     if not isinstance(table, tuple | list | np.ndarray) or len(table) != 2:
         raise InvalidArgumentError("position_limit", "must be a pair", value=table, remedy=remedy)
-    rows = [read_array("position_limit", each).astype(build.dtype) for each in table]
-    for each in rows:
-        if (
-            each.ndim not in (1, 2, 3)
-            or each.shape[-1] < 2
-            or (each.ndim > 1 and each.shape[-2] != build.joints)
-        ):
-            raise InvalidArgumentError("position_limit", f"has shape {each.shape}", remedy=remedy)
-    if rows[0].shape[-1] != rows[1].shape[-1]:
-        problem = f"has {rows[0].shape[-1]} positions and {rows[1].shape[-1]} efforts"
-        raise InvalidArgumentError("position_limit", problem, remedy=remedy)
-    shape = (1, build.joints, rows[0].shape[-1])
+    rows = [read_array("position_limit", part).astype(build.dtype) for part in table]
+    points = rows[0].shape[-1:]
+    shape = (1, build.joints, *points)
+    for part in rows:
+        fits = part.shape in (points, shape[1:]) or (part.ndim == 3 and part.shape[1:] == shape[1:])
+        if points < (2,) or not fits:
+            raise InvalidArgumentError("position_limit", f"has shape {part.shape}", remedy=remedy)
     positions, efforts = (
-        np.broadcast_to(each, np.broadcast_shapes(each.shape, shape)) for each in rows
+        np.broadcast_to(part, np.broadcast_shapes(part.shape, shape)) for part in rows
     )
     rising = np.isfinite(positions)
     rising[..., 1:] &= positions[..., 1:] >= positions[..., :-1]
     good = (efforts >= 0) & (np.isfinite(efforts) | np.isinf(efforts).all(2, keepdims=True))
-    problems = "has positions that do not ascend", "has an effort < 0 or not finite"
-    for each, right, problem in zip((positions, efforts), (rising, good), problems, strict=True):
-        first = np.take_along_axis(each, right.argmin(2, keepdims=True), 2)[..., 0]
+    checks = {
+        "has positions that do not ascend": (positions, rising),
+        "has an effort < 0 or not finite": (efforts, good),
+    }
+    for problem, (values, right) in checks.items():
+        first = np.take_along_axis(values, right.argmin(2, keepdims=True), 2)[..., 0]
         entries("position_limit", first, right.all(2), problem, build.names)
-    return (
-        (None, None)
-        if np.isinf(efforts).all()
-        else (build.freeze(positions), build.freeze(efforts))
-    )
-
-
-def check_actuators(actuators: Actuators, num_envs: int, joint_names: Sequence[str]) -> None:
-    """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by
-    hand.
-    """
-    check_leaves("actuators", actuators, FIELDS | TABLE, num_envs, joint_names)
+    if np.isinf(efforts).all():
+        return None, None
+    return build.freeze(positions), build.freeze(efforts)

@@ -22,36 +22,38 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 from batchpid.arrays.array_types import Array, ArrayModule, DType
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, clip, in_dtype_of, namespace, wrap
-from batchpid.arrays.field_tables import Field, check_leaves, declared
-from batchpid.arrays.leaves import LeafBuilder
+from batchpid.arrays.field_tables import Field, declared
+from batchpid.arrays.records import LeafBuilder, Record, with_fields
 from batchpid.checks.validate import check_time_step
 
 
-class Guard(NamedTuple):
-    """Limits of setpoints, (1, joints) or (envs, joints); None is off. Build one with
-    :func:`make_guard`.
-    """
-
-    lower: Array = None
-    upper: Array = None
-    rate: Array = None
+class _GuardFields(NamedTuple):
+    lower: Annotated[Array, Field("rad or m", -math.inf, low=-math.inf)] = None
+    upper: Annotated[Array, Field("rad or m", math.inf, low=-math.inf)] = None
+    rate: Annotated[Array, Field("rad/s or m/s", math.inf, above=True)] = None
     """V [rad/s or m/s]."""
-    acceleration: Array = None
+    acceleration: Annotated[Array, Field("rad/s^2 or m/s^2", math.inf, above=True)] = None
     """A [rad/s^2 or m/s^2]."""
     turns: Array = None
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
 
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
 
-    def for_envs(self, envs: slice | Any) -> Guard:
-        """Return the guard of some envs (a slice or an index array); shared rows stay shared."""
-        return Guard(*(leaf if leaf is None or leaf.shape[0] == 1 else leaf[envs] for leaf in self))
+FIELDS = declared(_GuardFields, Field)
+"""Options of a joint."""
+
+
+class Guard(Record, _GuardFields):
+    """Limits of setpoints, (1, joints) or (envs, joints); None is off. Build one with
+    :func:`make_guard`.
+    """
+
+    __slots__ = ()
+    NAME = "guard"
+    FIELDS = FIELDS
 
 
 class GuardState(NamedTuple):
@@ -63,16 +65,14 @@ class GuardState(NamedTuple):
     """v [rad/s or m/s]."""
 
 
+@with_fields(FIELDS)
 def make_guard(
     joints: int,
     *,
-    lower: Annotated[Array, Field("rad or m", -math.inf, low=-math.inf)] = None,
-    upper: Annotated[Array, Field("rad or m", math.inf, low=-math.inf)] = None,
-    rate: Annotated[Array, Field("rad/s or m/s", math.inf, above=True)] = None,
-    acceleration: Annotated[Array, Field("rad/s^2 or m/s^2", math.inf, above=True)] = None,
     continuous: Array = None,
     joint_names: Sequence[str] | None = None,
     dtype: DType = None,
+    **limits: Array,
 ) -> Guard:
     """Build a validated :class:`Guard`; a number may be a scalar, (joints,) or (envs, joints), None
     is off.
@@ -91,24 +91,20 @@ def make_guard(
     InvalidArgumentError
         Naming the option, joint, env and value.
     """
-    build = LeafBuilder(joints, joint_names, dtype, (lower, upper, rate, acceleration))
+    build = LeafBuilder(joints, joint_names, dtype, limits.values())
     mask = build.mask("continuous", continuous)
-    low, high = build.limits(size=None, lower=lower, upper=upper)
+    low, high = build.limits("", "lower", "upper", limits)
     if mask is not None:
         xp = namespace(mask)
         low = None if low is None else xp.where(mask > 0, -math.inf, low)
         high = None if high is None else xp.where(mask > 0, math.inf, high)
+    rates = {name: FIELDS[name] for name in ("rate", "acceleration")}
     return Guard(
         lower=build.freeze(low),
         upper=build.freeze(high),
-        rate=build.option("rate", rate, FIELDS["rate"]),
-        acceleration=build.option("acceleration", acceleration, FIELDS["acceleration"]),
         turns=None if mask is None else build.freeze(mask / TURN),
+        **build.options(rates, limits),
     )
-
-
-FIELDS = declared(make_guard, Field)
-"""Options of a joint."""
 
 
 def init(guard: Guard, qpos: Array) -> GuardState:
@@ -118,7 +114,9 @@ def init(guard: Guard, qpos: Array) -> GuardState:
     return GuardState(zeros + qpos, zeros)
 
 
-def advance(guard: Guard, state: GuardState, setpoint: Array, dt: float) -> tuple[GuardState, Any]:
+def advance(
+    guard: Guard, state: GuardState, setpoint: Array, dt: float
+) -> tuple[GuardState, Array]:
     """Advance the guard by ``dt`` [s]; return the state, with the guarded ``setpoint``, and a mask
     of the changes.
 
@@ -131,7 +129,7 @@ def advance(guard: Guard, state: GuardState, setpoint: Array, dt: float) -> tupl
     xp = namespace(*guard, setpoint, *state)
     target = clip(setpoint, guard.lower, guard.upper, xp)
     error = wrap(target - state.setpoint, guard.turns, xp)
-    wanted = rate = error / dt
+    arriving = rate = error / dt
     if guard.acceleration is not None:
         rate = xp.sign(error) * _stop(guard.acceleration, xp.abs(error), dt, xp)
     if guard.rate is not None:
@@ -139,7 +137,7 @@ def advance(guard: Guard, state: GuardState, setpoint: Array, dt: float) -> tupl
     if guard.acceleration is not None:
         most = dt * guard.acceleration
         rate = clip(rate, state.rate - most, state.rate + most, xp)
-    guarded = xp.where(rate == wanted, target, state.setpoint + dt * rate)
+    guarded = xp.where(rate == arriving, target, state.setpoint + dt * rate)
     return GuardState(guarded, rate), guarded != setpoint
 
 
@@ -150,8 +148,3 @@ def _stop(acceleration: Array, distance: Array, dt: float, xp: ArrayModule) -> A
     steps = xp.maximum(xp.ceil(xp.sqrt(0.25 + 2 * distance / (a * dt**2)) - 0.5), 1.0)
     steps = xp.where(finite, steps, 1.0)
     return distance / (steps * dt) + (steps - 1) * (0.5 * dt * a)
-
-
-def check_guard(guard: Guard, num_envs: int, joint_names: Sequence[str]) -> None:
-    """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints)."""
-    check_leaves("guard", guard, FIELDS, num_envs, joint_names)

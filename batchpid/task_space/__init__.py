@@ -22,14 +22,16 @@ from batchpid.task_space.osc_state import (
     task_dynamics,
 )
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.tree_dynamics import (
+from batchpid.task_space.tree_quantities import (
     bias,
     forward_dynamics,
     gravity,
     inverse_dynamics,
+    jacobian,
+    jacobian_rate,
+    link_poses,
     mass_matrix,
 )
-from batchpid.task_space.tree_kinematics import jacobian, jacobian_rate, link_poses
 
 __all__ = [
     "IKResult",

@@ -20,12 +20,12 @@ passes them, and is turned back at the end.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Array, Float64
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.display import array_summary
 from batchpid.checks.validate import array, choice, entries, instance, integer, positive
 from batchpid.checks.warn import warn
@@ -118,160 +118,152 @@ def inverse_kinematics(
         An argument has a wrong shape or range, a quaternion is not of unit length, or, with
         "raise", a pose was not reached.
     """
-    index, how = (
-        instance("tree", tree, RigidTree, MAKE_TREE).index(link),
-        choice("on_failure", on_failure, ON_FAILURE),
-    )
+    index = instance("tree", tree, RigidTree, MAKE_TREE).index(link)
+    choice("on_failure", on_failure, ON_FAILURE)
     integer("starts", starts, 1, 10_000)
     integer("iterations", iterations, 1, 100_000)
-    tolerances = {
-        "position_tolerance": (position_tolerance, "m"),
-        "rotation_tolerance": (rotation_tolerance, "rad"),
-    }
-    tolerance = np.array([positive(name, *value) for name, value in tolerances.items()])
-    goal, rows = _goals_and_starts(tree, pose, start)
-    at = (
-        None
-        if point is None
-        else array("point", read_point(goal[0], point), (3,), "xyz", kind="entry")
-    )
-    search = _Search(tree, index, at, tolerance, iterations)
     integer("seed", seed, 0, 2**63)
+    position = positive("position_tolerance", position_tolerance, "m")
+    rotation = positive("rotation_tolerance", rotation_tolerance, "rad")
+    goal, rows = _goals_and_starts(tree, pose, start)
+    if point is not None:
+        point = array("point", read_point(goal[0], point), (3,), "xyz", kind="entry")
+    search = _Search(tree, index, point, np.array([position, rotation]), iterations)
+    shares = np.random.default_rng(seed).uniform(size=(starts - 1, tree.dof))
+    number = np.zeros(len(goal), np.intp)
     with quiet():
-        best = search.solve(goal, rows)
-        if best.success.all():
-            return best
-        shares = np.random.default_rng(seed).uniform(size=(starts - 1, tree.dof))
-        for first, last in (
-            (0, 4),
-            (4, starts - 1),
-        ):  # most poses are reached from one of the first five
-            left, drawn = np.flatnonzero(~best.success), shares[first:last]
-            if len(left) and len(drawn):
-                began = np.concatenate([search.drawn(rows[left], share) for share in drawn])
-                found = search.solve_past_limits(np.tile(goal[left], (len(drawn), 1)), began)
-                for number, part in enumerate(
-                    np.arange(len(began)).reshape(len(drawn), -1), start=first + 1
-                ):
-                    _replace(
-                        best, left, IKResult._make(leaf[part] for leaf in found), number, tolerance
-                    )
-    if how != "return" and not best.success.all():
-        _report(best, how)
-    return best
+        best = search.solve(goal, rows, search.limits)
+        # Most poses are reached from one of the first five starts.
+        for first, last in ((0, 4), (4, starts - 1)):
+            left, drawn = np.flatnonzero(~search.reached(best)), shares[first:last]
+            if not len(left) or not len(drawn):
+                continue
+            began = np.concatenate([search.drawn(rows[left], share) for share in drawn])
+            results = search.solve_past_limits(np.tile(goal[left], (len(drawn), 1)), began)
+            for at in range(len(drawn)):
+                part = results.rows(slice(at * len(left), (at + 1) * len(left)))
+                present = best.rows(left)
+                # The first start that reaches a pose is kept, else the nearest.
+                nearer = search.size(part) < search.size(present)
+                nearer &= ~search.reached(present)
+                best.write(left[nearer], part.rows(nearer))
+                number[left[nearer]] = first + 1 + at
+    success = search.reached(best)
+    steps = best.steps[:, 0].astype(np.intp)
+    result = IKResult(best.qpos, best.errors[:, 0], best.errors[:, 1], success, number, steps)
+    if on_failure != "return" and not success.all():
+        _report(result, on_failure)
+    return result
 
 
-class _Search:
+class _Found(NamedTuple):
+    """Nearest poses of some searches."""
+
+    qpos: Float64
+    """Positions (n, dof)."""
+    errors: Float64
+    """Errors of position and rotation (n, 2) [m, rad]."""
+    steps: Float64
+    """Numbers of steps (n, 1)."""
+
+    def rows(self, chosen: Rows | slice) -> _Found:
+        """Return some rows."""
+        return _Found(*(leaf[chosen] for leaf in self))
+
+    def write(self, rows: Rows, part: _Found) -> None:
+        """Write ``part`` over some rows."""
+        for leaf, values in zip(self, part, strict=True):
+            leaf[rows] = values
+
+
+class _Search(NamedTuple):
     """Searches for the poses of one tool."""
 
-    def __init__(
-        self,
-        tree: RigidTree,
-        index: int,
-        point: Float64 | None,
-        tolerance: Float64,
-        iterations: int,
-    ) -> None:
-        self._tree = tree
-        self._index = index
-        self._point = point
-        self._tolerance, self._iterations = tolerance, iterations
-        self._chain = tree.chain(tree.links[index])
-        self._limits: tuple[Float64, Float64] = np.asarray(tree.lower), np.asarray(tree.upper)
-        turn = self._limits[1] - self._limits[0]
-        turns = _wholly_turning(tree)
-        self._full = self._chain & turns & (turn > _FULL_TURN) & np.isfinite(turn)
+    tree: RigidTree
+    link: int
+    point: Float64 | None
+    tolerance: Float64
+    """Of position and rotation (2,) [m, rad]."""
+    iterations: int
+
+    @property
+    def limits(self) -> tuple[Float64, Float64]:
+        """Position limits of the joints (dof,)."""
+        return np.asarray(self.tree.lower), np.asarray(self.tree.upper)
+
+    def size(self, found: _Found) -> Float64:
+        """Return the larger of position and rotation error over its tolerance (n,)."""
+        return (found.errors / self.tolerance).max(-1)
+
+    def reached(self, found: _Found) -> Bool:
+        """Return the rows (n,) with both errors within the tolerances."""
+        within: Bool = found.errors <= self.tolerance
+        return within[:, 0] & within[:, 1]
 
     def drawn(self, rows: Float64, share: Float64) -> Float64:
         """Return starts at a ``share`` (dof,) of the range of each joint, half a turn about
         ``rows`` without limits.
         """
-        low, high = self._limits
-        low, high = (
-            np.where(np.isfinite(low), low, rows - np.pi),
-            np.where(np.isfinite(high), high, rows + np.pi),
-        )
-        return self._tree.positions(np.where(self._chain, low + share * (high - low), rows))
+        low, high = self.limits
+        low = np.where(np.isfinite(low), low, rows - np.pi)
+        high = np.where(np.isfinite(high), high, rows + np.pi)
+        chain = self.tree.chain(self.tree.links[self.link])
+        return self.tree.positions(np.where(chain, low + share * (high - low), rows))
 
-    def solve_past_limits(self, goal: Float64, qpos: Float64) -> IKResult:
+    def solve_past_limits(self, goal: Float64, qpos: Float64) -> _Found:
         """Return the results of searches in which joints with a full turn between their limits pass
         these.
         """
-        low, high = self._limits
-        if not self._full.any():
-            return self.solve(goal, qpos)
-        found = self.solve(
-            goal, qpos, (np.where(self._full, -np.inf, low), np.where(self._full, np.inf, high))
-        )
-        over, turn = found.qpos - np.where(self._full, high, np.inf), 2 * np.pi
-        under = np.where(self._full, low, -np.inf) - found.qpos
-        back = turn * (np.ceil(np.maximum(under, 0) / turn) - np.ceil(np.maximum(over, 0) / turn))
-        past = back.any(axis=1)
-        if (
-            past.any()
-        ):  # a joint between two turns is clipped to its limits, so search again from there
-            within = self.solve(goal[past], np.clip(found.qpos[past] + back[past], low, high))
-            for whole, part in zip(
-                found,
-                within._replace(iterations=within.iterations + found.iterations[past]),
-                strict=True,
-            ):
-                whole[past] = part
+        low, high = self.limits
+        chain = self.tree.chain(self.tree.links[self.link])
+        full = chain & _wholly_turning(self.tree) & (high - low > _FULL_TURN)
+        full &= np.isfinite(high - low)
+        free = np.where(full, -np.inf, low), np.where(full, np.inf, high)
+        found = self.solve(goal, qpos, free)
+        over = np.where(full, np.maximum(found.qpos - high, 0), 0.0)
+        under = np.where(full, np.maximum(low - found.qpos, 0), 0.0)
+        back = 2 * np.pi * (np.ceil(under / (2 * np.pi)) - np.ceil(over / (2 * np.pi)))
+        past = np.flatnonzero(back.any(axis=1))
+        if len(past):
+            # A joint between two turns is clipped to its limits, so search again from there.
+            turned = np.clip(found.qpos[past] + back[past], low, high)
+            within = self.solve(goal[past], turned, self.limits)
+            found.write(past, within._replace(steps=within.steps + found.steps[past]))
         return found
 
-    def solve(
-        self, goal: Float64, qpos: Float64, limits: tuple[Float64, Float64] | None = None
-    ) -> IKResult:
-        """Return the results of searches that begin at ``qpos`` (n, dof), within ``limits``, by
-        default the tree's.
-        """
-        limits = limits or self._limits
-        found = native_rows.search(
-            self._tree,
-            self._index,
-            self._point,
-            limits,
-            goal,
-            qpos,
-            self._tolerance,
-            self._iterations,
-        )
-        if found is None:
-            found = self._solve(goal, qpos, limits)
-        nearest, lengths, steps = found
-        near, start = lengths <= self._tolerance, np.zeros(len(goal), np.intp)
-        success, count = near[:, 0] & near[:, 1], steps[:, 0].astype(np.intp)
-        return IKResult(nearest, lengths[:, 0], lengths[:, 1], success, start, count)
-
-    def _solve(
-        self, goal: Float64, qpos: Float64, limits: tuple[Float64, Float64]
-    ) -> list[Float64]:
-        """Compute the results of :func:`native_rows.search` in NumPy."""
+    def solve(self, goal: Float64, qpos: Float64, limits: tuple[Float64, Float64]) -> _Found:
+        """Return the results of searches that begin at ``qpos`` (n, dof), within ``limits``."""
+        tool = self.tree, self.link, self.point
+        native = native_rows.search(*tool, limits, goal, qpos, self.tolerance, self.iterations)
+        if native is not None:
+            return _Found(*native)
         count = len(goal)
-        nearest, lengths, steps = [qpos.copy(), np.full((count, 2), np.inf), np.zeros((count, 1))]
+        best = _Found(qpos.copy(), np.full((count, 2), np.inf), np.zeros((count, 1)))
         going, q = np.arange(count), qpos
-        for step in range(self._iterations + 1):
-            at = _At(self._tree, self._index, self._point, q)
+        for step in range(self.iterations + 1):
+            at = _At(*tool, q)
             error = pose_error(goal[going], at.pose)
-            found = np.sqrt((error * error).reshape(-1, 2, 3).sum(-1))
-            better = _size(found, self._tolerance) < _size(lengths[going], self._tolerance)
-            rows = going[better]
-            nearest[rows], lengths[rows], steps[rows] = q[better], found[better], step
-            stay = ~(found <= self._tolerance).all(1)
-            going, q = going[stay], self._tree.positions(_stepped(limits, at, q, error))[stay]
+            lengths = np.sqrt((error * error).reshape(-1, 2, 3).sum(-1))
+            found = _Found(q, lengths, np.full((len(q), 1), float(step)))
+            better = self.size(found) < self.size(best.rows(going))
+            best.write(going[better], found.rows(better))
+            stay = ~self.reached(found)
+            going, q = going[stay], self.tree.positions(_stepped(limits, at, q, error))[stay]
             if not len(going):
                 break
-        return [nearest, lengths, steps]
+        return best
 
 
 class _At:
     """Tool at given positions (n, dof)."""
 
     def __init__(self, tree: RigidTree, index: int, point: Float64 | None, qpos: Float64) -> None:
-        self._tree, self._index = tree, index
+        self._tree = tree
+        self._index = index
         self._motions = motions_of(tree, tree.bodies, qpos, np)
         tool = tool_frame(tree, tree.bodies, self._motions.frames, index, point)
-        self.pose, self._place = pose_of(tool), tool[..., 3]
+        self.pose = pose_of(tool)
+        self._place = tool[..., 3]
         self.jacobian = jacobian_at(tree, tree.bodies, self._motions, index, self._place)
 
     def rate(self, qvel: Float64) -> Float64:
@@ -295,10 +287,8 @@ def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Flo
         if not beyond.any():
             break
     acceleration = -_damped(part, damping, at.rate(move))
-    size, most = (
-        np.sqrt((x * x).sum(-1, keepdims=True))
-        for x in (acceleration, _LARGEST_ACCELERATION * move)
-    )
+    size = np.sqrt((acceleration * acceleration).sum(-1, keepdims=True))
+    most = _LARGEST_ACCELERATION * np.sqrt((move * move).sum(-1, keepdims=True))
     share = np.where(size > most, most / size, 1.0) / 2
     return np.clip(qpos + move + np.where(free, share * acceleration, 0.0), *limits)
 
@@ -317,7 +307,8 @@ def _goals_and_starts(
 ) -> tuple[Float64, Float64]:
     """Return checked poses (envs, 7) and starts (envs, dof)."""
     columns = ("x", "y", "z", "qw", "qx", "qy", "qz")
-    envs = max(1, *(np.shape(given)[0] for given in (pose, start) if np.ndim(given) == 2), 1)
+    counts = [np.shape(given)[0] for given in (pose, start) if np.ndim(given) == 2]
+    envs = max([1, *counts])
     goal = array("pose", pose, (envs, 7), columns, kind="entry").copy()
     rows = array("start", start, (envs, tree.dof), tree.joint_names)
     length = np.linalg.norm(goal[:, 3:], axis=1, keepdims=True)
@@ -338,41 +329,17 @@ def _wholly_turning(tree: RigidTree) -> NDArray[np.bool_]:
     return turning & back & tree.independent
 
 
-def _lengths(found: IKResult, rows: Any) -> Float64:
-    return np.stack([found.position_error[rows], found.rotation_error[rows]], axis=-1)
-
-
-def _size(lengths: Float64, tolerance: Float64) -> Float64:
-    """Return the larger of position and rotation error over its tolerance."""
-    return (lengths / tolerance).max(-1)
-
-
-def _replace(best: IKResult, left: Array, found: IKResult, start: int, tolerance: Float64) -> None:
-    """Write ``found`` over the rows ``left`` of ``best`` that have not succeeded, where it is
-    nearer.
-    """
-    nearer = _size(_lengths(found, slice(None)), tolerance) < _size(_lengths(best, left), tolerance)
-    rows = nearer & ~best.success[left]
-    for whole, part in zip(best, found, strict=True):
-        whole[left[rows]] = part[rows]
-    best.start[left[rows]] = start
-
-
-def _report(found: IKResult, how: str) -> None:
+def _report(result: IKResult, on_failure: str) -> None:
     """Warn, or raise, for the first env that failed."""
-    failed = np.flatnonzero(~found.success)
+    failed = np.flatnonzero(~result.success)
     env = int(failed[0])
     problem = (
-        f"was not reached in {len(failed)} of {len(found.success)} envs:"
-        f" {found.position_error[env] * 1e3:.3g} mm and {found.rotation_error[env] * 1e3:.3g} mrad"
-        " are left"
+        f"was not reached in {len(failed)} of {len(result.success)} envs:"
+        f" {result.position_error[env] * 1e3:.3g} mm and"
+        f" {result.rotation_error[env] * 1e3:.3g} mrad are left"
     )
-    error = InvalidArgumentError(
-        "pose",
-        problem,
-        env=env,
-        remedy="check that it is in reach, or give more starts or larger tolerances",
-    )
-    if how == "raise":
+    remedy = "check that it is in reach, or give more starts or larger tolerances"
+    error = InvalidArgumentError("pose", problem, env=env, remedy=remedy)
+    if on_failure == "raise":
         raise error
     warn(str(error), InverseKinematicsWarning)

@@ -63,7 +63,7 @@ def kinematics(
     qvel: Array = None,
     index: int = 0,
     point: Array = None,
-) -> tuple[Array, ...] | None:
+) -> dict[str, Float64] | None:
     """Return the ``wanted`` arrays (..., ...), of "pose", "jacobian", "jacobian_rate",
     "mass_matrix" and "bias".
 
@@ -83,7 +83,7 @@ def kinematics(
     found = empty(wanted, leading, dof)
     inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
     call(native.kinematics, *_arguments(native, tree, found, inputs, index, point))
-    return tuple(found.values())
+    return found
 
 
 def bound(

@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Mapping
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Array, Document
+from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.arrays.choices import CHOICES, NamedChoice
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field, declared
-from batchpid.arrays.leaves import checked_ends
-from batchpid.checks.validate import (
-    AxisKind,
-    array,
-    choice,
-    entries,
-    instance,
-    known_keywords,
-    read_array,
-)
+from batchpid.arrays.records import Record, checked_ends, frozen, with_fields
+from batchpid.checks.validate import AxisKind, array, choice, entries, instance, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.tree_dynamics import check_masses
@@ -44,43 +37,45 @@ TASK_CHOICES: dict[str, Document] = {
 """Options chosen by name, and the entries of the params; the first is the default."""
 
 
-class OSCParams(NamedTuple):
-    """Parameters of operational-space control, for one tool of one kind of robot. Build it with
-    :func:`make_osc_params`.
-
-    Every leaf is a float64 array of one row or one per env; None is off.
-    """
-
-    stiffness: Array
+class _OSCParamsFields(NamedTuple):
+    stiffness: Annotated[Array, Field("1/s^2", group="axis", default=150.0)]
     """kp (1 | envs, 6) [1/s^2]."""
-    damping: Array
+    damping: Annotated[Array, Field("1/s", group="axis")]
     """kd (1 | envs, 6) [1/s]."""
-    posture_stiffness: Array
+    posture_stiffness: Annotated[Array, Field("1/s^2", group="joint", default=10.0)]
     """(1 | envs, dof) [1/s^2]."""
     posture_damping: Array
     """(1 | envs, dof) [1/s]."""
-    position_error_limit: Array
+    position_error_limit: Annotated[
+        Array, Field("m", math.inf, above=True, group="norm", default=0.1)
+    ]
     """(1 | envs, 1) [m]."""
-    rotation_error_limit: Array
+    rotation_error_limit: Annotated[
+        Array, Field("rad", math.inf, above=True, group="norm", default=0.5)
+    ]
     """(1 | envs, 1) [rad]."""
-    smallest_eigenvalue: Array
+    smallest_eigenvalue: Annotated[
+        Array, Field("1/kg or 1/(kg m^2)", above=True, group="s0", default=0.02)
+    ]
     """s0 (1 | envs, 1) [1/kg, 1/(kg m^2)]."""
-    axes: Any = None
+    axes: Annotated[Array, Field(neutral=True, group="axis")] = None
     """1.0 for the axes whose motion is controlled (1 | envs, 6); None for all."""
-    force_axes: Any = None
+    force_axes: Annotated[Array, Field(neutral=False, group="axis")] = None
     """1.0 for further axes that the posture must not act on (1 | envs, 6)."""
-    effort_min: Array = None
+    effort_min: Annotated[Array, Field("N m or N", -math.inf, low=-math.inf, group="joint")] = None
     """(1 | envs, dof) [N m or N]."""
-    effort_max: Array = None
-    frame: Any = None
+    effort_max: Annotated[Array, Field("N m or N", math.inf, low=-math.inf, group="joint")] = None
+    frame: NamedChoice | None = None
     """None for "world", or a choice without fields."""
-    integral_gain: Array = None
+    integral_gain: Annotated[Array, Field("1/s^3", group="axis")] = None
     """ki (1 | envs, 6) [1/s^3]."""
-    integral_limit: Array = None
+    integral_limit: Annotated[
+        Array, Field("m/s^2 or rad/s^2", math.inf, group="axis", default=math.inf)
+    ] = None
     """(1 | envs, 6) [m/s^2, rad/s^2]."""
-    limit_stiffness: Array = None
+    limit_stiffness: Annotated[Array, Field("1/s^2", group="joint", default=400.0)] = None
     """(1 | envs, dof) [1/s^2]."""
-    limit_margin: Array = None
+    limit_margin: Annotated[Array, Field("rad or m", group="joint")] = None
     """(1 | envs, dof) [rad or m]."""
     lower: Array = None
     """Position limits of the tree (1, dof) [rad or m]; None without ``limit_margin``."""
@@ -89,40 +84,42 @@ class OSCParams(NamedTuple):
     """1 / (2 pi) for joints of the tree that turn without limits, whose posture is the one next to
     qpos, else 0 (1, dof); None without such joints.
     """
-    discretization: Any = None
+    discretization: NamedChoice | None = None
     """ImplicitLaw(): the gains act on the predicted end of the step; None: on its beginning."""
+
+
+FIELDS = declared(_OSCParamsFields, Field) | {
+    "damping_ratio": Field("1", 1.0, group="axis", default=1.0),
+    "posture_damping_ratio": Field("1", 1.0, group="joint", default=1.0),
+    "effort_limit": Field("N m or N", math.inf, group="joint"),
+}
+"""Options with a value for each axis or joint, or one for each env."""
+WITHOUT_EFFECT = {
+    "damping_ratio": ("damping", True, "damping is given, too"),
+    "integral_limit": ("integral_gain", False, "integral_gain is not given"),
+    "limit_stiffness": ("limit_margin", False, "limit_margin is not given"),
+}
+"""Options without effect where another one is given (True), or is not (False), and the reason."""
+
+
+class OSCParams(Record, _OSCParamsFields):
+    """Parameters of operational-space control, for one tool of one kind of robot. Build it with
+    :func:`make_osc_params`.
+
+    Every leaf is a float64 array of one row or one per env; None is off.
+    """
+
+    __slots__ = ()
+    NAME = "params"
+    FIELDS = FIELDS
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "axes")
 
 
-@known_keywords
+@with_fields(FIELDS)
 def make_osc_params(
-    tree: RigidTree,
-    *,
-    stiffness: Annotated[ArrayLike, Field("1/s^2")] = 150.0,
-    damping_ratio: Annotated[ArrayLike, Field("1", 1.0)] = 1.0,
-    damping: Annotated[ArrayLike | None, Field("1/s")] = None,
-    integral_gain: Annotated[ArrayLike | None, Field("1/s^3")] = None,
-    integral_limit: Annotated[ArrayLike, Field("m/s^2 or rad/s^2", math.inf)] = math.inf,
-    axes: Annotated[ArrayLike | None, Field(neutral=True)] = None,
-    force_axes: Annotated[ArrayLike | None, Field(neutral=False)] = None,
-    posture_stiffness: Annotated[ArrayLike, Field("1/s^2", group="joint")] = 10.0,
-    posture_damping_ratio: Annotated[ArrayLike, Field("1", 1.0, group="joint")] = 1.0,
-    limit_margin: Annotated[ArrayLike | None, Field("rad or m", group="joint")] = None,
-    limit_stiffness: Annotated[ArrayLike, Field("1/s^2", group="joint")] = 400.0,
-    position_error_limit: Annotated[ArrayLike, Field("m", math.inf, above=True)] = 0.1,
-    rotation_error_limit: Annotated[ArrayLike, Field("rad", math.inf, above=True)] = 0.5,
-    smallest_eigenvalue: Annotated[ArrayLike, Field("1/kg or 1/(kg m^2)", above=True)] = 0.02,
-    effort_limit: Annotated[ArrayLike | None, Field("N m or N", math.inf, group="joint")] = None,
-    effort_min: Annotated[
-        ArrayLike | None, Field("N m or N", -math.inf, low=-math.inf, group="joint")
-    ] = None,
-    effort_max: Annotated[
-        ArrayLike | None, Field("N m or N", math.inf, low=-math.inf, group="joint")
-    ] = None,
-    frame: str = "world",
-    discretization: str = "explicit",
+    tree: RigidTree, *, frame: str = "world", discretization: str = "explicit", **options: ArrayLike
 ) -> OSCParams:
     """Build validated :class:`OSCParams` for a tool of ``tree``.
 
@@ -172,109 +169,86 @@ def make_osc_params(
     """
     check_masses(instance("tree", tree, RigidTree, MAKE_TREE))
     joints = tree.joint_names
-    # An option without effect is an error: it is nearly always a misunderstanding.
-    _check_unused("damping_ratio", damping_ratio, 1.0, damping is not None, "damping is given, too")
-    _check_unused(
-        "integral_limit",
-        integral_limit,
-        math.inf,
-        integral_gain is None,
-        "integral_gain is not given",
-    )
-    _check_unused(
-        "limit_stiffness", limit_stiffness, 400.0, limit_margin is None, "limit_margin is not given"
-    )
-    kp = _rows("stiffness", stiffness, AXES)
-    kd = 2 * _rows("damping_ratio", damping_ratio, AXES) * np.sqrt(kp)
-    posture = _rows("posture_stiffness", posture_stiffness, joints) * tree.independent
-    motion, force = (
-        _mask(name, value) for name, value in (("axes", axes), ("force_axes", force_axes))
-    )
+    rows = _read(options, {"axis": AXES, "joint": joints, "norm": ("norm",), "s0": ("s0",)})
+    motion, force = rows["axes"], rows["force_axes"]
     if force is not None:
-        both = force * (np.ones((1, 6)) if motion is None else motion)
+        both = force * (1.0 if motion is None else motion)
         entries("force_axes", both > 0, both == 0, "is an axis of motion, too", AXES, kind="entry")
-    given = {"effort_limit": effort_limit, "effort_min": effort_min, "effort_max": effort_max}
-    efforts = {
-        name: None if rows is None else _rows(name, rows, joints) for name, rows in given.items()
-    }
-    low, high = checked_ends(efforts, joints)
+    if rows["damping"] is None:
+        rows["damping"] = 2 * rows["damping_ratio"] * np.sqrt(rows["stiffness"])
+    posture = rows["posture_stiffness"] * tree.independent
+    rows["posture_stiffness"] = posture
+    rows["posture_damping"] = 2 * rows["posture_damping_ratio"] * np.sqrt(posture)
+    ends = {name: rows[name] for name in ("effort_limit", "effort_min", "effort_max")}
+    rows["effort_min"], rows["effort_max"] = checked_ends(ends, joints)
+    if rows["integral_gain"] is None:
+        rows["integral_limit"] = None
     # Joints without limits that turn are angles modulo 2 pi for the posture. Followers have no
     # posture and no limits of their own: their leader has them.
-    limits, own = np.array([tree.lower, tree.upper]), tree.independent
-    endless = np.isinf(limits).all(0) & (tree.bodies.slides[:, 0] == 0)
-    margin = None if limit_margin is None else _rows("limit_margin", limit_margin, joints)
-    integral = None if integral_gain is None else _rows("integral_gain", integral_gain, AXES)
-    params = OSCParams(
-        stiffness=kp,
-        damping=kd if damping is None else _rows("damping", damping, AXES),
-        posture_stiffness=posture,
-        posture_damping=2
-        * _rows("posture_damping_ratio", posture_damping_ratio, joints)
-        * np.sqrt(posture),
-        position_error_limit=_rows("position_error_limit", position_error_limit, ("norm",)),
-        rotation_error_limit=_rows("rotation_error_limit", rotation_error_limit, ("norm",)),
-        smallest_eigenvalue=_rows("smallest_eigenvalue", smallest_eigenvalue, ("s0",)),
-        axes=motion,
-        force_axes=force,
-        effort_min=low,
-        effort_max=high,
-        frame=TASK_CHOICES["frame"][choice("frame", frame, TASK_CHOICES["frame"])],
-        integral_gain=integral,
-        integral_limit=None if integral is None else _rows("integral_limit", integral_limit, AXES),
-        limit_stiffness=(
-            None if margin is None else _rows("limit_stiffness", limit_stiffness, joints) * own
-        ),
-        limit_margin=None if margin is None else np.minimum(margin, (limits[1:] - limits[:1]) / 4),
-        lower=None if margin is None else limits[:1],
-        upper=None if margin is None else limits[1:],
-        turns=(endless / TURN)[None] if endless.any() else None,
-        discretization=TASK_CHOICES["discretization"][
-            choice("discretization", discretization, TASK_CHOICES["discretization"])
-        ],
-    )
-    _check_rows(params)
-    return params
+    lower, upper = np.array([tree.lower]), np.array([tree.upper])
+    if rows["limit_margin"] is None:
+        rows["limit_stiffness"] = None
+    else:
+        rows["limit_stiffness"] = rows["limit_stiffness"] * tree.independent
+        rows["limit_margin"] = np.minimum(rows["limit_margin"], (upper - lower) / 4)
+        rows |= {"lower": lower, "upper": upper}
+    endless = np.isinf(lower) & np.isinf(upper) & (tree.bodies.slides[:, 0] == 0)
+    if endless.any():
+        rows["turns"] = endless / TURN
+    for name, chosen in {"frame": frame, "discretization": discretization}.items():
+        rows[name] = TASK_CHOICES[name][choice(name, chosen, TASK_CHOICES[name])]
+    return _checked(OSCParams(**{name: rows.get(name) for name in OSCParams._fields}))
 
 
-FIELDS = declared(make_osc_params, Field)
-"""Options that are numbers."""
+def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...]]) -> Document:
+    """Return the rows of all options of FIELDS, with their defaults; None stays.
 
-
-def _rows(name: str, value: ArrayLike, columns: tuple[str, ...]) -> NDArray[np.float64]:
-    """Return ``value`` as read-only rows (1 | envs, columns) within the bounds of its field."""
-    given = read_array(name, value)
-    shape = (len(given) if given.ndim == 2 else 1, len(columns))
-    if len(columns) == 1 and given.ndim == 1:  # one number per env
-        given = given[:, None]
-        shape = given.shape
-    kind: AxisKind = "joint" if FIELDS[name].group == "joint" else "entry"
-    rows = array(name, given, shape, columns, finite=False, kind=kind).copy()
-    FIELDS[name].checked(name, rows, columns, kind=kind)
-    rows.setflags(write=False)
+    Raises InvalidArgumentError for an option that is given, and has no effect.
+    """
+    values: Document = {name: options.get(name, field.default) for name, field in FIELDS.items()}
+    rows: Document = {
+        name: None if value is None else _rows(name, value, columns[FIELDS[name].group])
+        for name, value in values.items()
+    }
+    # An option without effect is nearly always a misunderstanding.
+    for name, (other, is_given, reason) in WITHOUT_EFFECT.items():
+        is_unused = (rows[other] is not None) == is_given
+        if is_unused and (rows[name] != FIELDS[name].default).any():
+            remedy = "leave it out, or correct the other option"
+            raise InvalidArgumentError(name, f"has no effect: {reason}", remedy=remedy)
     return rows
 
 
-def _check_unused(name: str, value: ArrayLike, default: float, unused: bool, reason: str) -> None:
-    """Raise InvalidArgumentError for an option that is given, and has no effect."""
-    if unused and (read_array(name, value) != default).any():
-        raise InvalidArgumentError(
-            name, f"has no effect: {reason}", remedy="leave it out, or correct the other option"
-        )
+def _rows(name: str, value: ArrayLike, columns: tuple[str, ...]) -> Float64:
+    """Return ``value`` as rows (1 | envs, columns) within the bounds of its field; bools as 1.0 and
+    0.0.
+    """
+    field = FIELDS[name]
+    if isinstance(field.neutral, bool):
+        return array(name, read_array(name, value, "b").astype(float), *_shape(value, columns))
+    numbers = read_array(name, value)
+    if len(columns) == 1 and numbers.ndim == 1:  # one number per env
+        numbers = numbers[:, None]
+    kind: AxisKind = "joint" if field.group == "joint" else "entry"
+    shape = _shape(numbers, columns)
+    rows = array(name, numbers, *shape, finite=False, kind=kind)
+    field.checked(name, rows, columns, kind=kind)
+    return rows
 
 
-def _mask(name: str, value: ArrayLike | None) -> NDArray[np.float64] | None:
-    """Return a mask of axes as read-only rows of 1.0 and 0.0; None where it is left out."""
-    return None if value is None else _rows(name, read_array(name, value, "b").astype(float), AXES)
+def _shape(value: ArrayLike, columns: tuple[str, ...]) -> tuple[tuple[int, int], tuple[str, ...]]:
+    """Return the shape of rows that ``value`` gives, and the names of the columns."""
+    rows = np.shape(value)
+    return (rows[0] if len(rows) == 2 else 1, len(columns)), columns
 
 
-def _check_rows(params: OSCParams) -> None:
-    """Raise InvalidArgumentError if options have rows for different numbers of envs."""
-    most = max(
-        (leaf.shape[0], name)
-        for name, leaf in params._asdict().items()
-        if isinstance(leaf, np.ndarray)
-    )
-    for name, leaf in params._asdict().items():
-        if isinstance(leaf, np.ndarray) and leaf.shape[0] not in (1, most[0]):
-            problem = f"has rows for {leaf.shape[0]} envs, but {most[1]} for {most[0]}"
+def _checked(params: OSCParams) -> OSCParams:
+    """Return read-only params.
+
+    Raises InvalidArgumentError if options have rows for different numbers of envs.
+    """
+    for name, leaf in params.leaves().items():
+        if leaf.shape[0] not in (1, params.num_envs):
+            problem = f"has rows for {leaf.shape[0]} envs, but others for {params.num_envs}"
             raise InvalidArgumentError(name, problem, remedy="give one row, or one for each env")
+    return frozen(params)

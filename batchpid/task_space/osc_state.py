@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import array_summary
-from batchpid.task_space import native_rows
-from batchpid.task_space.frames import in_axes, matrix_of, pose_of
+from batchpid.arrays.elementwise import namespace
+from batchpid.task_space.frames import in_axes, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.symmetric import quiet
-from batchpid.task_space.tree_dynamics import effort_of, mass_matrix_of
-from batchpid.task_space.tree_kinematics import (
-    jacobian_at,
-    motions_of,
-    prepared,
-    rate_at,
-    read_point,
-    tool_frame,
-    velocities_of,
-)
+from batchpid.task_space.tree_quantities import evaluated
 
 
 class Tool(NamedTuple):
@@ -70,7 +60,7 @@ class TaskDynamics(NamedTuple):
     """M (envs, dof, dof) [kg m^2 or kg]."""
     bias: Array
     """h (envs, dof): gravity, Coriolis and centrifugal forces [N m or N]."""
-    chain: Any
+    chain: Array
     """1.0 for the joints between the base and the tool, else 0.0 (dof,)."""
 
 
@@ -131,32 +121,13 @@ def task_dynamics(
     InvalidArgumentError
         The link is unknown, or a shape is wrong.
     """
-    (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
-    index = tree.index(link)
-    chain = xp.asarray(tree.chains[tree.link_bodies[index]], dtype=q.dtype)
-    wanted = (
-        "pose",
-        "jacobian",
-        "jacobian_rate",
-        "mass_matrix",
-        *(("bias",) if bias is None else ()),
-    )
-    found = native_rows.kinematics(tree, wanted, q, v, index, read_point(q, point))
-    if found is not None:
-        pose, matrix, rate, mass, *own = found
-        return TaskDynamics(pose, matrix, rate, mass, own[0] if own else bias, chain)
-    with quiet():
-        motions = motions_of(tree, bodies, q, xp)
-        velocities = velocities_of(tree, motions, v, xp)
-        tool = tool_frame(tree, bodies, motions.frames, index, point)
-        return TaskDynamics(
-            pose=pose_of(tool),
-            jacobian=jacobian_at(tree, bodies, motions, index, tool[..., 3]),
-            jacobian_rate=rate_at(tree, velocities, index, tool[..., 3]),
-            mass_matrix=mass_matrix_of(tree, bodies, motions, xp),
-            bias=effort_of(tree, bodies, motions, velocities, xp) if bias is None else bias,
-            chain=chain,
-        )
+    names: tuple[str, ...] = ("pose", "jacobian", "jacobian_rate", "mass_matrix")
+    if bias is None:
+        names = (*names, "bias")
+    found = evaluated(tree, names, qpos, qvel, link, point)
+    xp = namespace(found["pose"])
+    chain = xp.asarray(tree.chain(link), dtype=found["pose"].dtype)
+    return TaskDynamics(**{"bias": bias, "chain": chain, **found})
 
 
 def in_tool_axes(dynamics: TaskDynamics) -> TaskDynamics:

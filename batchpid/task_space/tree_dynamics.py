@@ -33,117 +33,14 @@ from typing import Any, NamedTuple
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space import native_rows
 from batchpid.task_space.frames import cross, multiply, rotate
 from batchpid.task_space.rigid_tree import Bodies, RigidTree
-from batchpid.task_space.symmetric import product, quiet, solve
+from batchpid.task_space.symmetric import solve
 from batchpid.task_space.tree_kinematics import (
     Motions,
     Velocities,
-    from_base,
     from_tips,
-    motions_of,
-    prepared,
-    velocities_of,
 )
-
-
-def mass_matrix(tree: RigidTree, qpos: Array, bodies: Bodies | None = None) -> Array:
-    """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof), armature
-    included.
-
-    ``bodies`` belong to robots that differ from the tree, one for each row:
-    :meth:`RigidTree.varied`.
-
-    Raises
-    ------
-    InvalidArgumentError
-        The shape is wrong.
-    """
-    (q,), own, xp = prepared(tree, qpos=qpos)
-    found = native_rows.kinematics(tree, ("mass_matrix",), q) if bodies is None else None
-    if found is not None:
-        return found[0]
-    with quiet():
-        return mass_matrix_of(tree, bodies or own, motions_of(tree, own, q, xp), xp)
-
-
-def bias(
-    tree: RigidTree, qpos: Array, qvel: Array, turning: Any = None, *, bodies: Bodies | None = None
-) -> Array:
-    """Return h(q, q') (..., dof) [N m or N]: the efforts that cancel gravity and Coriolis and
-    centrifugal forces.
-
-    A floating base turns at ``turning`` (..., 3) [rad/s], in its own axes; default 0. ``bodies``
-    are as in :func:`mass_matrix`.
-
-    Raises
-    ------
-    InvalidArgumentError
-        A shape is wrong.
-    """
-    (q, v), own, xp = prepared(tree, qpos=qpos, qvel=qvel)
-    found = native_rows.kinematics(tree, ("bias",), q, v) if bodies is None else None
-    if found is not None:
-        return found[0]
-    with quiet():
-        motions = motions_of(tree, own, q, xp)
-        return effort_of(
-            tree, bodies or own, motions, velocities_of(tree, motions, v, xp, turning), xp, turning
-        )
-
-
-def gravity(tree: RigidTree, qpos: Array) -> Array:
-    """Return the efforts (..., dof) [N m or N] that hold the robot at ``qpos`` (..., dof): h(q,
-    0).
-    """
-    return bias(tree, qpos, 0 * qpos if hasattr(qpos, "shape") else [0 * entry for entry in qpos])
-
-
-def inverse_dynamics(tree: RigidTree, qpos: Array, qvel: Array, qacc: Array) -> Array:
-    """Return the efforts (..., dof) [N m or N] of the accelerations ``qacc`` (..., dof): M q'' + h.
-
-    Raises
-    ------
-    InvalidArgumentError
-        A shape is wrong.
-    """
-    (q, v, a), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel, qacc=qacc)
-    if (found := native_rows.kinematics(tree, ("mass_matrix", "bias"), q, v)) is not None:
-        with quiet():
-            return product(found[0], tree.independent * a) + found[1]
-    a = tree.rates(a)
-    with quiet():
-        motions = motions_of(tree, bodies, q, xp)
-        still = velocities_of(tree, motions, v, xp)
-        moving = still._replace(
-            linear_rate=still.linear_rate + from_base(tree, motions.linear * a[..., None], xp),
-            angular_rate=still.angular_rate + from_base(tree, motions.angular * a[..., None], xp),
-        )
-        return tree.efforts(effort_of(tree, bodies, motions, moving, xp) + bodies.armature * a)
-
-
-def forward_dynamics(tree: RigidTree, qpos: Array, qvel: Array, effort: Array) -> Array:
-    """Return the accelerations (..., dof) [rad/s^2 or m/s^2] under ``effort`` (..., dof): M^-1 (tau
-    - h).
-
-    Raises
-    ------
-    InvalidArgumentError
-        A shape is wrong, or a joint moves no mass and has no armature.
-    """
-    (q, v, u), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel, effort=effort)
-    check_masses(tree)
-    u = tree.efforts(u)
-    if (found := native_rows.kinematics(tree, ("mass_matrix", "bias"), q, v)) is not None:
-        with quiet():
-            return tree.rates(solve(found[0], (u - found[1])[..., None])[..., 0])
-    with quiet():
-        motions = motions_of(tree, bodies, q, xp)
-        force = effort_of(tree, bodies, motions, velocities_of(tree, motions, v, xp), xp)
-        return tree.rates(
-            solve(mass_matrix_of(tree, bodies, motions, xp), (u - force)[..., None])[..., 0]
-        )
 
 
 def check_masses(tree: RigidTree) -> None:

@@ -20,22 +20,17 @@ the others, to the last bit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace
-from batchpid.checks.validate import choice, instance, is_traced, read_array
+from batchpid.checks.validate import instance, is_traced, read_array
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space import native_rows
-from batchpid.task_space.frames import cross, in_axes, matrix_of, pose_of, rotate, turned
+from batchpid.task_space.frames import cross, rotate, turned
 from batchpid.task_space.rigid_tree import MAKE_TREE, Bodies, RigidTree
 from batchpid.task_space.symmetric import quiet
-
-FRAMES = ("world", "tool")
-"""Axes of Jacobians and accelerations: the axes of the world or of the link."""
 
 
 class Motions(NamedTuple):
@@ -62,99 +57,6 @@ class Velocities(NamedTuple):
     angular: Array
     linear_rate: Array
     angular_rate: Array
-
-
-def link_poses(
-    tree: RigidTree, qpos: Array, links: Sequence[str] | None = None, *, point: Array = None
-) -> Array:
-    """Return the poses (..., links, 7) of ``links``, by default all, at ``qpos`` (..., dof) [rad or
-    m].
-
-    With a ``point`` (3,) in the frame of the links [m], the positions of this point.
-
-    Raises
-    ------
-    InvalidArgumentError
-        A link is unknown, or the shape is wrong.
-    """
-    if isinstance(links, str):
-        raise InvalidArgumentError(
-            "links", "must be a list of names", value=links, remedy=f"pass [{links!r}]"
-        )
-    (q,), bodies, xp = prepared(tree, qpos=qpos)
-    indices = [tree.index(link) for link in (tree.links if links is None else links)]
-    at = read_point(q, point)
-    found = [native_rows.kinematics(tree, ("pose",), q, None, index, at) for index in indices]
-    poses = [each[0] for each in found if each is not None]
-    if len(poses) == len(indices):
-        return np.stack(poses, axis=-2)
-    frames = frames_of_bodies(tree, bodies, q, xp)
-    with quiet():
-        return xp.stack(
-            [pose_of(tool_frame(tree, bodies, frames, index, at)) for index in indices], axis=-2
-        )
-
-
-def jacobian(
-    tree: RigidTree, qpos: Array, link: str, *, point: Array = None, frame: str = "world"
-) -> Array:
-    """Return the Jacobian (..., 6, dof) of a point of ``link`` at ``qpos`` (..., dof).
-
-    Parameters
-    ----------
-    point
-        Point in the link's frame, (3,) or (..., 3) [m]; default its origin.
-    frame
-        Axes of the twist: "world" or "tool", the axes of the link.
-
-    Raises
-    ------
-    InvalidArgumentError
-        The link or the frame is unknown, or a shape is wrong.
-    """
-    (q,), bodies, xp = prepared(tree, qpos=qpos)
-    index, _ = tree.index(link), choice("frame", frame, FRAMES)
-    found = native_rows.kinematics(tree, ("pose", "jacobian"), q, None, index, read_point(q, point))
-    if found is not None:
-        pose, matrix = found
-        return matrix if frame == "world" else in_axes(matrix_of(pose[..., 3:]), matrix)
-    with quiet():
-        motions = motions_of(tree, bodies, q, xp)
-        tool = tool_frame(tree, bodies, motions.frames, index, point)
-        matrix = jacobian_at(tree, bodies, motions, index, tool[..., 3])
-        return matrix if frame == "world" else in_axes(tool[..., :3], matrix)
-
-
-def jacobian_rate(
-    tree: RigidTree,
-    qpos: Array,
-    qvel: Array,
-    link: str,
-    *,
-    point: Array = None,
-    frame: str = "world",
-) -> Array:
-    """Return J' q' (..., 6): the acceleration [m/s^2, rad/s^2] that a point of ``link`` has by
-    velocities alone.
-
-    ``qpos`` and ``qvel`` are (..., dof). With frame "tool" the same vectors are given in the axes
-    of the link. Other arguments and errors as in :func:`jacobian`.
-    """
-    (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
-    index, _ = tree.index(link), choice("frame", frame, FRAMES)
-    found = native_rows.kinematics(
-        tree, ("pose", "jacobian_rate"), q, v, index, read_point(q, point)
-    )
-    if found is not None:
-        pose, rate = found
-        return (
-            rate if frame == "world" else in_axes(matrix_of(pose[..., 3:]), rate[..., None])[..., 0]
-        )
-    with quiet():
-        motions = motions_of(tree, bodies, q, xp)
-        tool = tool_frame(tree, bodies, motions.frames, index, point)
-        rate = rate_at(tree, velocities_of(tree, motions, v, xp), index, tool[..., 3])
-        return rate if frame == "world" else in_axes(tool[..., :3], rate[..., None])[..., 0]
 
 
 def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Any], Bodies, Any]:

@@ -1,87 +1,82 @@
-"""The command line: each command is a frozen dataclass whose fields are its flags.
+"""The command line: each command is a function, whose signature is the flags and whose docstring is
+the help.
 
-To add a command, write a module with such a dataclass and list it in :data:`COMMANDS`. The range of
-a number is a :class:`batchpid.arrays.field_tables.Field` in its annotation, and is checked before
-``run()`` starts, which returns the exit status (None: 0). Modules that load SAPIEN or Matplotlib
-are named in ``imports`` and imported after the flags are parsed, so that ``--help`` answers at
-once.
+The result writes itself. ``report()`` is printed, and the output files come from ``save(path)``,
+``figure()`` and ``document()``; ``status`` is the exit status (without it: 0). To add a command,
+write such a function and list it in :data:`COMMANDS`.
 """
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import sys
 import warnings
 from collections.abc import Sequence
+from inspect import getdoc
 from typing import Any
 
 import tyro
 
 import batchpid
 from batchpid.errors import BatchPIDError
-from batchpid.sim.cli import flags
-from batchpid.sim.cli.compare import CompareCommand
-from batchpid.sim.cli.demo import DemoCommand
-from batchpid.sim.cli.excite import ExciteCommand
-from batchpid.sim.cli.export import ExportCommand
-from batchpid.sim.cli.identify import IdentifyCommand
-from batchpid.sim.cli.inspect import InspectCommand
+from batchpid.sim.cli.commands import COMMANDS, execute
+from batchpid.sim.cli.flags import check
 from batchpid.sim.cli.outputs import close_bars
-from batchpid.sim.cli.plot import PlotCommand
-from batchpid.sim.cli.rollout import RolloutCommand
-from batchpid.sim.cli.tune import TuneCommand
-from batchpid.sim.cli.view import ViewCommand
 
-COMMANDS: dict[str, type[Any]] = {
-    "demo": DemoCommand,
-    "rollout": RolloutCommand,
-    "tune": TuneCommand,
-    "compare": CompareCommand,
-    "excite": ExciteCommand,
-    "identify": IdentifyCommand,
-    "export": ExportCommand,
-    "inspect": InspectCommand,
-    "plot": PlotCommand,
-    "view": ViewCommand,
-}
+INPUT_ERROR = 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status.
 
     0: success. 2: bad input, or a file that cannot be written. 3: no env of ``rollout`` or ``demo``
-        settled. 130:
-    Ctrl-C. 141: the reader of stdout closed it, as in ``| head``. 2 and 130 come with one line on
-    stderr.
+    settled. 130: Ctrl-C. 141: the reader of stdout closed it, as in ``| head``. 2 and 130 come with
+    one line on stderr.
     """
-    message = None
     try:
         status = _run(list(sys.argv[1:] if argv is None else argv))
         sys.stdout.flush()
+        return status
     except BatchPIDError as error:
-        status, message = 2, str(error)
+        return _fail(INPUT_ERROR, str(error))
     except KeyboardInterrupt:
-        status, message = 128 + signal.SIGINT, "interrupted"
+        return _fail(128 + signal.SIGINT, "interrupted")
     except BrokenPipeError:
-        status = 128 + signal.SIGPIPE
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # Python flushes it once more at exit
+        # Python flushes stdout once more at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
     except OSError as error:
-        status, message = (
-            2,
-            (
-                f"{error.filename}: {error.strerror}"
-                if error.filename
-                else error.strerror or str(error)
-            ),
-        )
-    if message is not None:
-        close_bars()
-        print("batchpid:", " ".join(message.splitlines()), file=sys.stderr)
-    return status
+        problem = error.strerror or str(error)
+        return _fail(INPUT_ERROR, f"{error.filename}: {problem}" if error.filename else problem)
+
+
+def parse(arguments: Sequence[str]) -> tuple[str, Any]:
+    """Return the name of the command and the record of its flags; for --help or unknown flags print
+    help and raise SystemExit.
+    """
+    if os.environ.get("NO_COLOR"):
+        os.environ["TERM"] = "dumb"  # tyro colours its help on every other terminal
+    config = (
+        tyro.conf.DisallowNone,  # a flag is left out, not given None
+        tyro.conf.FlagCreatePairsOff,  # --force without --no-force
+        tyro.conf.PositionalMetavarFromFieldName,
+        # Without a help of the choice itself, tyro looks for one in the source of `typing`, which
+        # takes 0.05 s.
+        tyro.conf.arg(help="`batchpid COMMAND --help` lists the flags of a command."),
+    )
+    # A command is parsed alone, so that a message names its help.
+    if arguments and arguments[0] in COMMANDS:
+        name, *words = arguments
+        record = COMMANDS[name].record()
+        return name, tyro.cli(record, prog=f"batchpid {name}", args=words, config=config)
+    app = tyro.extras.SubcommandApp()
+    for name, command in COMMANDS.items():
+        about = getdoc(command.function) or ""
+        app.command(name=name, help=about.partition("\n\n")[0].replace("\n", " "))(_nothing)
+    about = "Joint-level PID control for many robots at once, in SAPIEN or MuJoCo."
+    app.cli(prog="batchpid", description=about, args=arguments, config=config)
+    raise SystemExit(0)
 
 
 def _run(arguments: list[str]) -> int:
@@ -92,38 +87,23 @@ def _run(arguments: list[str]) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:
-            command = parse(arguments)
+            name, flags = parse(arguments)
         except SystemExit as end:  # after --help, or a message about unknown flags
             return int(end.code or 0)
-        flags.check(command)
-        for name in command.imports:
-            importlib.import_module(name)
-        return command.run() or 0
+        check(flags)
+        return execute(COMMANDS[name], vars(flags))
 
 
-def parse(arguments: Sequence[str]) -> Any:
-    """Return the command with its flags; for --help or unknown flags print help and raise
-    SystemExit.
-    """
-    if os.environ.get("NO_COLOR"):
-        os.environ["TERM"] = "dumb"  # tyro colours its help on every other terminal
-    options = (
-        tyro.conf.DisallowNone,  # a flag is left out, not given None
-        tyro.conf.FlagCreatePairsOff,  # --force without --no-force
-        tyro.conf.PositionalMetavarFromFieldName,
-        # Without a help of the choice itself, tyro looks for one in the source of `typing`, which
-        # takes 0.05 s.
-        tyro.conf.arg(help="`batchpid COMMAND --help` lists the flags of a command."),
-    )
-    if arguments and arguments[0] in COMMANDS:  # alone, so that a message names its help
-        prog, command = f"batchpid {arguments[0]}", COMMANDS[arguments[0]]
-        return tyro.cli(command, prog=prog, args=arguments[1:], config=options)
-    app = tyro.extras.SubcommandApp()
-    for name, command in COMMANDS.items():
-        app.command(name=name, help=(command.__doc__ or "").partition("\n")[0])(command)
-    about = "Joint-level PID control for many robots at once, in SAPIEN or MuJoCo."
-    return app.cli(prog="batchpid", description=about, args=arguments, config=options)
+def _fail(status: int, message: str) -> int:
+    """Print a message in one line, and return the status."""
+    close_bars()
+    print("batchpid:", " ".join(message.splitlines()), file=sys.stderr)
+    return status
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     print(f"batchpid: warning: {message}", file=sys.stderr)
+
+
+def _nothing() -> None:
+    """Take the place of a command in the overview."""

@@ -1,23 +1,25 @@
-"""``batchpid export``: gains as a file for another program."""
+"""``batchpid export``: gains, or the robot itself, as a file for another program."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
 from batchpid.arrays.field_tables import Field
+from batchpid.checks.validate import file_path
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
-from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import FOLDER, OutputFiles
 
 if TYPE_CHECKING:
     import batchpid as bp
     from batchpid.export import Exported
 
-FILES = {
+ENDINGS = {
     "c": "-pid.h",
     "ros2_control": "-controllers.yaml",
     "mjcf": "-pid.xml",
@@ -25,158 +27,170 @@ FILES = {
 }
 """End of the default file name of each target."""
 USED = {
-    "c": ("gains", "timestep", "limits", "prefix", "dynamics"),
-    "ros2_control": ("gains", "timestep", "limits", "prefix", "controller"),
-    "mjcf": ("gains", "timestep", "limits", "actuators", "motors"),
+    "c": ("gains", "limits", "dynamics"),
+    "ros2_control": ("gains", "limits"),
+    "mjcf": ("gains", "limits", "motors"),
     "urdf": (),
 }
 """Flags that have an effect for each target, of those that only some have."""
 COMMENTS = {"c": "/* {} */", "mjcf": "<!-- {} -->", "urdf": "<!-- {} -->"}
 """Comment of a target's language; of the others "# {}"."""
-UNLIMITED = "guard: setpoints are not limited in the target"
 POSES = 64
 """Sampled poses, for the range of the inertia."""
 
 
 @dataclass(frozen=True)
-class ExportCommand:
+class ExportedFile:
+    """File for a target, with its differences from batchpid's law or the robot's file."""
+
+    target: str
+    make: Callable[[Path], Exported]
+    """Function of the file's folder."""
+
+    def report(self) -> str:
+        """Return a line for each difference."""
+        differences = self.make(Path.cwd()).differences
+        return (
+            "\n".join(f"differs: {text}" for text in differences) or "The file differs in nothing."
+        )
+
+    def save(self, path: Path) -> None:
+        """Write the file, with a comment for each difference that it does not hold yet."""
+        from batchpid.io.files import write_atomically
+
+        file_path("out", path, (Path(ENDINGS[self.target]).suffix,))
+        text, differences = self.make(path.absolute().parent)
+        comment = COMMENTS.get(self.target, "# {}")
+        lines = []
+        for difference in differences:
+            # Two hyphens would end a comment of XML, and */ one of C.
+            sentence = " ".join(difference.split()).replace("--", "- -").replace("*/", "* /")
+            if sentence not in text:
+                lines.append(comment.format(f"differs: {sentence}") + "\n")
+        # The declaration of an XML file stays its first line.
+        declaration = ""
+        if text.startswith("<?xml"):
+            declaration, _, text = text.partition("?>\n")
+            declaration += "?>\n"
+        write_atomically(path, declaration + "".join(lines) + text)
+
+
+def export(
+    robot: Robot,
+    to: Literal["c", "ros2_control", "mjcf", "urdf"] = "c",
+    gains: str | None = None,
+    timestep: Annotated[float, Field("seconds, not a rate: 1/1000", low=1e-6, high=1.0)] = 1 / 1000,
+    limits: bool = False,
+    prefix: str = "batchpid",
+    dynamics: bool = False,
+    motors: bool = False,
+) -> ExportedFile:
     """Write a robot's gains, or the robot itself, as a file for another program.
 
     Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to
     batchpid's. "ros2_control" is the YAML of a controller. "mjcf" is the robot with the law in
     MuJoCo's own actuators, "urdf" the robot with its repairs. Differences between the file and
     batchpid's law or the robot's file are printed, one line each.
+
+    Parameters
+    ----------
+    to
+        Target.
+    gains
+        Gains, as for `batchpid rollout`.
+    timestep
+        Time step of the control on the robot, or of the physics [s].
+    limits
+        Limit setpoints to the robot's joint limits and speeds before they reach the law.
+    prefix
+        Beginning of every name in the file; in ros2_control the name of the controller.
+    dynamics
+        In C, add the robot's mass matrix, gravity and bias as functions.
+    motors
+        In MJCF, write the motors without the law: their inputs are the efforts asked for.
     """
-
-    robot: flags.RobotName = "panda"
-    gains: flags.Gains = None
-    to: Literal["c", "ros2_control", "mjcf", "urdf"] = "c"
-    """Target."""
-    actuators: flags.Actuators = None
-    controller: Literal["joint_trajectory_controller", "pid_controller"] = (
-        "joint_trajectory_controller"
-    )
-    """Controller of ros2_control."""
-    timestep: Annotated[float, Field("seconds, not a rate: 1/1000", low=1e-6, high=1.0)] = 1 / 1000
-    """Time step of the control on the robot, or of the physics [s]."""
-    limits: flags.Switch = False
-    """Limit setpoints to the robot's joint limits and speeds before they reach the law."""
-    prefix: str = "batchpid"
-    """Beginning of every name in the file; in ros2_control the name of the controller."""
-    dynamics: flags.Switch = False
-    """In C, add the robot's mass matrix, gravity and bias as functions."""
-    motors: flags.Switch = False
-    """In MJCF, write the motors without the law: their inputs are the efforts asked for."""
-    strict: flags.Switch = False
-    """End with an error if the target's law differs."""
-    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
-    out: flags.OptionalPath = None
-    """File to write. Default: out/ROBOT-pid.h, or another ending."""
-    force: flags.Force = False
-
-    imports = ("batchpid.sim.robot.robot_model", "batchpid.sim.tuning.gain_sets", "batchpid.export")
-
-    def run(self) -> None:
-        """Run the command."""
-        from batchpid.errors import InvalidArgumentError
-        from batchpid.io.files import write_atomically
-        from batchpid.sim.robot.urdf_export import to_urdf
-        from batchpid.sim.tuning.gain_sets import gain_set
-
-        out = self.out or FOLDER / f"{Path(self.robot).stem}{FILES[self.to]}"
-        out = OutputFiles(self).path("out", out, (Path(FILES[self.to]).suffix,))
-        known = {name for names in USED.values() for name in names}
-        unused = [
-            entry.name for entry in fields(self) if entry.name in known.difference(USED[self.to])
-        ]
-        flags.refuse(self, unused, f"has no effect with --to {self.to}")
-        robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
-        if self.to == "urdf":
-            exported = to_urdf(robot, out.absolute().parent)
-            content = f"{robot.name}, {robot.dof} joints, without need of repair"
-        elif self.motors:
-            if self.gains is not None or self.limits:
-                raise InvalidArgumentError(
-                    "motors", "are written without a law", remedy="leave out --gains and --limits"
-                )
-            exported, content = (
-                _mjcf(robot, None, self.timestep, False),
-                f"motors of {robot.dof} joints",
-            )
-        else:
-            chosen = gain_set(robot, self.gains)
-            if chosen.control != "pid":
-                remedy = "choose gains of the law: tuned, designed, tutorial, or a file"
-                problem = "are a drive's, which has no file"
-                raise InvalidArgumentError("gains", problem, value=chosen.name, remedy=remedy)
-            exported = self._exported(robot, chosen.params)
-            content = f"{chosen.name} gains of {robot.dof} joints at {1 / self.timestep:g} Hz"
-        differences = exported.differences
-        if self.strict and differences:
-            raise InvalidArgumentError(
-                "to", "; ".join(differences), value=self.to, remedy="leave out --strict"
-            )
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(out, _with_differences(exported, COMMENTS.get(self.to, "# {}")))
-        for difference in differences:
-            print(f"differs: {difference}")
-        print(f"written: {out}: {content}")
-
-    def _exported(self, robot: Robot, params: bp.PIDParams) -> Exported:
-        """Return the file of a target for gains."""
-        from batchpid.export import to_c, to_ros2_control
-
-        if self.to == "mjcf":
-            return _mjcf(robot, params, self.timestep, self.limits)
-        joints, followers = (
-            [robot.joint_names[at] for at in np.flatnonzero(mask)]
-            for mask in (robot.independent, ~robot.independent)
+    chosen = {"gains": gains, "limits": limits, "dynamics": dynamics, "motors": motors}
+    unused = [name for name, value in chosen.items() if value and name not in USED[to]]
+    if unused:
+        raise InvalidArgumentError(
+            unused[0], f"has no effect with --to {to}", remedy="leave it out"
         )
-        notes = list[str]()
-        if followers:
-            place = (
-                "joints of their own in the file; ignore their efforts"
-                if self.to == "c"
-                else "not in the file"
-            )
-            notes.append(f"{', '.join(followers)}: followers are {place}")
-        if self.to == "c":
-            guard = robot.guard() if self.limits else None
-            tree = robot.kinematic_tree() if self.dynamics else None
-            exported = to_c(
-                params,
-                self.timestep,
-                joint_names=robot.joint_names,
-                guard=guard,
-                prefix=self.prefix,
-                tree=tree,
-            )
+    if to == "urdf":
+        from batchpid.sim.robot.urdf_export import to_urdf
+
+        return ExportedFile(to, partial(to_urdf, robot))
+    if motors:
+        if gains is not None or limits:
+            remedy = "leave out --gains and --limits"
+            raise InvalidArgumentError("motors", "are written without a law", remedy=remedy)
+        exported = _mjcf(robot, None, timestep, False)
+    else:
+        params = _gains(robot, gains)
+        if to == "mjcf":
+            exported = _mjcf(robot, params, timestep, limits)
+        elif to == "c":
+            exported = _c_header(robot, params, timestep, limits, prefix, dynamics)
         else:
-            notes += [UNLIMITED] if self.limits else []
-            exported = to_ros2_control(
-                params.for_joints(robot.independent),
-                joints,
-                self.timestep,
-                controller=self.controller,
-                name=self.prefix,
-                inertia=_inertia(robot)[:, robot.independent],
-            )
-        return exported._replace(differences=(*exported.differences, *notes))
+            exported = _controllers(robot, params, timestep, limits, prefix)
+    return ExportedFile(to, lambda folder: exported)
 
 
-def _with_differences(exported: Exported, comment: str) -> str:
-    """Return the text, with a comment for each difference that it does not hold yet."""
-    sentences = [
-        " ".join(difference.split()).replace("--", "- -").replace("*/", "* /")
-        for difference in exported.differences
-    ]
-    lines = "".join(
-        f"{comment.format(f'differs: {each}')}\n" for each in sentences if each not in exported.text
+def _gains(robot: Robot, gains: str | None) -> bp.PIDParams:
+    """Return the gains of the law by name."""
+    from batchpid.sim.tuning.gain_sets import gain_set
+
+    chosen = gain_set(robot, gains)
+    if chosen.control != "pid":
+        remedy = "choose gains of the law: tuned, designed, sapien-tutorial, or a file"
+        problem = "are a drive's, which has no file"
+        raise InvalidArgumentError("gains", problem, value=chosen.name, remedy=remedy)
+    return chosen.params
+
+
+def _c_header(
+    robot: Robot, params: bp.PIDParams, dt: float, limits: bool, prefix: str, dynamics: bool
+) -> Exported:
+    """Return the C header."""
+    from batchpid.export import to_c
+
+    exported = to_c(
+        params,
+        dt,
+        joint_names=robot.joint_names,
+        guard=robot.guard() if limits else None,
+        prefix=prefix,
+        tree=robot.kinematic_tree() if dynamics else None,
     )
-    declaration, end, rest = (
-        exported.text.partition("?>\n") if exported.text.startswith("<?xml") else ("", "", "")
+    return _with_followers(robot, exported, "joints of their own in the file; ignore their efforts")
+
+
+def _controllers(
+    robot: Robot, params: bp.PIDParams, dt: float, limits: bool, name: str
+) -> Exported:
+    """Return the file of controllers for ros2_control."""
+    from batchpid.export import to_ros2_control
+
+    leaders = robot.independent
+    exported = to_ros2_control(
+        params.for_joints(leaders),
+        [robot.joint_names[joint] for joint in np.flatnonzero(leaders)],
+        dt,
+        name=name or "joint_trajectory_controller",
+        inertia=_inertia(robot)[:, leaders],
     )
-    return f"{declaration}{end}{lines}{rest}" if end else f"{lines}{exported.text}"
+    if limits:
+        text = "guard: setpoints are not limited in the target"
+        exported = exported._replace(differences=(*exported.differences, text))
+    return _with_followers(robot, exported, "not in the file")
+
+
+def _with_followers(robot: Robot, exported: Exported, place: str) -> Exported:
+    """Return the file with a difference about followers, if there are any."""
+    names = [robot.joint_names[joint] for joint in np.flatnonzero(~robot.independent)]
+    if not names:
+        return exported
+    text = f"{', '.join(names)}: followers are {place}"
+    return exported._replace(differences=(*exported.differences, text))
 
 
 def _mjcf(robot: Robot, params: bp.PIDParams | None, dt: float, limits: bool) -> Exported:
@@ -186,10 +200,10 @@ def _mjcf(robot: Robot, params: bp.PIDParams | None, dt: float, limits: bool) ->
     load_engine("mujoco")  # raises without MuJoCo
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
 
-    guard = robot.guard() if limits else None
-    return to_mjcf(
-        robot, params, dt, actuators=robot.actuators, guard=guard, inertia=_inertia(robot)
-    )
+    options: dict[str, Any] = {"actuators": robot.actuators, "inertia": _inertia(robot)}
+    if limits:
+        options["guard"] = robot.guard()
+    return to_mjcf(robot, params, dt, **options)
 
 
 def _inertia(robot: Robot) -> np.ndarray:

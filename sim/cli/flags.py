@@ -1,9 +1,17 @@
-"""Flags that several commands share: one name, one meaning and one help text each."""
+"""Flags of a command, made from the signature and the docstring of its function.
+
+A parameter becomes a flag where its type has plain values (numbers, text, paths, words), and its
+section in the docstring is the help. A robot becomes a positional name or file, with the flags of
+:data:`LOADING`; a randomization becomes ``--randomize FILE``. Other parameters are for Python.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
+import inspect
+import re
+import textwrap
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, field, fields, make_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -12,205 +20,135 @@ import tyro
 
 from batchpid.arrays.array_types import Document, Kind
 from batchpid.arrays.field_tables import Field, declared, plain
-from batchpid.errors import InvalidArgumentError
-from batchpid.sim.runner_keywords import (
-    KINDS,
-    OPTIONS,
-    Compensation,
-    EngineName,
-    PhysicsPreset,
-    RunnerKeywords,
-)
+from batchpid.sim.options.options import KINDS, OPTIONS, RunnerKeywords
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.robot.robot import Robot
+
+PLAIN = (NoneType, bool, int, float, str, Path)
+OPTIONS_WITH_FLAG = {
+    entry.name: entry.default for entry in fields(RunnerKeywords) if OPTIONS[entry.name].flag
+}
+"""Options of a Runner that have a flag, with their defaults."""
+BOUNDS = declared(RunnerKeywords, Field)
+"""Ranges of the options that are numbers."""
+LOADING = {
+    "base": (
+        Literal["free", "fixed"] | None,
+        "Base of the robot: free to move, or fixed to the world. Default: as the file says.",
+    ),
+    "actuators": (
+        Path | None,
+        "Motors and sensors: a file (.yaml or .json) of batchpid.save_actuators. Default: ideal"
+        " ones. Drives take their friction and armature alone.",
+    ),
+}
+"""Arguments of :meth:`Robot.load` that are flags, with their types and help."""
+ROBOT = "Bundled robot (panda, jaco2 or quadruped), or path of a URDF or MJCF file."
+METAVARS = {
+    "gains": "NAME|FILE",
+    "control": None,
+    "tool": "LINK",
+    "ground": "on|off",
+    "joints": "NAME [NAME ...]",
+    "setpoint": "FLOAT [FLOAT ...]",
+}
+"""Words for the values of flags, where the type does not give them."""
 
 
-def _flag(help: str | None = None, **options: Any) -> Any:
-    """Return tyro's options of a flag; its help leaves out the defaults None, False, True and
-    ().
+def record_of(
+    function: Callable[..., Any],
+    options: Sequence[str] = (),
+    loading: Sequence[str] = (),
+    outputs: Document | None = None,
+) -> type[Any]:
+    """Return a frozen dataclass whose fields are the flags of ``function``, for tyro.
+
+    ``options`` are options of a Runner, and ``loading`` arguments of :meth:`Robot.load`, that have
+    flags too; ``outputs`` are the output files with their help.
     """
+    about, texts = sections(function)
+    hints = get_type_hints(function, include_extras=True)
+    rows = []
+    for name, parameter in inspect.signature(function).parameters.items():
+        kind = _plain_part(hints[name])
+        default = parameter.default
+        if Robot in (hints[name], *get_args(hints[name])):
+            # A recording has a robot already.
+            name_or_none = default is None
+            word: Kind = str | None if name_or_none else str
+            word = Annotated[word, tyro.conf.Positional]
+            rows.append(_flag("robot", word, None if name_or_none else "panda", ROBOT))
+        elif Randomization in get_args(hints[name]):
+            rows.append(_flag("randomize", Path | None, None, texts[name]))
+        elif kind is not None and name in texts:
+            rows.append(_flag(name, kind, default, texts[name]))
+    for name in options:
+        kind, default = _plain_part(get_args(KINDS[name])[0]), OPTIONS_WITH_FLAG[name]
+        if default is None and bool in get_args(kind):
+            kind = Literal["on", "off"] | None
+        rows.append(_flag(name, Annotated[kind, BOUNDS.get(name)], default, OPTIONS[name].flag))
+    rows += [_flag(name, LOADING[name][0], None, LOADING[name][1]) for name in loading]
+    for name, text in (outputs or {}).items():
+        rows.append(_flag(name, Path | None, None, text))
+    if outputs:
+        rows.append(_flag("force", bool, False, "Replace output files that exist."))
+    # A field without a default stands first.
+    rows.sort(key=lambda row: row[2].default is not MISSING)
+    record = make_dataclass("Flags", rows, frozen=True)
+    record.__doc__ = about
+    return record
+
+
+def sections(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
+    """Return the description in a function's docstring, and the text of each parameter."""
+    about, _, rest = inspect.getdoc(function).partition("\n\nParameters\n")  # type: ignore[union-attr]
+    parameters = rest.partition("\n\nRaises\n")[0].partition("\n\nReturns\n")[0]
+    texts = {}
+    for names, text in re.findall(r"^(\w[\w, ]*)\n((?:    .*\n?|\n)+)", parameters, re.MULTILINE):
+        for name in names.split(", "):
+            texts[name] = _words(textwrap.dedent(text).strip())
+    return _words(about), texts
+
+
+def check(record: Any) -> None:
+    """Check flags by their ranges. InvalidArgumentError names the first bad one.
+
+    Types and words are tyro's task, and numbers without a range that of the function.
+    """
+    for entry in fields(record):
+        if any(isinstance(note, Field) for note in get_args(entry.type)):
+            plain(entry.name, entry.type, getattr(record, entry.name))
+
+
+def _flag(name: str, kind: Kind, default: Any, text: str) -> tuple[str, Any, Any]:
+    """Return a field of a dataclass; its help leaves out the defaults None, False, True and ()."""
 
     def hint(default: str) -> str:
         return "" if default in ("None", "False", "True", "") else f"(default: {default})"
 
-    return tyro.conf.arg(help=help, help_behavior_hint=hint, **options)
+    options = {"metavar": METAVARS[name]} if name in METAVARS else {}
+    if default is None and Path in get_args(kind):
+        options = {"metavar": "FILE"}
+    described = Annotated[kind, tyro.conf.arg(help=text, help_behavior_hint=hint, **options)]
+    made = field() if default is inspect.Parameter.empty else field(default=default)
+    return name, described, made
 
 
-def check(command: Any) -> None:
-    """Check the flags of a command, and of its groups of flags, by their types and the Field in
-    their annotations.
-
-    Raises InvalidArgumentError for the first value that is out of range.
-    """
-    for name, kind in get_type_hints(type(command), include_extras=True).items():
-        value = getattr(command, name)
-        if is_dataclass(value):
-            check(value)
-        else:
-            plain(name, kind, value)
-
-
-def chosen(command: Any, names: str) -> Document:
-    """Return the values of some flags of a command, as arguments of the same names, which are
-    separated by blanks.
-    """
-    return {name: getattr(command, name) for name in names.split()}
+def _plain_part(kind: Kind) -> Any:
+    """Return the part of a type that has plain values; None if it has none besides None."""
+    if get_origin(kind) is Annotated:
+        inner, *notes = get_args(kind)
+        part = _plain_part(inner)
+        return None if part is None else Annotated[(part, *notes)]
+    if get_origin(kind) in (Union, UnionType):
+        members = [member for member in get_args(kind) if _plain_part(member) or member is NoneType]
+        return None if members in ([], [NoneType]) else Union[tuple(members)]  # noqa: UP007
+    if get_origin(kind) is tuple:
+        return kind if get_args(kind)[0] in PLAIN or _plain_part(get_args(kind)[0]) else None
+    return kind if (kind in PLAIN and kind is not NoneType) or get_origin(kind) is Literal else None
 
 
-def refuse(command: Any, names: Iterable[str], problem: str) -> None:
-    """Raise InvalidArgumentError for the first flag among ``names`` that is not at its default."""
-    defaults = {entry.name: entry.default for entry in fields(command)}
-    for name in names:
-        if (value := getattr(command, name)) != defaults[name]:
-            raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
-
-
-FLAGS = {entry.name: entry.default for entry in fields(RunnerKeywords) if OPTIONS[entry.name].flag}
-"""Options that have a flag, with their defaults."""
-SCENE_FLAGS = tuple(name for name in FLAGS if "scene" in OPTIONS[name].kept and name != "engine")
-"""Options that change the scenes in an engine."""
-BOUNDS = declared(RunnerKeywords, Field)
-"""Ranges of the options that are numbers."""
-_PLAIN = (NoneType, bool, int, float, str)
-_SWITCHES = [name for name, kind in KINDS.items() if get_args(kind)[0] == bool | None]
-"""Options that are on, off, or chosen by the Runner."""
-
-
-def of_option(name: str) -> Any:
-    """Return tyro's options of the flag of a Runner's option."""
-    return _flag(OPTIONS[name].flag, metavar="on|off" if name in _SWITCHES else None)
-
-
-def _kind(name: str) -> Kind:
-    """Return the type of the flag of a Runner's option: the part of its declared type that has
-    plain values.
-    """
-    kind = Literal["on", "off"] | None if name in _SWITCHES else get_args(KINDS[name])[0]
-    if get_origin(kind) not in (Union, UnionType):
-        return kind
-    return Union[  # noqa: UP007
-        tuple(
-            option for option in get_args(kind) if option in _PLAIN or get_origin(option) is Literal
-        )
-    ]
-
-
-@dataclass(frozen=True)
-class RunnerFlags:
-    """Flags that are options of a Runner, by :func:`runner_flags`."""
-
-    def options(self) -> Document:
-        """Return the options as arguments of a Runner; switches that are left out are left to
-        it.
-        """
-        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        switches = {name: values.pop(name) for name in _SWITCHES if name in values}
-        return values | {
-            name: value == "on" for name, value in switches.items() if value is not None
-        }
-
-
-def runner_flags(*names: str) -> type[RunnerFlags]:
-    """Return the flags of a Runner's options, by default of all that have one."""
-    chosen = names or FLAGS
-    kinds = {name: Annotated[_kind(name), BOUNDS.get(name), of_option(name)] for name in chosen}
-    made = [(name, kind, field(default=FLAGS[name])) for name, kind in kinds.items()]
-    return make_dataclass("ChosenFlags", made, bases=(RunnerFlags,), frozen=True)
-
-
-def group(made: type[RunnerFlags]) -> Any:
-    """Return tyro's options of a field that holds the flags of :func:`runner_flags`."""
-    return tyro.conf.arg(name="", constructor=made)
-
-
-OptionalPath = Annotated[Path | None, _flag()]
-OptionalName = Annotated[str | None, _flag(metavar="NAME")]
-OptionalFloats = Annotated[tuple[float, ...] | None, _flag(metavar="FLOAT [FLOAT ...]")]
-Switch = Annotated[bool, _flag()]
-Force = Annotated[bool, _flag("Replace output files that exist.")]
-
-RobotName = Annotated[
-    str,
-    tyro.conf.Positional,
-    _flag("Bundled robot (panda or jaco2), or path of a URDF or MJCF file."),
-]
-RecordedRobot = Annotated[
-    str | None,
-    tyro.conf.Positional,
-    _flag(
-        "Bundled robot, or path of a URDF or MJCF file. Default: that of the recording, or panda."
-    ),
-]
-
-
-@dataclass(frozen=True)
-class MeshOptions:
-    """Flags of every command that loads a robot, as arguments of ``Robot.load``."""
-
-    missing_meshes: Annotated[
-        Literal["error", "skip"], _flag("Skip collision shapes whose mesh is missing, or raise.")
-    ] = "skip"
-    package_dirs: Annotated[
-        tuple[Path, ...],
-        _flag(
-            "Folders that hold the packages of package:// mesh paths, looked up first.",
-            metavar="FOLDER [FOLDER ...]",
-        ),
-    ] = ()
-
-
-Meshes = Annotated[MeshOptions, tyro.conf.arg(name="")]
-NumEnvs = Annotated[int, BOUNDS["num_envs"], _flag("Number of robots, one in each scene.")]
-Workers = Annotated[int | None, BOUNDS["workers"], of_option("workers")]
-Cluster = Annotated[Literal["ray"] | None, of_option("cluster")]
-Gains = Annotated[
-    str | None,
-    _flag(
-        "Gains: tuned, designed, tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml"
-        " or .json) that `batchpid tune` or batchpid.save_params wrote, or an MJCF file (.xml)."
-        " Default: tuned where the robot has them, else designed.",
-        metavar="NAME|FILE",
-    ),
-]
-Actuators = Annotated[
-    Path | None,
-    _flag(
-        "Motors and sensors: a file (.yaml or .json) of batchpid.save_actuators. Default: ideal"
-        " ones. Of these, drives have the friction and armature alone.",
-        metavar="FILE",
-    ),
-]
-GainSets = Annotated[
-    tuple[str, ...],
-    _flag(
-        "Sets of gains: tuned, designed, tutorial, mjcf, drive, drive:STIFFNESS,DAMPING, params"
-        " files (.yaml or .json) that `batchpid tune` or batchpid.save_params wrote, or MJCF files"
-        " (.xml). Default: tuned, tutorial and drive for a bundled robot, else designed and drive.",
-        metavar="NAME|FILE [NAME|FILE ...]",
-    ),
-]
-Engine = Annotated[EngineName, of_option("engine")]
-Engines = Annotated[tuple[EngineName, ...], _flag("Physics engines, one or both.")]
-Physics = Annotated[PhysicsPreset, of_option("physics")]
-Compensate = Annotated[Compensation, of_option("compensate")]
-Seed = Annotated[int, Field(high=2**31 - 1)]
-Seconds = Annotated[
-    float, Field("simulated time, s", low=1e-6, high=1e6), _flag("Simulated time [s].")
-]
-MoveSeconds = Annotated[float, Field("simulated time, s", low=0.05, high=600.0)]
-Distance = Annotated[float, Field("rad or m", high=10.0)]
-Spread = Annotated[
-    Distance, _flag("Largest distance of a start pose from that of env 0 [rad or m].")
-]
-Json = Annotated[Path | None, _flag("Figures to write: .json.", metavar="FILE")]
-ShownEnvs = Annotated[int, Field(low=1, high=64)]
-Fps = Annotated[float, Field("frames per second", low=1.0, high=120.0), _flag("Frames per second.")]
-TimeLimit = Annotated[
-    float | None, Field("s"), _flag("Stop after this wall-clock time [s]. Default: none.")
-]
-Randomize = Annotated[
-    str | None,
-    _flag(
-        "Draw the robot of each move or env: a YAML file (docs/randomization.md), e.g. `payload:"
-        " {uniform: [0, 0.5]}`.",
-        metavar="FILE",
-    ),
-]
+def _words(text: str) -> str:
+    """Return a docstring's text without its marks of references and code, a line a paragraph."""
+    text = re.sub(r":\w+:`~?([^`]*)`|``", r"\1", text)
+    return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n"))

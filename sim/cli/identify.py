@@ -2,30 +2,90 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from batchpid.arrays.array_types import Document
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
-from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import AT_MOST, FOLDER, OutputFiles, bar, beside, write_figures
+from batchpid.sim.options.groups import Compensation
 
 if TYPE_CHECKING:
-    import batchpid as bp
+    from matplotlib.figure import Figure
 
-Logs = Annotated[
-    tuple[Path, ...],
-    tyro.conf.Positional,
-    tyro.conf.arg(help="Logs: .csv, .h5, ROS bags (.bag, .mcap, folders) or recordings."),
-]
+    import batchpid as bp
+    from batchpid.sim.identification.identification import Identification
+
+EVALUATIONS = 45
+"""Length of the bar: a fit usually ends before."""
 
 
 @dataclass(frozen=True)
-class IdentifyCommand:
+class Identified:
+    """Identification that is written where it explains the logs."""
+
+    result: Identification
+    force: bool
+
+    def report(self) -> str:
+        """Return the report of the identification.
+
+        Raises InvalidArgumentError, after the report is printed, for logs that it does not explain.
+        """
+        if self.result.explains or self.force:
+            return self.result.report()
+        print(self.result.report())
+        problem = (
+            "are explained to less than half of the error of ideal motors, and no file is written"
+        )
+        remedy = f"{self.result.advice}; --force writes the file nevertheless"
+        raise InvalidArgumentError("logs", problem, remedy=remedy)
+
+    def save(self, path: Path) -> None:
+        """Write the actuators, and the gains that were found beside them."""
+        import batchpid as bp
+
+        self.result.save(path)
+        gains = self.result.gains()
+        if gains is not None:
+            names = [self.result.robot.joint_names[joint] for joint in self.result.joints]
+            bp.save_params(path.with_name(f"{path.stem}-gains.yaml"), gains, names)
+
+    def document(self) -> Document:
+        """Return the estimates with their intervals."""
+        return self.result.document()
+
+    def figure(self) -> Figure:
+        """Draw the errors before and after."""
+        return self.result.figure()
+
+    def corrected_urdf(self) -> str:
+        """Return the URDF with the masses that were found."""
+        return self.result.corrected_urdf()
+
+
+def identify_logs(
+    robot: Robot,
+    logs: tyro.conf.Positional[tuple[Path, ...]] = (),
+    gains: str | None = None,
+    compensate: Compensation | None = None,
+    timestep: Annotated[float | None, Field("s", low=1e-5, high=0.01)] = None,
+    hold: bool = False,
+    degrees: bool = False,
+    topic: str = "/joint_states",
+    command_topic: str | None = None,
+    prefix: str = "",
+    no_payload: bool = False,
+    extras: tuple[str, ...] = (),
+    workers: Annotated[int, Field(low=0, high=1000)] = 0,
+    force: bool = False,
+    progress: Callable[[Any], Any] | None = None,
+) -> Identified:
     """Identify a robot's motors from logs of its motion, from this robot or another simulator.
 
     Finds armature, damping, friction, strength and bias of each joint, the delays of efforts and
@@ -33,110 +93,60 @@ class IdentifyCommand:
     of other commands. A log has a header and SI units: "time, setpoint:JOINT ..., qpos:JOINT ...",
     with the gains that drove the robot as --gains FILE, or "time, effort:JOINT ..., qpos:JOINT
     ...". The fit simulates a rigid-body model with a Runner's control and motors.
-    """
 
-    robot: flags.RobotName = "panda"
-    logs: Logs = ()
-    gains: Annotated[flags.OptionalName, tyro.conf.arg(metavar="NAME|FILE")] = None
-    """Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file
-    as for --gains of other commands. Without it a recording's own, or the logs' efforts.
+    Parameters
+    ----------
+    logs
+        Logs: .csv, .h5, ROS bags (.bag, .mcap, folders) or recordings.
+    gains
+        Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file
+        as for --gains of other commands. Without it a recording's own, or the logs' efforts. Gains
+        that are found are written beside the actuators, as NAME-gains.yaml.
+    compensate
+        Forces that the robot compensates: gravity+coriolis+friction, gravity+coriolis, gravity or
+        none. Default: as the recordings say, else gravity+coriolis+friction.
+    timestep
+        Time step of the control that drove the robot [s]. Default: as the recordings say, else
+        1/2000.
+    hold
+        Commands hold from row to row of a log; otherwise they are interpolated. Recordings are
+        always held.
+    degrees
+        Positions and setpoints of revolute joints are in degrees.
+    topic
+        Topic of the measurements in a ROS bag (sensor_msgs/JointState), whose efforts count as
+        measured.
+    command_topic
+        Topic of the commands in a ROS bag: positions are setpoints, efforts are efforts. Default:
+        measured efforts.
+    prefix
+        Prefix of the joints' names in the logs.
+    no_payload
+        The tool carries no payload.
+    extras
+        Further unknowns: load_friction, stribeck, offset, mass (of each link); with --gains also
+        gain (a factor of gains that are not known), kd, saturation and slew (the limit of the
+        goal's rate).
+    workers
+        Number of processes, 0 for none besides this one. The result does not depend on it.
     """
-    compensate: Annotated[flags.Compensate | None, tyro.conf.arg(metavar="FORCES")] = None
-    """Forces that the robot compensates: gravity+coriolis+friction, gravity+coriolis, gravity or
-    none. Default: as the recordings say, else gravity+coriolis+friction.
-    """
-    timestep: Annotated[
-        float | None, Field("s", low=1e-5, high=0.01), tyro.conf.arg(metavar="FLOAT")
-    ] = None
-    """Time step of the control that drove the robot [s]. Default: as the recordings say, else
-    1/2000.
-    """
-    hold: flags.Switch = False
-    """Commands hold from row to row of a log; otherwise they are interpolated. Recordings are
-    always held.
-    """
-    degrees: flags.Switch = False
-    """Positions and setpoints of revolute joints are in degrees."""
-    topic: str = "/joint_states"
-    """Topic of the measurements in a ROS bag (sensor_msgs/JointState), whose efforts count as
-    measured.
-    """
-    command_topic: Annotated[flags.OptionalName, tyro.conf.arg(metavar="TOPIC")] = None
-    """Topic of the commands in a ROS bag: positions are setpoints, efforts are efforts. Default:
-    measured efforts.
-    """
-    prefix: str = ""
-    """Prefix of the joints' names in the logs."""
-    no_payload: flags.Switch = False
-    """The tool carries no payload."""
-    extras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ()
-    """Further unknowns: load_friction, stribeck, offset, mass (of each link); with --gains also
-    gain (a factor of gains that are not known), kd, saturation and slew (the limit of the goal's
-    rate).
-    """
-    workers: Annotated[int, Field(low=0, high=1000)] = 0
-    """Number of processes, 0 for none besides this one. The result does not depend on it."""
-    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
-    out: flags.OptionalPath = None
-    """Actuators file to write: .yaml or .json. Default: out/ROBOT.actuators.yaml."""
-    json: flags.Json = None
-    """Estimates with their 95 % intervals to write: .json."""
-    corrected_urdf: flags.OptionalPath = None
-    """URDF to write with the masses that were found with --extras mass: .urdf."""
-    picture: flags.OptionalPath = None
-    """Position errors before and after, to draw: .png or .svg. Default: NAME-fit.png, next to the
-    actuators file."""
-    force: flags.Force = False
+    from batchpid.sim.identification.identification import identify
+    from batchpid.sim.identification.logs import Reading
 
-    imports = ("batchpid.sim.plots", "batchpid.sim.identification.identification")
-
-    def run(self) -> None:
-        """Run the command."""
-        import batchpid as bp
-        from batchpid.io.files import write_atomically
-        from batchpid.sim import plots
-        from batchpid.sim.identification.identification import identify
-        from batchpid.sim.identification.logs import Reading
-
-        out = self.out or FOLDER / f"{Path(self.robot).stem}.actuators.yaml"
-        outputs = OutputFiles(self)
-        out = outputs.path("out", out, (".yaml", ".yml", ".json"))
-        details = outputs.path("json", self.json, (".json",))
-        corrected = outputs.path("corrected_urdf", self.corrected_urdf, (".urdf",))
-        picture = outputs.path("picture", self.picture or beside(out, "fit"), plots.FORMATS)
-        robot = Robot.load(self.robot, **vars(self.meshes))
-        evaluations = iter(bar("identifying", bar_format=AT_MOST)(range(45)))
-        result = identify(
-            robot,
-            self.logs,
-            None if self.gains is None else _gains(robot, self.gains),
-            payload=not self.no_payload,
-            reading=Reading(**flags.chosen(self, "hold degrees topic command_topic prefix")),
-            progress=lambda: next(evaluations, None),
-            **flags.chosen(self, "compensate timestep extras workers"),
-        )
-        print(result.report())
-        if not (result.explains or self.force):
-            problem = (
-                "are explained to less than half of the error of ideal motors, and no file is"
-                " written"
-            )
-            raise InvalidArgumentError(
-                "logs", problem, remedy=f"{result.advice}; --force writes the file nevertheless"
-            )
-        result.save(out)
-        print(f"\nwritten: {out}")
-        if (gains := result.gains()) is not None:
-            path = beside(out, "gains").with_suffix(".yaml")
-            bp.save_params(path, gains, [robot.joint_names[joint] for joint in result.joints])
-            print(f"gains that were found, for --gains: {path}")
-        if details is not None:
-            write_figures(details, result.document())
-            print(f"written: {details}")
-        if corrected is not None:
-            write_atomically(corrected, result.corrected_urdf())
-            print(f"written: {corrected}")
-        print(f"picture: {plots.save(result.figure(), picture)}")
+    evaluations = iter(range(EVALUATIONS) if progress is None else progress(range(EVALUATIONS)))
+    result = identify(
+        robot,
+        logs,
+        None if gains is None else _gains(robot, gains),
+        payload=not no_payload,
+        reading=Reading(hold, degrees, topic, command_topic, prefix),
+        compensate=compensate,
+        timestep=timestep,
+        extras=extras,
+        workers=workers,
+        progress=lambda: next(evaluations, None),
+    )
+    return Identified(result, force)
 
 
 def _gains(robot: Robot, name: str) -> bp.PIDParams:

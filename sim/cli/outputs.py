@@ -1,4 +1,4 @@
-"""Output of the commands: files, with default names and checks before the run, and progress bars.
+"""Output of the commands: files, checked before the run, and progress bars.
 
 A run may take hours, so files are checked before it. No file is replaced without ``--force``.
 """
@@ -13,8 +13,9 @@ import sys
 import weakref
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
+from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
@@ -24,75 +25,66 @@ if TYPE_CHECKING:
 
 FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
-OUTPUTS = ("out", "picture", "json", "film", "corrected_urdf")
-"""Flags that name output files."""
-P = TypeVar("P", bound=Path | None)
 
 
 class OutputFiles:
-    """Output files of one run of a ``command``. With ``--force`` they replace files, but none that
-    the command reads.
-
-    The command reads the file that any other flag names.
+    """Output files of one run. With ``--force`` they replace files, but none that the command
+    reads: that any flag but ``names`` names.
     """
 
-    def __init__(self, command: Any) -> None:
-        self._force: bool = command.force
+    def __init__(self, values: Document, names: Collection[str]) -> None:
+        self._force: bool = values.get("force", False)
         self._outputs = list[str]()
         self._inputs = list[str | Path]()
-        for name, value in vars(command).items():
-            if name not in OUTPUTS:
-                values = value if isinstance(value, tuple) else (value,)
+        for name, value in values.items():
+            paths = value if isinstance(value, tuple) else (value,)
+            if name not in names:
                 self._inputs += [
-                    path for path in values if isinstance(path, str | Path) and os.path.isfile(path)
+                    path for path in paths if isinstance(path, str | Path) and os.path.isfile(path)
                 ]
 
-    def path(self, argument: str, path: P, suffixes: Collection[str]) -> P:
-        """Return ``path`` after a check that a file may be written there; None is returned as None.
+    def path(self, argument: str, path: Path, suffixes: Collection[str]) -> Path:
+        """Return ``path`` after a check that a file may be written there.
 
         Raises InvalidArgumentError if its suffix is not one of ``suffixes``, its folder neither
         exists nor is :data:`FOLDER`, the command reads it or writes it as another output, or it
         exists and may not be replaced.
         """
-        if path is None:
-            return path
         file_path(argument, path, suffixes)
-        problem, remedy = None, "choose another file"
-        exists = os.path.lexists(path)
+        self._check(argument, path)
+        self._outputs.append(os.path.realpath(path))
+        return path
+
+    def _check(self, argument: str, path: Path) -> None:
+        folder = str(path.parent)
+        remedy = "choose another file"
         if os.path.exists(path) and any(os.path.samefile(path, source) for source in self._inputs):
             problem = "is a file to read"
         elif os.path.realpath(path) in self._outputs:
             problem = "is another output of this run"
         elif not path.parent.exists() and path.parent != FOLDER:
-            folder = str(path.parent)
-            problem, remedy = (
-                f"has no folder {folder!r}",
-                f"make it: mkdir -p {shlex.quote(folder)}",
-            )
-        elif exists and not self._force:
-            problem, remedy = "exists already", "add --force to replace it, or choose another name"
-        if problem is not None:
-            raise InvalidArgumentError(argument, problem, value=str(path), remedy=remedy)
-        self._outputs.append(os.path.realpath(path))
-        return path
+            problem = f"has no folder {folder!r}"
+            remedy = f"make it: mkdir -p {shlex.quote(folder)}"
+        elif os.path.lexists(path) and not self._force:
+            problem = "exists already"
+            remedy = "add --force to replace it, or choose another name"
+        else:
+            return
+        raise InvalidArgumentError(argument, problem, value=str(path), remedy=remedy)
 
 
 def write_figures(path: Path, figures: Any) -> None:
     """Write figures as JSON: arrays as lists, named tuples and mappings as objects, null for NaN
     and infinity.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps(_plain(figures), indent=1, allow_nan=False) + "\n")
 
 
 def _plain(value: Any) -> Any:
-    value = (
-        value._asdict()
-        if hasattr(value, "_asdict")
-        else value.tolist()
-        if hasattr(value, "tolist")
-        else value
-    )
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    elif hasattr(value, "tolist"):
+        value = value.tolist()
     if isinstance(value, Mapping):
         return {name: _plain(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -100,18 +92,6 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def beside(path: Path, shown: str, suffix: str = ".png") -> Path:
-    """Return the default path of a picture or film of ``path``, in the same folder:
-    NAME-SHOWN.png.
-    """
-    return path.with_name(f"{path.stem}-{shown}{suffix}")
-
-
-AT_MOST = (
-    "{desc}: {n_fmt} of at most {total_fmt} evaluations, {elapsed}, at most {remaining}"
-    " more{postfix}"
-)
-"""Format of a bar for work that usually ends long before the last step."""
 _bars: weakref.WeakSet[tqdm[Any]] = weakref.WeakSet()
 
 
@@ -123,11 +103,8 @@ def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
     """
     from tqdm import tqdm
 
-    options = (
-        {"delay": 1.0}
-        | options
-        | {"leave": False, "dynamic_ncols": True, "disable": not sys.stderr.isatty()}
-    )
+    fixed = {"leave": False, "dynamic_ncols": True, "disable": not sys.stderr.isatty()}
+    options = {"delay": 1.0, **options, **fixed}
 
     def wrap(items: Iterable[Any]) -> Iterable[Any]:
         shown = tqdm(items, desc=label, **options)

@@ -19,9 +19,9 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 from batchpid.sim.robot.findings import Finding, Findings
+from batchpid.sim.signals.rollout import Rollout
 
 BAND = 0.02  # half width of the settling band, as a share of the move
 EXAMINED = 100  # envs at most
@@ -38,7 +38,7 @@ def settled_envs(rollout: Rollout, robot: RobotDescription) -> Bool:
     """Return the envs of a ``rollout`` of ``robot`` that have not failed and whose joints all
     settle (envs,).
     """
-    return np.asarray(~_Run(rollout, robot).unsettled.any(1))
+    return ~np.logical_or.reduce(_Run(rollout, robot).unsettled, axis=1)
 
 
 def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
@@ -60,19 +60,18 @@ def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
         return findings
     run = _Run(rollout.for_envs(envs), robot)
     unexplained = run.unsettled.copy()
+    # Of one cause the joint that is farthest from its setpoint comes first.
     farthest = np.argsort(-np.abs(run.error[run.tail]).max((0, 1)))
     for rule in RULES:
         fits = unexplained & rule.test(run)
-        unexplained[fits.any(1)] = False
-        # The joint that is farthest from its setpoint comes first; a cause of whole envs names no
-        # other.
-        places = farthest if rule.names_joint else farthest[:1]
-        for joint in places:
-            rows = np.flatnonzero(fits[:, joint] if rule.names_joint else fits.any(1))
+        is_concerned = fits.any(1)
+        unexplained[is_concerned] = False
+        if not rule.names_joint:
+            fits[:, farthest[0]] = is_concerned
+        for joint in farthest if rule.names_joint else farthest[:1]:
+            rows = np.flatnonzero(fits[:, joint])
             if len(rows):
                 findings.append(_finding(run, rule, joint, rows, envs))
-        if not unexplained.any():
-            break
     return findings
 
 
@@ -84,28 +83,19 @@ def _finding(
     """
     times = run.rest_time[rows, joint]
     rows = rows[np.argsort(times, kind="stable")]
-    first, name = rows[0], None
+    first = rows[0]
+    name = None
     if rule.names_joint:
         name = run.robot.joint_names[joint]
         detail = f"{run.error[-1, first, joint]:.2g} {run.robot.units[joint]} remain"
     elif run.failed[first]:
-        faults = [
-            f"{fault.joint}: {fault.cause}" for fault in run.info.faults if fault.env == first
-        ]
-        detail = "".join(faults[-1:])
+        faults = [fault for fault in run.info.faults if fault.env == first]
+        detail = f"{faults[-1].joint}: {faults[-1].cause}" if faults else ""
     else:
         detail = run.pressed[first]
     numbers = tuple(envs[rows].tolist())
-    return Finding(
-        "warning",
-        rule.code,
-        rule.text,
-        rule.remedy,
-        name,
-        detail=detail,
-        envs=numbers,
-        time=times.min(),
-    )
+    time = times.min()
+    return Finding("warning", rule.code, rule.text, rule.remedy, name, None, detail, numbers, time)
 
 
 class _Run:
@@ -119,60 +109,46 @@ class _Run:
         self.tail = slice(-min(ticks, max(3, round(TAIL * ticks))), None)
         self.qpos = rollout.qpos.astype(np.float64)
         self.failed: Bool = np.asarray(~rollout.ok.all(0))[:, None]
-        command = self.info.own_command
-        has_pose = command is not None and command.size == 7
-        self.is_pose = has_pose and self.info.tool is not None and robot.fixed_base
-
-    @cached_property
-    def solution(self) -> Any:
-        """Joint positions that bring the tool to the last setpoints, from the ends of the run."""
-        pose = self.rollout.setpoint[-1, :, :7].copy()
-        pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-        end = np.nan_to_num(self.qpos[-1])
-        return ts.inverse_kinematics(
-            self.robot.rigid_tree, self.info.tool or "", pose, end, on_failure="return"
-        )
-
-    @cached_property
-    def goal(self) -> Float64:
+        self.out_of_reach: Bool = np.zeros_like(self.failed)
+        """Envs whose tool has no such pose within the limits (envs, 1)."""
+        self.goal = self._find_goal()
         """Joint positions at the last setpoints, of a pose those nearest to the end; the end where
         they are unknown.
         """
-        if self.is_pose:
-            return np.asarray(self.solution.qpos)
-        is_known = self.info.own_command is None and self.info.control != "effort"
-        return self.robot.coupled(self.rollout.setpoint[-1]) if is_known else self.qpos[-1]
-
-    @cached_property
-    def error(self) -> Float64:
-        """Last setpoint minus each position (ticks, envs, dof) [rad or m]."""
         error = self.goal - self.qpos
-        return np.where(self.robot.continuous, error - TURN * np.rint(error / TURN), error)
-
-    @cached_property
-    def band(self) -> Float64:
+        turns = np.rint(error / TURN) * robot.continuous
+        self.error = error - TURN * turns
+        """Last setpoint minus each position (ticks, envs, dof) [rad or m]."""
+        self.band = np.maximum(BAND * np.abs(self.error[0]), absolute_band(robot))
         """Half width of the settling band [rad or m]."""
-        return np.maximum(BAND * np.abs(self.error[0]), absolute_band(self.robot))
-
-    @cached_property
-    def unsettled(self) -> Bool:
-        """Joints that end outside their band, and all joints of envs that failed, or whose tool has
-        no such pose.
+        outside = (np.abs(self.error[-1]) > self.band) | self.failed | self.out_of_reach
+        self.unsettled: Bool = outside & robot.independent
+        """Joints that end outside their band, and all joints of envs that failed or cannot reach
+        the pose.
         """
-        outside = (np.abs(self.error[-1]) > self.band) | self.failed
-        if self.is_pose:
-            outside |= ~self.solution.success[:, None]
-        return np.asarray(outside & self.robot.independent)
+
+    def _find_goal(self) -> Float64:
+        command = self.info.own_command
+        end = self.qpos[-1]
+        if command is None:
+            is_known = self.info.control != "effort"
+            return self.robot.coupled(self.rollout.setpoint[-1]) if is_known else end
+        if command.size != 7 or self.info.tool is None or not self.robot.fixed_base:
+            return end
+        pose = self.rollout.setpoint[-1, :, :7].copy()
+        pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+        tree, start = self.robot.rigid_tree, np.nan_to_num(end)
+        solution = ts.inverse_kinematics(tree, self.info.tool, pose, start, on_failure="return")
+        self.out_of_reach = ~np.asarray(solution.success)[:, None]
+        return np.asarray(solution.qpos)
 
     @cached_property
     def limit(self) -> Float64:
         """Largest effort [N m or N]."""
         params = self.info.params
-        limit = (
-            self.info.effort_limit
-            if params is None or params.effort_max is None
-            else params.effort_max
-        )
+        limit = self.info.effort_limit
+        if params is not None and params.effort_max is not None:
+            limit = params.effort_max
         return np.broadcast_to(limit, self.band.shape)
 
     @cached_property
@@ -180,12 +156,10 @@ class _Run:
         """Effort (ticks, envs, dof), of a drive from its law."""
         effort = self.rollout.effort.astype(np.float64)
         params = self.info.params
-        if self.info.control != "drive" or params is None:
-            return effort
-        drive = params.kp * self.error
-        if params.kd is not None:
-            drive = drive - params.kd * self.rollout.qvel
-        return effort + np.clip(drive, -self.limit, self.limit)
+        if self.info.control == "drive" and params is not None:
+            rate = 0.0 if params.kd is None else params.kd * self.rollout.qvel
+            effort += np.clip(params.kp * self.error - rate, -self.limit, self.limit)
+        return effort
 
     @cached_property
     def load(self) -> Float64:
@@ -210,12 +184,9 @@ class _Run:
         """Joints that are fast at the end and yet stay where they are, since their effort
         alternates.
         """
-        motion = (
-            np.median(np.abs(np.diff(self.qpos[self.tail], axis=0)), axis=0) / self.rollout.tick
-        )
-        return np.asarray(
-            np.median(np.abs(self.rollout.qvel[self.tail]), axis=0) > 3 * motion + 1e-2
-        )
+        change = np.median(np.abs(np.diff(self.qpos[self.tail], axis=0)), axis=0)
+        speed = np.median(np.abs(self.rollout.qvel[self.tail]), axis=0)
+        return np.asarray(speed > 3 * change / self.rollout.tick + 1e-2)
 
     @cached_property
     def rest_time(self) -> Float64:
@@ -223,22 +194,20 @@ class _Run:
         its env failed [s].
         """
         away = np.abs(self.qpos - self.qpos[-1]) > self.band
-        last = np.where(away.any(0), len(away) - 1 - np.argmax(away[::-1], axis=0), 0)
-        rest = np.minimum(last + 1, len(away) - 1)
-        return self.rollout.time[
-            np.where(self.failed, np.argmin(self.rollout.ok, axis=0)[:, None], rest)
-        ]
+        away[0] = True
+        rest = len(away) - np.argmax(away[::-1], axis=0)
+        failure = np.argmin(self.rollout.ok, axis=0)[:, None]
+        ticks = np.where(self.failed, failure, np.minimum(rest, len(away) - 1))
+        return self.rollout.time[ticks]
 
-    def _near(self, qpos: Float64, within: float) -> dict[str, float]:
-        """Return the distances [m] below ``within`` of pairs of links, and of links to the
-        ground.
+    def _distances(self, qpos: Float64) -> dict[str, float]:
+        """Return the distances [m] below TOUCH of links to each other and to the ground, the
+        nearest last.
         """
-        ground = (
-            self.info.ground if self.robot.fixed_base else False
-        )  # on which a floating base stands
-        pairs = sorted(
-            self.robot.dynamics(ground).contacts.near(qpos, within), key=itemgetter(2), reverse=True
-        )
+        # A floating base stands on its ground.
+        ground = self.info.ground if self.robot.fixed_base else False
+        near = self.robot.dynamics(ground).contacts.near(qpos, TOUCH)
+        pairs = sorted(near, key=itemgetter(2), reverse=True)
         return {f"{link} on {other or 'the ground'}": distance for link, other, distance in pairs}
 
     def _pressed_links(self, env: int) -> str:
@@ -247,18 +216,19 @@ class _Run:
         """
         most = 20 * absolute_band(self.robot)
         step = np.clip(self.error[-1, env], -most, most) * self.unsettled[env]
-        before = self._near(self.qpos[-1, env], TOUCH)
-        after = self._near(self.robot.coupled(self.qpos[-1, env] + step), TOUCH)
+        before = self._distances(self.qpos[-1, env])
+        after = self._distances(self.robot.coupled(self.qpos[-1, env] + step))
         pressed = [links for links in before if after.get(links, TOUCH) < before[links] - 1e-4]
         return min(pressed, key=before.__getitem__, default="")
 
     @cached_property
     def pressed(self) -> list[str]:
         """Links that are pressed together at the end, per env; "" if there are none."""
-        collides = ~self.failed[:, 0] & (self.info.collisions is not False)
-        return [
-            self._pressed_links(env) if examined else "" for env, examined in enumerate(collides)
-        ]
+        links = [""] * len(self.failed)
+        for env in np.flatnonzero(~self.failed):
+            if self.info.collisions is not False:
+                links[env] = self._pressed_links(int(env))
+        return links
 
 
 class Rule(NamedTuple):
@@ -307,7 +277,7 @@ RULES: tuple[Rule, ...] = (
          lambda run: run.failed, names_joint=False),
     Rule("setpoint-limits", "the setpoint is outside the joint limits", "move it inside", _is_beyond_limits),
     Rule("out-of-reach", "no pose within the joint limits brings the tool to the setpoint", "move it nearer",
-         lambda run: ~run.solution.success[:, None] if run.is_pose else False, names_joint=False),
+         lambda run: run.out_of_reach, names_joint=False),
     Rule("guard", "the guard holds the setpoint back", "move it inside the guard's limits, or give it more time",
          lambda run: run.rollout.guarded[-1]),
     Rule("touching", "links are pressed together, or against the ground",

@@ -4,10 +4,12 @@ ends of ticks.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Bool, Rows
 from batchpid.sim.engine.robot_model import contacts_of, description_tree
 from batchpid.sim.engine.scene_spec import SceneSpec
 
@@ -58,14 +60,34 @@ class MissedContacts:
         """Forget the distances of the robots of ``mask`` (size,), which are now in other states."""
         self._margins[mask] = 0.0
 
-    def look(self, qpos: Float64, step: int, first: NDArray[np.int64]) -> None:
-        """Write ``step`` into ``first`` (size,), if it is 0, for robots with overlaps at ``qpos``
-        (size, dof).
+    def look(
+        self,
+        qpos: Rows,
+        steps: NDArray[np.int64],
+        first: NDArray[np.int64],
+        tables: NDArray[np.int64],
+    ) -> None:
+        """Look for overlaps at ``qpos`` (ticks, size, dof), after these ``steps`` (ticks,).
+
+        The step of the first one of a robot is written into ``first`` (size,), where that is 0,
+        and into the rows of ``tables`` (ticks, size) from there on.
         """
-        closed = np.abs(qpos - self._centers) @ self._arms.T
-        for row in np.flatnonzero((closed >= self._margins).any(axis=1) & (first == 0)):
-            distances = self._contacts.least_distances(qpos[row])
-            margins = np.array([distances[pair] for pair in self._pairs]) + DEPTH
-            self._centers[row], self._margins[row] = qpos[row], margins
-            if (margins < 0).any():
-                first[row] = step
+        for row in np.flatnonzero(self._closes(qpos, slice(None)).any(axis=0) & (first == 0)):
+            tick = 0
+            while first[row] == 0:
+                closes = np.flatnonzero(self._closes(qpos[tick:, row], row))
+                if not closes.size:
+                    break
+                tick += int(closes[0])
+                distances = self._contacts.least_distances(qpos[tick, row])
+                margins = np.array([distances[pair] for pair in self._pairs]) + DEPTH
+                self._centers[row], self._margins[row] = qpos[tick, row], margins
+                if (margins < 0).any():
+                    first[row] = tables[tick:, row] = steps[tick]
+                tick += 1
+
+    def _closes(self, qpos: Rows, rows: Any) -> Bool:
+        """Return whether motion to ``qpos`` (..., dof) can have closed a distance of ``rows``."""
+        moved = np.abs(qpos - self._centers[rows]) @ self._arms.T
+        closes: Bool = (moved >= self._margins[rows]).any(axis=-1)
+        return closes

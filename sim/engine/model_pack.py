@@ -30,9 +30,8 @@ class ModelPack(SingleOwner):
     """Pack of ``size`` robots of ``spec``, numbered from ``first_env``, with mass matrices and
     forces from its model.
 
-    ``variation`` holds the robots' differences from the model, one row for each. ``carrier`` is the
-    link of the URDF that carries the payload; ``links`` are the links with varying mass or center
-    of mass. ``natively`` selects native code.
+    ``variation`` holds the robots' differences from the model, one row for each. ``natively``
+    selects native code.
     """
 
     _tree: RigidTree
@@ -44,8 +43,6 @@ class ModelPack(SingleOwner):
         size: int,
         first_env: int,
         variation: Variation | None,
-        carrier: str,
-        links: Sequence[str],
         natively: bool,
     ) -> None:
         self.spec = spec
@@ -53,7 +50,7 @@ class ModelPack(SingleOwner):
         self.first_env = first_env
         self.steps_natively = natively
         self.dof, self._variation = len(spec.joints), variation or Variation()
-        self._masses = VariedMasses(spec, size, self._variation, carrier, links)
+        self._masses = VariedMasses(spec, size, self._variation)
         self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
         self.friction = own_friction(spec, self._variation)
         armature = self._variation.armature  # vary() changes its rows

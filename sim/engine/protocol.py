@@ -10,7 +10,8 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from sys import modules
@@ -294,70 +295,40 @@ class CompiledPack(EnginePack, Protocol):
         """
 
 
-class Engine(Protocol):
-    """Physics engine: it makes packs, and the rigid trees of its robots.
-
-    Attributes
-    ----------
-    name, title
-        Value of the option ``engine``, and name of the library in messages.
-    capabilities
-        Its optional features.
-    physics
-        Settings of its solver, frozen dataclasses of plain values, by the name of the preset.
-    group_size
-        Envs that the loop steps together: enough to share the overhead of NumPy calls, few enough
-        for the working set to stay in the cache. It changes no result.
-    """
+@dataclass
+class Engine:
+    """Physics engine: it makes packs, and the rigid trees of its robots."""
 
     name: str
+    """Value of the option ``engine``."""
     title: str
+    """Name of the library in messages."""
     capabilities: frozenset[Capability]
+    """Its optional features."""
     physics: Mapping[str, Any]
+    """Settings of its solver, frozen dataclasses of plain values, by the name of the preset."""
     group_size: int
+    """Envs that the loop steps together: enough to share the overhead of NumPy calls, few enough
+    for the working set to stay in the cache. It changes no result.
+    """
+    make_pack: Callable[..., EnginePack]
+    """``make_pack(spec, size, first_env=0, variation=None, workspace=None)`` returns a new pack of
+    ``size`` envs.
 
-    def native_obstacle(self) -> str:
-        """Return why native code cannot call the engine, in a sentence; "" if it can."""
+    ``variation`` are differences of the robots from the model; None for robots that
+    :meth:`EnginePack.vary` never changes. ``workspace`` is a dictionary for the working memory,
+    shared by packs that never step at the same time, such as the packs of a loop. None: the pack
+    allocates its memory. Raises RobotError if the engine cannot build the robot, and
+    InvalidArgumentError if the function ``build`` of the spec is wrong.
+    """
+    scene_tree: Callable[[SceneSpec], RigidTree]
+    """Rigid tree of the robot of a spec as the engine has it: the same object for equal specs."""
+    native_obstacle: Callable[[], str]
+    """Reason for which native code cannot call the engine, in a sentence; "" if it can."""
 
     def is_physics(self, settings: object) -> bool:
         """Return whether ``settings`` are settings of its solver."""
-
-    def make_pack(
-        self,
-        spec: SceneSpec,
-        size: int,
-        first_env: int = 0,
-        variation: Variation | None = None,
-        carrier: str = "",
-        links: Sequence[str] = (),
-        workspace: dict[Any, Any] | None = None,
-    ) -> EnginePack:
-        """Return a new pack of ``size`` envs.
-
-        Parameters
-        ----------
-        variation
-            Differences of the robots from the model; None for robots that :meth:`EnginePack.vary`
-            never changes.
-        carrier, links
-            Link of the URDF that carries the payload, and links whose mass or center of mass
-            varies.
-        workspace
-            Working memory, shared by packs that never step at the same time, such as the packs of a
-            loop. Only the engine knows its content. None: the pack allocates its memory.
-
-        Raises
-        ------
-        RobotError
-            The engine cannot build the robot.
-        InvalidArgumentError
-            The function ``build`` of the spec is wrong.
-        """
-
-    def scene_tree(self, spec: SceneSpec) -> RigidTree:
-        """Return the rigid tree of the robot of ``spec`` as the engine has it: the same object for
-        equal specs.
-        """
+        return isinstance(settings, type(self.physics["accurate"]))
 
 
 def require(engine: Engine, capability: Capability, argument: str) -> None:

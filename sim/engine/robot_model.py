@@ -13,9 +13,8 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.collision_shapes import link_shapes
 from batchpid.sim.robot.contacts import Contacts
-from batchpid.sim.robot.simulated_links import body_inertias, rigid_tree, simulated
+from batchpid.sim.robot.simulated_links import rigid_tree
 from batchpid.task_space.frames import matrix_of, unrotate
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -65,9 +64,7 @@ def description_tree(spec: SceneSpec) -> RigidTree:
     """Return the rigid tree of the simulated bodies of ``spec``, not coupled; the same object for
     equal specs.
     """
-    text = simulated(spec.urdf, spec.separate).urdf
-    inertias = body_inertias(spec.urdf, spec.separate)
-    return rigid_tree(text, inertias, gravity=spec.gravity, fixed_base=spec.fixed_base)
+    return rigid_tree(spec.simulated, gravity=spec.gravity, fixed_base=spec.fixed_base)
 
 
 def contacts_of(spec: SceneSpec, ground: bool) -> Contacts:
@@ -75,7 +72,7 @@ def contacts_of(spec: SceneSpec, ground: bool) -> Contacts:
     at height 0.
     """
     ignored = {frozenset(pair) for pair in spec.ignored}
-    return Contacts(description_tree(spec), link_shapes(spec.urdf, spec.separate), ignored, ground)
+    return Contacts(description_tree(spec), spec.simulated.shapes, ignored, ground)
 
 
 def scene_tree(spec: SceneSpec) -> RigidTree:

@@ -6,7 +6,7 @@ A variation changes a robot's inertias, and the friction and damping of its join
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -15,9 +15,11 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
+from batchpid.sim.robot.merging import merge_fixed
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
-from batchpid.sim.robot.simulated_links import Body, varied_bodies
+from batchpid.sim.robot.simulated_links import BodyParts, varied_bodies
+from batchpid.sim.robot.tables import Tables
 from batchpid.task_space.rigid_tree import GRAVITY
 from batchpid.task_space.spatial_inertia import SpatialInertia, spatial_matrix, total
 
@@ -33,15 +35,16 @@ An object is an entity or the name of a link of the robot, merged links included
 class SceneSpec:
     """Everything that a scene is built from, picklable.
 
-    ``urdf`` is sanitised text (see :mod:`batchpid.sim.robot.urdf`); ``ignored`` are pairs of its
-    links that do not collide; ``joints`` are the degrees of freedom, in the order of all arrays.
+    ``tables`` are the rows of the robot's file; ``ignored`` are pairs of its links that do not
+    collide; ``joints`` are the degrees of freedom, in the order of all arrays.
     ``physics`` are the solver settings of ``engine``, in the engine's type. Without ``collisions``
     scenes have no collision shapes and no ground, but the same masses and inertias. ``mjcf`` is the
-    file that MuJoCo compiles in place of ``urdf``. ``contacts`` and ``wrenches`` are links with
-    sensors. Specs that differ in ``build`` alone are equal.
+    file that MuJoCo compiles in place of ``tables``. ``contacts`` and ``wrenches`` are links with
+    sensors. ``carrier`` is the link that carries payloads, and ``varied_links`` are those whose mass
+    or center of mass varies. Specs that differ in ``build`` alone are equal.
     """
 
-    urdf: str
+    tables: Tables
     ignored: tuple[tuple[str, str], ...]
     joints: tuple[Joint, ...]
     timestep: float
@@ -56,6 +59,13 @@ class SceneSpec:
     contacts: tuple[str, ...] | None = None
     wrenches: tuple[str, ...] | None = None
     mjcf: MjcfFile | None = None
+    carrier: str = ""
+    varied_links: tuple[str, ...] = ()
+
+    @property
+    def simulated(self) -> Tables:
+        """Tables of the simulated bodies."""
+        return merge_fixed(self.tables, self.separate)
 
     @property
     def separate(self) -> tuple[str, ...]:
@@ -97,9 +107,6 @@ class VariedMasses:
     """Inertias of the simulated links of ``size`` robots that differ by ``variation``, one row for
     each.
 
-    ``carrier`` is the link of the URDF that carries the payload; ``links`` are those whose mass or
-    center varies.
-
     Attributes
     ----------
     added
@@ -107,15 +114,13 @@ class VariedMasses:
         no mass varies.
     """
 
-    def __init__(
-        self, spec: SceneSpec, size: int, variation: Variation, carrier: str, links: Sequence[str]
-    ) -> None:
-        self._variation, self._bodies = variation, dict[str, Body]()
+    def __init__(self, spec: SceneSpec, size: int, variation: Variation) -> None:
+        self._variation = variation
+        self._bodies: dict[str, BodyParts] = {}
         varies_links = variation.link_mass is not None or variation.center_of_mass is not None
         if varies_links or variation.payload is not None:
-            self._bodies = varied_bodies(
-                spec.urdf, spec.separate, carrier, links if varies_links else []
-            )
+            links = spec.varied_links if varies_links else ()
+            self._bodies = varied_bodies(spec.tables, spec.separate, spec.carrier, links)
         self._nominal = {
             name: total([part.inertia for part in body.parts])
             for name, body in self._bodies.items()
@@ -131,7 +136,7 @@ class VariedMasses:
             self.added[name][row] = spatial_matrix(inertia) - spatial_matrix(self._nominal[name])
         return inertias
 
-    def _inertia(self, body: Body, row: int) -> SpatialInertia:
+    def _inertia(self, body: BodyParts, row: int) -> SpatialInertia:
         """Return the inertia of a body with its links as in ``row``, and with the payload."""
         parts, variation = [], self._variation
         for part in body.parts:

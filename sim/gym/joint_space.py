@@ -8,8 +8,8 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import TURN, wrap
-from batchpid.sim.observation import Observation
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.observation import Observation
 
 MAX_SPEED = 100.0
 """Joint speed that PhysX allows, and bound of the observed one [rad/s or m/s]."""

@@ -13,13 +13,13 @@ from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.arrays.elementwise import TURN, wrap
 from batchpid.checks.validate import array, choice, entries, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.command import CommandSpec, own_command
 from batchpid.sim.gym.joint_space import MAX_SPEED, JointSpace
 from batchpid.sim.gym.robot_env import RobotEnv
 from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
-from batchpid.sim.observation import Observation
 from batchpid.sim.robot.description import LIMIT_TOLERANCE
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.command import CommandSpec, own_command
+from batchpid.sim.signals.observation import Observation
 
 ACTIONS = ("setpoint", "increment")
 SPREAD = 0.1

@@ -22,12 +22,11 @@ from batchpid.arrays.array_types import Bool, Document, DType, Float32, Float64,
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import array, check_keywords, choice, env_mask, flag, integer, number
 from batchpid.errors import CallOrderError, InvalidArgumentError
-from batchpid.sim.observation import Observation
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import LARGEST
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner import Runner
-from batchpid.sim.runner_keywords import OPTIONS, checked_option
+from batchpid.sim.runner.runner import Runner
+from batchpid.sim.signals.observation import Observation
 
 RUNNER_OPTIONS = tuple(OPTIONS.keys() - {"robot", "num_envs", "substeps"})
 """Options of the runner, without ``substeps``, which follow from ``rate_hz``."""

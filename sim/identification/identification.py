@@ -19,15 +19,15 @@ from batchpid.checks.validate import choice, flag, instance, integer, number
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.identification.fit import Problem, windows_of
-from batchpid.sim.identification.log import Log, LogWarning, checked
+from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
 from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.regression import Guess, LogData, better_reading, regress, smooth
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import Dynamics, LogControl, Plant
 from batchpid.sim.identification.unknowns import BASIC, EXTRAS, LAW, Unknowns
+from batchpid.sim.options.groups import Compensation
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner_keywords import Compensation
 
 STILL = {"rad": 1e-3, "m": 1e-4}
 """Standard deviation of the positions up to which a joint did not move."""
@@ -62,7 +62,7 @@ def identify(
     payload: bool = True,
     extras: Sequence[str] = (),
     reading: Reading | None = None,
-    evaluations: int = 30,
+    evaluations: int = 60,
     workers: int = 0,
     progress: Callable[[], Any] | None = None,
 ) -> Identification:
@@ -134,7 +134,7 @@ def _read(
     if find_spec("scipy") is None:
         raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
-    kind = None
+    kind: CommandKind | None = None
     if params is not None:
         instance("params", params, bp.PIDParams, "load them with load_params()")
         kind = "setpoint"
@@ -206,8 +206,9 @@ def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | 
         problem = "have gains per inertia or mass matrix, which a fit does not simulate"
         raise InvalidArgumentError("params", problem, remedy="log the efforts, and give no params")
     for name in ("kp", "ki", "kd") if recorded is not None else ():
-        gains = [getattr(one, name) for one in (recorded, law)]
-        if not np.allclose(*[0.0 if gain is None else gain for gain in gains], rtol=1e-6):
+        gains = getattr(recorded, name), getattr(law, name)
+        before, now = (0.0 if gain is None else gain for gain in gains)
+        if not np.allclose(before, now, rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
             remedy = "leave them out: a recording has its own"
             raise InvalidArgumentError("params", problem, remedy=remedy)
@@ -272,13 +273,11 @@ def _guesses(parts: list[LogData], has_slew: bool) -> list[Guess]:
 
 def _sensible(result: Identification) -> Identification:
     """Return the result; raise InvalidArgumentError if setpoints acted before they were logged."""
-    kinds = [entry.kind for entry in result.unknowns.entries]
-    if "setpoint_delay" in kinds:
-        delay, _, high = result.interval("setpoint_delay")
-        if high < -LEAD:
+    for at, entry in enumerate(result.unknowns.entries):
+        delay, _, high = result.row(at)
+        if entry.kind == "setpoint_delay" and high < -LEAD:
             problem = f"make sense with setpoints that were logged {-1e3 * delay:.0f} ms late"
-            remedy = "correct their times"
-            raise InvalidArgumentError("logs", problem, remedy=remedy)
+            raise InvalidArgumentError("logs", problem, remedy="correct their times")
     return result
 
 

@@ -26,10 +26,10 @@ from batchpid.checks.validate import file_path
 from batchpid.checks.warn import warn
 from batchpid.errors import MissingDependencyError
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
-from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import RecordingError, read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.rollout import Rollout
 
 QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
@@ -270,7 +270,7 @@ def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
     time = np.array([stamp - first for stamp in max(stamps, key=len) if first <= stamp <= last])
     columns = {"time": time / 1e9}
     for (_, name), rows in samples.items():
-        known = sorted(rows)
-        values = [rows[stamp] for stamp in known]
-        columns[name] = np.interp(time, [stamp - first for stamp in known], values)
+        moments = sorted(rows)
+        values = [rows[stamp] for stamp in moments]
+        columns[name] = np.interp(time, [stamp - first for stamp in moments], values)
     return columns

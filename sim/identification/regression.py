@@ -174,7 +174,7 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
     moves |= moves.sum(0) < 50
     guesses = list[Guess]()
     names = ("armature", "damping", "friction", "strength", "bias", "cost")
-    for late, by_delay in zip(SETPOINT_DELAYS, efforts, strict=False):
+    for setpoint_delay, by_delay in zip(SETPOINT_DELAYS, efforts, strict=False):
         options = list[Guess]()
         for delay, effort in zip(delays, by_delay, strict=True):
             joints = []
@@ -183,7 +183,7 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
             values = dict(zip(names, np.array(joints).T, strict=True))
             cost = float(values.pop("cost").mean())
             values["delay"] = np.array([delay])
-            values["setpoint_delay"] = np.array([late])
+            values["setpoint_delay"] = np.array([setpoint_delay])
             options.append(Guess(values, cost))
         guesses.append(min(options, key=_cost))
     # The sum of both delays is certain, but armature and damping make up for their shares.
@@ -220,9 +220,10 @@ def _commanded(part: LogData, has_slew: bool) -> Float64:
     control = Control(drive, ideal, dynamics, q[0], v[0])
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)
     efforts = np.empty(q.shape)
+    zero = np.zeros(q.shape[1:])
     for step in range(steps):
         setpoint = motion.command[np.clip(step - late, 0, steps - 1)]
-        efforts[step] = control.advance(setpoint, q[step], v[step], None)
+        efforts[step] = control.advance(setpoint, q[step], v[step], zero)
     if motion.feedforward is not None:
         efforts += motion.feedforward[:, None]
     return efforts.swapaxes(0, 1)
@@ -237,7 +238,7 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     from scipy.optimize import nnls
 
     target, *motion, effort = table
-    columns = np.stack([*(-column for column in motion), effort, target], axis=1)
+    columns: Any = np.stack([*(-column for column in motion), effort, target], axis=1)
     # The bias is the mean of what is left, so that the others are found without it.
     center = columns.mean(0)
     columns = columns - center

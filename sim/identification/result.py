@@ -136,12 +136,13 @@ class Identification:
         entries = self.unknowns.entries + self.fit.hidden.entries
         for at, entry in enumerate(entries):
             if (entry.kind, entry.link or entry.joint) == (kind, joint):
-                return self._row(at) if at < len(self.unknowns.entries) else None
+                return self.row(at) if at < len(self.unknowns.entries) else None
         kinds = ", ".join(sorted({entry.kind for entry in entries}))
         problem = f"is no unknown of {joint!r}"
         raise InvalidArgumentError("kind", problem, value=kind, remedy=f"there are {kinds}")
 
-    def _row(self, at: int) -> tuple[float, float, float]:
+    def row(self, at: int) -> tuple[float, float, float]:
+        """Return the interval of an unknown by its place among :attr:`unknowns`."""
         entry = self.unknowns.entries[at]
         value = float(self.values[at])
         half = INTERVAL * float(self.fit.intervals.deviation[at])
@@ -191,7 +192,7 @@ class Identification:
         for at, entry in enumerate(self.unknowns.entries):
             place = self._place(entry)
             table = intervals if place is None else intervals.setdefault(place, {})
-            table[entry.kind] = list(self._row(at))
+            table[entry.kind] = list(self.row(at))
         return {
             "intervals": intervals,
             "not_shown": self.not_identified,
@@ -277,7 +278,7 @@ class Identification:
         return "\n".join([*lines, self.advice])
 
     def _cell(self, at: int) -> str:
-        value, low, high = self._row(at)
+        value, _, high = self.row(at)
         half = high - value
         if half > abs(value) and self.unknowns.entries[at].is_positive:
             return f"< {high:.2g}"
@@ -333,8 +334,8 @@ def advice(problem: Problem, solution: Solution) -> str:
     further = [entry for new in effects.values() for entry in new]
     wide = replace(unknowns, entries=(*unknowns.entries, *further))
     count = len(solution.point)
-    start = [entry.coordinate(entry.start) for entry in further]
-    point = np.concatenate([solution.point, start])
+    coordinates = [entry.coordinate(entry.start) for entry in further]
+    point = np.concatenate([solution.point, coordinates])
     steps = STEP * np.eye(len(point))
     wider = replace(problem, unknowns=wide)
     residual, matrix = wider.system(wider.evaluate(point, steps), point, solution.size)

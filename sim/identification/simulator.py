@@ -36,7 +36,6 @@ from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
 from batchpid.native.tracing import Trace, trace_trees
 from batchpid.sim.engine.scene_spec import added_friction
-from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import REFRESH_STEPS, control_step
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Step, StepState
@@ -293,9 +292,7 @@ class Control:
         state.gain[...] = fresh.gain
         state.memory[...] = fresh.memory
 
-    def advance(
-        self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64 | None
-    ) -> Float64:
+    def advance(self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64) -> Float64:
         """Return the efforts of motors and friction (n, joints), which the next call may reuse.
 
         ``command`` are setpoints or efforts, ``passive`` the compensated force and the feedforward.
@@ -307,7 +304,7 @@ class Control:
         if self._program is None:
             self._program = self._compiled(inputs)
         program, state, results = self._program
-        program(*state, *[table for table in inputs if table is not None], out=results)
+        program(*state, *inputs, out=results)
         return results[-1]
 
     def _compiled(self, inputs: Any) -> Any:
@@ -329,7 +326,7 @@ def _step(layout: Layout, constants: Constants, state: StepState, inputs: Any) -
     """Return state and efforts of a control step."""
     command, *reading = inputs
     measured = Measured(*reading)
-    new, outputs = control_step(layout, constants, state, Command(command), measured, Step(0, 1))
+    new, outputs = control_step(layout, constants, state, command, measured, Step(0, 1))
     return new, outputs.qf
 
 
@@ -428,6 +425,7 @@ def simulate(
     if control.friction.viscous is not None:
         added += dt * control.friction.viscous
     native = native_rows.in_use()
+    zero = np.zeros_like(q)
     track = np.empty((len(commands) - past, 2, *q.shape))
     with np.errstate(all="ignore"):
         for step in range(len(track)):
@@ -441,7 +439,7 @@ def simulate(
                 command += share * (older - command)
             # What the robot compensates is added to the command, or cancels forces exactly.
             force = dynamics.force
-            passive = None
+            passive = zero
             if described is not None:
                 measured[...] = q + offset
                 described.update()
@@ -450,8 +448,7 @@ def simulate(
                 else:
                     force = force - described.force
             if forwards is not None:
-                forward = np.tile(forwards[past + step], (count, 1))
-                passive = forward if passive is None else passive + forward
+                passive = passive + np.tile(forwards[past + step], (count, 1))
             effort = control.advance(command, q, v, passive) - force
             if native is not None:
                 native.move(

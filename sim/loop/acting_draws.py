@@ -1,7 +1,8 @@
-"""Robots, params and actuators of a loop, changed by the draws of the randomization."""
+"""Robots, params and actuators of a group of envs, changed by the draws of the randomization."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,51 @@ import numpy as np
 import batchpid as bp
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
 from batchpid.sim.randomization.fields import elements, nominal_values
 from batchpid.sim.randomization.randomization import PHYSICAL
+
+
+class ActingDraws:
+    """Params and actuators of a group, with the draws of its envs applied.
+
+    Attributes
+    ----------
+    draws
+        Draws of the envs; None before the first reset. A reset, or new params, put them into
+        effect.
+    params, actuators
+        As they were given.
+    acting_params
+        With the draws in effect.
+    motors
+        Actuators with the draws in effect; None without an effect on efforts or measurements.
+    """
+
+    def __init__(self, options: RunnerOptions, params: bp.PIDParams) -> None:
+        self._options = options
+        self.draws: Draws | None = None
+        self.params = self.acting_params = params
+        self.actuators: bp.Actuators | None = None
+        self.motors: bp.Actuators | None = None
+
+    def set_params(self, params: bp.PIDParams) -> None:
+        """Put params into effect."""
+        randomization, robot = self._options.randomization, self._options.robot
+        self.params = self.acting_params = params
+        if randomization is not None:
+            self.acting_params = randomization.randomized_params(params, self.draws, robot)
+
+    def set_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
+        """Put actuators into effect; return them with the draws applied."""
+        randomization, robot = self._options.randomization, self._options.robot
+        self.actuators = actuators
+        if randomization is not None:
+            actuators = randomization.randomized_actuators(actuators, self.draws, robot)
+        acts = actuators is not None and (actuators.measures or actuators.delivers)
+        self.motors = actuators if acts else None
+        return actuators
 
 
 def make_pack(
@@ -24,12 +66,13 @@ def make_pack(
     workspace: dict[Any, Any],
 ) -> EnginePack:
     """Return the pack of ``size`` envs; without ``draws`` all robots equal the model."""
-    randomization, robot = options.randomization, options.robot
+    randomization = options.randomization
     make = options.load_engine().make_pack
     if randomization is None or not randomization.changes_robot:
         return make(scene, size, first_env, workspace=workspace)
-    varied, links = variation(options, size, draws), elements("link_mass", robot)
-    return make(scene, size, first_env, varied, randomization.carrier(robot), links, workspace)
+    links = tuple(elements("link_mass", options.robot))
+    scene = replace(scene, carrier=randomization.carrier(options.robot), varied_links=links)
+    return make(scene, size, first_env, variation(options, size, draws), workspace)
 
 
 def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variation:
@@ -38,39 +81,13 @@ def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variati
     assert randomization is not None
     values = {}
     for name in PHYSICAL:
-        if name in randomization.given:
-            nominal = nominal_values(name, robot, options.mjcf)
-            rows = (
-                np.tile(nominal, (size, 1))
-                if draws is None
-                else randomization.apply(name, nominal, draws, robot)
-            )
-            values[name] = rows / nominal if name == "link_mass" else rows
-    for name in ("payload", "ground_friction"):
-        if name in values:
-            values[name] = values[name][:, 0]
+        if name not in randomization.given:
+            continue
+        nominal = nominal_values(name, robot, options.mjcf)
+        rows = np.tile(nominal, (size, 1))
+        if draws is not None:
+            rows = randomization.apply(name, nominal, draws, robot)
+        if name == "link_mass":
+            rows = rows / nominal
+        values[name] = rows[:, 0] if name in ("payload", "ground_friction") else rows
     return Variation(**values)
-
-
-def acting_params(
-    options: RunnerOptions, params: bp.PIDParams, draws: Draws | None
-) -> bp.PIDParams:
-    """Return ``params`` with the draws applied."""
-    randomization = options.randomization
-    return (
-        params
-        if randomization is None
-        else randomization.randomized_params(params, draws, options.robot)
-    )
-
-
-def acting_actuators(
-    options: RunnerOptions, actuators: bp.Actuators | None, draws: Draws | None
-) -> bp.Actuators | None:
-    """Return ``actuators`` with the draws applied."""
-    randomization = options.randomization
-    return (
-        actuators
-        if randomization is None
-        else randomization.randomized_actuators(actuators, draws, options.robot)
-    )

@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Rows
-from batchpid.sim.observation import OBSERVED, Observation, Quantity
+from batchpid.sim.signals.observation import OBSERVED, Observation, Quantity
 
 Layout = dict[str, tuple[tuple[int, ...], Any]]
 """Name -> (shape, dtype)."""
 
 
 class Command(NamedTuple):
-    """Command of one tick, (envs, ...), or of several, (ticks, envs, ...); None where nothing is
-    given.
+    """Command of one tick, (envs, ...), or of several, (ticks, envs, ...).
+
+    In a loop an array that the caller does not give is 0; in the calling process it is None.
     """
 
     setpoint: Array
@@ -42,12 +43,6 @@ class Command(NamedTuple):
         """Which arrays are given."""
         return tuple(map(is_not, self, repeat(None)))
 
-    def with_only(self, given: tuple[bool, ...]) -> Command:
-        """Return the command with only the arrays that are ``given``."""
-        return Command(
-            *[rows if is_given else None for rows, is_given in zip(self, given, strict=True)]
-        )
-
 
 class FaultArrays(NamedTuple):
     """Last fault of each env (envs,): sim step (-1: none), joint, and index into
@@ -68,8 +63,6 @@ class FaultArrays(NamedTuple):
 class Arrays(NamedTuple):
     """Input and output of a loop, with leading axes (envs,) for one tick or (ticks, envs) for
     several.
-
-    Each run tells which commands it uses; the others are ignored.
     """
 
     command: Command

@@ -10,7 +10,7 @@ order::
     mass matrix     M    = M(y) half way ahead            every 4 sim steps of a tick, 1 with the implicit law
     setpoint        r    = r at this moment of the tick   where its rate is given: :func:`carried`
     guard           r    = guard(r)                       limits of position, rate and acceleration
-    feedforward     f    = p + feedforward + known friction
+    feedforward     f    = p + feedforward + modelled friction
     controller      u    = the caller's own
     law             qf   = saturated(law(r, r', r'', y, y', f)), or saturated(u + f)
     motors          qf   = motors(qf)
@@ -21,7 +21,7 @@ order::
 
 The executors run this table, each with its own kind of arrays.
 :mod:`batchpid.sim.loop.numpy_executor` and :mod:`batchpid.sim.loop.xla_executor` call its
-functions. :mod:`batchpid.sim.loop.native_ticks` makes native programs of them. The last three
+functions. :mod:`batchpid.sim.loop.native_program` makes native programs of them. The last three
 stages are the executors' own. A :class:`batchpid.sim.loop.step_values.StepState` is the whole state
 of the control between sim steps.
 """
@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, nearest_turn, replace_envs, wrap
 from batchpid.law.pid import advance_drive
-from batchpid.motors import advance_effort, advance_measurement
+from batchpid.motors import advance_effort, advance_measurement, command_limits
 from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
 from batchpid.motors.friction import FrictionState
@@ -62,31 +62,29 @@ def control_step(
     layout: Layout,
     constants: Constants,
     state: StepState,
-    command: Command,
+    setpoint: Array,
     measured: Measured,
     step: Step,
 ) -> tuple[StepState, Outputs]:
-    """Advance the control by one sim step; return its state and the efforts to apply. Inputs are
-    not modified.
+    """Advance the control by one sim step under a setpoint; return its state and the efforts to
+    apply. Inputs are not modified.
     """
+    zero = namespace(setpoint).zeros_like(setpoint)
+    command = Command(setpoint, zero, zero, zero)
     values = sim_step(layout, constants, Values(state, command, measured, step, measured), {})
     return values.state, values.outputs
 
 
 def sim_step(
-    layout: Layout,
-    constants: Constants,
-    values: Values,
-    engine: Mapping[str, Callable[[Values], Values]],
+    layout: Layout, constants: Constants, values: Values, engine: Mapping[str, StageFunction]
 ) -> Values:
     """Run the stages of a sim step in the order of the table; ``engine`` has the executor's own
     stages, by name.
     """
     for stage in STAGES:
-        if stage.function is not None:
-            values = stage.function(layout, constants, values)
-        elif stage.name in engine:
-            values = engine[stage.name](values)
+        function = stage.function or engine.get(stage.name)
+        if function is not None and stage.applies(layout, constants):
+            values = function(layout, constants, values)
     return values
 
 
@@ -115,7 +113,7 @@ def refreshed(
 
 
 def carried(command: Command, left: Array) -> Command:
-    """Return ``command`` at the time ``left`` before the end of its tick, where its rate is given::
+    """Return ``command`` at the time ``left`` before the end of its tick::
 
         r <- r - left (r' - left r'' / 2)        r' <- r' - left r''
 
@@ -123,28 +121,9 @@ def carried(command: Command, left: Array) -> Command:
     :class:`batchpid.trajectories.Trajectory`; an acceleration is the same in the whole tick.
     """
     setpoint, rate, acceleration, _ = command
-    if rate is None:
-        return command
-    if acceleration is None:
-        return command._replace(setpoint=setpoint - left * rate)
     change = left * acceleration
     return command._replace(
         setpoint=setpoint - left * (rate - 0.5 * change), setpoint_rate=rate - change
-    )
-
-
-def feedforward(constants: Constants, command: Command, qpos: Array, passive: Array) -> Array:
-    """Return the passive force plus the caller's feedforward and known friction, for the leaders;
-    None for zero.
-    """
-    forward = _sum(passive, command.feedforward)
-    forward = None if forward is None else constants.coupling.efforts(forward)
-    if (known := constants.known) is None:
-        return forward
-    error = wrap(command.setpoint - qpos, known.turns, namespace(qpos))
-    return _sum(
-        friction_model.compensation(known.friction, error, command.setpoint_rate, known.band),
-        forward,
     )
 
 
@@ -154,12 +133,8 @@ def feedforward(constants: Constants, command: Command, qpos: Array, passive: Ar
 
 def _sensors(layout: Layout, constants: Constants, values: Values) -> Values:
     motors, (qpos, qvel, passive), model = values.state.motors, values.measured, layout.model
-    if motors is None:
-        return values
     noise = values.noise if model.noise is None else model.noise(constants.motors, motors, qpos)
-    motors, qpos, qvel = advance_measurement(
-        constants.motors, motors, qpos, qvel, noise, model.stages
-    )
+    motors, qpos, qvel = advance_measurement(constants.motors, motors, qpos, qvel, noise)
     seen = Measured(qpos, qvel, passive)
     return values._replace(state=values.state._replace(motors=motors), seen=seen, noise=None)
 
@@ -168,19 +143,13 @@ def _passive_force(layout: Layout, constants: Constants, values: Values) -> Valu
     """The passive force of the description at the measured state, which the engine does not
     know.
     """
-    if not layout.measures or layout.model.passive_force is None:
-        return values
-    qpos, qvel, _ = values.seen
-    return values._replace(
-        seen=values.seen._replace(passive=layout.model.passive_force(qpos, qvel))
-    )
+    passive = layout.model.passive_force(values.seen.qpos, values.seen.qvel)
+    return values._replace(seen=values.seen._replace(passive=passive))
 
 
 def _inertia(layout: Layout, constants: Constants, values: Values) -> Values:
     """The inertia of the friction model, for the envs where it is ``REFRESH_STEPS`` old."""
     state, qpos = values.state, values.measured.qpos
-    if constants.friction.coulomb is None:
-        return values
     xp, due = namespace(state.age), state.age == REFRESH_STEPS
 
     def fresh() -> FrictionState:
@@ -193,8 +162,7 @@ def _inertia(layout: Layout, constants: Constants, values: Values) -> Values:
 def _mass_matrix(layout: Layout, constants: Constants, values: Values) -> Values:
     """The mass matrix of the law, which is kept for ``law.matrix_steps``."""
     (qpos, qvel, _), step, law = values.seen, values.step, layout.law
-    if law is None or not law.uses_mass_matrix:
-        return values
+    assert law is not None
 
     def fresh() -> Any:
         xp = namespace(qpos)
@@ -207,68 +175,62 @@ def _mass_matrix(layout: Layout, constants: Constants, values: Values) -> Values
 
 def _setpoint(layout: Layout, constants: Constants, values: Values) -> Values:
     """The setpoint at the moment of this sim step."""
-    moves = layout.control in ("pid", "drive")
-    return values._replace(command=carried(values.command, values.step.left)) if moves else values
+    return values._replace(command=carried(values.command, values.step.left))
 
 
 def _guard(layout: Layout, constants: Constants, values: Values) -> Values:
-    """Guarded setpoints and rates (if given), and the mask of changes. Followers move with their
-    leaders.
+    """Guarded setpoints and rates, and the mask of changes. Followers move with their leaders.
 
     A given acceleration is 0 where the guard changes the setpoint.
     """
-    state = values.state.guard
-    command = values.command
+    setpoint, rate, acceleration, _ = values.command
     coupling = constants.coupling
-    if state is None:
-        return values
-    xp = namespace(command.setpoint)
+    xp = namespace(setpoint)
     state, changed = guard_model.advance(
-        constants.guard, state, command.setpoint, constants.timestep
+        constants.guard, values.state.guard, setpoint, constants.timestep
     )
-    setpoint = state.setpoint
-    rate = command.setpoint_rate
-    acceleration = command.setpoint_acceleration
-    if rate is not None:
-        rate = xp.where(changed, state.rate, rate)
-    if acceleration is not None:
-        acceleration = xp.where(changed, 0.0, acceleration)
-    setpoint, changed = coupling.positions(setpoint), coupling.of_leaders(changed)
-    rate, acceleration = (
-        None if each is None else coupling.rates(each) for each in (rate, acceleration)
-    )
+    command = values.command._replace(setpoint=coupling.positions(state.setpoint))
+    if layout.moves:
+        command = command._replace(
+            setpoint_rate=coupling.rates(xp.where(changed, state.rate, rate)),
+            setpoint_acceleration=coupling.rates(xp.where(changed, 0.0, acceleration)),
+        )
     return values._replace(
         state=values.state._replace(guard=state),
-        command=Command(setpoint, rate, acceleration, command.feedforward),
-        outputs=values.outputs._replace(guarded=changed),
+        command=command,
+        outputs=values.outputs._replace(guarded=coupling.of_leaders(changed)),
     )
 
 
 def _feedforward(layout: Layout, constants: Constants, values: Values) -> Values:
-    forward = feedforward(constants, values.command, values.seen.qpos, values.seen.passive)
-    return values._replace(seen=values.seen._replace(passive=forward))
+    """The passive force plus the caller's feedforward and modelled friction, for the leaders."""
+    command, seen = values.command, values.seen
+    forward = constants.coupling.efforts(seen.passive + command.feedforward)
+    if (modelled := constants.modelled) is not None:
+        error = wrap(command.setpoint - seen.qpos, modelled.turns, namespace(seen.qpos))
+        forward = forward + friction_model.compensation(
+            modelled.friction, error, command.setpoint_rate, modelled.band
+        )
+    return values._replace(seen=seen._replace(passive=forward))
 
 
 def _controller(layout: Layout, constants: Constants, values: Values) -> Values:
     """The caller's own controller; the feedforward is one of its inputs."""
-    seen, state = values.seen, values.state
-    if layout.control != "custom":
-        return values
-    passive = namespace(seen.qpos).zeros_like(seen.qpos) if seen.passive is None else seen.passive
-    law, returned, *limited = layout.model.controller(
-        state.law, values.command.setpoint, seen.qpos, seen.qvel, passive
-    )
-    outputs = values.outputs._replace(returned=returned)
+    setpoint = values.command.setpoint
+    law, returned, *limited = layout.model.controller(values.state.law, setpoint, *values.seen)
     return values._replace(
-        state=state._replace(law=law), limited=limited[0] if limited else None, outputs=outputs
+        state=values.state._replace(law=law),
+        limited=limited[0] if limited else None,
+        outputs=values.outputs._replace(returned=returned),
     )
 
 
 def _law(layout: Layout, constants: Constants, values: Values) -> Values:
     """Effort within the limits of params and motors."""
-    motors, (qpos, qvel, _), limits = constants.motors, values.seen, (None, None)
-    if values.state.motors is not None:
-        limits = layout.model.stages.limits(motors, qpos, qvel)
+    qpos, qvel, _ = values.seen
+    limits = None, None
+    if constants.motors is not None:
+        limits = command_limits(constants.motors, qpos, qvel)
     values = _LAWS[layout.control](layout, constants, values, limits)
     return values._replace(outputs=values.outputs._replace(motor=values.outputs.qf))
 
@@ -277,28 +239,19 @@ def _pid(
     layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]
 ) -> Values:
     """qf = sat(PID(setpoint, qpos) + feedforward)."""
-    seen = values.seen
-    state = values.state
-    law = layout.law
+    qpos, qvel, forward = values.seen
+    state, law = values.state, layout.law
+    coupling = constants.coupling
     assert law is not None
-    viscous = (
-        None
-        if constants.damping is None
-        else constants.coupling.efforts(constants.damping * seen.qvel)
-    )
+    viscous = None
+    if constants.damping is not None:
+        viscous = coupling.efforts(constants.damping * qvel)
     setpoint, rate, acceleration, _ = values.command
-    if acceleration is not None:  # the leaders' mass matrix has the followers' share
-        acceleration = constants.coupling.of_independent(acceleration)
-    inputs = (
-        (setpoint, rate, acceleration),
-        seen.qpos,
-        seen.qvel,
-        seen.passive,
-        state.matrix,
-        viscous,
-        *limits,
-    )
-    new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs)
+    motion = setpoint, None, None
+    if layout.moves:  # the leaders' mass matrix has the followers' share
+        motion = setpoint, rate, coupling.of_independent(acceleration)
+    inputs = motion, qpos, qvel, forward, state.matrix, viscous, *limits
+    new, effort, saturated = law.advance(constants.k, state.law, *inputs)
     outputs = values.outputs._replace(qf=effort, saturated=saturated)
     return values._replace(state=state._replace(law=new), outputs=outputs)
 
@@ -314,14 +267,12 @@ def _drive(
     jump at every sim step.
     """
     (target, rate, *_), seen, state = values.command, values.seen, values.state
-    xp = namespace(seen.qpos)
-    target = nearest_turn(target, seen.qpos, constants.turns, xp)
+    target = nearest_turn(target, seen.qpos, constants.turns, namespace(seen.qpos))
     if constants.driven is not None:
-        rates = {"setpoint_rate": rate, "feedforward": seen.passive}
+        rates = {"setpoint_rate": rate if layout.moves else None, "feedforward": seen.passive}
         law, target = advance_drive(constants.driven, state.law, target, seen.qpos, **rates)
         state = state._replace(law=law)
-    effort = xp.zeros_like(seen.qpos) if seen.passive is None else seen.passive
-    outputs = values.outputs._replace(qf=effort, target=target, target_rate=rate)
+    outputs = values.outputs._replace(qf=seen.passive, target=target, target_rate=rate)
     return values._replace(state=state, outputs=outputs)
 
 
@@ -331,23 +282,20 @@ def _effort(
     """qf = sat(the caller's effort + feedforward); the setpoint is the effort, and a follower's
     acts on its leader.
     """
-    asked = constants.coupling.efforts(values.command.setpoint)
-    return _saturated(constants, _sum(asked, values.seen.passive), values, limits)
+    effort = constants.coupling.efforts(values.command.setpoint)
+    return _saturated(constants, effort + values.seen.passive, values, limits)
 
 
 def _custom(
     layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]
 ) -> Values:
     """qf = sat(effort of the caller's own controller)."""
-    values = _saturated(
-        constants, constants.coupling.efforts(values.outputs.returned), values, limits
-    )
-    outputs = values.outputs
+    effort = constants.coupling.efforts(values.outputs.returned)
+    values = _saturated(constants, effort, values, limits)
     if values.limited is None:
         return values
-    return values._replace(
-        outputs=outputs._replace(saturated=outputs.saturated | (values.limited > 0))
-    )
+    saturated = values.outputs.saturated | (values.limited > 0)
+    return values._replace(outputs=values.outputs._replace(saturated=saturated))
 
 
 _LAWS: dict[str, Callable[..., Values]] = {
@@ -360,11 +308,7 @@ _LAWS: dict[str, Callable[..., Values]] = {
 
 def _motors(layout: Layout, constants: Constants, values: Values) -> Values:
     (qpos, qvel, _), state, outputs = values.measured, values.state, values.outputs
-    if state.motors is None:
-        return values
-    motors, effort = advance_effort(
-        constants.motors, state.motors, outputs.qf, qpos, qvel, layout.model.stages
-    )
+    motors, effort = advance_effort(constants.motors, state.motors, outputs.qf, qpos, qvel)
     return values._replace(
         state=state._replace(motors=motors), outputs=outputs._replace(qf=effort, motor=effort)
     )
@@ -378,33 +322,6 @@ def _friction(layout: Layout, constants: Constants, values: Values) -> Values:
     return values._replace(state=state._replace(friction=friction), outputs=outputs._replace(qf=qf))
 
 
-class SimStage(NamedTuple):
-    """Stage of a sim step."""
-
-    name: str
-    function: Callable[[Layout, Constants, Values], Values] | None = None
-    """Pure function of arrays; None for a stage that every executor has its own function for."""
-
-
-STAGES = (
-    SimStage("sensors", _sensors),
-    SimStage("passive force", _passive_force),
-    SimStage("inertia", _inertia),
-    SimStage("mass matrix", _mass_matrix),
-    SimStage("setpoint", _setpoint),
-    SimStage("guard", _guard),
-    SimStage("feedforward", _feedforward),
-    SimStage("controller", _controller),
-    SimStage("law", _law),
-    SimStage("motors", _motors),
-    SimStage("friction", _friction),
-    SimStage("targets"),
-    SimStage("constraint"),
-    SimStage("engine"),
-)
-"""Stages of a sim step, in order."""
-
-
 def _saturated(
     constants: Constants, total: Array, values: Values, limits: tuple[Array, Array]
 ) -> Values:
@@ -414,6 +331,46 @@ def _saturated(
     return values._replace(outputs=values.outputs._replace(qf=effort, saturated=effort != total))
 
 
-def _sum(first: Array, second: Array) -> Array:
-    """Return the sum of two arrays, either of which may be None for zero."""
-    return first if second is None else second if first is None else first + second
+StageFunction = Callable[[Layout, Constants, Values], Values]
+
+
+def _always(layout: Layout, constants: Constants) -> bool:
+    return True
+
+
+def _has_motors(layout: Layout, constants: Constants) -> bool:
+    return constants.motors is not None
+
+
+def uses_mass_matrix(layout: Layout, constants: Constants) -> bool:
+    """Return whether the law has gains per mass matrix."""
+    return layout.law is not None and layout.law.uses_mass_matrix
+
+
+class SimStage(NamedTuple):
+    """Stage of a sim step."""
+
+    name: str
+    applies: Callable[[Layout, Constants], bool] = _always
+    """Whether a group of envs needs it."""
+    function: StageFunction | None = None
+    """Pure function of arrays; None for a stage that every executor has its own function for."""
+
+
+STAGES = (
+    SimStage("sensors", _has_motors, _sensors),
+    SimStage("passive force", lambda layout, _: layout.measures and layout.gravity, _passive_force),
+    SimStage("inertia", lambda _, constants: constants.friction.coulomb is not None, _inertia),
+    SimStage("mass matrix", uses_mass_matrix, _mass_matrix),
+    SimStage("setpoint", lambda layout, _: layout.moves, _setpoint),
+    SimStage("guard", lambda _, constants: constants.guard is not None, _guard),
+    SimStage("feedforward", _always, _feedforward),
+    SimStage("controller", lambda layout, _: layout.control == "custom", _controller),
+    SimStage("law", _always, _law),
+    SimStage("motors", _has_motors, _motors),
+    SimStage("friction", _always, _friction),
+    SimStage("targets", lambda layout, _: layout.control == "drive"),
+    SimStage("constraint", lambda _, constants: not constants.coupling.is_identity),
+    SimStage("engine"),
+)
+"""Stages of a sim step, in order."""

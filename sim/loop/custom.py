@@ -18,12 +18,12 @@ from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.read_only import read_only
 from batchpid.arrays.trees import flatten, unflatten
 from batchpid.errors import ControllerError, InvalidArgumentError
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 
 class OwnController:
-    """Caller's own controller (:class:`batchpid.sim.options.Controller`), checked; its state is a
+    """Caller's own controller (:class:`batchpid.sim.Controller`), checked; its state is a
     dictionary of arrays by name.
 
     All groups of envs share it, and thus its JAX program.

@@ -1,7 +1,7 @@
-"""Group of envs that advance together: their state, and its changes by ticks, resets, params,
-actuators and faults.
+"""Group of envs that advance together: one pack, its control, and the parts that hold their state.
 
-Longer than 350 lines because every change of the state is here.
+An executor runs the sim steps. The group handles what happens between them: a possible failure, a
+command that is not finite, a push, the sensors of links, a reset, new params or actuators.
 """
 
 from __future__ import annotations
@@ -12,45 +12,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Array, Float64
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import clip
 from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.motors.friction import FrictionState
 from batchpid.motors.guard import GuardState
 from batchpid.sim.engine.missed_contacts import MissedContacts
-from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
-from batchpid.sim.loop.acting_draws import acting_actuators, acting_params, variation
-from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays, Ticks
+from batchpid.sim.engine.protocol import DrivenPack, EnginePack
+from batchpid.sim.loop.acting_draws import ActingDraws, variation
+from batchpid.sim.loop.arrays import Arrays, Command, Ticks
 from batchpid.sim.loop.custom import OwnController
-from batchpid.sim.loop.faults import FaultContainment, far, finite, near
-from batchpid.sim.loop.native_executor import NativeExecutor
-from batchpid.sim.loop.native_ticks import Table
-from batchpid.sim.loop.numpy_executor import NumPyExecutor, Span, passive_forces, with_model
-from batchpid.sim.loop.pid_law import PIDLaw
+from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
+from batchpid.sim.loop.model_functions import steps_natively
+from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
+from batchpid.sim.loop.native_program import Table
+from batchpid.sim.loop.numpy_executor import NumPyExecutor
 from batchpid.sim.loop.pushes import Pushes
+from batchpid.sim.loop.sensed import LinkSensors
 from batchpid.sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
 from batchpid.sim.loop.step_setup import (
+    Setup,
     init_motors,
-    make_constants,
-    make_layout,
+    make_setup,
     reset_friction,
     reset_guard,
     with_friction,
+    with_matrix,
     with_params,
 )
 from batchpid.sim.loop.step_values import StepState
 from batchpid.sim.loop.xla_executor import XLAExecutor
-from batchpid.sim.observation import untouched
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
 
 
 class EnvGroup:
-    """One pack and its control; runs the sim steps of a tick, and suspends or resets envs that
-    fail.
+    """One pack and its control; runs the sim steps of ticks, and suspends or resets envs that fail.
 
-    ``envs`` are its rows in the loop's arrays, and ``params`` the params of these envs.
-    ``controller`` is the caller's own, or None.
+    ``envs`` are its rows in the loop's arrays, ``params`` the params of these envs, and ``ticks``
+    their input and output. ``controller`` is the caller's own, or None.
     """
 
     def __init__(
@@ -59,131 +59,110 @@ class EnvGroup:
         envs: slice,
         params: bp.PIDParams,
         options: RunnerOptions,
-        controller: OwnController | None = None,
+        controller: OwnController | None,
+        ticks: Ticks,
     ) -> None:
         self.pack = pack
         self.envs = envs
-        self._options = options
-        self._controller = controller
-        self.draws: Draws | None = None
-        """Draws of the randomization for these envs; a reset, or new params, put them into
-        effect.
-        """
-        self._params = self._acting_params = params  # before and after the randomization
-        self._own_actuators: bp.Actuators | None = None  # before the randomization
-        self._actuators: bp.Actuators | None = (
-            None  # after it; None without effect on efforts or measurements
-        )
+        self.tick = 0
+        """First tick of the run that is not complete."""
+        self._step = 0  # sim steps of it that are done
+        self._steps = 0  # sim steps before the run
+        self._moves = False  # whether the run gives rates of setpoints
+        self._runs_whole = False  # whether the native code runs whole ticks
+        self._options, self._controller, self._ticks = options, controller, ticks
+        self.acting = ActingDraws(options, params)
+        self._faults = FaultContainment(pack.size, pack.dof, options.on_fault)
+        self._sensors = LinkSensors(options, pack.size)
+        self._pushes = Pushes(options, pack.size)
+        self._contacts: MissedContacts | None = None
+        if options.misses_contacts:
+            self._contacts = MissedContacts(pack.spec, pack.size, options.robot.has_ground)
         self._episode = np.zeros(pack.size, np.int64)
-        self._drops_actuators = False  # of a pack in use, at the next write()
-        self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
-        self._motor = np.zeros((pack.size, pack.dof), np.float32)
-        self._saturated, self._guarded = (np.zeros((pack.size, pack.dof), bool) for _ in range(2))
-        self._table: Table | None = None
-        self._sensed = untouched(pack.size, options.observed)
-        self._pushes = Pushes(options, pack.size) if options.has_pushes else None
+        shape = (pack.size, pack.dof)
+        last = np.zeros(shape, np.float32), np.zeros(shape, bool), np.zeros(shape, bool)
+        self._last = Table(ticks.arrays, *last, self._faults.rows)
         reads_base = "base_state" in options.load_engine().capabilities and pack.spec.mjcf is None
-        observed = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
-        self._observes_natively = observed and not self._sensed and self._pushes is None
-        self._steps = 0
-        missed = (
-            MissedContacts(pack.spec, pack.size, options.robot.has_ground)
-            if options.misses_contacts
-            else None
-        )
-        self._contacts = missed
-        qpos = pack.read_qpos()
-        self._state = StepState(
-            bp.init(params, qpos) if controller is None else controller.init(pack.size)
-        )
-        self._prepare()
-        everyone = np.ones(pack.size, bool)
-        self._state = reset_guard(self._constants, self._state, qpos, everyone)
-        self._state = reset_friction(self._layout, self._constants, self._state, pack, everyone)
-        self._write_drives()
+        is_read = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
+        has_parts = bool(self._sensors.values or self._pushes.counts)
+        self._observes_natively = is_read and not has_parts
+        qpos, everyone = pack.read_qpos(), np.ones(pack.size, bool)
+        law = bp.init(params, qpos) if controller is None else controller.init(pack.size)
+        setup = self._setup(None)
+        state = reset_guard(setup, StepState(law), qpos, everyone)
+        self._prepare(setup, reset_friction(setup, state, everyone))
 
-    def _prepare(self) -> None:
-        """Make constants and executor for the present robots, params and actuators."""
-        options = self._options
-        pack = self.pack
-        motors = self._state.motors
-        constants = make_constants(options, pack, self._acting_params, self._actuators, motors)
-        layout = make_layout(options, self._acting_params, self._actuators)
-        layout = with_model(options, pack, layout, constants, self._controller)
-        self._layout, self._constants = layout, constants
+    def _setup(self, motors: ActuatorState | None) -> Setup:
+        """Return the control step of the present robots, params and actuators."""
+        acting = self.acting
+        inputs = acting.acting_params, acting.motors, motors, self._controller
+        return make_setup(self._options, self.pack, *inputs)
+
+    def _prepare(self, setup: Setup, state: StepState, in_numpy: bool = False) -> None:
+        """Make the executor, which goes on from a state, and set the engine's drives."""
+        state = with_matrix(setup, state)
         # Native wherever the engine has native steps, under backend "numpy" too: the bits are the
         # same.
-        self._executor: NumPyExecutor | XLAExecutor
-        if not isinstance(pack, CompiledPack) or not pack.steps_natively:
-            self._executor = NumPyExecutor(options, pack, layout, constants)
-        elif options.backend == "jax":
-            self._executor = XLAExecutor(options, pack, layout, constants, self._controller)
+        self._executor: NumPyExecutor | NativeExecutor | XLAExecutor
+        if in_numpy or not steps_natively(self.pack):
+            self._executor = NumPyExecutor(setup, state)
+        elif self._options.backend == "jax":
+            self._executor = XLAExecutor(setup, state)
+        elif runs_natively(setup):
+            self._executor = NativeExecutor(setup, state, self._last)
         else:
-            self._executor = NativeExecutor(options, pack, layout, constants)
-        self._measured = self._executor.measure()
+            self._executor = NumPyExecutor(setup, state)
+        if self._options.control == "drive" and isinstance(self.pack, DrivenPack):
+            damping, stiffness = setup.constants.drive
+            limit = self.acting.acting_params.effort_max
+            if limit is None:
+                limit = np.full_like(stiffness, np.inf)
+            self.pack.write_drive(stiffness, damping, limit)
 
     def execute_in_numpy(self) -> None:
         """Run sim steps call by call in NumPy until the next change, so that the phases of a step
         can be timed.
         """
-        self._executor = NumPyExecutor(self._options, self.pack, self._layout, self._constants)
+        self._prepare(self._executor.setup, self._executor.read_state(), in_numpy=True)
 
-    def _write_drives(self) -> None:
-        """Set the engine's drives, under control "drive"."""
-        if isinstance(self.pack, DrivenPack) and self._options.control == "drive":
-            damping, stiffness = self._constants.drive
-            limit = self._acting_params.effort_max
-            self.pack.write_drive(
-                stiffness, damping, np.full_like(stiffness, np.inf) if limit is None else limit
-            )
-
-    @property
-    def _qpos(self) -> Float64:
-        return self._executor.rows(self._measured.qpos)
-
-    def _take_state(self) -> StepState:
-        """Convert the state of the control to NumPy arrays, which may be changed; return it."""
-        self._state = self._executor.numpy_state(self._state)
-        return self._state
+    # -- changes between ticks
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state carries on."""
-        state = self._take_state()
-        before = self._acting_params
-        constants = self._constants
-        self._params, self._acting_params = params, acting_params(self._options, params, self.draws)
-        self._prepare()
-        if not PIDLaw.of(before).uses_mass_matrix:
-            constants = self._constants
-        qpos = self.pack.read_qpos()
-        self._state = with_params(self._layout, constants, state, before, self._acting_params, qpos)
-        self._write_drives()
+        self._set_params(params, self._executor.read_state())
+
+    def _set_params(self, params: bp.PIDParams, state: StepState) -> None:
+        before, old = self._executor.setup, self.acting.acting_params
+        self.acting.set_params(params)
+        setup = self._setup(state.motors)
+        state = with_params(before, setup, state, old, self.acting.acting_params)
+        if state.age is None:  # the draws may have brought friction
+            state = reset_friction(setup, state, np.ones(self.pack.size, bool))
+        self._prepare(setup, state)
 
     def set_actuators(self, actuators: bp.Actuators | None) -> None:
         """Change the actuators in flight; their state carries on."""
-        if actuators is not None or self._own_actuators is not None:
-            self._take_state()
-            self._own_actuators = actuators
-            self.pack.write_joints(self._take_actuators())
-            self._prepare()
-            self._state = with_friction(self._layout, self._constants, self._state, self.pack)
+        if actuators is not None or self.acting.actuators is not None:
+            state = self._with_actuators(self._executor.read_state(), actuators)
+            setup = self._setup(state.motors)
+            self._prepare(setup, with_friction(setup, state))
 
-    def _take_actuators(self) -> bp.Actuators | None:
-        """Put the actuators, with the draws applied, into effect; return them."""
-        actuators = acting_actuators(self._options, self._own_actuators, self.draws)
-        old, motors = self._state.motors, None
-        self._actuators = (
-            actuators
-            if actuators is not None and (actuators.measures or actuators.delivers)
-            else None
-        )
-        if self._actuators is not None:
+    def _with_actuators(
+        self, state: StepState, actuators: bp.Actuators | None, rows: list[int] | None = None
+    ) -> StepState:
+        """Put actuators into effect, for the robots ``rows`` or all; return the state with motors
+        for them.
+        """
+        old, motors = state.motors, None
+        self.pack.write_joints(self.acting.set_actuators(actuators), rows)
+        if self.acting.motors is not None:
             if old is None:
                 self._episode[:] = 0
-            fresh = init_motors(self._actuators, self.pack, self._qpos, self._episode)
-            motors = fresh if old is None else old.matched_to(fresh)
-        self._state = self._state._replace(motors=motors)
-        return actuators
+            qpos = self.pack.read_qpos()
+            motors = init_motors(self.acting.motors, self.pack, qpos, self._episode)
+            if old is not None:
+                motors = old.matched_to(motors)
+        return state._replace(motors=motors)
 
     def reset(
         self,
@@ -201,326 +180,298 @@ class EnvGroup:
         An env whose ``qpos`` or ``qvel`` (M, dof) is not finite returns to its last start, and has
         failed.
         """
-        containment = self._containment
-        containment.clear(mask)
+        faults = self._faults
+        faults.clear(mask)
         self._vary(mask)
         bad = {
             cause: mask[:, None] & ~np.isfinite(rows)
             for cause, rows in (("qpos", qpos), ("qvel", qvel))
         }
         good = mask & ~(bad["qpos"] | bad["qvel"]).any(1)
-        containment.start_qpos[good], containment.start_qvel[good] = qpos[good], qvel[good]
+        faults.start_qpos[good], faults.start_qvel[good] = qpos[good], qvel[good]
         if base is not None:
-            containment.start_base[good] = base[good]
-        self._place(mask, containment.start_qpos, containment.start_qvel)
-        for sensed in self._sensed.values():
-            sensed[mask] = 0
+            faults.start_base[good] = base[good]
+        self._place(mask, faults.start_qpos, faults.start_qvel)
+        self._sensors.clear(mask)
         for cause, entries in bad.items():
-            containment.fail(entries, cause, steps, containment.start_qpos)
+            faults.fail(entries, cause, steps, faults.start_qpos)
         self._place_failed()
 
-    def run(
-        self,
-        ticks: Ticks,
-        given: tuple[bool, ...],
-        first: int,
-        until: int,
-        substeps: int,
-        steps: int,
-    ) -> int:
-        """Run ticks of ``substeps`` sim steps from ``first`` on, at least one; observe them; return
-        the next one.
+    def _vary(self, mask: NDArray[np.bool_]) -> None:
+        """Put the draws of the envs of ``mask`` (M,) into effect, before these envs are placed."""
+        randomization, acting = self._options.randomization, self.acting
+        rows = np.flatnonzero(mask).tolist()
+        if randomization is None or acting.draws is None or not rows:
+            return
+        if randomization.changes_robot:
+            self.pack.vary(rows, variation(self._options, len(rows), acting.draws.for_envs(rows)))
+        state = self._with_actuators(self._executor.read_state(), acting.actuators, rows)
+        self._set_params(acting.params, state)
 
-        It returns before ``until`` after a tick with an event: a possible contact, or a failed env.
-        ``given`` marks the commands that are used, and ``steps`` is the number of sim steps before
-        the first tick.
+    # -- ticks
+
+    def start(self, moves: bool, steps: int) -> list[NativeExecutor]:
+        """Start a run after ``steps`` sim steps, at tick 0; return the executor if native code runs
+        whole ticks.
+
+        ``moves`` says whether the commands give rates of setpoints.
         """
-        containment, command = self._containment, ticks[first].command.with_only(given)
-        containment.failed, table = containment.suspended.copy(), None
-        self._steps = steps
-        if self._sensed:
-            self.pack.take_sensed()
-        if self._pushes is not None:
-            self._push(self._pushes, substeps)
-        if containment.suspended.any() or not finite(*command):
-            command = self._without_faults(command)
-        elif self._contacts is None and self._observes_natively:
-            if self._table is None:
-                fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
-                self._table = Table(
-                    ticks.arrays, self._motor, self._saturated, self._guarded, fault
-                )
-            table = self._table
-        # With a table native code reads the commands and writes the observations of many ticks by
-        # itself. It stops within a tick where Python has to look: then ``done`` steps of it are
-        # made, and the rest follows here.
-        tick, done = self._execute(command, Span(first, 0, until, substeps), table)
-        if not done:
-            return tick
-        while done < substeps:
-            if table is not None:
-                command = ticks[tick].command.with_only(given)
-            _, done = self._execute(command, Span(tick, done, tick + 1, substeps), None)
-        with np.errstate(all="ignore"):
-            strays = not self.pack.spec.is_alone and self.pack.strays().any()
-            if strays or not (near(self._qpos) and finite(self.pack.read_qvel())):
-                self._contain(self._qpos, substeps, None)
-        if self._contacts is not None:
-            self._contacts.look(self._qpos, self._steps + substeps, containment.missed_contact)
-        if self._sensed:
-            for name, rows in self.pack.take_sensed().items():
-                sensed = self._sensed[name]
-                sensed[...] = rows > 0 if sensed.dtype == bool else rows / substeps
-                sensed[containment.failed] = 0
-        self.observe(ticks[tick])
-        return tick + 1
+        self.tick, self._steps = 0, steps
+        self._moves = moves and self._options.sets_positions
+        return self._start()
 
-    def _push(self, pushes: Pushes, substeps: int) -> None:
-        """Push the bases that are due before a tick."""
-        assert self.draws is not None
-        rows, twists = pushes.due(self._containment.suspended, self.draws.episodes)
+    def _start(self) -> list[NativeExecutor]:
+        """Start the next tick; return the executor if native code runs it, and more, as a whole."""
+        self._step = 0
+        is_quiet = self._faults.begin_tick()
+        executor = self._executor
+        self._runs_whole = False
+        if not isinstance(executor, NativeExecutor):
+            return []
+        if not (is_quiet and self._observes_natively and executor.runs_whole_ticks):
+            return []
+        self._runs_whole = True
+        executor.start(self._moves, 0, self.tick)
+        return [executor]
+
+    def finish(self, ticks: int, substeps: int) -> None:
+        """Run the rest of ``ticks`` of ``substeps`` sim steps, after the common native call for
+        whole ticks.
+        """
+        while True:
+            if self._runs_whole:
+                self._complete(substeps)
+            if self.tick == ticks:
+                return
+            with np.errstate(all="ignore"):  # overflow and invalid values become faults
+                self._run_tick(substeps)
+            self.tick += 1
+            if self.tick < ticks:
+                run_ticks(self._start(), ticks, substeps)
+
+    def _complete(self, substeps: int) -> None:
+        """Complete the ticks of a native call: they are observed, up to an event within a tick."""
+        assert isinstance(self._executor, NativeExecutor)
+        self._runs_whole = False
+        first = self.tick
+        self.tick, self._step = self._executor.complete()
+        self._find_contacts(first, self.tick, substeps)
+
+    def _run_tick(self, substeps: int) -> None:
+        """Run the present tick, or the rest of it, and observe it."""
+        executor, rows = self._executor, self._ticks[self.tick]
+        done, before = self._step, self._steps + self.tick * substeps
+        command = rows.command
+        if done == 0:
+            self._push(substeps)
+            self._sensors.begin(self.pack)
+            if self._faults.suspended.any() or not are_finite(*command):
+                command = self._without_faults(command, before + 1)
+        # An event may come at each sim step, the last one included.
+        while True:
+            if done == substeps:
+                self._take_results()
+            if executor.failed:
+                self._contain(before + done, executor.before, executor.results().returned)
+            if done == substeps:
+                break
+            done = executor.run(command, self._moves, done, substeps)
+        strays = not self.pack.spec.is_alone and self.pack.strays().any()
+        if strays or not (is_near(executor.qpos()) and are_finite(self.pack.read_qvel())):
+            self._contain(before + done, executor.qpos(), None)
+        self._sensors.end(self.pack, substeps, self._faults.failed)
+        self.observe(rows)
+        self._find_contacts(self.tick, self.tick + 1, substeps)
+
+    def _take_results(self) -> None:
+        outputs, last = self._executor.results(), self._last
+        last.effort[...] = outputs.motor
+        last.saturated[...] = False if outputs.saturated is None else outputs.saturated
+        last.guarded[...] = False if outputs.guarded is None else outputs.guarded
+
+    def _push(self, substeps: int) -> None:
+        """Push the bases that are due before a tick of ``substeps`` sim steps."""
+        pushes, draws = self._pushes, self.acting.draws
+        if not pushes.counts:
+            return
+        assert draws is not None
+        rows, twists = pushes.due(self._faults.suspended, draws.episodes)
         if rows:
             self.pack.push(rows, twists)
-            self._measured = self._executor.measure()
-        pushes.advance(substeps)
+            self._executor.measure()
+        pushes.counts["steps"] += substeps
 
-    def _execute(self, command: Command, span: Span, table: Table | None) -> tuple[int, int]:
-        """Run sim steps and handle an event; return the first tick that is not observed, and its
-        steps done.
+    def _find_contacts(self, first: int, until: int, substeps: int) -> None:
+        """Note the first missed contact of each env in the observed ticks ``first`` to ``until``,
+        in their rows too.
         """
-        with np.errstate(all="ignore"):  # overflow and invalid values become faults
-            ran = self._executor.run(self._state, self._measured, command, span, table)
-            self._state = ran.state
-            self._measured = ran.measured
-            rows = self._executor.rows
-            self._steps += (ran.tick - span.tick) * span.steps
-            if ran.done == span.steps:
-                self._motor[...] = rows(ran.outputs.motor)
-                self._saturated[...] = self._mask(ran.outputs.saturated)
-                self._guarded[...] = self._mask(ran.outputs.guarded)
-            if ran.failed:
-                self._contain(rows(ran.before), ran.done, ran.outputs.returned)
-        return ran.tick, ran.done
-
-    def _mask(self, array: Array) -> Array:
-        return False if array is None else self._executor.rows(array)
+        if self._contacts is None or first == until:
+            return
+        _, observation, fault = self._ticks.arrays.at(slice(first, until))
+        steps = self._steps + substeps * np.arange(first + 1, until + 1)
+        self._contacts.look(
+            observation.qpos, steps, self._faults.missed_contact, fault.missed_contact
+        )
 
     def observe(self, rows: Arrays) -> None:
         """Write observation and faults into these envs' rows."""
-        containment, observation = self._containment, rows.observation
-        observation.qpos[...] = self._qpos
+        observation, last = rows.observation, self._last
+        observation.qpos[...] = self._executor.qpos()
         observation.qvel[...] = self.pack.read_qvel(np.float32)
-        observation.effort[...] = self._motor
-        observation.saturated[...] = self._saturated
-        observation.guarded[...] = self._guarded
-        observation.ok[...] = ~containment.failed
+        observation.effort[...] = last.effort
+        observation.saturated[...] = last.saturated
+        observation.guarded[...] = last.guarded
         if observation.base_pose is not None and observation.base_twist is not None:
-            observation.base_pose[...], observation.base_twist[...] = np.split(
-                self.pack.read_base(), [7], axis=1
-            )
-        for name, values in self._sensed.items():
+            pose, twist = np.split(self.pack.read_base(), [7], axis=1)
+            observation.base_pose[...] = pose
+            observation.base_twist[...] = twist
+        for name, values in self._sensors.values.items():
             getattr(observation, name)[...] = values
-        fault = rows.fault
-        fault.step[...], fault.joint[...], fault.cause[...] = (
-            containment.step,
-            containment.joint,
-            containment.cause,
-        )
-        fault.missed_contact[...] = containment.missed_contact
-        if containment.suspended.any():
-            envs = containment.suspended
-            observation.qpos[envs] = containment.suspended_qpos[envs]
-            observation.qvel[envs] = observation.effort[envs] = 0
-            observation.saturated[envs] = observation.guarded[envs] = False
-            if observation.base_twist is not None:
-                observation.base_twist[envs] = 0
+        self._faults.observe(rows)
+
+    def observe_first(self) -> None:
+        """Write observation and faults into the first tick, after a change between runs."""
+        self.observe(self._ticks[0])
+
+    # -- snapshots
 
     def read(self) -> EnvStates:
         """Return the state of these envs, physics and controller."""
-        pack, state = self.pack, self._take_state()
-        friction = {} if state.age is None else {**state.friction._asdict(), AGE: state.age}
+        state, last = self._executor.read_state(), self._last
+        law, motors, friction, guard = state.law, state.motors, {}, {}
+        if state.age is not None:
+            friction = {**state.friction._asdict(), AGE: state.age}
+        if state.guard is not None:
+            guard = {**state.guard._asdict(), CHANGED: last.guarded.copy()}
         return EnvStates(
-            engine=pack.read_state(),
-            effort=self._motor.copy(),
-            saturated=self._saturated.copy(),
-            controller=(
-                state.law.leaves() if isinstance(state.law, bp.PIDState) else dict(state.law)
-            ),
+            engine=self.pack.read_state(),
+            effort=last.effort.copy(),
+            saturated=last.saturated.copy(),
+            controller=law.leaves() if isinstance(law, bp.PIDState) else dict(law),
             friction=friction,
             actuators=(
-                {}
-                if state.motors is None
-                else {**state.motors.leaves(), EPISODE: self._episode.copy()}
+                {} if motors is None else {**motors.leaves(), EPISODE: self._episode.copy()}
             ),
-            guard=(
-                {}
-                if state.guard is None
-                else {**state.guard._asdict(), CHANGED: self._guarded.copy()}
-            ),
-            containment=self._containment.read(),
-            sensors={name: rows.copy() for name, rows in self._sensed.items()},
-            pushes=(
-                {}
-                if self._pushes is None
-                else {name: rows.copy() for name, rows in self._pushes.counts.items()}
-            ),
+            guard=guard,
+            containment=self._faults.read(),
+            sensors=self._sensors.read(),
+            pushes=self._pushes.read(),
         )
 
-    def adopt(self, params: bp.PIDParams, actuators: bp.Actuators | None, draws: Draws) -> None:
-        """Take the params, actuators and draws of a snapshot; :meth:`write` puts them into
-        effect.
+    def write(
+        self,
+        pack: EnginePack,
+        states: EnvStates,
+        params: bp.PIDParams,
+        actuators: bp.Actuators | None,
+        draws: Draws | None,
+    ) -> None:
+        """Continue with ``pack`` in the given state, with the params, actuators and draws of a
+        snapshot.
         """
-        self._drops_actuators = actuators is None and self._own_actuators is not None
-        self.draws = draws
-        self._params = params
-        self._own_actuators = actuators
-        self._acting_params = acting_params(self._options, params, draws)
-
-    def write(self, pack: EnginePack, states: EnvStates) -> None:
-        """Continue with ``pack`` in the given state."""
+        acting, last = self.acting, self._last
         self.pack = pack
-        if self._own_actuators is not None or self._drops_actuators:
-            pack.write_joints(self._take_actuators())
+        acting.draws = draws
+        acting.set_params(params)
+        state = self._executor.read_state()
+        if actuators is not None or acting.actuators is not None:
+            self._with_actuators(state, actuators)
         pack.write_state_rows(states.engine)
-        self._containment.write(states.containment)
-        pack.suspend(self._containment.suspended)
+        self._faults.write(states.containment)
+        pack.suspend(self._faults.suspended)
         pack.write_qf(states.effort)
-        state = StepState(
-            states.controller if self._controller else bp.PIDState(**states.controller)
-        )
-        self._saturated[...], self._motor[...] = states.saturated, states.effort
-        for name, rows in states.sensors.items():
-            self._sensed[name][...] = rows
-        if self._pushes is not None:
-            self._pushes.counts = {name: rows.copy() for name, rows in states.pushes.items()}
+        last.effort[...], last.saturated[...] = states.effort, states.saturated
+        self._sensors.write(states.sensors)
+        self._pushes.write(states.pushes)
+        law: Any = states.controller
+        state = StepState(law if self._controller else bp.PIDState(**law))
         if states.friction:
             leaves = (states.friction[name] for name in FrictionState._fields)
             state = state._replace(friction=FrictionState(*leaves), age=states.friction[AGE])
-        if self._actuators is not None:
+        if acting.motors is not None:
             motors = dict(states.actuators)
             self._episode = motors.pop(EPISODE).copy()
             state = state._replace(motors=ActuatorState(**motors))
         if states.guard:
-            self._guarded[...] = states.guard[CHANGED]
-            state = state._replace(
-                guard=GuardState(*(states.guard[name] for name in GuardState._fields))
-            )
-        self._state = state
-        self._prepare()
-        self._write_drives()
+            last.guarded[...] = states.guard[CHANGED]
+            guard = GuardState(*(states.guard[name] for name in GuardState._fields))
+            state = state._replace(guard=guard)
+        self._prepare(self._setup(state.motors), state)
         if self._contacts is not None:
             self._contacts.place(np.ones(pack.size, bool))
 
-    def _vary(self, mask: NDArray[np.bool_]) -> None:
-        """Put the draws of the envs of ``mask`` (M,) into effect, before these envs are placed."""
-        rows = np.flatnonzero(mask).tolist()
-        if self._options.randomization is None or self.draws is None or not rows:
-            return
-        self._take_state()
-        if self._options.randomization.changes_robot:
-            self.pack.vary(rows, variation(self._options, len(rows), self.draws.for_envs(rows)))
-        self.pack.write_joints(self._take_actuators(), rows)
-        self.set_params(self._params)
-
     # -- envs that fail
-    # ----------------------------------------------------------------------------------------
 
-    def _contain(self, before: Float64, done: int, returned: Any) -> None:
-        """Suspend or reset the envs that failed ``done`` substeps into a tick, after positions
-        ``before`` (M, dof).
+    def _contain(self, step: int, before: Float64, returned: Any) -> None:
+        """Suspend or reset the envs that failed in sim step ``step``, after positions ``before``
+        (M, dof).
 
         ``returned`` is the effort of the caller's own controller, or None.
         """
-        containment, step = self._containment, self._steps + done
-        qpos, qvel = self.pack.read_qpos(), self.pack.read_qvel()
-        bad = far(qpos) | ~np.isfinite(qvel) | self.pack.strays()[:, None]
-        # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first
-        # joint.
-        failed = bad.any(1, keepdims=True)
-        source = ~np.isfinite(self.pack.qf) & failed
+        self._executor.failed = False
         if returned is not None:
-            wanted = clip(self._executor.rows(returned), *self._constants.limits, np)
-            wrong = ~np.isfinite(wanted) & failed
-            wrong = np.where(
-                wrong.any(1, keepdims=True), wrong, source
-            )  # actuators may have delayed it
-            containment.fail(wrong, "effort", step, before)
-        containment.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, before)
-        if (limit := self._options.speed_limit) is not None:
-            containment.fail((np.abs(qvel) > limit) & ~failed, "speed", step, before)
+            returned = clip(returned, *self._executor.setup.constants.limits, np)
+        limit = self._options.speed_limit
+        self._faults.fail_state(self.pack, step, before, returned, limit)
         self._place_failed()
 
-    def _without_faults(self, command: Command) -> Command:
-        """Mark the envs with non-finite commands as failed; return commands with neutral values for
-        all failed envs.
+    def _without_faults(self, command: Command, step: int) -> Command:
+        """Mark the envs with non-finite commands as failed in sim step ``step``; return commands
+        with neutral values for all failed envs.
         """
-        containment = self._containment
+        faults, options = self._faults, self._options
         for cause, rows in command._asdict().items():
-            if rows is not None:
-                containment.fail(~np.isfinite(rows), cause, self._steps + 1, self._qpos)
+            faults.fail(~np.isfinite(rows), cause, step, self._executor.qpos())
         self._place_failed()
-        neutral, failed = (
-            (
-                self._qpos if self._options.sets_positions else self._options.command.neutral,
-                0.0,
-                0.0,
-                0.0,
-            ),
-            containment.failed[:, None],
-        )
-        both = zip(command, neutral, strict=True)
-        return Command._make(
-            None if rows is None else np.where(failed, value, rows) for rows, value in both
-        )
+        setpoint = self._executor.qpos() if options.sets_positions else options.command.neutral
+        failed = faults.failed[:, None]
+        neutral = Command(setpoint, 0.0, 0.0, 0.0)
+        return Command(*map(np.where, [failed] * len(neutral), neutral, command))
 
     def _place_failed(self) -> None:
         """Place the envs that have failed since the last call: suspended, or at their start."""
-        containment = self._containment
-        failed = containment.pop_unplaced()
-        if failed.any() and containment.suspends:
-            self._place(
-                failed, containment.suspended_qpos, np.zeros_like(containment.suspended_qpos)
-            )
-        elif failed.any():
-            self._place(failed, containment.start_qpos, containment.start_qvel)
+        faults = self._faults
+        failed = faults.pop_unplaced()
+        if not failed.any():
+            return
+        qpos, qvel = faults.start_qpos, faults.start_qvel
+        if faults.suspends:
+            qpos, qvel = faults.suspended_qpos, np.zeros_like(qvel)
+        self._place(failed, qpos, qvel)
 
     def _place(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64) -> None:
         """Place the envs of ``mask`` (M,), and restart their control."""
+        pack, acting, executor = self.pack, self.acting, self._executor
+        setup, state = executor.setup, executor.read_state()
+        constants, model = setup.constants, setup.layout.model
         rows = np.flatnonzero(mask)
-        pack = self.pack
-        state = self._take_state()
-        base = None if pack.spec.fixed_base else self._containment.start_base[rows]
+        base = None if pack.spec.fixed_base else self._faults.start_base[rows]
         pack.write_state(rows.tolist(), qpos[rows], qvel[rows], base)
-        pack.suspend(self._containment.suspended)
-        self._motor[mask], self._saturated[mask], self._guarded[mask] = 0.0, False, False
-        if self._pushes is not None and self.draws is not None:
-            self._pushes.begin(mask, self.draws.episodes)
-        self._measured = self._executor.measure()
+        pack.suspend(self._faults.suspended)
+        for last in self._last[1:4]:
+            last[mask] = 0
+        if acting.draws is not None:
+            self._pushes.begin(mask, acting.draws.episodes)
         if self._contacts is not None:
             self._contacts.place(mask)
-        layout, qpos = self._layout, self._qpos
-        state = reset_guard(self._constants, state, qpos, mask)
-        if self._actuators is not None and state.motors is not None:
+        executor.measure()
+        qpos, qvel = pack.read_qpos(), pack.read_qvel()
+        state = reset_guard(setup, state, qpos, mask)
+        if acting.motors is not None and state.motors is not None:
             self._episode[mask] += 1
-            gravity, coriolis = passive_forces(self._options)
-            holding = (
-                self._constants.coupling.efforts(pack.passive_force(gravity, coriolis))
-                if gravity
-                else None
-            )
-            qvel = pack.read_qvel()
-            fresh = init_motors(
-                self._actuators, pack, qpos, self._episode, qvel=qvel, effort=holding
-            )
+            holding = None
+            if setup.layout.gravity:
+                passive = pack.passive_force(True, setup.layout.coriolis)
+                holding = constants.coupling.efforts(passive)
+            start = {"qvel": qvel, "effort": holding}
+            fresh = init_motors(acting.motors, pack, qpos, self._episode, **start)
             motors = bp.motors.reset(state.motors, fresh, mask)
             state = state._replace(motors=motors)
-            model = layout.model
-            noise = model.noise(self._constants.motors, motors, qpos)
-            _, qpos, _ = advance_measurement(
-                self._constants.motors, motors, qpos, qvel, noise, model.stages
-            )
+            # The law starts at the joints' state as the sensors show it.
+            noise = model.noise(constants.motors, motors, qpos)
+            _, qpos, _ = advance_measurement(constants.motors, motors, qpos, qvel, noise)
         if self._controller is None:
-            state = state._replace(law=bp.reset(self._acting_params, state.law, qpos, mask))
+            state = state._replace(law=bp.reset(acting.acting_params, state.law, qpos, mask))
         else:
             state = state._replace(law=self._controller.reset(state.law, mask))
-        self._state = reset_friction(layout, self._constants, state, pack, mask)
+        executor.write_state(reset_friction(setup, state, mask))

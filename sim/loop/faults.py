@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Array, Bool, Rows
+from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.sim.engine.native.interface import FARTHEST
-from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.step_values import Measured
-from batchpid.sim.runner_keywords import FaultAction
+from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.loop.arrays import Arrays, FaultArrays
+from batchpid.sim.options.groups import FaultAction
 
 CAUSES = (
     *("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort"),
@@ -60,12 +60,12 @@ class Fault(NamedTuple):
     """"joint", or "entry" for the setpoint of a command whose entries are not joints."""
 
     def __str__(self) -> str:
-        known = {
+        texts = {
             "state": f"its state is not finite, or a position is beyond {FARTHEST:,.0f} rad or m",
             "speed": "it is faster than speed_limit",
             "effort": "the effort that its controller returned is not finite",
         }
-        cause = known.get(self.cause, f"the {self.cause} given for it is not finite")
+        cause = texts.get(self.cause, f"the {self.cause} given for it is not finite")
         action = "held until it is reset" if self.action == "hold" else "reset"
         return (
             f"env {self.env}, {self.kind} {self.joint!r}: {cause}, at step {self.step}"
@@ -142,26 +142,32 @@ class FaultContainment:
     start_base
         Pose and twist of the base (M, 13) to which each env is reset, and where it is suspended;
         unused on fixed ones.
-    step, joint, cause
-        Last fault of each env (M,): sim step (-1: none), joint, and index into :data:`CAUSES`.
-    missed_contact
-        Sim step of the first missed contact of each env since its reset (M,); 0: none.
+    step, joint, cause, missed_contact
+        :class:`batchpid.sim.loop.arrays.FaultArrays` of the envs (M,).
     """
 
     _STATE = (
         *("suspended", "failed", "start_qpos", "start_qvel", "start_base", "suspended_qpos"),
-        *("step", "joint", "cause", "missed_contact"),
+        *FaultArrays._fields,
     )
 
     def __init__(self, size: int, dof: int, action: FaultAction) -> None:
         self.suspends = action == "hold"
         self.suspended, self.failed, self._unplaced = (np.zeros(size, bool) for _ in range(3))
-        self.start_qpos, self.start_qvel, self.suspended_qpos = (
-            np.zeros((size, dof)) for _ in range(3)
-        )
+        self.start_qpos, self.start_qvel, self.suspended_qpos = np.zeros((3, size, dof))
         self.start_base = np.tile(ORIGIN, (size, 1))
         self.step = np.full(size, -1)
-        self.joint, self.cause, self.missed_contact = (np.zeros(size, int) for _ in range(3))
+        self.joint, self.cause, self.missed_contact = np.zeros((3, size), int)
+
+    @property
+    def rows(self) -> FaultArrays:
+        """The last faults."""
+        return FaultArrays(self.step, self.joint, self.cause, self.missed_contact)
+
+    def begin_tick(self) -> bool:
+        """Forget the failures of the last tick; return whether no env is suspended."""
+        self.failed[...] = self.suspended
+        return not np.logical_or.reduce(self.suspended)
 
     def clear(self, mask: Bool) -> None:
         """Clear the faults and missed contacts of the envs of ``mask`` (M,), which are reset."""
@@ -176,21 +182,61 @@ class FaultContainment:
         if not failed.any():
             return
         new = failed & ~self.failed
-        self.step[new], self.joint[new], self.cause[new] = (
-            step,
-            bad.argmax(1)[new],
-            CAUSES.index(cause),
-        )
+        self.step[new] = step
+        self.joint[new] = bad.argmax(1)[new]
+        self.cause[new] = CAUSES.index(cause)
         self.failed |= failed
         self._unplaced |= failed
         if self.suspends:
             self.suspended_qpos[new] = np.where(np.isfinite(qpos), qpos, self.start_qpos)[new]
             self.suspended |= failed
 
+    def fail_state(
+        self,
+        pack: EnginePack,
+        step: int,
+        before: Float64,
+        returned: Float64 | None,
+        speed_limit: Array,
+    ) -> None:
+        """Note the faults of envs whose state is not finite, too far or too fast after sim step
+        ``step``; ``before`` are the positions before it (M, dof).
+
+        ``returned`` is the effort of the caller's own controller, within the limits; or None.
+        """
+        qpos, qvel = pack.read_qpos(), pack.read_qvel()
+        bad = ~(np.abs(qpos) <= FARTHEST) | ~np.isfinite(qvel) | pack.strays()[:, None]
+        # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first
+        # joint.
+        failed = bad.any(1, keepdims=True)
+        source = ~np.isfinite(pack.qf) & failed
+        if returned is not None:
+            wrong = ~np.isfinite(returned) & failed
+            # Actuators may have delayed it.
+            wrong = np.where(wrong.any(1, keepdims=True), wrong, source)
+            self.fail(wrong, "effort", step, before)
+        self.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, before)
+        if speed_limit is not None:
+            self.fail((np.abs(qvel) > speed_limit) & ~failed, "speed", step, before)
+
     def pop_unplaced(self) -> Bool:
         """Return the envs that failed since the last call (M,), which are to be placed."""
         unplaced, self._unplaced = self._unplaced, np.zeros_like(self._unplaced)
         return unplaced
+
+    def observe(self, rows: Arrays) -> None:
+        """Write the faults into the rows of a tick, and the observation of suspended envs."""
+        observation = rows.observation
+        observation.ok[...] = ~self.failed
+        for table, faults in zip(rows.fault, self.rows, strict=True):
+            table[...] = faults
+        if not (envs := self.suspended).any():
+            return
+        observation.qpos[envs] = self.suspended_qpos[envs]
+        observation.qvel[envs] = observation.effort[envs] = 0
+        observation.saturated[envs] = observation.guarded[envs] = False
+        if observation.base_twist is not None:
+            observation.base_twist[envs] = 0
 
     def read(self) -> dict[str, Rows]:
         """Return the state by name, one row per env, for :meth:`write`."""
@@ -202,31 +248,19 @@ class FaultContainment:
             getattr(self, name)[...] = state[name]
 
 
-def near(qpos: NDArray[np.float64]) -> bool:
+def is_near(qpos: NDArray[np.float64]) -> bool:
     """Return whether all positions are certainly finite and below :data:`FARTHEST`, in one pass.
 
-    The sum of squares may be larger although each position is near: the exact test is :func:`far`.
+    The sum of squares may be larger although each position is near.
     """
     return bool(np.vdot(qpos, qpos) <= FARTHEST**2)
 
 
-def far(qpos: NDArray[np.float64]) -> Bool:
-    """Return which positions are not finite, or beyond :data:`FARTHEST`."""
-    return ~(np.abs(qpos) <= FARTHEST)
-
-
-def sound(measured: Measured, speed_limit: Array) -> bool:
-    """Return whether certainly no robot has failed."""
-    return near(measured.qpos) and (
-        speed_limit is None or bool((np.abs(measured.qvel) <= speed_limit).all())
-    )
-
-
-def finite(*arrays: Rows | None) -> bool:
+def are_finite(*arrays: Rows) -> bool:
     """Return whether all entries are finite and below 1e150, in one pass: otherwise a sum of
     squares is inf or NaN.
     """
     for array in arrays:  # noqa: SIM110
-        if array is not None and not math.isfinite(np.vdot(array, array)):
+        if not math.isfinite(np.vdot(array, array)):
             return False
     return True

@@ -21,11 +21,14 @@ from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop.acting_draws import make_pack
 from batchpid.sim.loop.arrays import Arrays, Ticks
+from batchpid.sim.loop.backend import native_obstacle
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_group import EnvGroup
 from batchpid.sim.loop.failure import Failure, RunError, order
+from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.loop.xla_executor import ROWS
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 
 
@@ -50,11 +53,9 @@ class Loop:
     ) -> None:
         robot = options.robot
         self.options, self.arrays = options, arrays
-        self.ticks = Ticks(arrays)
-        """Input and output of each tick."""
         self._first_env = envs.start
         self._scene = SceneSpec(
-            urdf=robot.urdf,
+            tables=robot.tables,
             ignored=robot.ignored_pairs,
             joints=robot.joints,
             dissipation=robot.dissipation,
@@ -63,16 +64,20 @@ class Loop:
             **options.values_for("scene"),
         )
         self._steps = 0
+        self._given: tuple[bool, ...] = ()
         self._workspace: dict[Any, Any] = {}
-        count, size = envs.stop - envs.start, options.load_engine().group_size
-        slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
         controller = None if isinstance(options.control, str) else OwnController(options)
-        self.groups = [
-            EnvGroup(self._build(group), group, params.for_envs(group), options, controller)
-            for group in slices
-        ]
+        count, size = envs.stop - envs.start, group_size(options)
+        self.groups = list[EnvGroup]()
+        for first in range(0, count, size):
+            rows = slice(first, min(first + size, count))
+            ticks = Ticks(arrays.at((slice(None), rows)))
+            own_params = params.for_envs(rows)
+            group = EnvGroup(self._build(rows), rows, own_params, options, controller, ticks)
+            self.groups.append(group)
         self.set_actuators(None if options.actuators is None else options.actuators.for_envs(envs))
-        self._group_ticks = [Ticks(arrays.at((slice(None), group))) for group in slices]
+        # Packs that share working memory cannot run in one native call.
+        self._batches = [[group] for group in self.groups] if self._workspace else [self.groups]
 
     def _build(self, envs: slice, draws: Draws | None = None) -> EnginePack:
         first = self.options.first_env + self._first_env + envs.start
@@ -95,11 +100,12 @@ class Loop:
         ``draws`` apply to all envs from now on; they differ from the previous draws in these envs
         alone.
         """
-        for group, ticks in zip(self.groups, self._group_ticks, strict=True):
-            group.draws = draws.for_envs(group.envs)
-            own = None if base is None else base[group.envs]
-            group.reset(mask[group.envs], qpos[group.envs], qvel[group.envs], self._steps, own)
-            group.observe(ticks[0])
+        for group in self.groups:
+            rows = group.envs
+            group.acting.draws = draws.for_envs(rows)
+            start = None if base is None else base[rows]
+            group.reset(mask[rows], qpos[rows], qvel[rows], self._steps, start)
+            group.observe_first()
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state is kept."""
@@ -115,42 +121,51 @@ class Loop:
         """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the
         seconds it took.
 
-        ``given`` says which arrays of the commands are used
-        (:attr:`batchpid.sim.loop.arrays.Command.given`). Raises RunError if a group failed. The
-        other groups complete the run, so that the first failure does not depend on grouping.
+        ``given`` says which arrays of the commands are given
+        (:attr:`batchpid.sim.loop.arrays.Command.given`); the others are set to 0. Raises RunError
+        if a group failed. The other groups complete the run, so that the first failure does not
+        depend on grouping.
         """
         began = time.perf_counter()
-        failures = []
-        for group, group_ticks in zip(self.groups, self._group_ticks, strict=True):
-            done = 0
-            try:
-                while done < ticks:
-                    done = group.run(
-                        group_ticks, given, done, ticks, substeps, self._steps + done * substeps
-                    )
-            except Exception as error:
-                failures.append(self._failure(error, group, done, self._steps + done * substeps))
+        if given != self._given:
+            self._given = given
+            for table, is_given in zip(self.arrays.command, given, strict=True):
+                if not is_given:
+                    table[...] = 0
+        failures = list[Failure]()
+        for groups in self._batches:
+            executors = list[NativeExecutor]()
+            for group in groups:
+                executors += group.start(given[1], self._steps)
+            # First whole ticks of all groups in one native call, then the rest of each group.
+            run_ticks(executors, ticks, substeps)
+            for group in groups:
+                try:
+                    group.finish(ticks, substeps)
+                except Exception as error:
+                    failures.append(self._failure(error, group, substeps))
         if failures:
             raise RunError(min(failures, key=order))
         self._steps += ticks * substeps
         return time.perf_counter() - began
 
-    def _failure(self, error: Exception, group: EnvGroup, ticks: int, steps: int) -> Failure:
-        """Return the failure of a group after ``ticks`` whole ticks of a run; ``steps`` counts from
-        the start.
-        """
+    def _failure(self, error: Exception, group: EnvGroup, substeps: int) -> Failure:
+        """Return the failure of a group in a run of ticks of ``substeps``."""
+        steps = self._steps + group.tick * substeps
         step = steps + 1
         if isinstance(error, ControllerError):
             step = steps + error.step
             error = error.at(step, self.options.timestep)
-        return Failure(step, self._first_env + group.envs.start, ticks, error)
+        return Failure(step, self._first_env + group.envs.start, group.tick, error)
 
     def snapshot(self) -> EnvStates:
         """Return the state of every env. It is a barrier: the loop goes on as if restored from
         it.
         """
         states = EnvStates.join([group.read() for group in self.groups])
-        self._place(states)
+        for group in self.groups:
+            acting = group.acting
+            self._restore(group, states, acting.params, acting.actuators, acting.draws)
         return states
 
     def restore(self, snapshot: Snapshot, draws: Draws) -> None:
@@ -159,21 +174,26 @@ class Loop:
         for group in self.groups:
             envs, motors = group.envs, snapshot.actuators
             motors = None if motors is None else motors.for_envs(envs)
-            group.adopt(snapshot.params.for_envs(envs), motors, draws.for_envs(envs))
-        self._place(snapshot.states)
-        for group, ticks in zip(self.groups, self._group_ticks, strict=True):
-            group.observe(ticks[0])
+            params = snapshot.params.for_envs(envs)
+            self._restore(group, snapshot.states, params, motors, draws.for_envs(envs))
+            group.observe_first()
 
-    def _place(self, states: EnvStates) -> None:
+    def _restore(
+        self,
+        group: EnvGroup,
+        states: EnvStates,
+        params: bp.PIDParams,
+        actuators: bp.Actuators | None,
+        draws: Draws | None,
+    ) -> None:
         # The contact caches of some engines, and the order in which they solve contacts, depend on
         # the past. A new world has no past.
-        varies = self.options.randomization is not None and self.options.randomization.changes_robot
-        for group in self.groups:
-            pack = group.pack
-            if varies or not pack.state_is_complete:
-                pack.close()
-                pack = self._build(group.envs, group.draws)
-            group.write(pack, states.for_envs(group.envs))
+        randomization, pack = self.options.randomization, group.pack
+        varies = randomization is not None and randomization.changes_robot
+        if varies or not pack.state_is_complete:
+            pack.close()
+            pack = self._build(group.envs, draws)
+        group.write(pack, states.for_envs(group.envs), params, actuators, draws)
 
     def state_sizes(self) -> list[int]:
         """Return the number of values in the engine's state of each env."""
@@ -190,3 +210,11 @@ class Loop:
         for group in self.groups:
             group.pack.close()
         self.groups = []
+
+
+def group_size(options: RunnerOptions) -> int:
+    """Return the number of envs of a group, which changes no result."""
+    size = options.load_engine().group_size
+    is_native = options.backend == "numpy" and not native_obstacle(options)
+    # Calls of NumPy and XLA have an overhead, which more envs share.
+    return size if is_native else max(size, ROWS)

@@ -1,141 +1,201 @@
-"""Ticks in native code: one call of the extension runs them until an event needs Python.
-
-With a controller in Python, or more than MOST_SUMMED joints, the stages run in NumPy. One native
-call then applies efforts, does the engine's step and reads the state.
+"""Ticks in native code: one call of the extension runs those of several groups, until an event
+needs Python.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.trees import leaves, mapped
 from batchpid.native.operations import MOST_SUMMED
-from batchpid.sim.engine.protocol import CompiledModel, CompiledPack, CompiledStep, DrivenPack
+from batchpid.sim.engine import native
+from batchpid.sim.engine.native import interface
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.native_ticks import NativeTicks, Table
-from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran, Span
-from batchpid.sim.loop.step_values import Constants, Layout, Measured, StepState, Values
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.loop.native_program import Buffers, Table, TickProgram
+from batchpid.sim.loop.numpy_executor import EngineSteps
+from batchpid.sim.loop.step_setup import Setup
+from batchpid.sim.loop.step_values import Measured, Outputs, StepState
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
+_NO_NOISE = 1 << interface.STATUS.index("no_noise")
 
-class NativeExecutor(NumPyExecutor):
-    """Executor of control steps in native code, for the robots of ``pack``; ``layout`` has its
-    model functions.
+
+class NativeExecutor:
+    """Executor of the sim steps of the robots of ``setup`` in native code.
+
+    It has the methods of :class:`batchpid.sim.loop.numpy_executor.NumPyExecutor`. With
+    :func:`run_ticks` it also runs whole ticks, with their commands and observations in ``table``.
     """
 
-    _pack: CompiledPack
+    def __init__(self, setup: Setup, state: StepState, table: Table) -> None:
+        self.setup = setup
+        self._table = table
+        self._engine = EngineSteps(setup)
+        shape = table.effort.shape
+        command = Command(*np.zeros((4, *shape)))
+        if setup.layout.control == "custom":  # it has its own copy of setpoints, of any size
+            command = Command(None, feedforward=command.feedforward)
+        measured = Measured(*np.zeros((3, *shape)))
+        self._buffers = Buffers(_copied(state), command, measured, np.zeros(shape))
+        self._programs: dict[bool, TickProgram] = {}
+        self._program: TickProgram | None = None
+        self.failed = False
+        self.measure()
 
-    def __init__(
-        self, options: RunnerOptions, pack: CompiledPack, layout: Layout, constants: Constants
-    ) -> None:
-        super().__init__(options, pack, layout, constants)
-        self._step: CompiledStep | None = None
-        self._bound: object = None
-        self._ticks: dict[tuple[bool, ...], NativeTicks] = {}
-        self._reads_qvel = True  # for the observation
-        self._steps_read_force = pack.steps_read_force(self._gravity, self._coriolis)
-        self._force: CompiledModel | None = None
-        if (layout.measures and self._gravity) or (
-            self._reads_force and not self._steps_read_force
-        ):
-            self._force = pack.force_model()
-        has_native_law = layout.control != "custom" or _is_native(self._controller)
-        self._compiles = has_native_law and is_compiled(constants, pack.dof)
-
-    def run(
-        self,
-        state: StepState,
-        measured: Measured,
-        command: Command,
-        span: Span,
-        table: Table | None = None,
-    ) -> Ran:
-        """Run sim steps until an event needs Python: an env may have failed, or a command is not
-        finite.
-
-        With ``table``, its ticks run: commands are read from it, and observations are written to
-        it. Otherwise one tick runs under ``command``.
+    @property
+    def runs_whole_ticks(self) -> bool:
+        """Whether :func:`run_ticks` can be used: a native controller takes setpoints from
+        Python.
         """
-        if not self._compiles:
-            return super().run(state, measured, command, span)
-        if self._layout.control == "custom":  # a native controller takes setpoints from Python
-            table = None
-        ticks = self._ticks_for(state, command)
-        ticks.load(state, measured, None if table else command)
-        if table:
-            ticks.exchange(table)
-        until = span.until if table else span.tick + 1
-        tick, done, status = ticks.run(
-            self._prepared(), span.tick, span.begin, until, span.steps, table is not None
-        )
-        failed = self._prepared().may_have_failed(status)
-        return Ran(ticks.state, ticks.outputs, ticks.measured, ticks.before, tick, done, failed)
+        return self.setup.layout.control != "custom"
 
-    def numpy_state(self, state: StepState) -> StepState:
-        """Return a copy of ``state``, since the next sim steps overwrite its arrays."""
-        own = (
-            {name: np.array(leaf) for name, leaf in state.law.items()}
-            if isinstance(state.law, dict)
-            else state.law
-        )
-        return mapped(np.array, state._replace(law=own))
+    @property
+    def before(self) -> Rows:
+        """Positions before the last sim step (M, dof)."""
+        return self._buffers.before
 
-    def _step_engine(self, values: Values) -> Values:
-        """Do a sim step by one native call; see :meth:`NumPyExecutor._step_engine`."""
-        qf = values.outputs.qf
-        qpos, qvel, passive = np.empty((3, *qf.shape))
-        status = self._prepared()(np.ascontiguousarray(qf, np.float64), qpos, qvel, passive)
-        if not self._reads_force:
-            passive = None
-        elif not self._steps_read_force:
-            passive = self._pack.passive_force(self._gravity, self._coriolis)
-        self._failed = self._prepared().may_have_failed(status)
-        return values._replace(measured=Measured(qpos, qvel, passive))
+    def measure(self) -> None:
+        """Read the robots, after a change of their states between sim steps."""
+        for array, rows in zip(self._buffers.measured, self._engine.measure(), strict=True):
+            array[...] = rows
 
-    def _prepared(self) -> CompiledStep:
-        """Return the compiled sim step of the present robots and systems."""
-        pack = self._pack
-        if self._step is None or self._bound is not pack.calls:
-            limit = None if self._speed_limit is None else np.asarray(self._speed_limit)
-            reads_force = self._reads_force and self._steps_read_force
-            force = (self._gravity, self._coriolis) if reads_force else (False, False)
-            drives = self._layout.control == "drive" and isinstance(pack, DrivenPack)
-            self._bound, self._step = (
-                pack.calls,
-                pack.compiled_step(*force, self._reads_qvel, limit, drives),
+    def qpos(self) -> Float64:
+        """Return the positions of the last reading (M, dof)."""
+        qpos: Float64 = self._buffers.measured.qpos
+        return qpos
+
+    def read_state(self) -> StepState:
+        """Return the state of the control as new NumPy arrays."""
+        return _copied(self._buffers.state)
+
+    def write_state(self, state: StepState) -> None:
+        """Replace the state of the control; it has the arrays of the state before."""
+        for array, rows in zip(_arrays(self._buffers.state), _arrays(state), strict=True):
+            array[...] = rows
+        if state.motors is not None:  # its noise is drawn anew for another object as the key
+            motors = self._buffers.state.motors._replace(key=state.motors.key)
+            self._change_state(motors=motors)
+
+    def _change_state(self, **parts: Any) -> None:
+        self._buffers = self._buffers._replace(state=self._buffers.state._replace(**parts))
+
+    def results(self) -> Outputs:
+        """Return the results of the last sim step."""
+        assert self._program is not None
+        return self._program.outputs
+
+    def run(self, command: Command, moves: bool, begin: int, end: int) -> int:
+        """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
+        program = self.start(moves, begin)
+        if program.control is not None:
+            program.control.load(command.setpoint)
+        for array, rows in zip(self._buffers.command, command, strict=True):
+            if array is not None:
+                array[...] = rows
+        run_ticks([self], 1, end, whole=False)
+        _, done = self.complete()
+        return done
+
+    def start(self, moves: bool, step: int = 0, tick: int = 0) -> TickProgram:
+        """Prepare the next ticks, from sim step ``step`` of ``tick`` on; return their program."""
+        if moves not in self._programs:
+            layout = self.setup.layout._replace(moves=moves)
+            noise = mapped(lambda block: block[0].copy(), self._noise())
+            self._programs[moves] = program = TickProgram(
+                self.setup._replace(layout=layout),
+                self._buffers,
+                self._table,
+                noise,
+                self._engine.native_force,
             )
-        return self._step
+            if program.control is not None:
+                self._change_state(law=program.control.state)
+        self._program = program = self._programs[moves]
+        program.tick.tick, program.tick.step = tick, step
+        return program
 
-    def _ticks_for(self, state: StepState, command: Command) -> NativeTicks:
-        """Return the ticks for commands with these arrays."""
-        key = command.given
-        if key not in self._ticks:
-            compensated = self._gravity, self._coriolis
-            given = (
-                self._layout,
-                self._constants,
-                state,
-                command,
-                compensated,
-                self._controller,
-                self._force,
-            )
-            self._ticks[key] = NativeTicks(self._pack, *given)
-        return self._ticks[key]
+    def complete(self) -> tuple[int, int]:
+        """Complete ticks that ran: return the first tick that is not observed, and its sim steps
+        that are done.
+
+        RuntimeError if the engine has failed.
+        """
+        assert self._program is not None
+        tick = self._program.tick
+        self.failed = self._engine.compiled().may_have_failed(tick.status)
+        return tick.tick, tick.step
+
+    def prepare(self) -> Any:
+        """Return the program for the extension, with robots and noise prepared."""
+        assert self._program is not None
+        tick = self._program.tick
+        tick.group = self._engine.compiled().prepare()
+        noise = leaves(self._noise())
+        tick.drawn = min(map(len, noise), default=-1)
+        for place, block in enumerate(noise):
+            tick.noise[place] = block.ctypes.data
+        return self._program.bound
+
+    def is_waiting(self) -> bool:
+        """Count the sim steps that ran; return whether the rest waits for noise."""
+        assert self._program is not None
+        tick, motors = self._program.tick, self._buffers.state.motors
+        if motors is not None and motors.step is not None:
+            motors.step[...] += tick.ran
+        return bool(tick.status & _NO_NOISE)
+
+    def _noise(self) -> Any:
+        """Return the noise of positions and velocities in the next sim steps (steps, M, dof)."""
+        layout, motors = self.setup.layout, self._buffers.state.motors
+        if motors is None or not layout.measures:
+            return ()
+        return layout.model.noise.from_step(self.setup.constants.motors, motors, self.before)
 
 
-def _is_native(controller: Any) -> bool:
-    """Return whether a controller is native: operational-space control."""
-    if not isinstance(controller, OperationalSpace):
-        return False
-    return controller.bound(*np.zeros((3, 1, controller.tree.dof))) is not None
+def run_ticks(
+    executors: Sequence[NativeExecutor], until: int, steps: int, whole: bool = True
+) -> None:
+    """Run ticks of ``steps`` sim steps of several groups in one native call, up to the tick
+    ``until``, from where each was started; :meth:`NativeExecutor.complete` tells where each is.
 
-
-def is_compiled(constants: Constants, dof: int) -> bool:
-    """Return whether the control step can be a program: in float64, with at most MOST_SUMMED
-    joints.
+    A group stops at an event that needs Python: an env that may have failed, and with ``whole`` a
+    command or velocities that are not finite. With ``whole``, commands and observations are those
+    of the tables; else the ticks stop at the end of the first one.
     """
-    return dof <= MOST_SUMMED and all(leaf.dtype != np.float32 for leaf in leaves(constants))
+    call = native.extension("_gateway").ticks
+    while executors:
+        call(tuple([executor.prepare() for executor in executors]), until, steps, whole)
+        executors = [executor for executor in executors if executor.is_waiting()]
+
+
+def runs_natively(setup: Setup) -> bool:
+    """Return whether the control step can be native: a law of batchpid in float64, with at most
+    MOST_SUMMED joints.
+    """
+    control = setup.options.control
+    if isinstance(control, OperationalSpace):
+        if control.bound(*np.zeros((3, 1, control.tree.dof))) is None:
+            return False
+    elif not isinstance(control, str):
+        return False
+    constants = leaves(setup.constants)
+    return setup.pack.dof <= MOST_SUMMED and all(leaf.dtype != np.float32 for leaf in constants)
+
+
+def _copied(state: StepState) -> StepState:
+    """Return new arrays of a state."""
+    law = state.law
+    if isinstance(law, dict):
+        law = {name: np.array(leaf) for name, leaf in law.items()}
+    return mapped(partial(np.array, order="C"), state._replace(law=law))
+
+
+def _arrays(state: StepState) -> list[Rows]:
+    """Return all arrays of a state."""
+    law = state.law
+    return [*leaves(state), *(law.values() if isinstance(law, dict) else ())]

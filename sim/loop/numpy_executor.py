@@ -1,256 +1,179 @@
-"""Sim steps of a tick in NumPy: control step, efforts, step of the engine, reading."""
+"""Sim steps of a tick in NumPy, stage by stage: the oracle of the other executors, and the executor
+of controllers in Python.
+"""
 
 from __future__ import annotations
 
-from functools import cached_property, partial
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Float64, Rows
-from batchpid.law.coefficients import spread
-from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
-from batchpid.native.compiled import compiled_stages
-from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
-from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
+from batchpid.arrays.array_types import Float64, Rows
+from batchpid.sim.engine.protocol import CompiledPack, CompiledStep, EnginePack
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.control_step import COUPLING_STEPS, REFRESH_STEPS, sim_step
-from batchpid.sim.loop.custom import OwnController, controller_errors
-from batchpid.sim.loop.faults import sound
-from batchpid.sim.loop.step_setup import needs_qvel
+from batchpid.sim.loop.control_step import COUPLING_STEPS, sim_step
+from batchpid.sim.loop.custom import controller_errors
+from batchpid.sim.loop.faults import is_near
+from batchpid.sim.loop.model_functions import steps_natively
+from batchpid.sim.loop.step_setup import Setup, moves_drives
 from batchpid.sim.loop.step_values import (
     Constants,
     Layout,
     Measured,
-    Model,
     Outputs,
     Step,
     StepState,
     Values,
 )
-from batchpid.sim.options import RunnerOptions
-
-
-class Span(NamedTuple):
-    """Sim steps to run."""
-
-    tick: int
-    """First tick, a row of the loop's tables."""
-    begin: int
-    """Sim steps of it that are done."""
-    until: int
-    """End of the ticks, for an executor that runs several in one call; others run the first one."""
-    steps: int
-    """Sim steps of a tick."""
-
-
-class Ran(NamedTuple):
-    """Result of some sim steps, in the arrays of the executor."""
-
-    state: StepState
-    outputs: Outputs
-    """Results of the last step."""
-    measured: Measured
-    """Reading after the last step."""
-    before: Any
-    """qpos before the last step."""
-    tick: int
-    """First tick that is not complete, or not observed."""
-    done: int
-    """Sim steps of that tick that are done; 0 if it has not begun."""
-    failed: bool
-    """Whether an env may have failed in the last step."""
-
-
-def passive_forces(options: RunnerOptions) -> tuple[bool, bool]:
-    """Return whether gravity is compensated, and whether Coriolis and centrifugal forces are."""
-    parts = options.compensate.split("+")
-    return "gravity" in parts, "coriolis" in parts
 
 
 class NumPyExecutor:
-    """Executor of control steps in NumPy, for the robots of ``pack``; ``layout`` has its model
-    functions.
+    """Executor of the sim steps of the robots of ``setup``, from the control's ``state`` on.
+
+    Attributes
+    ----------
+    measured
+        Reading of the robots before the next sim step.
+    outputs
+        Results of the last sim step.
+    before
+        Positions before the last sim step (M, dof).
+    failed
+        Whether an env may have failed in the last sim step.
     """
 
-    def __init__(
-        self, options: RunnerOptions, pack: EnginePack, layout: Layout, constants: Constants
-    ) -> None:
-        self._pack = pack
-        self._layout = layout
-        self._constants = constants
-        self._gravity, self._coriolis = passive_forces(options)
-        self._speed_limit = options.speed_limit
-        self._controller = None if isinstance(options.control, str) else options.control
-        self._reads_qvel = needs_qvel(layout, constants, options.speed_limit)
-        self._reads_force = self._gravity and not layout.measures
-        self._failed = False
+    def __init__(self, setup: Setup, state: StepState) -> None:
+        self.setup = setup
+        self._state = state
+        self._first = 0
+        self._engine = EngineSteps(setup)
+        self.outputs = Outputs()
+        self.before: Any = None
+        self.failed = False
+        self.measure()
 
-    @cached_property
-    def _spread(self) -> Constants:
-        k = self._constants.k
-        return (
-            self._constants if k is None else self._constants._replace(k=spread(k, self._pack.size))
-        )
+    def measure(self) -> None:
+        """Read the robots, after a change of their states between sim steps."""
+        self.measured = self._engine.measure()
 
-    def measure(self) -> Measured:
-        """Return a reading of the robots."""
-        pack = self._pack
-        return Measured(
-            pack.read_qpos(),
-            pack.read_qvel() if self._reads_qvel else None,
-            pack.passive_force(self._gravity, self._coriolis) if self._reads_force else None,
-        )
+    def qpos(self) -> Float64:
+        """Return the positions of the last reading (M, dof)."""
+        qpos: Float64 = self.measured.qpos
+        return qpos
 
-    def run(
-        self, state: StepState, measured: Measured, command: Command, span: Span, table: Any = None
-    ) -> Ran:
-        """Run the sim steps of a tick, or until an env may have failed."""
-        constants = self._spread
-        end = span.steps
-        target = (None, None)
+    def read_state(self) -> StepState:
+        """Return the state of the control as NumPy arrays, which the next sim steps do not
+        change.
+        """
+        return self._state
 
-        def write_targets(values: Values) -> Values:
-            nonlocal target
-            outputs, pack = values.outputs, self._pack
-            # Writing the drives' targets costs a call for each joint.
-            if outputs.target is not target[0] and isinstance(pack, DrivenPack):
-                is_known = outputs.target_rate is target[1] and target[0] is not None
-                rate = (
-                    np.zeros_like(outputs.target)
-                    if outputs.target_rate is None
-                    else outputs.target_rate
-                )
-                pack.write_drive_target(outputs.target, None if is_known else rate)
-                target = outputs.target, outputs.target_rate
-            return values
+    def write_state(self, state: StepState) -> None:
+        """Replace the state of the control; it has the arrays of the state before."""
+        self._state = state
 
+    def results(self) -> Outputs:
+        """Return the results of the last sim step as NumPy arrays."""
+        return self.outputs
+
+    def run(self, command: Command, moves: bool, begin: int, end: int) -> int:
+        """Run sim steps ``begin`` to ``end`` of a tick under ``command`` (M, ...), or until an env
+        may have failed; return the sim steps of the tick that are done.
+
+        ``moves`` says whether joint setpoints move within the tick, at the given rate.
+
+        Raises ControllerError if a controller in Python does.
+        """
+        setup = self.setup
+        constants, layout = setup.constants, setup.layout._replace(moves=moves)
+        controller = None if isinstance(setup.options.control, str) else setup.options.control
+        self._first = begin
         engine = {
-            "targets": write_targets,
+            "targets": self._write_targets,
             "constraint": self._update_constraint,
             "engine": self._step_engine,
         }
-        for index in range(span.begin, end):
-            left = self._layout.left(index, end, constants.timestep)
-            values = Values(state, command, measured, Step(index, end, left), measured)
-            with controller_errors(self._controller, index + 1):
-                values = sim_step(self._layout, constants, values, engine)
-            before, state, measured = measured.qpos, values.state, values.measured
-            if self._failed:
-                break
-        return Ran(state, values.outputs, measured, before, span.tick, index + 1, self._failed)
+        for index in range(begin, end):
+            step = Step(index, end, layout.left(index, end, constants.timestep))
+            self.before = self.measured.qpos
+            values = Values(self._state, command, self.measured, step, self.measured)
+            with controller_errors(controller, index + 1):
+                values = sim_step(layout, constants, values, engine)
+            self._state, self.outputs, self.measured = values.state, values.outputs, values.measured
+            if self.failed:
+                return index + 1
+        return end
 
-    def _update_constraint(self, values: Values) -> Values:
-        if values.step.index % COUPLING_STEPS == 0:
-            self._pack.update_constraint()
+    def _write_targets(self, layout: Layout, constants: Constants, values: Values) -> Values:
+        """Write the targets of the drives where they move, since it costs a call for each joint."""
+        pack: Any = self.setup.pack
+        if values.step.index == self._first or moves_drives(layout, constants):
+            pack.write_drive_target(values.outputs.target, values.outputs.target_rate)
         return values
 
-    def _step_engine(self, values: Values) -> Values:
-        """Do a sim step; return its reading as the values' ``measured``, and note whether an env
-        may have failed.
-        """
-        self._pack.write_qf(values.outputs.qf)
-        self._pack.step()
-        measured = self.measure()
-        self._failed = not sound(measured, self._speed_limit)
+    def _update_constraint(self, layout: Layout, constants: Constants, values: Values) -> Values:
+        if values.step.index % COUPLING_STEPS == 0:
+            self.setup.pack.update_constraint()
+        return values
+
+    def _step_engine(self, layout: Layout, constants: Constants, values: Values) -> Values:
+        measured, self.failed = self._engine.advance(values.outputs.qf)
         return values._replace(measured=measured)
 
-    def rows(self, array: Array) -> Rows:
-        """Return an array of the executor as a NumPy array."""
-        return array
 
-    def numpy_state(self, state: StepState) -> StepState:
-        """Return a state of the executor with NumPy arrays."""
-        return state
-
-
-def with_model(
-    options: RunnerOptions,
-    pack: EnginePack,
-    layout: Layout,
-    constants: Constants,
-    controller: OwnController | None,
-) -> Layout:
-    """Return ``layout`` with model functions for NumPy arrays, natively compiled where possible."""
-    motors, (gravity, coriolis) = constants.motors, passive_forces(options)
-    model = Model(
-        mass_matrix_of(pack.spec, _is_native(pack)),
-        partial(_joint_mass_matrix, pack),
-        controller=controller,
-        noise=NoiseBlocks(),
-    )
-    if motors is not None and _is_native(pack):
-        model = model._replace(stages=compiled_stages(motors, (pack.size, pack.dof)))
-    if constants.friction.coulomb is not None and _is_native(pack):
-        given = constants.friction, constants.drive, constants.coupling, constants.timestep
-        model = model._replace(
-            refresh=NativeRefresh(
-                pack.joint_model(), pack.size, pack.armature, *given, REFRESH_STEPS
-            )
-        )
-    if gravity:
-        force = passive_force_of(pack.spec, _is_native(pack))
-        parts = gravity, coriolis
-        model = model._replace(
-            passive_force=lambda qpos, qvel: force(qpos, qvel, *parts, pack.read_base_motion())
-        )
-    return layout._replace(model=model)
-
-
-def _is_native(pack: EnginePack) -> TypeGuard[CompiledPack]:
-    return isinstance(pack, CompiledPack) and pack.steps_natively
-
-
-def _joint_mass_matrix(pack: EnginePack, qpos: Float64) -> Float64:
-    """Return the effective mass matrix of the joints, armature of the motors included."""
-    matrix = pack.joint_mass_matrix(qpos)
-    return matrix + pack.armature[:, None] * np.eye(pack.dof) if pack.armature.any() else matrix
-
-
-BLOCK = 64
-"""Sim steps of a block."""
-
-
-class NoiseBlocks:
-    """:func:`batchpid.motors.measurement_noise` at the step of a state, from blocks of consecutive
-    steps.
+class EngineSteps:
+    """Sim steps of the engine for the robots of ``setup``, and their readings: one native call
+    each where the engine has it, else calls of Python.
     """
 
-    def __init__(self) -> None:
-        self._key: Any = None
-        self._first = 0
-        self._block: tuple[Array, Array] = (None, None)
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
+        self._pack: EnginePack = setup.pack
+        layout = setup.layout
+        self.reads_force = layout.gravity and not layout.measures
+        """Whether a reading has the passive force, which is otherwise 0."""
+        self._parts = layout.gravity, layout.coriolis
+        self._is_native = steps_natively(setup.pack)
+        self.native_force = False
+        """Whether the native sim step reads the passive force."""
+        if isinstance(setup.pack, CompiledPack):
+            self.native_force = self.reads_force and setup.pack.steps_read_force(*self._parts)
+        self._step: CompiledStep | None = None
+        self._bound: object = None
 
-    def __call__(
-        self, k: MotorCoefficients, state: ActuatorState, like: Float64
-    ) -> tuple[Array, Array] | None:
-        """Return the noise of positions and velocities; None for sensors without noise."""
-        blocks = self.from_step(k, state, like)
-        return None if blocks is None else (_first(blocks[0]), _first(blocks[1]))
+    def measure(self) -> Measured:
+        """Return a reading of the robots."""
+        qpos, qvel = self._pack.read_qpos(), self._pack.read_qvel()
+        return Measured(qpos, qvel, self._passive_force(qpos))
 
-    def from_step(
-        self, k: MotorCoefficients, state: ActuatorState, like: Float64
-    ) -> tuple[Array, Array] | None:
-        """Return the noise of the step of a state and the next ones (steps, M, dof), as far as it
-        has been drawn.
-
-        A reset replaces the key. While the key is the same, all envs advance by the same number of
-        steps.
+    def advance(self, qf: Rows) -> tuple[Measured, bool]:
+        """Do a sim step with the efforts ``qf`` (M, dof); return the reading after it, and whether
+        an env may have failed.
         """
-        if state.key is None:
-            return None
-        at = int(state.step[0]) - self._first
-        if state.key is not self._key or not 0 <= at < BLOCK:
-            steps = state.step + np.arange(BLOCK, dtype=np.uint32)[:, None]
-            self._block = measurement_noise(k, state.key, steps, np.zeros_like(like), np)
-            self._key = state.key
-            self._first = int(state.step[0])
-            at = 0
-        position, velocity = self._block
-        return None if position is None else position[at:], (
-            None if velocity is None else velocity[at:]
-        )
+        if not self._is_native:
+            self._pack.write_qf(qf)
+            self._pack.step()
+            measured = self.measure()
+            limit = self._setup.speed_limit
+            is_slow = limit is None or bool((np.abs(measured.qvel) <= limit).all())
+            return measured, not (is_near(measured.qpos) and is_slow)
+        step = self.compiled()
+        qpos, qvel, passive = np.empty((3, *qf.shape))
+        status = step(np.ascontiguousarray(qf, np.float64), qpos, qvel, passive)
+        if not self.native_force:
+            passive = self._passive_force(qpos)
+        return Measured(qpos, qvel, passive), step.may_have_failed(status)
 
+    def compiled(self) -> CompiledStep:
+        """Return the native sim step of the present robots."""
+        pack: Any = self._setup.pack  # a CompiledPack, which takes long to check
+        if self._step is None or self._bound is not pack.calls:
+            parts = self._parts if self.native_force else (False, False)
+            drives = self._setup.layout.control == "drive"
+            self._bound = pack.calls
+            self._step = pack.compiled_step(*parts, True, self._setup.speed_limit, drives)
+        return self._step
 
-def _first(block: Any) -> Array:
-    return None if block is None else block[0]
+    def _passive_force(self, like: Float64) -> Float64:
+        if self.reads_force:
+            return self._pack.passive_force(*self._parts)
+        return np.zeros_like(like)

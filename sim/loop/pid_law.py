@@ -10,7 +10,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.law.coefficients import Coefficients
-from batchpid.law.computed_torque import advance_with_mass_matrix, given_acceleration
+from batchpid.law.computed_torque import advance_with_mass_matrix
 
 MASS_MATRIX_STEPS = 4
 """Sim steps for which a mass matrix is kept within a tick.
@@ -59,7 +59,7 @@ class PIDLaw(NamedTuple):
         Parameters
         ----------
         command
-            Setpoint, and its rate and acceleration, which may be None.
+            Setpoint, its rate (None: not given), and its acceleration.
         matrix
             M + dt B (envs, dof, dof) for gains per mass matrix.
         viscous
@@ -74,21 +74,13 @@ class PIDLaw(NamedTuple):
             low, high = (clip(end, k.effort_min, k.effort_max, xp) for end in (low, high))
             k = k._replace(effort_min=low, effort_max=high)
         if viscous is not None:
-            feedforward = viscous if feedforward is None else feedforward + viscous
+            feedforward = viscous + feedforward
         setpoint, setpoint_rate, acceleration = command
         rates = qvel if self.measures_rate else None, setpoint_rate
         if self.uses_mass_matrix:
             inputs = setpoint, qpos, matrix, *rates, acceleration, feedforward
             new, terms = advance_with_mass_matrix(k, state, *inputs)
-        else:
-            given = given_acceleration(k, acceleration)
-            feedforward = (
-                feedforward
-                if given is None
-                else given
-                if feedforward is None
-                else feedforward + given
-            )
+        else:  # accelerations are for gains per mass matrix only
             new, terms = bp.advance(k, state, setpoint, qpos, *rates, feedforward)
         return new, terms.effort, terms.effort != terms.unsaturated
 

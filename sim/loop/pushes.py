@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 
 Int64 = NDArray[np.int64]
 COUNTS = ("steps", "due", "number")
@@ -14,15 +14,16 @@ COUNTS = ("steps", "due", "number")
 
 
 class Pushes:
-    """Pushes of ``size`` envs under ``options``, whose randomization has some.
+    """Pushes of ``size`` envs, if the randomization of ``options`` has some.
 
     A push comes at the beginning of the first tick after its time, at most one in a tick.
     """
 
     def __init__(self, options: RunnerOptions, size: int) -> None:
         self._options = options
-        self.counts: dict[str, Int64] = {name: np.zeros(size, np.int64) for name in COUNTS}
-        """Counts of each env (size,), by name of :data:`COUNTS`."""
+        names = COUNTS if options.has_pushes else ()
+        self.counts: dict[str, Int64] = {name: np.zeros(size, np.int64) for name in names}
+        """Counts of each env (size,), by name of :data:`COUNTS`; empty without pushes."""
 
     def begin(self, mask: Bool, episodes: Int64) -> None:
         """Begin the episodes (envs, 2) of the envs of ``mask`` (envs,)."""
@@ -38,13 +39,17 @@ class Pushes:
         self._take(rows, episodes)
         return rows.tolist(), twists
 
-    def advance(self, steps: int) -> None:
-        """Count ``steps`` sim steps of all envs."""
-        self.counts["steps"] += steps
+    def read(self) -> dict[str, Int64]:
+        """Return the counts, for :meth:`write`."""
+        return {name: rows.copy() for name, rows in self.counts.items()}
+
+    def write(self, counts: dict[str, Int64]) -> None:
+        """Set the counts that :meth:`read` returned."""
+        self.counts = {name: rows.copy() for name, rows in counts.items()}
 
     def _take(self, rows: NDArray[np.intp], episodes: Int64) -> None:
         """Set the time of the next push of envs ``rows``."""
-        if rows.size:
+        if self.counts and rows.size:
             intervals = self._draw("push_interval", rows, episodes)[:, 0]
             steps = np.ceil(np.minimum(intervals / self._options.timestep, 2.0**53))
             self.counts["due"][rows] += steps.astype(np.int64)

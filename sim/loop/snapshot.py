@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
-from batchpid.arrays.choices import CHOICES, Everywhere
-from batchpid.arrays.trees import flatten, unflatten
+from batchpid.arrays.trees import unflatten
 from batchpid.checks.validate import file_path, integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
@@ -40,15 +39,11 @@ CHANGED = "changed"
 """Name of the setpoints that the guard changed in the last sim step."""
 AGE = "age"
 """Name of the sim steps since the friction model of an env took its inertia (envs,)."""
-_FORMAT = 13
+_FORMAT = 14
 _DIGITS = 64
 """Length of a digest."""
-_PARAMS, _MOTORS = "params", "actuator_params"
-_CHOICES: dict[str, tuple[Any, ...]] = {
-    name: tuple(named.values()) for name, named in CHOICES.items()
-}
-_CHOICES["conditional"] = (Everywhere(),)
-"""Params that hold no numbers, by name, with their values."""
+_TABLES = ("controller", "friction", "actuators", "guard", "containment", "sensors", "pushes")
+"""Parts of :class:`EnvStates` that are arrays by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +112,13 @@ class EnvStates:
 
     def for_envs(self, envs: slice | NDArray[np.intp]) -> EnvStates:
         """Return the state of some envs, as copies."""
-        tables = flatten(vars(self), ".")
-        return EnvStates(
-            **unflatten(vars(self), {name: rows[envs].copy() for name, rows in tables.items()}, ".")
-        )
+        parts: Document = {}
+        for name, part in vars(self).items():
+            if isinstance(part, dict):
+                parts[name] = {leaf: rows[envs].copy() for leaf, rows in part.items()}
+            else:
+                parts[name] = part[envs].copy()
+        return EnvStates(**parts)
 
     @staticmethod
     def join(parts: Sequence[EnvStates]) -> EnvStates:
@@ -130,9 +128,19 @@ class EnvStates:
         for part in parts:
             missing = width - part.engine.shape[1]
             engine = np.pad(part.engine, ((0, 0), (0, missing)), constant_values=np.nan)
-            tables.append(flatten(vars(part) | {"engine": engine}, "."))
+            tables.append(replace(part, engine=engine).tables())
         joined = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
         return EnvStates(**unflatten(vars(parts[0]), joined, "."))
+
+    def tables(self) -> dict[str, Rows]:
+        """Return all arrays by name, such as "friction.age"."""
+        tables: dict[str, Rows] = {}
+        for name, part in vars(self).items():
+            if isinstance(part, dict):
+                tables |= {f"{name}.{leaf}": rows for leaf, rows in part.items()}
+            else:
+                tables[name] = part
+        return tables
 
     def check(self, fresh: EnvStates, command_size: int, engine_sizes: Sequence[int]) -> None:
         """Compare the arrays with :meth:`fresh` states of the runner that restores them.
@@ -145,30 +153,18 @@ class EnvStates:
         InvalidArgumentError
             An array is missing, unknown, or of another shape, dtype or range.
         """
-        _compare(flatten(vars(self), "."), flatten(vars(fresh) | {"engine": self.engine}, "."))
+        sizes = np.array(engine_sizes)[:, None]
+        engine = np.zeros((len(sizes), sizes.max()))
+        _compare(self.tables(), replace(fresh, engine=engine).tables())
         joint, cause = self.containment["joint"], self.containment["cause"]
         of_command = np.isin(cause, [CAUSES.index(name) for name in COMMAND_CAUSES])
         joints = np.where(of_command, command_size, self.effort.shape[1])
         if ((joint < 0) | (joint >= joints) | (cause < 0) | (cause >= len(CAUSES))).any():
-            raise InvalidArgumentError(
-                "snapshot", "has a fault of an unknown joint or cause", remedy="take a new one"
-            )
-        sizes, columns = np.array(engine_sizes)[:, None], np.arange(self.engine.shape[-1])
-        is_table = (
-            self.engine.ndim == 2
-            and len(self.engine) == len(sizes)
-            and self.engine.dtype == np.float64
-        )
-        if (
-            not is_table
-            or sizes.max() > len(columns)
-            or not np.isnan(self.engine[columns >= sizes]).all()
-        ):
-            problem, remedy = (
-                "holds other content than this runner's build makes",
-                "use the same build=",
-            )
-            raise InvalidArgumentError("snapshot", problem, remedy=remedy)
+            problem = "has a fault of an unknown joint or cause"
+            raise InvalidArgumentError("snapshot", problem, remedy="take a new one")
+        if not np.isnan(self.engine[np.arange(engine.shape[1]) >= sizes]).all():
+            problem = "holds other content than this runner's build makes"
+            raise InvalidArgumentError("snapshot", problem, remedy="use the same build=")
 
     def __repr__(self) -> str:
         return "EnvStates({} envs, {} joints)".format(*self.effort.shape)
@@ -202,15 +198,12 @@ class Snapshot:
         """Raise InvalidArgumentError if a runner with options ``about`` cannot restore it."""
         different = [key for key, ours in about.items() if self.about.get(key) != ours]
         if different:
-            key, *others = different
+            key = different[0]
             ours, theirs = about[key], self.about.get(key)
-            is_digest = any(
-                isinstance(value, str) and len(value) == _DIGITS for value in (ours, theirs)
-            )
-            problem = (
-                f"another {key}" if is_digest else f"{key} {reprlib.repr(theirs)}, not {ours!r}"
-            )
-            problem += "".join(f", and another {other}" for other in others)
+            problem = f"{key} {reprlib.repr(theirs)}, not {reprlib.repr(ours)}"
+            if _DIGITS in (len(str(ours)), len(str(theirs))):
+                problem = f"another {key}"
+            problem = ", and another ".join([problem, *different[1:]])
             remedy = "restore it in a runner made with the same options"
             raise InvalidArgumentError("snapshot", f"is of a runner with {problem}", remedy=remedy)
 
@@ -229,7 +222,7 @@ class Snapshot:
         tables = {"episodes": self.episodes, "motion": self.motion}
         return {name: rows for name, rows in tables.items() if rows is not None}
 
-    def for_envs(self, envs: slice | Sequence[int] | NDArray[np.intp]) -> Snapshot:
+    def for_envs(self, envs: slice | Sequence[int] | Rows) -> Snapshot:
         """Return a snapshot of the envs with these numbers, in this order, and repeatedly where a
         number repeats.
 
@@ -238,34 +231,23 @@ class Snapshot:
 
         Raises
         ------
-        InvalidArgumentError
+        IndexError
             A number is not one of an env.
         """
-        count = len(self.states.effort)
-        if not isinstance(envs, slice):
-            envs = np.asarray(envs)
-            if (
-                envs.ndim != 1
-                or envs.dtype.kind not in "iu"
-                or not envs.size
-                or not (envs < count).all()
-                or (envs < 0).any()
-            ):
-                problem, remedy = (
-                    f"are not numbers of {count} envs",
-                    f"pass a sequence of 0 to {count - 1}",
-                )
-                raise InvalidArgumentError("envs", problem, value=envs, remedy=remedy)
-        num_envs = len(np.arange(count)[envs])
+        envs = np.arange(len(self.states.effort))[envs]
         return replace(
             self,
-            about=self.about | {"num_envs": num_envs},
+            about=self.about | {"num_envs": len(envs)},
             params=self.params.for_envs(envs),
             states=self.states.for_envs(envs),
             actuators=None if self.actuators is None else self.actuators.for_envs(envs),
             episodes=None if self.episodes is None else self.episodes[envs],
             motion=None if self.motion is None else self.motion[envs],
         )
+
+    def copy(self) -> Snapshot:
+        """Return a snapshot with arrays of its own."""
+        return self.for_envs(slice(None))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an .npz file, as a whole or not at all: an older file stays until this one is
@@ -276,16 +258,13 @@ class Snapshot:
         OSError
             The file cannot be written.
         """
-        leaves = {name: leaf for name, leaf in self.params._asdict().items() if leaf is not None}
-        choices = {
-            name: type(leaf).__name__ for name, leaf in leaves.items() if isinstance(leaf, tuple)
-        }
-        numbers = {name: leaf for name, leaf in leaves.items() if name not in choices}
-        motors = {} if self.actuators is None else self.actuators.options()
-        motors = {name: np.asarray(value) for name, value in motors.items() if name != "dtype"}
-        head = {"format": _FORMAT, "about": self.about, "steps": self.steps, "choices": choices}
+        joints = self.about["joints"]
+        head = {"format": _FORMAT, "about": self.about, "steps": self.steps}
+        head["params"] = bp.dumps_params(self.params, joints, format="json")
+        if self.actuators is not None:
+            head["actuators"] = bp.motors.dumps_actuators(self.actuators, joints, format="json")
         tables: Document = {"head": np.array(json.dumps(head))} | self.tables()
-        tables |= flatten({**vars(self.states), _PARAMS: numbers, _MOTORS: motors}, ".")
+        tables |= self.states.tables()
         write_atomically(file_path("path", path), lambda file: np.savez(file, **tables))
 
     @classmethod
@@ -317,37 +296,21 @@ class Snapshot:
         head = json.loads(str(tables.pop("head")))
         if head["format"] != _FORMAT:
             raise ValueError(f"format {head['format']}, not {_FORMAT}")
-        episodes, motion = tables.pop("episodes", None), tables.pop("motion", None)
-        groups: Document = {
-            "controller": {},
-            "friction": {},
-            "actuators": {},
-            "guard": {},
-            "sensors": {},
-            "pushes": {},
-        }
-        for name, rows in tables.items():
-            group, dot, leaf = name.partition(".")
-            groups = groups | {group: groups.get(group, {}) | {leaf: rows} if dot else rows}
-        numbers, motors = groups.pop(_PARAMS), groups.pop(_MOTORS, None)
-        kinds = {
-            name: {type(one).__name__: one for one in _CHOICES[name]} for name in head["choices"]
-        }
-        params = bp.PIDParams(
-            **numbers, **{name: kinds[name][kind] for name, kind in head["choices"].items()}
-        )
-        params.options()  # raises for an unknown choice
-        params.check(len(groups["effort"]))
-        if params.dtype.kind != "f":
-            raise ValueError(f"its params are of {params.dtype}")
-        actuators = None
-        if motors is not None:
-            motors = {name: leaf if leaf.ndim else leaf.item() for name, leaf in motors.items()}
-            actuators = bp.make_actuators(params.num_joints, **motors)
+        about: Document = dict(head["about"])
         steps = integer("steps", head["steps"], 0, 2**62)
-        return cls(
-            dict(head["about"]), steps, params, EnvStates(**groups), actuators, episodes, motion
-        )
+        params, _ = bp.loads_params(head["params"], about["joints"])
+        actuators = None
+        if "actuators" in head:
+            actuators, _ = bp.motors.loads_actuators(head["actuators"], about["joints"])
+        rest = {name: tables.pop(name, None) for name in ("episodes", "motion")}
+        parts: Document = {name: {} for name in _TABLES}
+        for name, rows in tables.items():
+            part, dot, leaf = name.partition(".")
+            if dot:
+                parts[part][leaf] = rows
+            else:
+                parts[part] = rows
+        return cls(about, steps, params, EnvStates(**parts), actuators, **rest)
 
     def __repr__(self) -> str:
         about = self.about
@@ -361,13 +324,14 @@ def _compare(theirs: dict[str, Rows], ours: dict[str, Rows]) -> None:
     """Raise InvalidArgumentError if the arrays of a snapshot differ in name, shape or dtype from
     those of a runner.
     """
-    for name in sorted(ours.keys() | theirs.keys()):
-        kinds = [
-            f"{rows[name].dtype} {rows[name].shape}" if name in rows else "no array"
-            for rows in (theirs, ours)
-        ]
-        if kinds[0] != kinds[1]:
-            problem = f"has {kinds[0]} for {name}, not {kinds[1]}"
+    kinds, expected = (
+        {name: f"{rows.dtype.str} {rows.shape}" for name, rows in tables.items()}
+        for tables in (theirs, ours)
+    )
+    for name in kinds.keys() | expected.keys():
+        kind, other = kinds.get(name), expected.get(name)
+        if kind != other:
+            problem = f"has {kind} for {name}, not {other}"
             raise InvalidArgumentError("snapshot", problem, remedy="take a new one")
 
 

@@ -4,7 +4,7 @@ robots.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ import batchpid as bp
 from batchpid import motors as actuator_model
 from batchpid.arrays.array_types import Array, Bool, Float64
 from batchpid.arrays.elementwise import TURN, replace_envs
+from batchpid.law.coefficients import spread
 from batchpid.law.computed_torque import convert_integral
 from batchpid.motors import ActuatorState
 from batchpid.motors import friction as friction_model
@@ -20,100 +21,133 @@ from batchpid.motors import guard as guard_model
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import FrictionState
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.control_step import REFRESH_STEPS, mass_matrix, refreshed
+from batchpid.sim.loop.control_step import REFRESH_STEPS, mass_matrix, refreshed, uses_mass_matrix
+from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.loop.model_functions import model_functions
 from batchpid.sim.loop.pid_law import PIDLaw
-from batchpid.sim.loop.step_values import Constants, KnownFriction, Layout, StepState
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.loop.step_values import Constants, Layout, ModelledFriction, StepState
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION
 
 
-def make_layout(
-    options: RunnerOptions, params: bp.PIDParams, actuators: bp.Actuators | None
-) -> Layout:
-    """Return the layout of the control step, without the executor's model."""
-    control = options.control if isinstance(options.control, str) else "custom"
-    law = PIDLaw.of(params) if control == "pid" else None
-    return Layout(control, law, actuators is not None and actuators.measures)
+class Setup(NamedTuple):
+    """Control step of the robots of a pack, from which an executor is made."""
+
+    options: RunnerOptions
+    pack: EnginePack
+    layout: Layout
+    constants: Constants
+    controller: OwnController | None
+
+    @property
+    def speed_limit(self) -> Array:
+        """Speed beyond which a joint has failed (dof,); None for no limit."""
+        limit = self.options.speed_limit
+        return None if limit is None else np.asarray(limit)
 
 
-def make_constants(
+def make_setup(
     options: RunnerOptions,
     pack: EnginePack,
     params: bp.PIDParams,
-    actuators: bp.Actuators | None = None,
-    motors: ActuatorState | None = None,
-) -> Constants:
-    """Return the constants of the envs of ``pack``.
+    actuators: bp.Actuators | None,
+    motors: ActuatorState | None,
+    controller: OwnController | None,
+) -> Setup:
+    """Return the control step of the robots of ``pack``.
 
-    ``params`` and ``actuators`` include the draws of the randomization. ``motors`` is the state of
-    actuators that change efforts or measurements; None without such actuators.
+    ``params`` and ``actuators`` include the draws of the randomization. ``actuators`` and
+    ``motors``, their state, are None without an effect on efforts or measurements.
     """
+    parts = options.compensate.split("+")
+    is_pid = options.control == "pid"
+    layout = Layout(
+        control=options.control if isinstance(options.control, str) else "custom",
+        law=PIDLaw.of(params) if is_pid else None,
+        measures=actuators is not None and actuators.measures,
+        gravity="gravity" in parts,
+        coriolis="coriolis" in parts,
+    )
+    constants = _constants(options, pack, params)
+    if actuators is not None and motors is not None:
+        timestep = pack.spec.timestep
+        coefficients = actuator_model.discretise(actuators, motors, timestep, pack.size)
+        constants = constants._replace(motors=coefficients)
+    model = model_functions(pack, layout, constants, controller)
+    return Setup(options, pack, layout._replace(model=model), constants, controller)
+
+
+def moves_drives(layout: Layout, constants: Constants) -> bool:
+    """Return whether the targets of the engine's drives move within a tick."""
+    moving = constants.driven, constants.guard, constants.turns
+    return layout.moves or any(value is not None for value in moving)
+
+
+def _constants(options: RunnerOptions, pack: EnginePack, params: bp.PIDParams) -> Constants:
+    """Return the constants of the envs of ``pack``, without their motors."""
     scene = pack.spec
-    robot = options.robot
-    guard = None
-    known = None if robot.actuators is None else known_joints(robot)
-    law, damping = PIDLaw.of(params), np.array([joint.damping for joint in scene.joints])
-    damping = damping if known is None else damping + known.viscous
+    timestep = scene.timestep
     coupling = coupling_of(scene.joints)
-    acting = acting_gains(params, coupling)
+    gains = acting_gains(params, coupling)
+    guard = None
     if options.guard is not None:
         row = pack.first_env - options.first_env
         guard = options.guard.for_envs(slice(row, row + pack.size))
     constants = Constants(
-        timestep=scene.timestep,
+        timestep=timestep,
         limits=(params.effort_min, params.effort_max),
         friction=pack.friction,
-        known=_known_friction(options, pack),
+        modelled=_modelled_friction(options, pack),
         guard=guard,
         coupling=coupling,
-        motors=(
-            None
-            if actuators is None or motors is None
-            else actuator_model.discretise(actuators, motors, scene.timestep, pack.size)
-        ),
     )
     if options.control == "pid":
+        robot = options.robot
+        armature = None
+        damping = np.array([joint.damping for joint in scene.joints])
+        if robot.actuators is not None:
+            motors = known_joints(robot)
+            armature = motors.armature
+            damping = damping + motors.viscous
+        has_damping = PIDLaw.of(params).uses_mass_matrix and damping.any()
         return constants._replace(
-            k=bp.discretise(acting, scene.timestep),
-            armature=None if known is None else known.armature,
-            damping=damping if law.uses_mass_matrix and damping.any() else None,
+            k=spread(bp.discretise(gains, timestep), pack.size),
+            armature=armature,
+            damping=damping if has_damping else None,
         )
     if options.control == "drive":
-        kd = np.zeros_like(acting.kp) if acting.kd is None else acting.kd
-        integrates = params.ki is not None and bool(np.any(params.ki > 0))
-        driven = (
-            bp.discretise(acting._replace(measurement_rate=None), scene.timestep)
-            if integrates
-            else None
-        )
-        return constants._replace(drive=(kd, acting.kp), driven=driven, turns=_turns(pack))
+        driven = None
+        if params.ki is not None and np.any(params.ki > 0):
+            driven = bp.discretise(gains._replace(measurement_rate=None), timestep)
+        damping = np.zeros_like(gains.kp) if gains.kd is None else gains.kd
+        return constants._replace(drive=(damping, gains.kp), driven=driven, turns=_turns(pack))
     return constants
 
 
 def acting_gains(params: bp.PIDParams, coupling: Coupling) -> bp.PIDParams:
     """Return ``params`` with zero gains for followers, which move with their leaders."""
     gains = {"kp": params.kp, "ki": params.ki, "kd": params.kd}
-    own = {name: coupling.of_independent(gain) for name, gain in gains.items() if gain is not None}
-    return params._replace(**own)
+    leaders = {
+        name: coupling.of_independent(gain) for name, gain in gains.items() if gain is not None
+    }
+    return params._replace(**leaders)
 
 
-def _known_friction(options: RunnerOptions, pack: EnginePack) -> KnownFriction | None:
+def _modelled_friction(options: RunnerOptions, pack: EnginePack) -> ModelledFriction | None:
     """Return the friction to compensate, from the description and the robot's own actuators, or
     None.
     """
     joints = pack.spec.joints
-    modelled = DISSIPATION[pack.spec.dissipation].modelled
-    friction = (
-        np.array([joint.friction * modelled for joint in joints])
-        + known_joints(options.robot).coulomb
-    )
-    if not (
-        friction.any() and "friction" in options.compensate.split("+") and options.sets_positions
-    ):
+    share = DISSIPATION[pack.spec.dissipation].modelled
+    friction = np.array([joint.friction * share for joint in joints])
+    friction = friction + known_joints(options.robot).coulomb
+    is_compensated = "friction" in options.compensate.split("+") and options.sets_positions
+    if not (is_compensated and friction.any()):
         return None
-    return KnownFriction(friction, np.array([BAND[joint.unit] for joint in joints]), _turns(pack))
+    band = np.array([BAND[joint.unit] for joint in joints])
+    return ModelledFriction(friction, band, _turns(pack))
 
 
 def _turns(pack: EnginePack) -> Array:
@@ -124,82 +158,69 @@ def _turns(pack: EnginePack) -> Array:
     return turns if turns.any() else None
 
 
-def needs_qvel(layout: Layout, constants: Constants, speed_limit: Array) -> bool:
-    """Return whether the joint velocities are needed at each sim step."""
-    law = layout.law
-    takes = law is not None and (law.measures_rate or law.uses_mass_matrix)
-    rubs = any(leaf is not None for leaf in constants.friction)
-    return (
-        takes
-        or rubs
-        or constants.motors is not None
-        or layout.control == "custom"
-        or speed_limit is not None
-    )
-
-
-def reset_friction(
-    layout: Layout, constants: Constants, state: StepState, pack: EnginePack, mask: Bool
-) -> StepState:
+def reset_friction(setup: Setup, state: StepState, mask: Bool) -> StepState:
     """Return ``state`` with the friction model of the envs of ``mask`` (M,) restarted at the
     robots' present state.
     """
+    _, pack, layout, constants, _ = setup
     model = constants.friction
     if model.coulomb is None:
         return state._replace(friction=FrictionState(), age=None)
     falls = not pack.spec.fixed_base  # then gravity does not load the joints
-    velocity, load = (
-        pack.read_qvel(),
-        constants.coupling.efforts(pack.passive_force(not falls, True)),
-    )
-    fresh = refreshed(layout, constants, friction_model.started(velocity, load), pack.read_qpos())
+    load = constants.coupling.efforts(pack.passive_force(not falls, True))
+    fresh = friction_model.started(pack.read_qvel(), load)
+    fresh = refreshed(layout, constants, fresh, pack.read_qpos())
     fresh = friction_model.with_sliding(model, fresh)
-    age = np.zeros(pack.size, np.int64)
-    if state.age is not None:
-        fresh, age = replace_envs(state.friction, fresh, mask), np.where(mask, 0, state.age)
-    return state._replace(friction=fresh, age=age)
+    if state.age is None:
+        return state._replace(friction=fresh, age=np.zeros(pack.size, np.int64))
+    age = np.where(mask, 0, state.age)
+    return state._replace(friction=replace_envs(state.friction, fresh, mask), age=age)
 
 
-def with_friction(
-    layout: Layout, constants: Constants, state: StepState, pack: EnginePack
-) -> StepState:
-    """Return ``state`` after a change of the friction of ``pack``; the next sim step updates the
+def with_friction(setup: Setup, state: StepState) -> StepState:
+    """Return ``state`` after a change of the friction of the robots; the next sim step updates the
     model's inertia.
     """
-    if constants.friction.coulomb is None or state.age is None:
-        return reset_friction(layout, constants, state, pack, np.ones(pack.size, bool))
+    if setup.constants.friction.coulomb is None or state.age is None:
+        return reset_friction(setup, state, np.ones(setup.pack.size, bool))
     return state._replace(age=np.full_like(state.age, REFRESH_STEPS))
 
 
-def with_params(
-    layout: Layout,
-    constants: Constants,
-    state: StepState,
-    old: bp.PIDParams,
-    new: bp.PIDParams,
-    qpos: Float64,
-) -> StepState:
-    """Return ``state`` for the params ``new`` in place of ``old``, with the integral in the unit of
-    the new gains.
+def with_matrix(setup: Setup, state: StepState) -> StepState:
+    """Return ``state`` with room for the mass matrix of the law, if it uses one."""
+    pack, matrix = setup.pack, None
+    if uses_mass_matrix(setup.layout, setup.constants):
+        matrix = np.zeros((pack.size, pack.dof, pack.dof))
+    return state._replace(matrix=matrix)
 
-    ``constants`` belong to the params that have gains per mass matrix, if one of the two has.
+
+def with_params(
+    before: Setup, setup: Setup, state: StepState, old: bp.PIDParams, new: bp.PIDParams
+) -> StepState:
+    """Return ``state`` for the params ``new`` of ``setup``, with the integral in the unit of the
+    new gains; ``old`` are the params of the setup ``before``.
     """
+    layout = setup.layout
     if layout.control == "custom":
         return state
-    law = state.law
+    law, qpos = state.law, setup.pack.read_qpos()
     if layout.control == "pid" and old.gain_units != new.gain_units:
+        constants = setup.constants
+        if uses_mass_matrix(before.layout, before.constants):
+            constants = before.constants  # of the params that have gains per mass matrix
         law = convert_integral(law, old, new, mass_matrix(layout, constants, qpos))
-    return state._replace(law=law.matched_to(bp.init(new, qpos)), matrix=None)
+    return state._replace(law=law.matched_to(bp.init(new, qpos)))
 
 
-def reset_guard(constants: Constants, state: StepState, qpos: Float64, mask: Bool) -> StepState:
+def reset_guard(setup: Setup, state: StepState, qpos: Float64, mask: Bool) -> StepState:
     """Return ``state`` with the guard of the envs of ``mask`` (M,) at rest at ``qpos``."""
-    if constants.guard is None:
+    guard = setup.constants.guard
+    if guard is None:
         return state
-    fresh = guard_model.init(constants.guard, qpos)
-    return state._replace(
-        guard=fresh if state.guard is None else replace_envs(state.guard, fresh, mask)
-    )
+    fresh = guard_model.init(guard, qpos)
+    if state.guard is not None:
+        fresh = replace_envs(state.guard, fresh, mask)
+    return state._replace(guard=fresh)
 
 
 def init_motors(

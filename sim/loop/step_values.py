@@ -11,10 +11,8 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array
 from batchpid.law.coefficients import Coefficients
-from batchpid.motors import STAGES, ActuatorState, Stages
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction, FrictionState
-from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.pid_law import PIDLaw
 
@@ -31,9 +29,10 @@ class StepState(NamedTuple):
     """Sim steps since the last update of the friction model's inertia (M,); None without Coulomb
     friction.
     """
-    motors: ActuatorState | None = None
-    """Motors and sensors; None for ideal ones."""
-    guard: GuardState | None = None
+    motors: Any = None
+    """:class:`batchpid.motors.ActuatorState` of motors and sensors; None for ideal ones."""
+    guard: Any = None
+    """:class:`batchpid.motors.guard.GuardState`; None without guard."""
     matrix: Array = None
     """Mass matrix of the law (M, dof, dof). Each tick begins with a new one."""
 
@@ -43,11 +42,8 @@ class Measured(NamedTuple):
 
     qpos: Array
     qvel: Array
-    """None where nothing needs it."""
     passive: Array
-    """Efforts that cancel gravity, and Coriolis and centrifugal forces; None without
-    compensation.
-    """
+    """Efforts that cancel gravity, and Coriolis and centrifugal forces; 0 without compensation."""
 
 
 class Step(NamedTuple):
@@ -102,7 +98,7 @@ class Values(NamedTuple):
     outputs: Outputs = Outputs()
 
 
-class KnownFriction(NamedTuple):
+class ModelledFriction(NamedTuple):
     """Friction that the compensation cancels, arrays (dof,)."""
 
     friction: Array
@@ -123,8 +119,8 @@ class Constants(NamedTuple):
     limits: tuple[Array, Array]
     """Least and largest effort of the params [N m or N]."""
     coupling: Coupling
-    k: Coefficients | None = None
-    """Coefficients of the PID law."""
+    k: Any = None
+    """:class:`batchpid.law.coefficients.Coefficients` of the PID law."""
     armature: Array = None
     """Armature of the motors that the law knows (dof,) [kg m^2 or kg]."""
     damping: Array = None
@@ -132,7 +128,8 @@ class Constants(NamedTuple):
     friction: Friction = Friction()
     drive: tuple[Array, Array] = (0.0, 0.0)
     """Damping and stiffness of the engine's drives [N m s/rad, N m/rad]."""
-    known: KnownFriction | None = None
+    modelled: ModelledFriction | None = None
+    """Friction of the description and of the robot's actuators."""
     guard: Any = None
     """:class:`batchpid.Guard`"""
     motors: Any = None
@@ -169,8 +166,6 @@ class Model(NamedTuple):
     """
     when: Callable[[Any, Callable[[], Any], Any], Any] = when
     """:func:`when`, or a conditional of JAX."""
-    law: Callable[..., Any] = PIDLaw.advance
-    """:meth:`batchpid.sim.loop.pid_law.PIDLaw.advance`, or a law with its arguments."""
     controller: Any = None
     """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort), and,
     if it limits efforts itself, the mask of joints with limited efforts.
@@ -179,7 +174,6 @@ class Model(NamedTuple):
     """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it
     at each step.
     """
-    stages: Stages = STAGES
 
 
 class Layout(NamedTuple):
@@ -192,6 +186,11 @@ class Layout(NamedTuple):
     measures: bool = False
     """Whether the law takes the joints' state from sensors."""
     model: Model = Model()
+    moves: bool = False
+    """Whether joint setpoints move within a tick, at a given rate."""
+    gravity: bool = False
+    coriolis: bool = False
+    """Parts of the passive force that are compensated."""
 
     def left(self, index: Any, end: Array, timestep: Array) -> Array:
         """Return the time from the law's setpoint in sim step ``index`` to the end of a tick of

@@ -14,17 +14,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Pytree, Rows
+from batchpid.arrays.array_types import Array, Float64, Pytree, Rows
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine.native import xla
-from batchpid.sim.engine.protocol import CompiledPack, CompiledStep
 from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.control_step import sim_step
-from batchpid.sim.loop.custom import OwnController, controller_errors
-from batchpid.sim.loop.numpy_executor import Ran, Span, passive_forces
-from batchpid.sim.loop.step_setup import needs_qvel
+from batchpid.sim.loop.control_step import sim_step, uses_mass_matrix
+from batchpid.sim.loop.custom import controller_errors
+from batchpid.sim.loop.numpy_executor import EngineSteps
+from batchpid.sim.loop.step_setup import Setup
 from batchpid.sim.loop.step_values import (
     Constants,
     Layout,
@@ -35,7 +34,6 @@ from batchpid.sim.loop.step_values import (
     StepState,
     Values,
 )
-from batchpid.sim.options import RunnerOptions
 
 ROWS = 16
 """Number of which the rows in a program are a multiple."""
@@ -68,125 +66,97 @@ class Carry(NamedTuple):
 
 
 class XLAExecutor:
-    """Executor of the ticks of the robots of ``pack`` by one program.
+    """Executor of the ticks of the robots of ``setup`` by one program.
 
     It has the methods of :class:`batchpid.sim.loop.numpy_executor.NumPyExecutor`.
     """
 
-    def __init__(
-        self,
-        options: RunnerOptions,
-        pack: CompiledPack,
-        layout: Layout,
-        constants: Constants,
-        controller: OwnController | None,
-    ) -> None:
-        self._pack = pack
-        self._options = options
-        self._layout = layout._replace(model=Model())
-        self._gravity, self._coriolis = passive_forces(options)
-        self._controller = controller
-        self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
-        self._reads_qvel = needs_qvel(layout, constants, None)
-        self._native: CompiledStep | None = None
-        self._bound: Any = None
-        self._no_matrix: Any = None
-        law = layout.law
-        needs_bodies = (
-            law is not None and law.uses_mass_matrix
-        ) or constants.friction.coulomb is not None
-        tables = scene_tree(pack.spec).tables if needs_bodies else None
-
-        def spread(part: Any) -> Array:
-            return mapped(lambda array: padded(np.broadcast_to(array, (pack.size, pack.dof))), part)
-
-        limits = (None, None) if law is not None else spread(constants.limits)
-        k = spread(constants.k)
-        friction = spread(constants.friction)
-        timestep = np.float64(constants.timestep)
-        arrays = constants._replace(timestep=timestep, k=k, limits=limits, friction=friction)
+    def __init__(self, setup: Setup, state: StepState) -> None:
+        self.setup = setup
+        self._engine = EngineSteps(setup)
+        self.failed = False
+        pack, constants, layout = setup.pack, setup.constants, setup.layout
         rows = (pack.size, pack.dof)
+
+        def spread(part: Any) -> Any:
+            return mapped(lambda array: padded(np.broadcast_to(array, rows)), part)
+
+        uses_bodies = uses_mass_matrix(layout, constants) or constants.friction.coulomb is not None
+        arrays = constants._replace(
+            timestep=np.float64(constants.timestep),
+            k=spread(constants.k),
+            limits=(None, None) if layout.law is not None else spread(constants.limits),
+            friction=spread(constants.friction),
+        )
         with own_settings("float64"):
             self._constants = put(arrays)
-            self._bodies = put(tables)
-            self._zero = put(padded(np.zeros(rows)))
+            self._bodies = put(scene_tree(pack.spec).tables) if uses_bodies else None
+        self.write_state(state)
+        self.measure()
 
-    def measure(self) -> Measured:
-        """Return a reading of the robots."""
-        pack = self._pack
-        qpos, qvel = pack.read_qpos(), pack.read_qvel()
-        passive = pack.passive_force(self._gravity, self._coriolis) if self._gravity else None
+    def measure(self) -> None:
+        """Read the robots, after a change of their states between sim steps."""
         with own_settings("float64"):
-            return put(
-                Measured(padded(qpos), padded(qvel), None if passive is None else padded(passive))
-            )
+            self._measured = put(mapped(padded, self._engine.measure()))
 
-    def run(
-        self, state: StepState, measured: Measured, command: Command, span: Span, table: Any = None
-    ) -> Ran:
-        """Run the sim steps of a tick, or until an env may have failed."""
-        native = self._bind()
-        with own_settings("float64"):
-            steps = np.array([span.begin, span.steps, 0, 0], np.int32)
-            steps[2:].view(np.uint64)[0] = native.prepare()
-            command = command.map(padded)
-            # Always a JAX array: for another kind the program would be compiled again.
-            extra = self._zero if command.feedforward is None else put(command.feedforward)
-            command = command._replace(feedforward=extra)
-            traced = None if self._controller is None else self._controller.traced
-            with controller_errors(self._controller and self._options.control, span.begin + 1):
-                program = compiled(self._layout, traced, self._gravity)
-                carry = program(
-                    steps, self._constants, self._bodies, self._started(state), measured, command
-                )
-            done, status = np.asarray(carry.progress).tolist()
-        failed = native.may_have_failed(status)
-        return Ran(
-            carry.state, carry.outputs, carry.measured, carry.before, span.tick, done, failed
-        )
+    def qpos(self) -> Float64:
+        """Return the positions of the last reading (M, dof)."""
+        return self._rows(self._measured.qpos)
 
-    def rows(self, array: Array) -> Rows:
-        """Return an array of the executor as a new NumPy array."""
-        return np.array(array)[: self._pack.size]
+    @property
+    def before(self) -> Rows:
+        """Positions before the last sim step (M, dof)."""
+        return self._rows(self._before)
 
-    def numpy_state(self, state: StepState) -> StepState:
-        """Return a state of the executor with NumPy arrays."""
-        import jax
-
-        state = jax.tree.map(lambda leaf: np.array(leaf)[: self._pack.size], state)
+    def read_state(self) -> StepState:
+        """Return the state of the control as new NumPy arrays."""
+        state: StepState = self._numpy(self._state)
         return state if state.age is None else state._replace(age=state.age.astype(np.int64))
 
-    def _started(self, state: StepState) -> StepState:
-        """Return ``state`` as the program takes it: padded JAX arrays, with a mass matrix if the
-        law needs one.
-        """
+    def write_state(self, state: StepState) -> None:
+        """Replace the state of the control."""
         import jax
 
-        law, pack = self._layout.law, self._pack
-        if any(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(state)):
-            age = None if state.age is None else state.age.astype(np.int32)
-            state = put(jax.tree.map(padded, state._replace(age=age)))
-        if state.matrix is None and law is not None and law.uses_mass_matrix:
-            if self._no_matrix is None:
-                self._no_matrix = put(padded(np.zeros((pack.size, pack.dof, pack.dof))))
-            state = state._replace(matrix=self._no_matrix)
-        return state
+        age = None if state.age is None else state.age.astype(np.int32)
+        with own_settings("float64"):
+            self._state = put(jax.tree.map(padded, state._replace(age=age)))
 
-    def _bind(self) -> CompiledStep:
-        """Return the compiled sim step of the present robots and systems."""
-        pack = self._pack
-        if self._native is None or self._bound is not pack.calls:
-            self._bound = pack.calls
-            self._native = pack.compiled_step(
-                self._gravity, self._coriolis, self._reads_qvel, self._speed_limit
-            )
-        return self._native
+    def results(self) -> Outputs:
+        """Return the results of the last sim step as new NumPy arrays."""
+        outputs: Outputs = self._numpy(self._outputs)
+        return outputs
+
+    def run(self, command: Command, moves: bool, begin: int, end: int) -> int:
+        """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
+        setup, step = self.setup, self._engine.compiled()
+        control, controller = setup.options.control, setup.controller
+        layout = setup.layout._replace(model=Model(), moves=moves)
+        traced = None if controller is None else controller.traced
+        with own_settings("float64"):
+            steps = np.array([begin, end, 0, 0], np.int32)
+            steps[2:].view(np.uint64)[0] = step.prepare()
+            rows = put(mapped(padded, command))
+            with controller_errors(None if controller is None else control, begin + 1):
+                carry = compiled(layout, traced)(
+                    steps, self._constants, self._bodies, self._state, self._measured, rows
+                )
+            done, status = np.asarray(carry.progress).tolist()
+        _, self._state, self._measured, self._outputs, self._before = carry
+        self.failed = step.may_have_failed(status)
+        return int(done)
+
+    def _rows(self, array: Array) -> Rows:
+        return np.array(array)[: self.setup.pack.size]
+
+    def _numpy(self, tree: Any) -> Any:
+        import jax
+
+        return jax.tree.map(self._rows, tree)
 
 
 def tick(
     layout: Layout,
     controller: Any,
-    gravity: bool,
     span: Any,
     constants: Constants,
     bodies: tuple[Any, Any] | None,
@@ -214,19 +184,19 @@ def tick(
         return lax.cond(due.any(), function, lambda: otherwise)
 
     model = Model(mass_matrix, mass_matrix, when=when, controller=controller)
-    whole = layout._replace(model=model)
+    with_model = layout._replace(model=model)
 
     def body(carry: Carry) -> Carry:
         index, status = carry.progress[0], carry.progress[1]
 
-        def engine(values: Values) -> Values:
+        def engine(layout: Layout, constants: Constants, values: Values) -> Values:
             nonlocal status
             qpos, qvel, passive, status = xla.sim_step(address, index, values.outputs.qf)
-            return values._replace(measured=Measured(qpos, qvel, passive if gravity else None))
+            return values._replace(measured=Measured(qpos, qvel, passive))
 
         step = Step(index, end, left=layout.left(index, end, constants.timestep))
         values = Values(carry.state, command, carry.measured, step, carry.measured)
-        values = sim_step(whole, constants, values, {"engine": engine})
+        values = sim_step(with_model, constants, values, {"engine": engine})
         progress = xp.stack([index + 1, status])
         return Carry(progress, values.state, values.measured, values.outputs, carry.measured.qpos)
 
@@ -240,11 +210,11 @@ def tick(
 
 
 @lru_cache(maxsize=8)
-def compiled(layout: Layout, controller: Any, gravity: bool) -> Any:
+def compiled(layout: Layout, controller: Any) -> Any:
     """Return :func:`tick` of this layout, compiled at its first call."""
     import jax
 
     return jax.jit(
-        partial(tick, layout, controller, gravity),
+        partial(tick, layout, controller),
         compiler_options={"xla_cpu_multi_thread_eigen": False},
     )

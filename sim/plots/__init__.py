@@ -6,8 +6,18 @@ from batchpid.sim.plots.figures import (
     comparison,
     efforts,
     fit_errors,
+    following_errors,
     save,
     step_responses,
 )
 
-__all__ = ["FORMATS", "FitErrors", "comparison", "efforts", "fit_errors", "save", "step_responses"]
+__all__ = [
+    "FORMATS",
+    "FitErrors",
+    "comparison",
+    "efforts",
+    "fit_errors",
+    "following_errors",
+    "save",
+    "step_responses",
+]

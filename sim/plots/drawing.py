@@ -15,7 +15,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, to_rgba
 
 from batchpid.arrays.array_types import Rows
-from batchpid.sim.observation import OBSERVED, Rollout, RunInfo
+from batchpid.sim.signals.observation import OBSERVED
+from batchpid.sim.signals.rollout import Rollout, RunInfo
 
 ENV = "#4c78a8"
 MEDIAN = "#16324f"

@@ -28,9 +28,9 @@ from batchpid.arrays.array_types import Array, Float64
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.sim.command import CommandSpec
-from batchpid.sim.observation import Rollout
 from batchpid.sim.plots import drawing
+from batchpid.sim.signals.command import CommandSpec
+from batchpid.sim.signals.rollout import Rollout
 
 FORMATS = (".png", ".svg")
 """Suffixes of the files that :func:`save` writes."""
@@ -120,6 +120,23 @@ def efforts(
         drawing.draw_efforts(axes, run, joint, mark)
     limit = Line2D([], [], color=drawing.LIMIT, lw=1.0, label="limit")
     _legend(figure, [*_fan_entries(run, mark), limit, _SATURATION])
+    return figure
+
+
+def following_errors(rollout: Rollout, *, joints: Joints = None, title: str = "") -> Figure:
+    """Draw, for each joint, position minus setpoint at the ends of the ticks, where a setpoint
+    holds.
+
+    Parameters as in :func:`step_responses`.
+    """
+    run = _blank_failed(rollout)
+    figure, blocks = _figure(run, joints, rows=1, title=title)
+    for joint, (axes,) in blocks:
+        error = run.qpos[..., joint] - run.setpoint[..., joint]
+        drawing.draw_fan(axes, run.time, error, None)
+        axes.autoscale(axis="y")
+        axes.set_ylabel(run.info.units[joint], fontsize=drawing.SMALL)
+    _legend(figure, _fan_entries(run, None))
     return figure
 
 

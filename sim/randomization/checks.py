@@ -7,12 +7,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Rows
+from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN
+from batchpid.motors.actuators import DELAYS, NOISES, TABLE
 from batchpid.motors.actuators import FIELDS as OF_ACTUATORS
-from batchpid.motors.actuators import TABLE
 from batchpid.sim.randomization.fields import GROUPS, Field, elements, nominal_values, parts
 from batchpid.sim.randomization.randomization import EVENTS, FIELDS, Randomization
 from batchpid.sim.robot.parts import MjcfFile
@@ -29,45 +29,44 @@ def check_robot(randomization: Randomization, robot: Robot, mjcf: MjcfFile | Non
 
     ``mjcf`` as for :func:`batchpid.sim.randomization.fields.nominal_values`.
     """
-    events = randomization.events
-    for name in EVENTS if events else ():
-        if name not in events:
-            other = next(iter(events))
-            raise InvalidArgumentError(
-                name, f"is missing, and there is a {other}", remedy="give both, or none"
-            )
-    if events and robot.fixed_base:
-        remedy = "load it with fixed_base=False"
-        raise InvalidArgumentError(
-            "push", f"needs a floating base, which {robot.name!r} does not have", remedy=remedy
-        )
-    for name, distribution in (randomization.given | events).items():
+    _check_events(randomization, robot)
+    for name, field in (randomization.given | randomization.events).items():
         if name.partition(".")[0] in GROUPS:
             continue  # check_params and prepared_actuators
         columns = elements(name, robot)
-        if name in _ZERO and any(
-            part.operation == "scale" for *_, part in parts(name, distribution, columns)
-        ):
-            raise InvalidArgumentError(
-                name, "is 0, which cannot be scaled", remedy="use operation 'add'"
-            )
-        for rows in _extremes(name, distribution, columns, nominal_values(name, robot, mjcf)[None]):
+        scales = [part.operation == "scale" for *_, part in parts(name, field, columns)]
+        if name in _ZERO and any(scales):
+            problem = "is 0, which cannot be scaled"
+            raise InvalidArgumentError(name, problem, remedy="use operation 'add'")
+        for rows in _extremes(name, field, columns, nominal_values(name, robot, mjcf)[None]):
             FIELDS[name].checked(name, rows[0], columns, kind="entry")
     if randomization.damping is not None and robot.dissipation != "urdf":
-        problem, remedy = (
-            "cannot be drawn: the engine sets it with this dissipation",
-            "load with dissipation='urdf'",
-        )
+        problem = "cannot be drawn: the engine sets it with this dissipation"
+        remedy = "load with dissipation='urdf'"
         raise InvalidArgumentError("damping", problem, remedy=remedy)
     if randomization.payload_link is not None:
         choice("payload_link", randomization.payload_link, [link.name for link in robot.links])
 
 
-def _extremes(name: str, each: Field, columns: Sequence[str], nominal: Rows) -> Iterator[Rows]:
+def _check_events(randomization: Randomization, robot: Robot) -> None:
+    events = randomization.events
+    if not events:
+        return
+    for name in EVENTS:
+        if name not in events:
+            problem = f"is missing, and there is a {next(iter(events))}"
+            raise InvalidArgumentError(name, problem, remedy="give both, or none")
+    if robot.fixed_base:
+        problem = f"needs a floating base, which {robot.name!r} does not have"
+        remedy = "load it with fixed_base=False"
+        raise InvalidArgumentError("push", problem, remedy=remedy)
+
+
+def _extremes(name: str, field: Field, columns: Sequence[str], nominal: Rows) -> Iterator[Rows]:
     """Yield ``nominal`` (rows, elements, ...) with the least and with the largest draw of each part
     of a field.
     """
-    for _, chosen, distribution in parts(name, each, columns):
+    for _, chosen, distribution in parts(name, field, columns):
         for end in np.clip(distribution.support, -_HUGE, _HUGE):
             rows = np.array(nominal)
             rows[:, chosen] = distribution.apply(rows[:, chosen], end)
@@ -79,20 +78,15 @@ def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robo
 
     Raises InvalidArgumentError if a leaf is off, or a draw may be out of its range.
     """
-    leaves = {
-        name: leaf
-        for name, leaf in params._asdict().items()
-        if leaf is not None and not isinstance(leaf, tuple)
-    }
+    leaves = params.leaves()
     for name, distribution in randomization.params.items():
         if name not in leaves:
-            problem, remedy = (
-                "is off in the params, or none of their numbers",
-                f"draw one of {', '.join(leaves)}",
-            )
+            problem = "is off in the params, or none of their numbers"
+            remedy = f"draw one of {', '.join(leaves)}"
             raise InvalidArgumentError(f"params.{name}", problem, remedy=remedy)
         for rows in _extremes(f"params.{name}", distribution, robot.joint_names, leaves[name]):
-            params._replace(**{name: rows}).check(params.num_envs, robot.joint_names)
+            drawn: Document = {name: rows}
+            params._replace(**drawn).check(params.num_envs, robot.joint_names)
 
 
 def prepared_actuators(
@@ -110,39 +104,44 @@ def prepared_actuators(
     """
     if not randomization.actuators:
         return actuators
-    if control == "drive" and (bypassed := sorted(randomization.actuators.keys() - set(DRIVEN))):
+    bypassed = sorted(randomization.actuators.keys() - set(DRIVEN))
+    if control == "drive" and bypassed:
+        problem = "has no effect on PhysX's drives"
         remedy = f"use control 'pid', or draw only {', '.join(DRIVEN)}"
-        raise InvalidArgumentError(
-            f"actuators.{bypassed[0]}", "has no effect on PhysX's drives", remedy=remedy
-        )
-    known = bp.Actuators() if actuators is None else actuators
-    delay = 0.0 if known.max_delay is None else float(known.max_delay[0, 0])
-    values: dict[str, Rows] = {}
-    for leaf, each in randomization.actuators.items():
-        field = (OF_ACTUATORS | TABLE)[choice("actuators", leaf, [*OF_ACTUATORS, *TABLE])]
-        nominal = getattr(known, leaf)
-        if nominal is None and np.isinf(field.neutral):
-            remedy = f"give the runner actuators with {'position_limit' if leaf in TABLE else leaf}"
-            raise InvalidArgumentError(
-                f"actuators.{leaf}", "is off, and has no value to change", remedy=remedy
-            )
-        values[leaf] = (
-            np.full((1, robot.dof), field.neutral) if nominal is None else np.asarray(nominal)
-        )
-        for rows in _extremes(f"actuators.{leaf}", each, robot.joint_names, values[leaf]):
-            least = rows.reshape(len(rows), robot.dof, -1).min(2)
-            field.checked(leaf, least, robot.joint_names, infinite=leaf in TABLE)
-            delay = max(delay, float(rows.max())) if leaf.endswith("delay") else delay
+        raise InvalidArgumentError(f"actuators.{bypassed[0]}", problem, remedy=remedy)
+    nominal = bp.Actuators() if actuators is None else actuators
+    delay = 0.0 if nominal.max_delay is None else float(nominal.max_delay[0, 0])
+    values: Document = {}
+    for name, field in randomization.actuators.items():
+        values[name], most = _with_extremes(name, field, nominal, robot)
+        if name in DELAYS:
+            delay = max(delay, most)
+    # Histories and noise are on where any draw needs them.
     like = bp.make_actuators(
         robot.dof, command_delay=1e-3, position_noise=1.0, max_delay=max(delay, 1e-3)
     )
-    noisy = known.seed is None and not values.keys().isdisjoint(
-        ("position_noise", "velocity_noise")
-    )
-    delayed = not values.keys().isdisjoint(("command_delay", "sensor_delay"))
-    return known._replace(
-        **values,
-        seed=like.seed if noisy else known.seed,
-        max_delay=like.max_delay if delayed else known.max_delay,
-        continuous=bp.make_actuators(robot.dof, continuous=robot.continuous).continuous,
-    )
+    if not values.keys().isdisjoint(DELAYS):
+        values["max_delay"] = like.max_delay
+    if nominal.seed is None and not values.keys().isdisjoint(NOISES):
+        values["seed"] = like.seed
+    values["continuous"] = bp.make_actuators(robot.dof, continuous=robot.continuous).continuous
+    return nominal._replace(**values)
+
+
+def _with_extremes(
+    name: str, field: Field, actuators: bp.Actuators, robot: Robot
+) -> tuple[Rows, float]:
+    """Return the nominal values of a field of the actuators, and the largest that can be drawn."""
+    declared = (OF_ACTUATORS | TABLE)[choice("actuators", name, [*OF_ACTUATORS, *TABLE])]
+    leaf = getattr(actuators, name)
+    if leaf is None and np.isinf(declared.neutral):
+        remedy = f"give the runner actuators with {'position_limit' if name in TABLE else name}"
+        problem = "is off, and has no value to change"
+        raise InvalidArgumentError(f"actuators.{name}", problem, remedy=remedy)
+    nominal = np.full((1, robot.dof), declared.neutral) if leaf is None else np.asarray(leaf)
+    most = -np.inf
+    for rows in _extremes(f"actuators.{name}", field, robot.joint_names, nominal):
+        least = rows.reshape(len(rows), robot.dof, -1).min(2)
+        declared.checked(name, least, robot.joint_names, infinite=name in TABLE)
+        most = max(most, float(rows.max()))
+    return nominal, most

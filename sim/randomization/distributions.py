@@ -10,15 +10,16 @@ from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Document, Float64
+from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.checks.validate import choice, flag, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 
 Episodes = NDArray[np.int64]
 Operation = Literal["add", "scale", "abs"]
+_UNIT = "in the unit of the field"
 LEAST_SHARE = 0.01
 """Least share of a normal distribution within its bounds."""
 
@@ -41,6 +42,8 @@ class Distribution(ABC):
     """True for one draw for all joints or links of an env."""
     kind: ClassVar[str] = ""
     """Name in a file, where the arguments without default are a list."""
+    least: ClassVar[float] = -math.inf
+    """Least value of low, high and std."""
 
     def __post_init__(self) -> None:
         choice("operation", self.operation, get_args(Operation))
@@ -55,33 +58,39 @@ class Distribution(ABC):
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
 
-    def apply(self, nominal: Any, drawn: Any) -> Any:
+    def apply(self, nominal: Rows, drawn: Rows | float) -> Rows:
         """Return the value that results from the nominal one and a draw."""
-        if self.operation == "abs":
-            return drawn + np.zeros_like(nominal)
-        return nominal * drawn if self.operation == "scale" else nominal + drawn
+        if self.operation == "add":
+            return nominal + drawn
+        return nominal * drawn if self.operation == "scale" else drawn + np.zeros_like(nominal)
+
+    @classmethod
+    def arguments(cls, keywords: bool) -> list[str]:
+        """Return the names of the arguments without a default, or of the ``keywords``."""
+        return [one.name for one in fields(cls) if one.kw_only is keywords]
 
     def to_dict(self) -> Document:
         """Return it as plain values: ``{"uniform": [low, high], "operation": "scale"}``."""
-        values = [getattr(self, each.name) for each in fields(self) if not each.kw_only]
-        options = [
-            each
-            for each in fields(self)
-            if each.kw_only and getattr(self, each.name) != each.default
-        ]
-        first = values if len(values) > 1 else list(*values)
-        return {self.kind: first, **{each.name: getattr(self, each.name) for each in options}}
+        values = [getattr(self, name) for name in self.arguments(keywords=False)]
+        document: Document = {self.kind: values if len(values) > 1 else list(*values)}
+        for one in fields(self):
+            if one.kw_only and getattr(self, one.name) != one.default:
+                document[one.name] = getattr(self, one.name)
+        return document
 
-    def _numbers(self, *names: str, low: float = -math.inf) -> None:
+    def _read(self, *names: str, low: float = -math.inf, infinite: bool = False) -> None:
+        """Convert arguments to finite numbers of at least ``low``, or ``infinite`` ones."""
         for name in names:
-            value = number(name, getattr(self, name), low, math.inf, "in the unit of the field")
-            object.__setattr__(self, name, value)
+            value = getattr(self, name)
+            if not (infinite and value in (-math.inf, math.inf)):
+                value = number(name, value, low, math.inf, _UNIT)
+            object.__setattr__(self, name, float(value))
 
-    def _ordered(self, low: float, high: float) -> None:
+    def _check_order(self) -> None:
+        low, high = self.support
         if low > high:
-            raise InvalidArgumentError(
-                "high", f"is less than low, {low:g}", value=high, remedy="swap them"
-            )
+            problem = f"is less than low, {low:g}"
+            raise InvalidArgumentError("high", problem, value=high, remedy="swap them")
 
 
 @dataclass(frozen=True)
@@ -91,12 +100,11 @@ class Uniform(Distribution):
     low: float
     high: float
     kind = "uniform"
-    _lowest = -math.inf
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._numbers("low", "high", low=self._lowest)
-        self._ordered(self.low, self.high)
+        self._read("low", "high", low=self.least)
+        self._check_order()
 
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
@@ -108,7 +116,7 @@ class LogUniform(Uniform):
     """Distribution on [low, high], both > 0, whose logarithm is uniform."""
 
     kind = "log_uniform"
-    _lowest = np.finfo(float).tiny
+    least = float(np.finfo(float).tiny)
 
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
@@ -128,22 +136,18 @@ class Normal(Distribution):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._numbers("mean")
-        self._numbers("std", low=np.finfo(float).tiny)
-        low, high = (_bound(name, getattr(self, name)) for name in ("low", "high"))
-        self._ordered(low, high)
-        share = 0.5 * (
-            math.erf((high - self.mean) / self._scale) - math.erf((low - self.mean) / self._scale)
-        )
+        self._read("mean")
+        self._read("std", low=LogUniform.least)
+        self._read("low", "high", infinite=True)
+        self._check_order()
+        # Draws outside are repeated, which a tail would do for long.
+        scale = math.sqrt(2.0) * self.std
+        below, above = (math.erf((end - self.mean) / scale) for end in self.support)
+        share = 0.5 * (above - below)
         if share < LEAST_SHARE:
             problem = f"and high leave {share:.2g} of the draws"
-            raise InvalidArgumentError(
-                "low", problem, value=low, remedy="use a uniform distribution for a tail"
-            )
-
-    @property
-    def _scale(self) -> float:
-        return math.sqrt(2.0) * self.std
+            remedy = "use a uniform distribution for a tail"
+            raise InvalidArgumentError("low", problem, value=self.low, remedy=remedy)
 
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
@@ -162,17 +166,14 @@ class Choice(Distribution):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if (
-            isinstance(self.values, str)
-            or not isinstance(self.values, Sequence | np.ndarray)
-            or not len(self.values)
-        ):
-            raise InvalidArgumentError(
-                "values", "must be a list of numbers", value=self.values, remedy="give one"
-            )
-        unit = "in the unit of the field"
-        values = tuple(number("values", value, -math.inf, math.inf, unit) for value in self.values)
-        object.__setattr__(self, "values", values)
+        is_list = isinstance(self.values, Sequence | np.ndarray) and not isinstance(
+            self.values, str
+        )
+        if not is_list or not len(self.values):
+            problem = "must be a list of numbers"
+            raise InvalidArgumentError("values", problem, value=self.values, remedy="give one")
+        values = [number("values", value, -math.inf, math.inf, _UNIT) for value in self.values]
+        object.__setattr__(self, "values", tuple(values))
 
     @property
     def support(self) -> tuple[float, float]:
@@ -185,12 +186,12 @@ class Choice(Distribution):
 
 
 KINDS: dict[str, type[Distribution]] = {
-    each.kind: each for each in (Uniform, LogUniform, Normal, Choice)
+    one.kind: one for one in (Uniform, LogUniform, Normal, Choice)
 }
 """Distributions by their name in a file."""
 
 
-def read_distribution(name: str, value: Any) -> Distribution:
+def read_distribution(name: str, value: object) -> Distribution:
     """Return the distribution of the field ``name`` that a file describes, as
     :meth:`Distribution.to_dict` does.
 
@@ -200,34 +201,23 @@ def read_distribution(name: str, value: Any) -> Distribution:
         It describes none.
     """
     kinds = [kind for kind in KINDS if isinstance(value, Mapping) and kind in value]
-    if len(kinds) != 1:
+    if not isinstance(value, Mapping) or len(kinds) != 1:
         remedy = f"write e.g. {{uniform: [0, 1], operation: add}}; there are {', '.join(KINDS)}"
         raise InvalidArgumentError(name, "is not a distribution", value=value, remedy=remedy)
     (kind,) = kinds
-    options = {key: option for key, option in value.items() if key != kind}
-    arguments = [value[kind]] if kind == Choice.kind else value[kind]
-    numbers, known = (
-        [each.name for each in fields(KINDS[kind]) if each.kw_only is only]
-        for only in (False, True)
-    )
+    options = dict(value)
+    arguments = options.pop(kind)
+    if kind == Choice.kind:
+        arguments = [arguments]
+    numbers = KINDS[kind].arguments(keywords=False)
     if not isinstance(arguments, list | tuple) or len(arguments) != len(numbers):
-        problem, remedy = f"{kind} needs a list of numbers", f"write {kind}: [{', '.join(numbers)}]"
-        raise InvalidArgumentError(
-            name, f"is not a distribution: {problem}", value=value, remedy=remedy
-        )
+        problem = f"is not a distribution: {kind} needs a list of numbers"
+        remedy = f"write {kind}: [{', '.join(numbers)}]"
+        raise InvalidArgumentError(name, problem, value=value, remedy=remedy)
     for option in options:
-        choice(name, option, known)
+        choice(name, option, KINDS[kind].arguments(keywords=True))
     with documents.named(name):
         return KINDS[kind](*arguments, **options)
-
-
-def _bound(name: str, value: Any) -> float:
-    """Return a bound, which may be infinite."""
-    return (
-        float(value)
-        if value in (-math.inf, math.inf)
-        else number(name, value, -math.inf, math.inf, "bound")
-    )
 
 
 class Draws(NamedTuple):
@@ -240,7 +230,7 @@ class Draws(NamedTuple):
     drawn.
     """
 
-    def for_envs(self, envs: slice | Any) -> Draws:
+    def for_envs(self, envs: slice | Rows | Sequence[int]) -> Draws:
         """Return the draws of some envs."""
         return Draws(self.episodes[envs], {name: rows[envs] for name, rows in self.values.items()})
 
@@ -264,7 +254,7 @@ NOTHING = Draws(np.zeros((0, 2), np.int64), {})
 
 
 def generators(
-    seed: int, name: str, episodes: Episodes, constant: bool, number: Any = 0
+    seed: int, name: str, episodes: Episodes, constant: bool, number: ArrayLike = 0
 ) -> Iterator[np.random.Generator]:
     """Yield a generator for each env, of draw ``number`` (an int, or one for each env) of one field
     in its episode.

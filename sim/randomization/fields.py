@@ -5,17 +5,16 @@ nominal values.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.command import TWIST_UNITS
 from batchpid.sim.randomization.distributions import Distribution, read_distribution
 from batchpid.sim.robot.parts import CONTACT_FRICTION, MjcfFile
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.command import TWIST_UNITS
 
 Field = Distribution | Mapping[str, Distribution]
 """Distribution for all joints or links, or one for each of those that are named."""
@@ -25,6 +24,8 @@ GROUPS = ("params", "actuators")
 
 SINGLE = ("payload", "ground_friction", "push_interval")
 """Fields of one value."""
+_AXES: dict[str, Sequence[str]] = {"gravity": ("x", "y", "z"), "push": tuple(TWIST_UNITS)}
+"""Fields of the world or the base, and their axes."""
 
 
 def elements(name: str, robot: Robot) -> Sequence[str]:
@@ -33,36 +34,28 @@ def elements(name: str, robot: Robot) -> Sequence[str]:
     """
     if name in SINGLE:
         return (name,)
-    if name == "gravity":
-        return ("x", "y", "z")
-    if name == "push":
-        return tuple(TWIST_UNITS)
-    if name == "center_of_mass":
-        return [f"{link}.{axis}" for link in elements("link_mass", robot) for axis in "xyz"]
-    if name == "link_mass":
-        return [
-            link.name
-            for link in robot.links
-            if link.mass or (link.mass is None and link.num_shapes)
-        ]
-    return robot.joint_names
+    if name in _AXES:
+        return _AXES[name]
+    if name not in ("link_mass", "center_of_mass"):
+        return robot.joint_names
+    links = [
+        link.name for link in robot.links if link.mass or (link.mass is None and link.num_shapes)
+    ]
+    return links if name == "link_mass" else [f"{link}.{axis}" for link in links for axis in "xyz"]
 
 
 def parts(
-    name: str, each: Field, columns: Sequence[str]
+    name: str, field: Field, columns: Sequence[str]
 ) -> Iterator[tuple[str, list[int], Distribution]]:
     """Yield the name of each independent part of a field, its columns and its distribution."""
-    if isinstance(each, Distribution):
-        yield name, list(range(len(columns))), each
+    if isinstance(field, Distribution):
+        yield name, list(range(len(columns))), field
         return
     owners = [column[:-2] for column in columns] if name == "center_of_mass" else columns
-    for element, distribution in each.items():
+    for element, distribution in field.items():
         choice(name, element, list(dict.fromkeys(owners)))
-        yield (
-            f"{name}.{element}",
-            [at for at, owner in enumerate(owners) if owner == element],
-            distribution,
-        )
+        chosen = [at for at, owner in enumerate(owners) if owner == element]
+        yield f"{name}.{element}", chosen, distribution
 
 
 def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None = None) -> Float64:
@@ -72,16 +65,16 @@ def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None = None) -> Flo
     """
     if name == "link_mass":
         return np.array([robot.link_masses[link].mass for link in elements(name, robot)])
-    nominal = {
-        "friction": robot.friction,
-        "damping": robot.damping,
-        "gravity": np.array([0.0, 0.0, -9.81]),
-    }
-    nominal |= {"ground_friction": np.array([CONTACT_FRICTION if mjcf is None else mjcf.friction])}
-    return nominal.get(name, np.zeros(len(elements(name, robot))))
+    if name in ("friction", "damping"):
+        return robot.friction if name == "friction" else robot.damping
+    if name == "gravity":
+        return np.array([0.0, 0.0, -9.81])
+    if name == "ground_friction":
+        return np.array([CONTACT_FRICTION if mjcf is None else mjcf.friction])
+    return np.zeros(len(elements(name, robot)))
 
 
-def mapping(name: str, value: object) -> Mapping[str, Any]:
+def mapping(name: str, value: object) -> Mapping[str, object]:
     """Return ``value`` if it is a mapping; raise InvalidArgumentError if not."""
     if not isinstance(value, Mapping):
         remedy = "write field: distribution, e.g. kp: {uniform: [0.9, 1.1], operation: scale}"
@@ -91,17 +84,14 @@ def mapping(name: str, value: object) -> Mapping[str, Any]:
     return value
 
 
-def read_field(name: str, value: Any) -> Field:
+def read_field(name: str, value: object) -> Field:
     """Return the field that a file describes: a distribution, or a mapping of names to
     distributions.
     """
-    if (
-        isinstance(value, Mapping)
-        and value
-        and all(isinstance(part, Mapping) for part in value.values())
-    ):
-        return {
-            str(element): read_distribution(f"{name}.{element}", part)
-            for element, part in value.items()
-        }
-    return read_distribution(name, value)
+    elements = value if isinstance(value, Mapping) else {}
+    if not elements or not all(isinstance(part, Mapping) for part in elements.values()):
+        return read_distribution(name, value)
+    return {
+        str(element): read_distribution(f"{name}.{element}", part)
+        for element, part in elements.items()
+    }

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ from batchpid.arrays.field_tables import declared, in_group
 from batchpid.checks.validate import choice, integer, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
-from batchpid.sim.randomization.distributions import Distribution, Draws, generators
+from batchpid.sim.randomization.distributions import Distribution, Draws, Episodes, generators
 from batchpid.sim.randomization.fields import (
     GROUPS,
     SINGLE,
@@ -115,16 +115,15 @@ class Randomization:
             object.__setattr__(self, name, _copied(getattr(self, name)))
         for group in GROUPS:
             mapping(group, getattr(self, group))
-        remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to such"
-        for name, each in (self.given | self.events).items():
-            given = (
-                list(each.values()) if isinstance(each, Mapping) and name not in SINGLE else [each]
-            )
-            for part in given or [None]:
+        for name, value in (self.given | self.events).items():
+            distributions: list[object] = [value]
+            if isinstance(value, Mapping) and name not in SINGLE:
+                distributions = list(value.values())
+            for part in distributions or [None]:
                 if not isinstance(part, Distribution):
-                    raise InvalidArgumentError(
-                        name, "is not a distribution", value=part, remedy=remedy
-                    )
+                    remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to such"
+                    problem = "is not a distribution"
+                    raise InvalidArgumentError(name, problem, value=part, remedy=remedy)
 
     @property
     def given(self) -> dict[str, Field]:
@@ -137,11 +136,7 @@ class Randomization:
     @property
     def events(self) -> dict[str, Field]:
         """Given fields of events during an episode, by name."""
-        return {
-            name: distribution
-            for name in EVENTS
-            if (distribution := getattr(self, name)) is not None
-        }
+        return {name: getattr(self, name) for name in EVENTS if getattr(self, name) is not None}
 
     @property
     def changes_robot(self) -> bool:
@@ -158,32 +153,26 @@ class Randomization:
     def draw(self, robot: Robot, episodes: Rows) -> Draws:
         """Return the draws for envs with these streams and episodes (envs, 2)."""
         episodes = episodes.astype(np.int64)
-        return Draws(
-            episodes,
-            {
-                name: self._draw(name, distribution, robot, episodes)
-                for name, distribution in self.given.items()
-            },
-        )
+        fields = self.given.items()
+        draws = {name: self._draw(name, value, robot, episodes) for name, value in fields}
+        return Draws(episodes, draws)
 
     def _draw(
-        self, name: str, each: Field, robot: Robot, episodes: NDArray[np.int64], number: Any = 0
+        self, name: str, value: Field, robot: Robot, episodes: Episodes, number: ArrayLike = 0
     ) -> Float64:
         """Return draws of a field (envs, elements), NaN where nothing is drawn; see
         :func:`generators`.
         """
         columns = elements(name, robot)
         rows = np.full((len(episodes), len(columns)), np.nan)
-        for part, chosen, distribution in parts(name, each, columns):
-            each_env = generators(self.seed, part, episodes, self.each == "env", number)
+        for part, chosen, distribution in parts(name, value, columns):
+            streams = generators(self.seed, part, episodes, self.each == "env", number)
             size = 1 if distribution.shared else len(chosen)
-            for row, generator in zip(rows, each_env, strict=True):
+            for row, generator in zip(rows, streams, strict=True):
                 row[chosen] = distribution.sample(generator, size)
         return rows
 
-    def next_push(
-        self, name: str, robot: Robot, episodes: NDArray[np.int64], number: NDArray[np.int64]
-    ) -> Float64:
+    def next_push(self, name: str, robot: Robot, episodes: Episodes, number: Episodes) -> Float64:
         """Return one field of the push after push ``number`` (n,) of these episodes (n, 2); number
         0 is the reset.
 
@@ -196,9 +185,7 @@ class Randomization:
         """Return the draws for the first episode of each env, of the stream of its number, from
         ``first_env`` on.
         """
-        return self.draw(
-            robot, np.stack([first_env + np.arange(num_envs), np.zeros(num_envs, np.int64)], 1)
-        )
+        return self.draw(robot, _first_episodes(first_env + np.arange(num_envs)))
 
     def redraw(
         self,
@@ -221,27 +208,20 @@ class Randomization:
         num_envs = len(mask)
         if seed is None:
             episodes = draws.episodes + np.array([0, 1])
+        elif np.ndim(seed) == 0:
+            first = first_env + integer("seed", seed, 0, LARGEST - first_env - num_envs)
+            episodes = _first_episodes(first + np.arange(num_envs))
         else:
-            if np.ndim(seed) == 0:
-                streams = (
-                    integer("seed", seed, 0, LARGEST - first_env - num_envs)
-                    + first_env
-                    + np.arange(num_envs)
-                )
-            else:
-                streams = read_array("seed", seed, "iu")
-                if (
-                    streams.shape != (num_envs,)
-                    or not ((streams >= 0) & (streams <= LARGEST)).all()
-                ):
-                    problem = f"must be {num_envs} whole numbers >= 0, one for each env"
-                    raise InvalidArgumentError(
-                        "seed", problem, value=seed, remedy="pass these, or an int"
-                    )
-            episodes = np.stack([streams.astype(np.int64), np.zeros(num_envs, np.int64)], 1)
+            streams = read_array("seed", seed, "iu")
+            is_each_env = streams.shape == (num_envs,)
+            if not is_each_env or not ((streams >= 0) & (streams <= LARGEST)).all():
+                problem = f"must be {num_envs} whole numbers >= 0, one for each env"
+                remedy = "pass these, or an int"
+                raise InvalidArgumentError("seed", problem, value=seed, remedy=remedy)
+            episodes = _first_episodes(streams)
         return draws.replaced(mask, self.draw(robot, episodes[mask]))
 
-    def apply(self, name: str, nominal: Any, draws: Draws, robot: Robot) -> Float64:
+    def apply(self, name: str, nominal: ArrayLike, draws: Draws, robot: Robot) -> Float64:
         """Return the values of a field (envs, joints or links) that result from ``nominal``, which
         broadcasts to it.
 
@@ -250,9 +230,8 @@ class Randomization:
         drawn = draws.values[name]
         if np.ndim(nominal) == 3:
             drawn = drawn[..., None]
-        values = np.array(
-            np.broadcast_to(nominal, np.broadcast_shapes(np.shape(nominal), drawn.shape))
-        )
+        shape = np.broadcast_shapes(np.shape(nominal), drawn.shape)
+        values = np.array(np.broadcast_to(nominal, shape))
         for _, chosen, distribution in parts(name, self.given[name], elements(name, robot)):
             values[:, chosen] = distribution.apply(values[:, chosen], drawn[:, chosen])
         return values
@@ -265,11 +244,11 @@ class Randomization:
         """
         if draws is None or not self.params:
             return params
-        values = {
-            name: self.apply(f"params.{name}", getattr(params, name), draws, robot)
-            for name in self.params
-        }
-        return params._replace(**{name: rows.astype(params.dtype) for name, rows in values.items()})
+        drawn: Document = {}
+        for name in self.params:
+            rows = self.apply(f"params.{name}", getattr(params, name), draws, robot)
+            drawn[name] = rows.astype(params.dtype)
+        return params._replace(**drawn)
 
     def randomized_actuators(
         self, actuators: bp.Actuators | None, draws: Draws | None, robot: Robot
@@ -281,11 +260,11 @@ class Randomization:
         """
         if draws is None or actuators is None or not self.actuators:
             return actuators
-        values = {}
+        drawn: Document = {}
         for name in self.actuators:
             rows = self.apply(f"actuators.{name}", getattr(actuators, name), draws, robot)
-            values[name] = rows * robot.independent if name in OF_JOINTS else rows
-        return actuators._replace(**values)
+            drawn[name] = rows * robot.independent if name in OF_JOINTS else rows
+        return actuators._replace(**drawn)
 
     def start(
         self, qpos: Float64, qvel: Float64, draws: Draws, robot: Robot
@@ -304,15 +283,11 @@ class Randomization:
 
     def to_dict(self) -> Document:
         """Return the given fields as plain values, for :meth:`from_dict`."""
-        document = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {
-            name: _plain(value)
-            for name, value in document.items()
-            if value is not None and value != {}
-        }
+        document = {one.name: _plain(getattr(self, one.name)) for one in fields(self)}
+        return {name: value for name, value in document.items() if value not in (None, {})}
 
     @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> Randomization:
+    def from_dict(cls, document: Mapping[str, object]) -> Randomization:
         """Return the randomization of :meth:`to_dict`, or of a file: ``{"payload": {"uniform": [0,
         0.5]}, ...}``.
 
@@ -321,28 +296,33 @@ class Randomization:
         InvalidArgumentError
             It is not a randomization, or has an unknown field.
         """
-        document = mapping("randomization", document)
-        names = [entry.name for entry in fields(cls)]
-        values = {choice("randomization", name, names): value for name, value in document.items()}
-        values |= {name: read_field(name, values[name]) for name in FIELDS.keys() & values.keys()}
-        for group in GROUPS:
-            group_values = mapping(group, values.get(group, {}))
-            values[group] = {
-                name: read_field(f"{group}.{name}", value) for name, value in group_values.items()
-            }
+        names = [one.name for one in fields(cls)]
+        values: Document = dict(mapping("randomization", document))
+        for name in values:
+            choice("randomization", name, names)
+            if name in FIELDS:
+                values[name] = read_field(name, values[name])
+            if name in GROUPS:
+                group = mapping(name, values[name]).items()
+                values[name] = {key: read_field(f"{name}.{key}", value) for key, value in group}
         return cls(**values)
 
 
-def _copied(each: Any) -> Any:
-    return (
-        {name: _copied(part) for name, part in each.items()} if isinstance(each, Mapping) else each
-    )
+def _first_episodes(streams: Rows) -> Episodes:
+    """Return the first episodes (envs, 2) of ``streams`` (envs,)."""
+    return np.stack([streams.astype(np.int64), np.zeros(len(streams), np.int64)], 1)
 
 
-def _plain(each: Any) -> Any:
-    if isinstance(each, Mapping):
-        return {name: _plain(part) for name, part in each.items()}
-    return each.to_dict() if isinstance(each, Distribution) else each
+def _copied(value: object) -> object:
+    if not isinstance(value, Mapping):
+        return value
+    return {name: _copied(part) for name, part in value.items()}
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {name: _plain(part) for name, part in value.items()}
+    return value.to_dict() if isinstance(value, Distribution) else value
 
 
 FIELDS = declared(Randomization, Bounds)

@@ -21,14 +21,15 @@ from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import flag, instance, integer
 from batchpid.errors import ClosedError, InUseError, InvalidArgumentError
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.observation import Observation, Redraw, RunInfo
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import RecordingError
+from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.rollout import Redraw, RunInfo
 
 if TYPE_CHECKING:
     import h5py
 
-    from batchpid.sim.runner import Runner
+    from batchpid.sim.runner.runner import Runner
 
 WRITE_PERIOD = 0.5
 """Time from one write to the next [s]. A kill loses the ticks since the last one."""
@@ -69,7 +70,9 @@ class Recorder(SingleOwner):
         seed: int | None = None,
         overwrite: bool = False,
     ) -> None:
-        from batchpid.sim.runner import Runner  # loads SAPIEN, as the runner has done already
+        from batchpid.sim.runner.runner import (
+            Runner,  # loads SAPIEN, as the runner has done already
+        )
 
         if instance("runner", runner, Runner, "pass the runner to record").closed:
             raise ClosedError("this Runner is closed; record one that is not")

@@ -27,9 +27,10 @@ from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks.validate import file_path, instance, integer
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.sim.command import CommandSpec
 from batchpid.sim.loop.faults import Fault
-from batchpid.sim.observation import Observation, Quantity, Redraw, Rollout, RunInfo
+from batchpid.sim.signals.command import CommandSpec
+from batchpid.sim.signals.observation import Observation, Quantity
+from batchpid.sim.signals.rollout import Redraw, Rollout, RunInfo
 
 if TYPE_CHECKING:
     import h5py  # functions load it, since commands that record nothing start sooner without it
@@ -212,19 +213,17 @@ def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Mapping
 # --------------------------------------------------------------------------------------------------
 
 
-def _dump_draws(draws: Mapping[str, Rows], joints: tuple[str, ...]) -> str:
-    return json.dumps({name: rows.tolist() for name, rows in draws.items()})
+Codec = tuple[Callable[[Any, tuple[str, ...]], object], Callable[[Any, tuple[str, ...]], Any]]
 
 
-def _load_draws(text: str, joints: tuple[str, ...]) -> dict[str, Rows]:
-    return {name: np.array(rows, np.float64) for name, rows in json.loads(text).items()}
+def _json(write: Callable[[Any], object], read: Callable[[Any], Any]) -> Codec:
+    """Return functions that write a value as JSON of what ``write`` makes of it, and read it."""
+    return (
+        lambda value, joints: json.dumps(write(value)),
+        lambda text, joints: read(json.loads(text)),
+    )
 
 
-Codec = tuple[Callable[[Any, tuple[str, ...]], str], Callable[[str, tuple[str, ...]], Any]]
-_MAPPING: Codec = (
-    lambda value, joints: json.dumps(dict(value)),
-    lambda text, joints: json.loads(text),
-)
 CODECS: dict[str, Codec] = {
     "params": (
         lambda params, joints: bp.dumps_params(params, joints, format="json"),
@@ -234,22 +233,18 @@ CODECS: dict[str, Codec] = {
         lambda actuators, joints: bp.motors.dumps_actuators(actuators, joints, format="json"),
         lambda text, joints: bp.motors.loads_actuators(text, joints)[0],
     ),
-    "own_command": (
-        lambda command, joints: json.dumps([command.names, command.units]),
-        lambda text, joints: CommandSpec(*json.loads(text)),
+    "own_command": _json(
+        lambda command: [command.names, command.units], lambda entries: CommandSpec(*entries)
     ),
-    "faults": (
-        lambda faults, joints: json.dumps([fault._asdict() for fault in faults]),
-        lambda text, joints: tuple([Fault(**fault) for fault in json.loads(text)]),
+    "faults": _json(list, lambda faults: tuple([Fault(*fault) for fault in faults])),
+    "redraws": _json(list, lambda redraws: tuple([Redraw(*redraw) for redraw in redraws])),
+    "draws": _json(
+        lambda draws: {name: rows.tolist() for name, rows in draws.items()},
+        lambda draws: {name: np.array(rows, np.float64) for name, rows in draws.items()},
     ),
-    "redraws": (
-        lambda redraws, joints: json.dumps(redraws),
-        lambda text, joints: tuple([Redraw(*redraw) for redraw in json.loads(text)]),
-    ),
-    "draws": (_dump_draws, _load_draws),
-    "versions": _MAPPING,
-    "randomization": _MAPPING,
-    "options": _MAPPING,
+    "versions": _json(dict, dict),
+    "randomization": _json(dict, dict),
+    "options": _json(dict, dict),
 }
 """Fields of :class:`RunInfo` that are JSON in a recording: functions (value, joint names) that
 write and read them.

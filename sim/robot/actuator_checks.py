@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
-from batchpid.motors import DRIVEN, JOINT_SIDE, check_actuators
+from batchpid.motors import DRIVEN, JOINT_SIDE
 from batchpid.sim.robot.description import RobotDescription
 
 BAND = {"rad": 1e-4, "m": 2e-5}
@@ -77,7 +77,7 @@ def fit_actuators(
     InvalidArgumentError if they do not fit.
     """
     instance("actuators", actuators, bp.Actuators, "build them with make_actuators()")
-    check_actuators(actuators, num_envs, robot.joint_names)
+    actuators.check(num_envs, robot.joint_names)
     if control == "drive" and (
         actuators.measures or actuators.delivers or actuators.load_friction is not None
     ):
@@ -87,7 +87,7 @@ def fit_actuators(
             " three",
             remedy=f"use control 'pid', or leave only {', '.join(DRIVEN)}",
         )
-    if actuators.num_joints is None:
+    if not actuators.num_joints:
         return actuators
     own = {name: getattr(actuators, name) for name in ("bias", *JOINT_SIDE)}
     own = {name: leaf * robot.independent for name, leaf in own.items() if leaf is not None}

@@ -17,9 +17,8 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from itertools import combinations
 
-from batchpid.sim.robot.merging import Separate, fixed_edges, place_links
-from batchpid.sim.robot.parts import Joint
-from batchpid.sim.robot.simulated_links import simulated
+from batchpid.sim.robot.merging import Separate, merge_fixed, rigid_bodies
+from batchpid.sim.robot.tables import Tables
 
 Words = tuple[int, int, int, int]
 Pair = frozenset[str]
@@ -65,37 +64,24 @@ def collision_groups(
 
 
 def link_groups(
-    urdf: str,
-    separate: Separate,
-    fixed_base: bool,
-    joints: Sequence[Joint],
-    ignored: Collection[Pair],
+    tables: Tables, separate: Separate, fixed_base: bool, ignored: Collection[Pair]
 ) -> tuple[dict[str, Words], frozenset[Pair]]:
-    """Return :func:`collision_groups` of the links of the URDF that have shapes, to ignore the
+    """Return :func:`collision_groups` of the links of ``tables`` that have shapes, to ignore the
     pairs ``ignored``.
 
     Links of one rigid body are ignored, too: they cannot move apart, and the solver would shake
     them. PhysX ignores contacts within a simulated link, and with its parent, unless that is the
     root of a fixed base.
     """
-    placements = place_links(urdf, separate)
-    bodies = {name: at.link for name, at in place_links(urdf).items()}
-    for first, second in fixed_edges(
-        urdf
-    ):  # a fixed joint that is not merged joins two links of one body
-        bodies = {
-            name: bodies[first] if body == bodies[second] else body for name, body in bodies.items()
-        }
-    root = next(at.link for at in placements.values()) if fixed_base else None
-    joined = [
-        (placements[joint.parent_link].link, placements[joint.child_link].link) for joint in joints
-    ]
-    neighbours = {frozenset(pair) for pair in joined if root not in pair}
-    links = list(
-        dict.fromkeys(
-            owner for owners in simulated(urdf, separate).owners.values() for owner in owners
-        )
-    )
+    simulated = merge_fixed(tables, separate)
+    placements, root = simulated.links, simulated.bodies[0].name
+    bodies = rigid_bodies(tables.joints)
+    neighbours = {
+        frozenset((joint.parent_link, joint.child_link))
+        for joint in simulated.joints
+        if joint.moves and not (fixed_base and joint.parent_link == root)
+    }
+    links = list(dict.fromkeys(shape.owner for shape in simulated.shapes))
     ignored, free = set(ignored), set[Pair]()
     for first, second in combinations(links, 2):
         pair = frozenset((placements[first].link, placements[second].link))

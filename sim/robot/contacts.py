@@ -6,7 +6,7 @@ The distance of two shapes that overlap is negative: the depth by which they pen
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Sequence
 from itertools import combinations
 from threading import RLock
 from typing import NamedTuple
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.sim.robot.collision_shapes import LinkShape, add_geom
+from batchpid.sim.robot.collision_shapes import add_geom
+from batchpid.sim.robot.tables import Shape
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -44,7 +45,7 @@ class Contacts:
         Tree of the simulated links. A link does not collide with its parent, except with the root
         of a fixed base.
     shapes
-        Shapes of each simulated link, by name.
+        Shapes of the simulated links.
     ignored
         Pairs of links of the URDF that do not collide.
     ground
@@ -55,15 +56,14 @@ class Contacts:
     def __init__(
         self,
         tree: RigidTree,
-        shapes: Mapping[str, list[LinkShape]],
+        shapes: Sequence[Shape],
         ignored: Collection[frozenset[str]],
         ground: bool,
     ) -> None:
         self._tree, self._lock = tree, RLock()
-        placed = [(link, shape) for link, of_link in shapes.items() for shape in of_link]
-        self._shapes = [shape for _, shape in placed]
-        self.links = tuple(dict.fromkeys(link for link, _ in placed))
-        self._link = np.array([self.links.index(link) for link, _ in placed], np.intp)
+        self._shapes = tuple(shapes)
+        self.links = tuple(dict.fromkeys(shape.body for shape in shapes))
+        self._link = np.array([self.links.index(shape.body) for shape in shapes], np.intp)
         bodies = [tree.link_bodies[tree.index(link)] for link in self.links]
         self._body = np.array([bodies[link] for link in self._link], np.intp)
         spec = mujoco.MjSpec()
@@ -81,9 +81,9 @@ class Contacts:
         free = {frozenset((link, tree.links[parent])) for link, parent in above if parent >= first}
         pairs = [
             (a, b)
-            for a, b in combinations(range(len(placed)), 2)
+            for a, b in combinations(range(len(shapes)), 2)
             if self._body[a] != self._body[b]
-            and frozenset((placed[a][0], placed[b][0])) not in free
+            and frozenset((shapes[a].body, shapes[b].body)) not in free
             and frozenset((self._shapes[a].owner, self._shapes[b].owner)) not in ignored
         ]
         self._pairs = np.array(pairs, np.intp).reshape(-1, 2)
@@ -120,12 +120,12 @@ class Contacts:
             *np.sort(self._body[self._pairs], axis=1).tolist(),
             *([-1, body] for body in self._body[self._grounded]),
         ]
-        found: dict[tuple[int, int], float] = {}
+        least: dict[tuple[int, int], float] = {}
         for distance, (first, second) in zip(
             [*apart.tolist(), *heights.tolist()], bodies, strict=True
         ):
-            found[first, second] = min(distance, found.get((first, second), np.inf))
-        return found
+            least[first, second] = min(distance, least.get((first, second), np.inf))
+        return least
 
     def _apart(self, qpos: Rows, within: float) -> tuple[Float64, Float64]:
         """Return lower bounds of the distances of the pairs (pairs,) [m], exact below ``within``,
@@ -154,7 +154,7 @@ class Contacts:
         """Return the two links nearest to each other; one if the other is the ground, none if none
         are near.
         """
-        nearest = min(self.near(qpos), key=lambda each: each.distance, default=Near("", "", np.inf))
+        nearest = min(self.near(qpos), key=lambda pair: pair.distance, default=Near("", "", np.inf))
         return tuple(name for name in nearest[:2] if name)
 
     def height(self, qpos: Rows, base_too: bool = False) -> float:
@@ -198,7 +198,7 @@ class Contacts:
         x, y, z = self._data.geom_xmat[index].reshape(3, 3)[
             2
         ]  # the shape's axes along the vertical
-        if shape.vertices is not None:
+        if shape.kind == "mesh":
             mesh = self._model.geom_dataid[index]
             start = self._model.mesh_vertadr[mesh]
             vertices = self._model.mesh_vert[start : start + self._model.mesh_vertnum[mesh]]

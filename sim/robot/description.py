@@ -18,7 +18,8 @@ from batchpid.arrays.digest import digest
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
-from batchpid.sim.observation import RunInfo
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.merging import merge_fixed, place_links
 from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import (
@@ -29,12 +30,12 @@ from batchpid.sim.robot.parts import (
     MjcfFile,
     Placement,
     Settings,
-    Urdf,
 )
 from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.sim.robot.self_collision import SelfContact, Srdf, self_contact
 from batchpid.sim.robot.setpoint_limits import setpoint_guard
-from batchpid.sim.robot.simulated_links import body_inertias, link_masses, rigid_tree, simulated
+from batchpid.sim.robot.simulated_links import link_masses, rigid_tree
+from batchpid.sim.robot.tables import Body, Tables
 from batchpid.task_space.rigid_tree import RigidTree
 
 GRAVITY_MARGIN = 2.0  # of the effort that holds the joint still
@@ -62,24 +63,27 @@ LIMIT_TOLERANCE = 1e-6  # rad or m
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RobotDescription(Urdf):
-    """Robot as its URDF describes it; every array is in the order of ``joint_names``.
+class RobotDescription:
+    """Robot as its file describes it; every array is in the order of ``joint_names``.
 
-    ``joints`` are the degrees of freedom, the moving joints of ``all_joints``. ``bodies`` is the
-    placement of every link, by name, in its simulated link: links joined by fixed joints are
-    simulated as one. ``settings`` come from a bundled robot, ``defaults`` and ``mjcf`` from an MJCF
+    ``tables`` are its bodies and shapes as in the file, after ``repairs``; ``oddities`` are
+    findings about content that was read as it stands. ``joints`` are the degrees of freedom, the
+    moving joints of ``all_joints``. ``settings`` come from a bundled robot, ``defaults`` and ``mjcf`` from an MJCF
     file, else None. ``package_dirs`` are the folders in which meshes are looked up first.
     ``actuators`` are its motors and sensors, None for ideal ones. ``base_start`` is the pose (7,)
     at which the file places a floating base, None if it does not.
     """
 
+    name: str
+    tables: Tables
+    repairs: tuple[Finding, ...]
+    oddities: tuple[Finding, ...]
     path: Path
     srdf: Srdf
     self_collision: str
     joints: tuple[Joint, ...]
     dissipation: str
     fixed_base: bool
-    bodies: Mapping[str, Placement]
     settings: Settings | None
     package_dirs: tuple[Path, ...] = ()
     actuators: bp.Actuators | None = None
@@ -88,17 +92,37 @@ class RobotDescription(Urdf):
     base_start: tuple[float, ...] | None = None
 
     def __repr__(self) -> str:
-        given = sum(link.mass or 0.0 for link in self.links)
-        shaped = sum(not link.inertial and link.num_shapes > 0 for link in self.links)
-        masses = [f"{given:.4g} kg"] * (given > 0 or not shaped) + [
-            f"{shaped} links with the mass of shapes"
-        ] * (shaped > 0)
-        mass = " and ".join(masses)
+        total = sum(body.mass for body in self.links)
+        owners = {shape.owner for shape in self.tables.shapes}
+        shaped = sum(not body.mass and body.name in owners for body in self.links)
+        mass = f"{total:.4g} kg"
+        if shaped:
+            by_shapes = f"{shaped} links with the mass of shapes"
+            mass = f"{mass} and {by_shapes}" if total else by_shapes
         joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
         head = (
             f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
         )
         return f"{head}\n  joints={joints})"
+
+    @property
+    def links(self) -> tuple[Body, ...]:
+        """Links of the file, with mass and the joint above, breadth first."""
+        return self.tables.bodies
+
+    @cached_property
+    def all_joints(self) -> tuple[Joint, ...]:
+        """All joints, in SAPIEN's order: breadth first, fixed joints counted, joints of one parent
+        in the order of the file.
+        """
+        return self.tables.joints
+
+    @cached_property
+    def bodies(self) -> Mapping[str, Placement]:
+        """Placement of every link, by name, in its simulated body: links joined by fixed joints are
+        one.
+        """
+        return place_links(self.tables)
 
     @property
     def dof(self) -> int:
@@ -259,17 +283,6 @@ class RobotDescription(Urdf):
             raise InvalidArgumentError("kp", f"robot {self.name!r} has no gains", remedy=remedy)
         return bp.make_params(joints=self.dof, **(known | options))
 
-    def run_info(self, **options: Any) -> RunInfo:
-        """Return the info of a run of this robot; ``options`` are further fields of
-        :class:`batchpid.sim.RunInfo`.
-        """
-        shared = (
-            *("joint_names", "units", "lower", "upper", "effort_limit"),
-            *("urdf", "dissipation", "fixed_base"),
-        )
-        values = {name: getattr(self, name) for name in shared}
-        return RunInfo(robot=self.name, description=self, **values, **options)
-
     def sample(self, count: int, seed: int = 0) -> Float64:
         """Return seeded poses (count, dof), uniform within the limits and half a turn of the start;
         followers match.
@@ -287,19 +300,9 @@ class RobotDescription(Urdf):
 
         Raises RobotError if a link's mass comes from its shapes, and a mesh cannot be read.
         """
-        inertias = simulated(self.urdf).inertias
         low, high = np.where(self.continuous, [[-np.inf], [np.inf]], [self.lower, self.upper])
         limits = {"lower": low, "upper": high}
-        return rigid_tree(
-            self.urdf, inertias, coupling=self.coupling, fixed_base=self.fixed_base, **limits
-        )
-
-    @cached_property
-    def simulated_tree(self) -> RigidTree:
-        """Tree of the simulated links, without coupling."""
-        return rigid_tree(
-            simulated(self.urdf).urdf, body_inertias(self.urdf), fixed_base=self.fixed_base
-        )
+        return rigid_tree(self.tables, coupling=self.coupling, fixed_base=self.fixed_base, **limits)
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof),
@@ -333,7 +336,7 @@ class RobotDescription(Urdf):
     @cached_property
     def link_masses(self) -> Mapping[str, LinkMass]:
         """Simulated mass of every link of the URDF, by name, computed at the first use."""
-        return link_masses(self)
+        return link_masses(self.tables, self.repairs)
 
     @property
     def ignored_pairs(self) -> tuple[tuple[str, str], ...]:
@@ -351,12 +354,12 @@ class RobotDescription(Urdf):
         """Return a description of the simulated robot as plain values, equal for robots of equal
         content.
 
-        The repaired URDF with its collision meshes, the .srdf, and the settings of a bundled robot
-        are given by their digests. The actuators are left out.
+        The tables with the collision meshes, the .srdf, and the settings of a bundled robot
+        are given by digests. The actuators are left out.
         """
         return {
             "robot": self.name,
-            "urdf": self._urdf_digest,
+            "content": self.digest,
             "srdf": digest(self.srdf.disabled, self.srdf.enabled),
             "settings": digest(self.settings) if self.defaults is None else digest(self.defaults),
             "mjcf": None if self.mjcf is None else digest(replace(self.mjcf, path="")),
@@ -368,8 +371,9 @@ class RobotDescription(Urdf):
         }
 
     @cached_property
-    def _urdf_digest(self) -> str:
-        return digest(content_of(self.urdf), self.all_joints, self.joints)
+    def digest(self) -> str:
+        """Digest of bodies, joints and shapes, with the content of mesh files in place of paths."""
+        return digest(self.tables.bodies, content_of(self.tables.shapes), self.joints)
 
     def limit_violations(self, qpos: ArrayLike) -> list[tuple[int, int, float]]:
         """Return the entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env,
@@ -385,4 +389,5 @@ class RobotDescription(Urdf):
 @lru_cache(maxsize=8)
 def _model(robot: RobotDescription, ground: bool) -> RobotModel:
     ignored = frozenset(map(frozenset, robot.ignored_pairs))
-    return RobotModel(robot.simulated_tree.held, robot.coupling, robot.urdf, ignored, ground)
+    simulated = merge_fixed(robot.tables)
+    return RobotModel(rigid_tree(simulated), robot.coupling, simulated, ignored, ground)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from lxml import etree
 
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
+from batchpid.sim.robot.tables import Shape
 from batchpid.sim.robot.xml import LARGEST, LFS_POINTER
 
 FORMATS = (".stl", ".obj", ".dae", ".glb")
@@ -169,19 +170,15 @@ def check_unchanged(path: Path) -> None:
         raise RobotError(f"{problem}; start Python again, or save the mesh under another name")
 
 
-def content_of(urdf: str) -> str:
-    """Return the text of a URDF in canonical form, with the digest of each mesh file in place of
-    its path.
+def content_of(shapes: Sequence[Shape]) -> list[Shape]:
+    """Return ``shapes`` with the digest of each mesh file in place of its path.
 
     Raises RobotError for a file that cannot be read.
     """
-    root = etree.fromstring(
-        urdf.encode(), etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
-    )
-    for mesh in root.iter("mesh"):
-        name = mesh.get("filename", "")
-        try:
-            mesh.set("filename", digest(Path(name).read_bytes()))
-        except OSError as error:
-            raise RobotError(f"{error}; restore the mesh, or load the robot again") from None
-    return etree.tostring(root, method="c14n", with_comments=False).decode()
+    try:
+        return [
+            shape._replace(file=digest(Path(shape.file).read_bytes()) if shape.file else "")
+            for shape in shapes
+        ]
+    except OSError as error:
+        raise RobotError(f"{error}; restore the mesh, or load the robot again") from None

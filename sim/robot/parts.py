@@ -1,6 +1,4 @@
-"""Parts of a robot's description: joints, links, dissipation, the text for the simulator, bundled
-settings.
-"""
+"""Parts of a robot's description: joints, dissipation, settings of bundled robots and of MJCF files."""
 
 from __future__ import annotations
 
@@ -10,8 +8,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.observation import OBSERVED
-from batchpid.sim.robot.findings import Finding
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
@@ -31,8 +27,8 @@ class Mimic:
 class Joint:
     """Joint of a URDF. Units: rad, N m, rad/s (revolute) or m, N, m/s (prismatic).
 
-    Limits that the URDF leaves out are infinite. ``origin`` [m] and ``rpy`` [rad] place the joint
-    in its parent link; ``axis`` is a direction in the joint's frame, not normalised.
+    Limits that the URDF leaves out are infinite. ``axis`` is a direction in the joint's frame, not
+    normalised.
     """
 
     name: str
@@ -48,8 +44,6 @@ class Joint:
     damping: float = 0.0
     friction: float = 0.0
     mimic: Mimic | None = None
-    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
-    rpy: tuple[float, ...] = (0.0, 0.0, 0.0)
     axis: tuple[float, ...] = (1.0, 0.0, 0.0)
 
     @property
@@ -70,23 +64,7 @@ class Joint:
     @property
     def effort_unit(self) -> str:
         """Unit of effort: ``"N"`` for a prismatic joint, else ``"N m"``."""
-        return OBSERVED["effort"].unit_for(self.unit)
-
-
-@dataclass(frozen=True)
-class Link:
-    """Link of a URDF: its mass [kg] (None without ``<inertial>``) and ``num_shapes`` that collide.
-
-    ``inertial`` is True if SAPIEN takes mass and inertia from the URDF. ``triangle_excess`` is
-    positive if no body has that inertia tensor: see
-    :func:`batchpid.sim.robot.link_repair.triangle_excess`.
-    """
-
-    name: str
-    mass: float | None
-    num_shapes: int
-    inertial: bool
-    triangle_excess: float = 0.0
+        return {"rad": "N m", "m": "N"}[self.unit]
 
 
 class LinkMass(NamedTuple):
@@ -173,22 +151,6 @@ class MjcfFile:
     is_alone: bool = True
     has_floor: bool = False
     friction: float = 1.0
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Urdf:
-    """URDF prepared for headless simulation.
-
-    ``urdf`` is the text that the simulator parses. ``all_joints`` are in SAPIEN's order: breadth
-    first from the root, fixed joints counted, joints of one parent in the order of the file.
-    ``repairs`` are findings, one for each change that the simulator needs.
-    """
-
-    name: str
-    urdf: str
-    all_joints: tuple[Joint, ...]
-    links: tuple[Link, ...]
-    repairs: tuple[Finding, ...]
 
 
 HEADERS = (

@@ -26,11 +26,9 @@ from collections import defaultdict
 from collections.abc import Iterator
 
 import numpy as np
-from lxml import etree
 
 from batchpid.sim.robot.description import POSES, RobotDescription
-from batchpid.sim.robot.findings import Finding, finding_of
-from batchpid.sim.robot.xml import numbers
+from batchpid.sim.robot.findings import Finding
 from batchpid.task_space.rigid_tree import GRAVITY
 
 LARGEST, SMALLEST = 20.0, 1 / 200
@@ -50,8 +48,6 @@ FARTHEST, PLACEHOLDER = 4 * np.pi, 1000.0
 """Bounds between which limits of a hinge are taken for degrees [rad]; larger ones mean "no
 limit".
 """
-TURN = 2 * np.pi + 0.01
-"""Bound of an angle of an origin [rad]."""
 
 _UNITS = "give sizes in metres, meshes in millimetres with <mesh scale='0.001 0.001 0.001'>"
 
@@ -146,13 +142,7 @@ def _degrees(robot: RobotDescription) -> Iterator[Finding]:
             text = "angles of many turns, as if degrees were read as radians"
             remedy = "give radians, and velocities in rad/s"
             yield Finding("warning", "degrees", text, remedy, joint.name, detail=", ".join(large))
-    for origin in etree.fromstring(robot.urdf.encode()).iter("origin"):
-        if max(map(abs, numbers(origin, "rpy", "0 0 0", robot.name))) > TURN:
-            text = "roll, pitch or yaw of more than a turn, as if degrees were read as radians"
-            detail = f"<{origin.getparent().tag}> rpy {origin.get('rpy')}"
-            yield finding_of(
-                origin, "warning", "degrees", text, "give <origin rpy=> in radians", detail
-            )
+    yield from robot.oddities
 
 
 def _distances(robot: RobotDescription) -> tuple[float, dict[str, float]]:
@@ -161,8 +151,8 @@ def _distances(robot: RobotDescription) -> tuple[float, dict[str, float]]:
     """
     depth: dict[str, float] = defaultdict(float)
     farthest: dict[str, float] = defaultdict(float)
-    for joint in robot.all_joints:  # parents first
-        offset = float(np.linalg.norm(joint.origin))
+    for joint, body in zip(robot.all_joints, robot.links[1:], strict=True):  # parents first
+        offset = float(np.linalg.norm(body.position))
         ends = (joint.lower, joint.upper) if joint.type == "prismatic" else ()
         travel = max((abs(end) for end in ends if np.isfinite(end)), default=0.0)
         depth[joint.child_link] = depth[joint.parent_link] + offset + travel

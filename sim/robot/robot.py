@@ -20,14 +20,11 @@ from batchpid.checks.validate import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.findings import Findings
-from batchpid.sim.robot.joint_repair import free_base, free_joint_of
-from batchpid.sim.robot.merging import place_links
+from batchpid.sim.robot.findings import Findings, report
 from batchpid.sim.robot.mimics import couple
 from batchpid.sim.robot.parts import DISSIPATION, FileDefaults, Joint, Settings
-from batchpid.sim.robot.preflight import check
 from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
-from batchpid.sim.robot.urdf import read_source, read_urdf
+from batchpid.sim.robot.urdf import read_robot
 from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:
@@ -118,47 +115,40 @@ class Robot(RobotDescription):
         # the file.
         path = _find(name_or_path)
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
-        root, repairs, mjcf = read_source(path, fixed_base is not False, missing_meshes)
-        free_joint = free_joint_of(root)
-        fixed_base = free_joint is None if fixed_base is None else fixed_base
-        base = None if mjcf is None else mjcf.base
-        if free_joint is not None and not fixed_base:
-            base = free_base(root, free_joint, repairs)
-        urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
-        if not any(joint.moves for joint in urdf.all_joints):
+        source = read_robot(path, fixed_base, folders, missing_meshes)
+        report(path, source.repairs, strict)
+        tables, mjcf = source.tables, source.mjcf
+        joints = couple([joint for joint in tables.joints if joint.moves])
+        if not joints:
             raise RobotError(
                 f"{path}: a robot without moving joints cannot be controlled; check the joint types"
             )
-        # From here on links mean bodies: those that fixed joints hold together are one.
-        bodies = place_links(urdf.urdf)
-        if (count := len({at.link for at in bodies.values()})) > MAX_LINKS:
-            problem = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
-            raise RobotError(f"{path}: {problem}; split the robot")
-        joints = couple([joint for joint in urdf.all_joints if joint.moves])
         beside = path.with_suffix(".srdf")
-        srdf = (
-            read_srdf(beside, [link.name for link in urdf.links])
-            if os.path.isfile(beside)
-            else Srdf()
-        )
+        srdf = read_srdf(beside, tables.links) if os.path.isfile(beside) else Srdf()
         if mjcf is not None:
             srdf = srdf._replace(disabled=(*mjcf.pairs, *srdf.disabled))
         bundled = path.parent == _ASSETS
         robot = cls(
-            **vars(urdf),
+            name=source.name,
+            tables=tables,
+            repairs=source.repairs,
+            oddities=source.oddities,
             path=path,
             srdf=srdf,
             self_collision=self_collision,
             joints=joints,
             dissipation=dissipation,
-            fixed_base=fixed_base,
+            fixed_base=source.fixed_base,
             package_dirs=folders,
-            bodies=bodies,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
             defaults=None if mjcf is None else _file_defaults(mjcf, joints),
             mjcf=None if mjcf is None else mjcf.file,
-            base_start=base,
+            base_start=source.base_start,
         )
+        # From here on links mean bodies: those that fixed joints hold together are one.
+        if (count := len({at.link for at in robot.bodies.values()})) > MAX_LINKS:
+            problem = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
+            raise RobotError(f"{path}: {problem}; split the robot")
         if actuators is None and mjcf is not None:
             actuators = _file_actuators(mjcf, joints)
         return (
@@ -201,6 +191,8 @@ class Robot(RobotDescription):
         InvalidArgumentError
             An argument has a wrong shape, type or range.
         """
+        from batchpid.sim.diagnosis.preflight import check
+
         if params is None and self.settings is not None and control == "pid":
             params = self.params()
         return check(self, params, qpos, setpoint, timestep, control)

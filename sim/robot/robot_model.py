@@ -15,8 +15,8 @@ import numpy as np
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.motors.coupling import Coupling
-from batchpid.sim.robot.collision_shapes import link_shapes
 from batchpid.sim.robot.contacts import Contacts
+from batchpid.sim.robot.tables import Tables
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -30,8 +30,8 @@ class RobotModel:
     ----------
     tree, coupling
         Tree of the simulated links on a fixed base, and the coupling of its joints.
-    urdf, ignored
-        Text of the robot, and pairs of its links that do not collide.
+    tables, ignored
+        Simulated bodies of the robot, and pairs of its links that do not collide.
     ground
         Whether there is a ground at height 0.
     """
@@ -40,18 +40,18 @@ class RobotModel:
         self,
         tree: RigidTree,
         coupling: Coupling,
-        urdf: str,
+        tables: Tables,
         ignored: frozenset[frozenset[str]],
         ground: bool,
     ) -> None:
         self.tree = tree
         self._coupling = coupling
-        self._urdf = urdf
+        self._tables = tables
         self._ignored = ignored
         self._ground = ground
 
     def __reduce__(self) -> Any:  # a controller that keeps it can be sent to worker processes
-        return RobotModel, (self.tree, self._coupling, self._urdf, self._ignored, self._ground)
+        return RobotModel, (self.tree, self._coupling, self._tables, self._ignored, self._ground)
 
     def mass_matrix(self, qpos: Array) -> Array:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg], in NumPy or JAX as
@@ -121,7 +121,7 @@ class RobotModel:
     @cached_property
     def contacts(self) -> Contacts:
         """Distances of the links to each other and to the ground."""
-        return Contacts(self.tree, link_shapes(self._urdf), self._ignored, self._ground)
+        return Contacts(self.tree, self._tables.shapes, self._ignored, self._ground)
 
     def in_contact(self, qpos: Rows, clearance: float = 0.0) -> Bool:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground

@@ -18,10 +18,11 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.robot.collision_groups import link_groups
-from batchpid.sim.robot.collision_shapes import link_shapes
 from batchpid.sim.robot.contacts import Contacts
 from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.merging import merge_fixed, rigid_bodies
 from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.simulated_links import rigid_tree
 from batchpid.sim.robot.xml import parse_xml
 
 SELF_COLLISION = ("auto", "urdf", "none")
@@ -132,10 +133,11 @@ def self_contact(robot: Any) -> SelfContact:
 
     Deterministic: the poses are seeded. Raises RobotError for a mesh that cannot be read.
     """
-    solid = [link.name for link in robot.links if link.num_shapes]
-    bodies = _rigid_bodies(robot.all_joints)
-    shapes, tree = link_shapes(robot.urdf), robot.simulated_tree
-    contacts = Contacts(tree, shapes, frozenset(), ground=False)
+    solid = list(dict.fromkeys(shape.owner for shape in robot.tables.shapes))
+    bodies = rigid_bodies(robot.all_joints)
+    simulated = merge_fixed(robot.tables)
+    tree = rigid_tree(simulated, fixed_base=robot.fixed_base)
+    contacts = Contacts(tree, simulated.shapes, frozenset(), ground=False)
     computed: tuple[DisabledPair, ...] = ()
     if robot.self_collision == "none":
         computed = tuple(DisabledPair(*pair, "User") for pair in combinations(solid, 2))
@@ -155,7 +157,7 @@ def self_contact(robot: Any) -> SelfContact:
         if links not in robot.srdf.enabled and links <= set(solid)
     ]
     ignored = [pair.links for pair in pairs]
-    _, left_over = link_groups(robot.urdf, (), robot.fixed_base, robot.joints, ignored)
+    _, left_over = link_groups(robot.tables, (), robot.fixed_base, ignored)
     return SelfContact(
         pairs=tuple(pair for pair in pairs if pair.links not in left_over),
         left_over=tuple(pair for pair in pairs if pair.links in left_over),
@@ -174,24 +176,13 @@ def _distances(contacts: Contacts, qpos: Float64) -> dict[frozenset[str], float]
     return distances
 
 
-def _rigid_bodies(joints: Iterable[Joint]) -> dict[str, str]:
-    """Return the rigid body of each link, named after its first link, for ``joints`` in
-    breadth-first order.
-    """
-    bodies: dict[str, str] = {}
-    for joint in joints:
-        body = bodies.setdefault(joint.parent_link, joint.parent_link)
-        bodies[joint.child_link] = joint.child_link if joint.moves else body
-    return bodies
-
-
 def _adjacent_links(joints: Iterable[Joint], solid: Collection[str]) -> list[frozenset[str]]:
     """Return the pairs of links with shapes, ``solid``, whose rigid bodies are neighbours.
 
     Neighbours are connected by a joint, or by a chain of joints and bodies without shapes.
     """
     joints = list(joints)
-    bodies = _rigid_bodies(joints)
+    bodies = rigid_bodies(joints)
     parents = {joint.child_link: bodies[joint.parent_link] for joint in joints if joint.moves}
     members = defaultdict(list)
     for link, body in bodies.items():

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.arrays.leaves import frozen
+from batchpid.arrays.records import frozen
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
-from batchpid.motors.guard import check_guard
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import Joint
 
@@ -113,5 +112,5 @@ def fit_guard(
         raise InvalidArgumentError("guard", problem, value=control, remedy=remedy)
     limits = setpoint_guard(joints, None, None) if guard is True else guard
     limits = instance("guard", limits, bp.Guard, "pass True, or robot.guard(...)")
-    check_guard(limits, num_envs, [joint.name for joint in joints])
+    limits.check(num_envs, [joint.name for joint in joints])
     return frozen(_of_leaders(limits, joints))

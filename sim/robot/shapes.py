@@ -18,15 +18,17 @@ from numpy.typing import NDArray
 
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.link_repair import SHAPES
 from batchpid.sim.robot.meshes import find_mesh, read_mesh
-from batchpid.sim.robot.urdf import is_mjcf
+from batchpid.sim.robot.tables import Shape
+from batchpid.sim.robot.urdf import is_mjcf, read_origin, read_shape
 from batchpid.sim.robot.xml import numbers, parse_xml
-from batchpid.task_space.rotations import from_rpy, rotate
+from batchpid.task_space.rotations import rotate
 
 Rgba = tuple[float, ...]
 _REMEDY = (
     "repair the file, put it next to the URDF, or pass package_dirs=[...] to Robot.load"
-    " (--package-dirs)"
+    ", or ROS_PACKAGE_PATH"
 )
 
 DEVIATION = 2e-3  # default distance allowed between a chord and its arc [m]
@@ -71,34 +73,22 @@ def surfaces(
     """
     from trimesh.util import concatenate
 
-    original, sanitised = parse_xml(robot.path), etree.fromstring(robot.urdf.encode())
-    if is_mjcf(original):  # drawn by its collision shapes
-        original = sanitised
-    colours = {
-        material.get("name"): _rgba(material.find("color"), f"{robot.path}: material")
-        for material in original.iter("material")
-        if material.find("color") is not None
-    }
-    solid = {link.get("name"): link.findall("collision") for link in sanitised.findall("link")}
+    visuals = _read_visuals(robot)
     result = []
-    undrawn = {link.name for link in robot.links}
-    for link in original.findall("link"):
-        name = link.get("name", "").strip()
-        if name not in undrawn:
-            continue  # left out of the robot: see batchpid.sim.robot.repair
-        undrawn.remove(name)
-        where = f"{robot.path}: link {name!r}"
+    for body in robot.links:
+        name = body.name
+        solid = [(shape, None) for shape in robot.tables.shapes_of(name)]
         parts: dict[Rgba, list[Any]] = {}
         unreadable: list[_UnreadableMesh] = []
-        for elements in (link.findall("visual"), solid.get(name, [])):
+        for elements in (visuals.get(name, []), solid):
             try:
-                meshes = [_mesh(element, robot, deviation, where) for element in elements]
+                meshes = [_mesh(shape, robot, deviation) for shape, _ in elements]
             except _UnreadableMesh as error:
                 unreadable.append(error)
                 continue
             if meshes and all(mesh is not None for mesh in meshes):
-                for element, mesh in zip(elements, meshes, strict=True):
-                    parts.setdefault(_colour(element, colours, name, where), []).append(mesh)
+                for (_, rgba), mesh in zip(elements, meshes, strict=True):
+                    parts.setdefault(rgba or _default_colour(name), []).append(mesh)
                 break
         if findings is not None:
             shown = "collision shapes are drawn instead" if parts else "it is not drawn"
@@ -113,6 +103,37 @@ def surfaces(
                 Surface(name, rgba, np.asarray(joined.vertices), np.asarray(joined.faces))
             )
     return result or _rods(robot)
+
+
+def _read_visuals(robot: RobotDescription) -> dict[str, list[tuple[Shape | None, Rgba | None]]]:
+    """Return shape and colour of the ``<visual>`` elements of each link of a URDF, None for those
+    without; MJCF files are drawn by the collision shapes.
+    """
+    root = parse_xml(robot.path)
+    if is_mjcf(root):
+        return {}
+    colours = {
+        material.get("name"): _rgba(material.find("color"), f"{robot.path}: material")
+        for material in root.iter("material")
+        if material.find("color") is not None
+    }
+    visuals: dict[str, list[tuple[Shape | None, Rgba | None]]] = {}
+    for link in root.findall("link"):
+        name = link.get("name", "").strip()
+        where = f"{robot.path}: link {name!r}"
+        rows = []
+        for element in link.findall("visual"):
+            geometry, material = element.find("geometry/*"), element.find("material")
+            shape, rgba = None, None
+            if geometry is not None and geometry.tag in SHAPES:
+                shape = read_shape(geometry, name, read_origin(element, where), where)
+            if material is not None:
+                rgba = colours.get(material.get("name"))
+                if (color := material.find("color")) is not None:
+                    rgba = _rgba(color, where)
+            rows.append((shape, rgba))
+        visuals.setdefault(name, rows)  # the first of links with one name
+    return visuals
 
 
 def _rods(robot: RobotDescription) -> list[Surface]:
@@ -172,55 +193,35 @@ def _read_mesh(name: str, robot: RobotDescription) -> Any:
     return loaded
 
 
-def _mesh(element: etree._Element, robot: RobotDescription, deviation: float, where: str) -> Any:
-    """Return the ``trimesh.Trimesh`` of a visual or collision in its link's frame, or None if it
-    has no shape.
+def _mesh(shape: Shape | None, robot: RobotDescription, deviation: float) -> Any:
+    """Return the ``trimesh.Trimesh`` of a shape in its link's frame, or None without one.
 
     Raises _UnreadableMesh.
     """
     from trimesh import Trimesh, creation
 
-    shape = element.find("geometry/*")
-    kind = None if shape is None else shape.tag
-    if kind == "mesh":
-        loaded = _read_mesh(shape.get("filename", ""), robot)
+    if shape is None:
+        return None
+    if shape.kind == "mesh":
+        loaded = _read_mesh(shape.file, robot)
         mesh: Any = Trimesh(loaded.vertices, loaded.faces, process=False)
-        mesh.apply_scale(numbers(shape, "scale", "1 1 1", where))
-    elif kind == "box":
-        mesh = creation.box(numbers(shape, "size", "0 0 0", where))
+        mesh.apply_scale(shape.scale)
+    elif shape.kind == "box":
+        mesh = creation.box([2 * side for side in shape.size])
         mesh.unmerge_vertices()
-    elif kind in ("cylinder", "capsule", "sphere"):
-        (radius,), (length,) = (
-            numbers(shape, "radius", "0", where),
-            numbers(shape, "length", "0", where),
-        )
+    else:
+        radius, length = shape.size[0], 2 * sum(shape.size[1:])
         segments = segments_of(radius, deviation)
         # Made with radius 1 and scaled: trimesh drops triangles smaller than 1e-8 m^2.
-        if kind == "cylinder":
+        if shape.kind == "cylinder":
             mesh = creation.revolve(_CYLINDER, sections=segments, process=False)
             mesh.vertices *= (radius, radius, length)
         else:
-            mesh = creation.capsule(
-                length / max(radius, 1e-9), 1.0, count=((segments + 1) // 2, segments)
-            )
+            count = ((segments + 1) // 2, segments)
+            mesh = creation.capsule(length / max(radius, 1e-9), 1.0, count=count)
             mesh.vertices *= radius
-    else:
-        return None
-    origin = element.find("origin")
-    turn = from_rpy(numbers(origin, "rpy", "0 0 0", where))
-    mesh.vertices = rotate(turn, np.asarray(mesh.vertices)) + numbers(origin, "xyz", "0 0 0", where)
+    mesh.vertices = rotate(shape.wxyz, np.asarray(mesh.vertices)) + shape.position
     return mesh
-
-
-def _colour(
-    element: etree._Element, colours: dict[str | None, Rgba], link: str, where: str
-) -> Rgba:
-    """Return the colour of an element, or one chosen by the name of its link."""
-    material = element.find("material")
-    if material is not None and material.find("color") is not None:
-        return _rgba(material.find("color"), where)
-    default = _default_colour(link)
-    return default if material is None else colours.get(material.get("name"), default)
 
 
 def _default_colour(link: str) -> Rgba:

@@ -1,42 +1,55 @@
-"""URDF reader for headless simulation: parses safely, drops visuals, resolves meshes, lists the
-joints.
+"""URDF reader: parses safely, repairs the text, resolves meshes, and reads the tables of the robot.
 
 An MJCF file is read as the URDF that is equivalent to it (:mod:`batchpid.sim.robot.mjcf`).
-
-SAPIEN's own loader builds render components for every ``<visual>``, which fails on a machine
-without a render device, and silently skips a collision mesh that it cannot read. The text made here
-has no visuals, absolute mesh paths, and no mimic joint: the coupling is not SAPIEN's
-(:mod:`batchpid.sim.engine.coupled_joints`).
 """
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 from lxml import etree
 
-from batchpid.errors import MissingDependencyError
-from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.xml import parse_xml
+from batchpid.arrays.array_types import Document, Float64
+from batchpid.arrays.read_only import read_only
+from batchpid.errors import MissingDependencyError, RobotError
+from batchpid.sim.robot.findings import Finding, finding_of
+from batchpid.sim.robot.joint_repair import ends_of, free_base, free_joint_of
+from batchpid.sim.robot.link_repair import MOMENTS, from_entries
+from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
+from batchpid.sim.robot.parts import Joint, Mimic, Placement
+from batchpid.sim.robot.repair import repair
+from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Shape, Tables
+from batchpid.sim.robot.xml import number, numbers, parse_xml
+from batchpid.task_space.rotations import from_rpy
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.mjcf.mjcf_reader import Mjcf
 
-from collections import Counter, defaultdict
-from functools import cache
-
-from batchpid.arrays.array_types import Document
-from batchpid.errors import RobotError
-from batchpid.sim.robot.findings import report
-from batchpid.sim.robot.joint_repair import ends_of
-from batchpid.sim.robot.link_repair import MOMENTS, from_entries, triangle_excess
-from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
-from batchpid.sim.robot.parts import Joint, Link, Mimic, Urdf
-from batchpid.sim.robot.repair import repair
-from batchpid.sim.robot.xml import number, numbers
-
 MOST_READ = 4096  # links and joints of a file
+TURN = 2 * np.pi + 0.01
+"""Largest plausible angle of an origin [rad]."""
+
+
+class Source(NamedTuple):
+    """Robot as its file gives it.
+
+    ``repairs`` are findings, one for each change that the simulation needs; ``oddities`` are
+    findings about content that was read as it stands. ``base_start`` is the pose (7,) at which the
+    file places a floating base.
+    """
+
+    name: str
+    tables: Tables
+    repairs: tuple[Finding, ...]
+    oddities: tuple[Finding, ...]
+    fixed_base: bool
+    base_start: tuple[float, ...] | None
+    mjcf: Mjcf | None
 
 
 def is_mjcf(root: etree._Element) -> bool:
@@ -44,25 +57,43 @@ def is_mjcf(root: etree._Element) -> bool:
     return root.prefix is None and etree.QName(root).localname == "mujoco"
 
 
-def read_source(
-    path: Path, fixed_base: bool, missing_meshes: str
-) -> tuple[etree._Element, list[Finding], Mjcf | None]:
-    """Return the root of the URDF at ``path``, or of one that is equivalent to the MJCF there, and
-    the findings.
+def read_robot(
+    path: Path, fixed_base: bool | None, package_dirs: tuple[Path, ...], missing_meshes: str
+) -> Source:
+    """Return the robot in the URDF or MJCF file at ``path``.
 
-    The last value is the rest of an MJCF file, None for a URDF.
+    For the arguments see :meth:`batchpid.sim.Robot.load`.
 
     Raises
     ------
     RobotError
-        The file cannot be read, or MuJoCo does not compile it.
+        A file that cannot be read, a structure or number that SAPIEN cannot build, a bad mesh, or
+        an MJCF file that MuJoCo does not compile.
     MissingDependencyError
         The file is MJCF, and the package ``mujoco`` is missing.
     """
     findings: list[Finding] = []
     root = parse_xml(path, findings)
-    if not is_mjcf(root):
-        return root, findings, None
+    mjcf, base = None, None
+    if is_mjcf(root):
+        mjcf = _read_mjcf(path, root, fixed_base is not False, missing_meshes)
+        root, base = mjcf.root, mjcf.base
+        findings += mjcf.findings
+    free_joint = free_joint_of(root)
+    fixed_base = free_joint is None if fixed_base is None else fixed_base
+    if free_joint is not None and not fixed_base:
+        base = free_base(root, free_joint, findings)
+    _repair(root, path, findings, package_dirs, missing_meshes)
+    links = [link.get("name", "") for link in root.findall("link")]
+    joints = [_read_joint(element, path) for element in root.findall("joint")]
+    added = [str(finding.link) for finding in findings if finding.code == "missing-link"]
+    ordered = _breadth_first(links, joints, path, added)
+    tables = _read_tables(root, ordered, str(path))
+    name, oddities = root.get("name", path.stem), tuple(_degrees(root))
+    return Source(name, tables, tuple(findings), oddities, fixed_base, base, mjcf)
+
+
+def _read_mjcf(path: Path, root: etree._Element, fixed_base: bool, missing_meshes: str) -> Mjcf:
     if not path.is_file():
         raise RobotError(
             f"{path}: an MJCF file is read several times, also by workers; save it as a file first"
@@ -74,58 +105,21 @@ def read_source(
     from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
 
     try:
-        mjcf = read_mjcf(path, root.get("model") or path.stem, fixed_base, missing_meshes)
+        return read_mjcf(path, root.get("model") or path.stem, fixed_base, missing_meshes)
     except UnicodeDecodeError as error:
         raise RobotError(
             f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
         ) from error
-    return mjcf.root, [*findings, *mjcf.findings], mjcf
 
 
-def read_urdf(
-    root: etree._Element,
-    path: Path,
-    repairs: list[Finding],
-    package_dirs: tuple[Path, ...],
-    missing_meshes: str,
-    strict: bool,
-) -> Urdf:
-    """Sanitise a URDF.
-
-    Parameters
-    ----------
-    root, path, repairs
-        Its root element, the file that it is from, and the findings of reading that.
-    package_dirs, missing_meshes, strict
-        See :meth:`batchpid.sim.Robot.load`.
-
-    Raises
-    ------
-    RobotError
-        A structure or number that SAPIEN cannot build, or a bad mesh.
-    """
-    repairs = list(repairs)
-    repair_urdf(root, path, repairs, package_dirs, missing_meshes)
-    joints = [_read_joint(element, path) for element in root.findall("joint")]
-    links = [_read_link(element, path) for element in root.findall("link")]
-    added = [str(finding.link) for finding in repairs if finding.code == "missing-link"]
-    ordered = _breadth_first(links, joints, path, added)
-    for element, joint in zip(root.findall("joint"), joints, strict=True):
-        if joint.mimic is not None:
-            element.remove(element.find("mimic"))  # batchpid.sim.engine.coupled_joints simulates it
-    report(path, repairs, strict)
-    text = etree.tostring(root, encoding="unicode")
-    return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(repairs))
-
-
-def repair_urdf(
+def _repair(
     root: etree._Element,
     path: Path,
     repairs: list[Finding],
     package_dirs: tuple[Path, ...],
     missing_meshes: str,
 ) -> None:
-    """Repair the ``<robot>`` of the file at ``path``, and append the repairs. See above."""
+    """Repair the ``<robot>`` of the file at ``path``, and append the repairs."""
     if root.tag != "robot":
         problem = f"the root element is <{root.tag}>, not <robot> (URDF) or <mujoco> (MJCF)"
         raise RobotError(
@@ -141,17 +135,16 @@ def repair_urdf(
     if missing and missing_meshes == "error":
         raise RobotError(
             f"{path}: collision mesh not found or not readable: {', '.join(missing)}; repair the"
-            " file, pass package_dirs=[...] (--package-dirs on the command line) with the folder"
-            " that holds the package, or missing_meshes='skip' (--missing-meshes skip) to simulate"
-            " without"
+            " file, pass package_dirs=[...] with the folder that holds the package (or name it in"
+            " ROS_PACKAGE_PATH), or missing_meshes='skip' to simulate without"
         )
     if missing:
         text = (
             f"collision meshes not found or not readable, simulated without: {', '.join(missing)}"
         )
         remedy = (
-            "repair the files, or pass package_dirs=[...] to Robot.load (--package-dirs on the"
-            " command line)"
+            "repair the files, or pass package_dirs=[...] to Robot.load, or name their folder in"
+            " ROS_PACKAGE_PATH"
         )
         repairs.append(Finding("warning", "missing-mesh", text, remedy))
 
@@ -178,83 +171,128 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
 
 
 def _read_joint(element: etree._Element, path: Path) -> Joint:
-    """Return a repaired joint, and write out or remove what SAPIEN fails on."""
+    """Return a repaired joint."""
     name, kind = element.get("name", ""), element.get("type", "")
     where = f"{path}: joint {name!r}"
     parent, child = ends_of(element)
     if not parent or not child:
         raise RobotError(f"{where}: needs <parent link=...> and <child link=...>; add them")
-    axis, limit, dynamics, mimic = map(element.find, ("axis", "limit", "dynamics", "mimic"))
-    fields: Document = _origin(element, where)
+    axis, limit, dynamics, mimic, safety = map(
+        element.find, ("axis", "limit", "dynamics", "mimic", "safety_controller")
+    )
+    fields: Document = {}
     if axis is not None:
         fields["axis"] = numbers(axis, "xyz", "1 0 0", where)
     if limit is not None:
-        fields |= {
-            f"{key}_limit": number(limit, key, "inf", where, limit=True)
-            for key in ("effort", "velocity")
-        }
-        if kind == "continuous":
-            element.remove(limit)
-        else:
-            fields |= {
-                key: number(limit, key, "0", where, limit=True) for key in ("lower", "upper")
-            }
-    for safety in element.findall("safety_controller"):
-        element.remove(safety)
-        soft = [number(safety, f"soft_{key}_limit", "0", where) for key in ("lower", "upper")]
-        if soft[0] < soft[1]:  # both are 0 where they are left out
-            fields |= {"soft_lower": soft[0], "soft_upper": soft[1]}
+        for key in ("effort", "velocity"):
+            fields[f"{key}_limit"] = number(limit, key, "inf", where, limit=True)
+        for key in ("lower", "upper") if kind != "continuous" else ():
+            fields[key] = number(limit, key, "0", where, limit=True)
+    if safety is not None:
+        low, high = (number(safety, f"soft_{key}_limit", "0", where) for key in ("lower", "upper"))
+        if low < high:  # both are 0 where they are left out
+            fields |= {"soft_lower": low, "soft_upper": high}
     for key in ("damping", "friction") if dynamics is not None else ():
         fields[key] = number(dynamics, key, "0", where)
-        dynamics.set(key, repr(fields[key]))
     if mimic is not None:
-        multiplier, offset = (
-            number(mimic, "multiplier", "1", where),
-            number(mimic, "offset", "0", where),
-        )
+        multiplier = number(mimic, "multiplier", "1", where)
+        offset = number(mimic, "offset", "0", where)
         fields["mimic"] = Mimic(mimic.get("joint", ""), multiplier, offset)
     return Joint(name, kind, parent, child, **fields)
 
 
-def _read_link(element: etree._Element, path: Path) -> Link:
-    """Return a repaired link."""
-    name, inertial = element.get("name", ""), element.find("inertial")
-    where, shapes = f"{path}: link {name!r}", element.findall("collision")
-    for part in [each for each in (inertial, *shapes) if each is not None]:
-        _origin(part, where)
-    if inertial is None:
-        return Link(name, None, len(shapes), False)
-    mass, inertia = inertial.find("mass"), inertial.find("inertia")
-    excess = triangle_excess(from_entries([number(inertia, key, "0", where) for key in MOMENTS]))
-    return Link(name, number(mass, "value", "0", where), len(shapes), True, excess)
-
-
-def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]:
-    """Return the position [m] and the roll, pitch and yaw [rad] of an element's ``<origin>``."""
-    origin = element.find("origin")
-    return {
-        "origin": numbers(origin, "xyz", "0 0 0", where),
-        "rpy": numbers(origin, "rpy", "0 0 0", where),
+def _read_tables(root: etree._Element, joints: Sequence[Joint], where: str) -> Tables:
+    """Return the tables of a repaired URDF with these joints, breadth first."""
+    elements = {
+        (tag, element.get("name")): element
+        for tag in ("link", "joint")
+        for element in root.findall(tag)
     }
+    children = {joint.child_link for joint in joints}
+    base = next(name for tag, name in elements if tag == "link" and name not in children)
+    bodies: list[Body] = []
+    shapes: list[Shape] = []
+    for joint in (None, *joints):
+        name = base if joint is None else joint.child_link
+        link = elements["link", name]
+        body = Body(name, joint)
+        if joint is not None:
+            position, wxyz = read_origin(elements["joint", joint.name], where)
+            body = body._replace(position=position, wxyz=wxyz)
+        if (inertial := link.find("inertial")) is not None:
+            center, turn = read_origin(inertial, where)
+            tensor = inertial.find("inertia")
+            entries = [number(tensor, key, "0", where) for key in MOMENTS]
+            body = body._replace(
+                mass=number(inertial.find("mass"), "value", "0", where),
+                center=center,
+                inertia=read_only(from_entries(entries)),
+                inertia_wxyz=turn,
+            )
+        bodies.append(body)
+        for collision in link.findall("collision"):
+            place = read_origin(collision, where)
+            shapes += [
+                read_shape(geometry, name, place, where)
+                for geometry in collision.iterfind("geometry/*")
+            ]
+    own = {body.name: Placement(body.name, ORIGIN, NO_TURN) for body in bodies}
+    return Tables(tuple(bodies), tuple(shapes), own)
+
+
+def _degrees(root: etree._Element) -> Iterator[Finding]:
+    """Yield a finding for each origin with an angle of more than a turn, in degrees probably."""
+    for origin in root.iter("origin"):
+        if max(map(abs, numbers(origin, "rpy", "0 0 0", "origin"))) > TURN:
+            text = "roll, pitch or yaw of more than a turn, as if degrees were read as radians"
+            detail = f"<{origin.getparent().tag}> rpy {origin.get('rpy')}"
+            remedy = "give <origin rpy=> in radians"
+            yield finding_of(origin, "warning", "degrees", text, remedy, detail)
+
+
+def read_shape(
+    geometry: etree._Element, link: str, place: tuple[Float64, Float64], where: str
+) -> Shape:
+    """Return the shape of a ``<geometry>`` of ``link``, at a position and orientation."""
+    kind = geometry.tag
+    size: tuple[float, ...] = ()
+    if kind == "mesh":
+        scale = numbers(geometry, "scale", "1 1 1", where)
+        return Shape(link, link, kind, size, *place, geometry.get("filename", ""), scale)
+    if kind == "box":
+        size = tuple(0.5 * side for side in numbers(geometry, "size", "0 0 0", where))
+    else:
+        size = (number(geometry, "radius", "0", where),)
+    if kind in ("capsule", "cylinder"):
+        size += (0.5 * number(geometry, "length", "0", where),)
+    return Shape(link, link, kind, size, *place)
+
+
+def read_origin(element: etree._Element, where: str) -> tuple[Float64, Float64]:
+    """Return position (3,) [m] and orientation (4,) of an element's ``<origin>``."""
+    origin = element.find("origin")
+    position = np.array(numbers(origin, "xyz", "0 0 0", where))
+    wxyz = from_rpy(numbers(origin, "rpy", "0 0 0", where))
+    return read_only(position), read_only(wxyz)
 
 
 def _breadth_first(
-    links: list[Link], joints: list[Joint], path: Path, added: list[str]
+    links: list[str], joints: list[Joint], path: Path, added: list[str]
 ) -> list[Joint]:
     """Return the joints level by level from the root, siblings in file order, if they form one
     tree.
 
     ``added`` are links that joints name and the file does not hold.
     """
-    known, children = [link.name for link in links], [joint.child_link for joint in joints]
-    moved, below = set(children), defaultdict(list)
+    children = [joint.child_link for joint in joints]
+    below = defaultdict(list)
     for joint in joints:
         below[joint.parent_link].append(joint)
     if twice := sorted(name for name, count in Counter(children).items() if count > 1):
         raise RobotError(
             f"{path}: link with two parents: {', '.join(twice)}; a robot must be a tree"
         )
-    roots = [name for name in known if name not in moved]
+    roots = [name for name in links if name not in children]
     if len(roots) != 1:
         remedy = (
             f"joints name {added}, not in the file: correct the names"

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from copy import deepcopy
 from pathlib import Path
 
+import numpy as np
 from lxml import etree
 
+from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.export.differences import Exported
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import summary
+from batchpid.sim.robot.link_repair import MOMENTS
+from batchpid.sim.robot.merging import link_inertias
 from batchpid.sim.robot.meshes import find_mesh
 from batchpid.sim.robot.repair import UNUSED
-from batchpid.sim.robot.urdf import read_source, read_urdf, repair_urdf
-from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.sim.robot.tables import NO_TURN, Body, Shape
+from batchpid.sim.robot.urdf import is_mjcf, read_robot
+from batchpid.sim.robot.xml import parse_xml
+from batchpid.task_space.rotations import to_rpy
+
+COPIED = {*UNUSED, "safety_controller"}
+"""Elements that are copied from a URDF."""
 
 
 def to_urdf(
@@ -27,8 +36,8 @@ def to_urdf(
 ) -> Exported:
     """Return the URDF of ``robot`` with its repairs, which need none again, and a list of them.
 
-    Links, joints, numbers and mimics are copied from the file unless repaired; visuals and other
-    elements without effect here are copied. Links that fixed joints connect stay apart.
+    Links, joints, shapes and mimics are written from the tables; visuals, soft limits and elements
+    without effect here are copied from the file. Links that fixed joints connect stay apart.
 
     Parameters
     ----------
@@ -46,17 +55,13 @@ def to_urdf(
         The file cannot be read, or has changed since the robot was loaded.
     """
     path, packages = robot.path, robot.package_dirs
-    source, findings, _ = read_source(path, robot.fixed_base, "skip")
-    root = deepcopy(source)
-    if read_urdf(deepcopy(source), path, findings, packages, "skip", False).urdf != robot.urdf:
+    if read_robot(path, robot.fixed_base, packages, "skip").tables != robot.tables:
         raise RobotError(f"{path}: has changed since the robot was loaded; load it again")
-    repair_urdf(root, path, findings, packages, "skip")
-    root.set("name", robot.name)
-    found = [sentence.partition(": ")[2] for sentence in summary(robot.repairs)]
-    found += _copy_unused(source, root, path, packages)
-    found += _lacking(robot)
-    for link, factor in (mass_factors or {}).items():
-        _scale_masses(root, robot.rigid_tree, link, factor)
+    root = _write(robot, mass_factors or {})
+    differences = [sentence.partition(": ")[2] for sentence in summary(robot.repairs)]
+    if not is_mjcf(source := parse_xml(path)):
+        differences += _copy_unused(source, root, path, packages)
+    differences += _lacking(robot)
     if folder is not None:
         for mesh in root.iter("mesh"):
             if os.path.isabs(name := mesh.get("filename", "")):
@@ -64,35 +69,80 @@ def to_urdf(
     etree.indent(root)
     etree.cleanup_namespaces(root)
     text = etree.tostring(root, encoding="unicode")
-    return Exported(f'<?xml version="1.0"?>\n{text}\n', tuple(found))
+    return Exported(f'<?xml version="1.0"?>\n{text}\n', tuple(differences))
 
 
-def _scale_masses(root: etree._Element, tree: RigidTree, link: str, factor: float) -> None:
-    """Multiply mass and inertia tensor of each link of a body by ``factor``; those by shapes become
-    numbers.
-    """
-    body = tree.link_bodies[tree.index(link)]
-    for index, name in enumerate(tree.links):
-        if tree.link_bodies[index] != body or not tree.mass[index]:
-            continue
-        owner = next(element for element in root.findall("link") if element.get("name") == name)
-        if (old := owner.find("inertial")) is not None:
-            owner.remove(old)
-        inertial = etree.SubElement(owner, "inertial")
-        etree.SubElement(inertial, "origin", xyz=" ".join(map(repr, tree.center[index].tolist())))
-        etree.SubElement(inertial, "mass", value=repr(factor * float(tree.mass[index])))
-        places = {
-            "ixx": (0, 0),
-            "ixy": (0, 1),
-            "ixz": (0, 2),
-            "iyy": (1, 1),
-            "iyz": (1, 2),
-            "izz": (2, 2),
-        }
-        tensor = {
-            key: repr(factor * float(tree.inertia[index][place])) for key, place in places.items()
-        }
-        etree.SubElement(inertial, "inertia", **tensor)
+def _write(robot: RobotDescription, mass_factors: Mapping[str, float]) -> etree._Element:
+    """Return the ``<robot>`` of the tables."""
+    root = etree.Element("robot", name=robot.name)
+    tree, inertias = robot.rigid_tree, link_inertias(robot.tables)
+    factors = {tree.link_bodies[tree.index(name)]: mass_factors[name] for name in mass_factors}
+    for body in robot.links:
+        link = etree.SubElement(root, "link", name=body.name)
+        factor = factors.get(tree.link_bodies[tree.index(body.name)])
+        if factor is not None and body.name in inertias:
+            # A mass of shapes becomes a number.
+            mass, center, inertia = inertias[body.name]
+            body = body._replace(center=center, inertia_wxyz=NO_TURN)
+            body = body._replace(mass=factor * mass, inertia=factor * inertia)
+        if body.mass:
+            inertial = _placed(link, "inertial", body.center, body.inertia_wxyz)
+            etree.SubElement(inertial, "mass", value=_text([body.mass]))
+            entries = map(repr, body.inertia[np.triu_indices(3)].tolist())
+            etree.SubElement(inertial, "inertia", dict(zip(MOMENTS, entries, strict=True)))
+        for shape in robot.tables.shapes_of(body.name):
+            collision = _placed(link, "collision", shape.position, shape.wxyz)
+            geometry = etree.SubElement(collision, "geometry")
+            etree.SubElement(geometry, shape.kind, _shape_attributes(shape))
+    for body in robot.links[1:]:
+        _write_joint(root, body)
+    return root
+
+
+def _write_joint(root: etree._Element, body: Body) -> None:
+    joint = body.joint
+    assert joint is not None  # of a body that is not the base
+    element = _placed(root, "joint", body.position, body.wxyz)
+    element.attrib.update({"name": joint.name, "type": joint.type})
+    etree.SubElement(element, "parent", link=joint.parent_link)
+    etree.SubElement(element, "child", link=joint.child_link)
+    if not joint.moves:
+        return
+    etree.SubElement(element, "axis", xyz=_text(joint.axis))
+    limits = {"effort": joint.effort_limit, "velocity": joint.velocity_limit}
+    limits = {key: limit for key, limit in limits.items() if math.isfinite(limit)}
+    if not joint.continuous:
+        limits |= {"lower": joint.lower, "upper": joint.upper}
+    etree.SubElement(element, "limit", {key: repr(limit) for key, limit in limits.items()})
+    damping, friction = repr(joint.damping), repr(joint.friction)
+    etree.SubElement(element, "dynamics", damping=damping, friction=friction)
+    if (mimic := joint.mimic) is not None:
+        factors = {"multiplier": repr(mimic.multiplier), "offset": repr(mimic.offset)}
+        etree.SubElement(element, "mimic", factors, joint=mimic.joint)
+
+
+def _shape_attributes(shape: Shape) -> dict[str, str]:
+    if shape.kind == "mesh":
+        return {"filename": shape.file, "scale": _text(shape.scale)}
+    if shape.kind == "box":
+        return {"size": _text([2 * side for side in shape.size])}
+    radius, *half_length = shape.size
+    attributes = {"radius": repr(radius)}
+    if half_length:
+        attributes["length"] = repr(2 * half_length[0])
+    return attributes
+
+
+def _placed(parent: etree._Element, tag: str, position: Float64, wxyz: Float64) -> etree._Element:
+    """Return a new element below ``parent`` with an ``<origin>``."""
+    element = etree.SubElement(parent, tag)
+    etree.SubElement(element, "origin", xyz=_text(position), rpy=_text(to_rpy(wxyz)))
+    return element
+
+
+def _text(values: Iterable[float]) -> str:
+    """Return numbers as text that reads back to the same numbers."""
+    return " ".join(repr(float(value)) for value in values)
 
 
 def _copy_unused(
@@ -112,7 +162,7 @@ def _copy_unused(
         if target is None or owner in copied:
             continue  # left out, or the second of its name
         copied.add(owner)
-        target.extend(deepcopy([each for each in parent if each.tag in UNUSED]))
+        target.extend(deepcopy([child for child in parent if child.tag in COPIED]))
     for mesh in root.iterfind("link/visual/geometry/mesh"):
         if (found := find_mesh(mesh.get("filename", ""), path, packages)) is None:
             missing.append(mesh.get("filename", ""))

@@ -14,16 +14,16 @@ from batchpid.arrays.array_types import Array
 from batchpid.arrays.digest import digest
 from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
-from batchpid.arrays.leaves import frozen
+from batchpid.arrays.records import frozen
 from batchpid.checks.validate import array, choice, flag, instance, names
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.friction import LOOKAHEAD, compensation
-from batchpid.sim.command import POSE_UNITS, CommandSpec
+from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
-from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.command import POSE_UNITS, CommandSpec
 from batchpid.task_space import native_law, native_rows
 from batchpid.task_space.frames import pose_error
 from batchpid.task_space.native_law import BoundOSC

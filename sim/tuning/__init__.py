@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from batchpid.sim.tuning.comparison import Comparison, compare
     from batchpid.sim.tuning.cost import Weights
     from batchpid.sim.tuning.evaluation import (
         Evaluation,
@@ -25,12 +26,14 @@ if TYPE_CHECKING:
     from batchpid.sim.tuning.search import Tuning, tune
 
 __all__ = [
+    "Comparison",
     "Evaluation",
     "GainSet",
     "Moves",
     "Tuning",
     "Weights",
     "arm_joints",
+    "compare",
     "evaluate_gains",
     "following_error",
     "gain_set",
@@ -45,6 +48,7 @@ __all__ = [
 ]
 
 _MODULES = {
+    "comparison": ("Comparison", "compare"),
     "cost": ("Weights",),
     "evaluation": (
         "Evaluation",

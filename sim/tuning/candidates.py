@@ -58,11 +58,11 @@ from batchpid.gains.stability import stability_bound
 from batchpid.metrics import StepMetrics
 from batchpid.motors.actuators import Actuators
 from batchpid.sim.diagnosis.findings import absolute_band
+from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.randomization.checks import prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner import Runner
+from batchpid.sim.runner.runner import Runner
 from batchpid.sim.tuning.cost import Weights
 from batchpid.sim.tuning.evaluation import (
     SETTLE_SECONDS,

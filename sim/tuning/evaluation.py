@@ -23,13 +23,13 @@ from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.diagnosis.findings import absolute_band
-from batchpid.sim.observation import Rollout
-from batchpid.sim.robot.loop_stability import StabilityReport, stability_report
+from batchpid.sim.diagnosis.loop_stability import StabilityReport, stability_report
+from batchpid.sim.diagnosis.run_checks import SetpointWarning
+from batchpid.sim.options.groups import EngineName
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.run_checks import SetpointWarning
-from batchpid.sim.runner import Runner
+from batchpid.sim.runner.runner import Runner
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.tuning.moves import (
-    MAX_OVERSHOOT,
     Moves,
     shortest_durations,
     smooth_durations,
@@ -45,14 +45,6 @@ SETTLE_SECONDS, SETTLE_SLACK = 1.0, 1.2
 """A move should settle within a second, or within this multiple of the shortest that its effort
 limits allow.
 """
-MAX_ERROR, MAX_CHATTER = 1e-3, 2.0
-"""Demands on the steady-state error [rad or m] and on the chatter."""
-CRITERIA = (
-    "moves that settle too late",
-    "moves that miss a demand",
-    "largest excess over a demand",
-)
-"""Criteria that rank two sets of gains, the most important first."""
 POSES = 3
 """Number of poses, starts and targets of moves, at which the stability of each draw is
 evaluated.
@@ -79,67 +71,12 @@ class Evaluation(NamedTuple):
     if not asked for.
     """
 
-    def demands(self, joints: NDArray[np.bool_]) -> dict[str, Float64]:
-        """Return the figure of each demand on ``joints`` (dof,), in units of its limit (moves,
-        dof); 0 elsewhere.
 
-        Settling within ``settling_limit``, overshoot <= 5 %, steady-state error <= 1e-3, chatter <=
-        2.
-        """
-        figures = {
-            "settling time": self.metrics.settling_time / self.settling_limit[:, None],
-            "overshoot": self.metrics.overshoot / MAX_OVERSHOOT,
-            "steady-state error": self.metrics.steady_state_error / MAX_ERROR,
-            "chatter": self.chatter / MAX_CHATTER,
-        }
-        return {
-            demand: np.where(joints, np.nan_to_num(figure, nan=0.0, posinf=np.inf), 0.0)
-            for demand, figure in figures.items()
-        }
-
-    def shortfalls(self, joints: NDArray[np.bool_]) -> list[str]:
-        """Return the :meth:`demands` that ``joints`` (dof,) miss, worst first."""
-        drawbacks = []
-        for demand, excess in self.demands(joints).items():
-            for move, joint in np.argwhere(excess > 1):
-                where = (
-                    f"move {self.moves.names[move]!r}, joint"
-                    f" {self.rollout.info.joint_names[joint]!r}"
-                )
-                text = f"{demand} of {where}: {excess[move, joint]:.2f} x limit"
-                drawbacks.append((float(excess[move, joint]), text))
-        return [text for _, text in sorted(drawbacks, reverse=True)]
-
-    def drawback(self, other: Evaluation, joints: NDArray[np.bool_]) -> str | None:
-        """Return the criterion by which these gains are worse than ``other``, with both figures, or
-        None.
-
-        The first of :data:`CRITERIA` in which the two differ decides, over the :meth:`demands` on
-        ``joints`` (dof,).
-        """
-        ranks = self._rank(joints), other._rank(joints)
-        if ranks[0] <= ranks[1]:
-            return None
-        index, criterion = next(
-            (index, criterion)
-            for index, criterion in enumerate(CRITERIA)
-            if ranks[0][index] != ranks[1][index]
-        )
-        figures = [
-            (
-                evaluation.shortfalls(joints)[0]
-                if criterion == CRITERIA[-1]
-                else f"{rank[index]} of {len(evaluation.moves.start)}"
-            )
-            for evaluation, rank in zip((self, other), ranks, strict=True)
-        ]
-        return f"{criterion}: {self.name} {figures[0]}, {other.name} {figures[1]}"
-
-    def _rank(self, joints: NDArray[np.bool_]) -> tuple[int, int, float]:
-        """Return the figures of :data:`CRITERIA`."""
-        demands = self.demands(joints)
-        late, excess = demands["settling time"].max(1) > 1, np.max([*demands.values()], axis=(0, 2))
-        return int(late.sum()), int((excess > 1).sum()), max(1.0, float(excess.max(initial=0.0)))
+def tuning_engine(build: Callable[..., Any] | None) -> EngineName:
+    """Return the default engine of searches and comparisons: MuJoCo, which is several times as
+    fast, unless scenes have content of the user's for SAPIEN.
+    """
+    return "mujoco" if build is None else "sapien"
 
 
 def step_response_metrics(

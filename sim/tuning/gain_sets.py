@@ -11,10 +11,10 @@ import numpy as np
 import batchpid as bp
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.options.groups import ControlMode
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner_keywords import ControlMode
 
-NAMES = ("tuned", "designed", "tutorial", "mjcf", "drive")
+NAMES = ("tuned", "designed", "sapien-tutorial", "mjcf", "drive")
 """Names of gain sets; "drive" is "drive:20,5"."""
 
 
@@ -26,11 +26,16 @@ class GainSet(NamedTuple):
     control: ControlMode = "pid"
 
 
+def default_gains(robot: Robot) -> str:
+    """Return the name of the gains that a robot has by default."""
+    return "tuned" if robot.has_tuned else "designed"
+
+
 def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     """Return the gains of ``robot`` by name; default "tuned" where the robot has them, else
     "designed".
 
-    "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "tutorial"
+    "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "sapien-tutorial"
     are the gains in SAPIEN's tutorial, for a bundled robot, "mjcf" is
     :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or "drive:STIFFNESS,DAMPING" is the engine's
     internal drive. Other names are params files, or an MJCF file (.xml), whose differences are
@@ -41,11 +46,11 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     InvalidArgumentError
         There is no such name or file, or the robot lacks these gains.
     """
-    name = name or ("tuned" if robot.has_tuned else "designed")
+    name = name or default_gains(robot)
     named = {
         "tuned": robot.tuned,
         "designed": robot.designed,
-        "tutorial": robot.params,
+        "sapien-tutorial": robot.params,
         "mjcf": robot.mjcf_gains,
     }
     if name in named:

@@ -16,12 +16,13 @@ the designed ones. For such robots the first generation consists of designs for 
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from importlib.util import find_spec
-from typing import Any, Literal, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -30,18 +31,22 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.versions import package_versions
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.groups import EngineName
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner import Runner
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE
+from batchpid.sim.runner.runner import Runner
 from batchpid.sim.tuning.candidates import Candidates, first_gains, loop_delay
+from batchpid.sim.tuning.comparison import Comparison, compare
 from batchpid.sim.tuning.cost import Weights
-from batchpid.sim.tuning.evaluation import SUBSTEPS
+from batchpid.sim.tuning.evaluation import SUBSTEPS, tuning_engine
+from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
 from batchpid.sim.tuning.randomization_files import reseeded
 from batchpid.sim.workers.contact_log import MissedContactWarning
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
@@ -61,10 +66,13 @@ SEARCH_SCENE: Document = {"collisions": False, "physics": "fast", "ground": None
 """Options of the runner in a search on moves that are free of contact."""
 
 
-class Tuning(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Tuning:
     """Result of a search."""
 
+    robot: Robot
     params: bp.PIDParams
+    """Best gains; the designed ones where they beat all candidates."""
     cost: float
     """Cost in the search."""
     start_params: bp.PIDParams
@@ -78,64 +86,100 @@ class Tuning(NamedTuple):
     """Criterion by which the designed gains beat all candidates, with both figures; None if a
     candidate was best.
     """
+    scene: Document
+    """Options of the comparison with the designed gains."""
+
+    @cached_property
+    def comparison(self) -> Comparison:
+        """Comparison of the designed and the tuned gains, on moves that the search did not see."""
+        name = "tuned" if self.rejected is None else "result"
+        sets = [GainSet("designed", self.start_params), GainSet(name, self.params)]
+        return compare(self.robot, sets, seed=self.settings["seed"], **self.scene)
+
+    def report(self) -> str:
+        """Return the costs, and the table of the :attr:`comparison`."""
+        lines = [f"cost {self.start_cost:.4f} as designed, {self.cost:.4f} as tuned\n"]
+        if self.rejected is not None:
+            lines.append(
+                f"The designed gains are the result, the tuned ones are rejected: {self.rejected}."
+            )
+        return "\n".join([*lines, self.comparison.report()])
+
+    def save(self, path: str | Path) -> None:
+        """Write the params and the settings of the search."""
+        about = {
+            "cost": self.cost,
+            "start_cost": self.start_cost,
+            "gains": "tuned" if self.rejected is None else "designed",
+        }
+        if self.rejected is not None:
+            about["rejected"] = self.rejected
+        bp.save_params(path, self.params, self.robot.joint_names, self.settings | about)
+
+    def figure(self) -> Figure:
+        """Draw the tuned gains beside the designed ones on the first move."""
+        return self.comparison.figure()
 
 
 def tune(
     robot: Robot,
     *,
-    seed: int = 0,
     generations: int = 10,
     population: int = 8,
+    seed: int = 0,
     seconds: float = 1.5,
-    gain_units: str = "mass_matrix",
+    gain_units: Literal["mass_matrix", "effort"] = "mass_matrix",
     per_joint: bool = False,
     weights: Weights | None = None,
     moves: Moves | None = None,
     randomization: Randomization | None = None,
     motors: bp.Actuators | None = None,
+    engine: EngineName | None = None,
     workers: int | None = None,
-    cluster: Literal["ray"] | Ray | None = None,
-    time_limit: float | None = None,
     progress: Callable[[Any], Any] | None = None,
     **runner_options: Any,
 ) -> Tuning:
-    """Search for gains of ``robot``. The result depends on the seed and not on the number of
-    workers.
+    """Tune the gains of any robot: design them from its inertia, then search by CMA-ES on simulated
+    moves.
+
+    The report is a table of the gains before and after, on moves that the search did not see. The
+    result depends on the seed and not on the number of workers.
 
     Parameters
     ----------
+    generations
+        Number of populations that the search evaluates.
+    population
+        Candidates of a population, evaluated at once.
     seed
-        Seed of the search, of the moves and, together with the randomization's seed, of the draws.
-    generations, population
-        Number of generations, and of candidates in each.
+        Seed of the search, of its moves and of the draws.
     seconds
-        Simulated time of each move [s].
+        Simulated time of each move of the search [s].
     gain_units
-        "effort" or "mass_matrix": :mod:`batchpid.law.computed_torque`.
+        Gains per mass matrix (all joints respond equally fast), or as efforts (for any controller).
     per_joint
-        Search for a factor of each joint's gains too, which needs more generations.
+        Search for a factor of each joint too; needs more generations.
     weights
         Of the terms of the cost. Default: 1 for a second of a step's settling time and 1 for the
         logarithm of the following error.
     moves
         Default: :func:`batchpid.sim.tuning.moves.search_moves`, and FINAL_MOVES random ones in the
-            final round. For
-        robots with actuators or a randomization, the search uses the tutorial's move and
-        VARIED_MOVES random ones (with drawn ``motors`` DRAWN_MOVES), because the hardest moves
-        within the effort limits of the model are too hard for such robots. Given moves replace
-        them, with contacts, since they may touch something. There is then no final round.
+        final round. For robots with actuators or a randomization, the search uses the tutorial's
+        move and VARIED_MOVES random ones (with drawn ``motors`` DRAWN_MOVES), because the hardest
+        moves within the effort limits of the model are too hard for such robots. Given moves
+        replace them, with contacts, since they may touch something. There is then no final round.
     randomization
-        The robot of each move is drawn from it, the same for all candidates. None: the robot as
-        described.
+        Draw the robot of each move, the same for all candidates: a YAML file
+        (docs/randomization.md), e.g. `payload: {uniform: [0, 0.5]}`.
     motors
         Actuators of which one is the true one, a row each, such as the draws of
         :func:`batchpid.sim.identification.draw_motors`: every move is made with another row, the
         same for all candidates, and the worst move counts as much as the mean. The controller knows
         the robot's own actuators.
-    workers, cluster
-        Number of processes, or a cluster: as for :class:`batchpid.sim.Runner`.
-    time_limit
-        Stop after the generation in which this many seconds have passed; None: run all generations.
+    engine
+        Physics engine. Default: mujoco, or sapien with a ``build``.
+    workers
+        Processes that step the scenes; 0: this one. Default: one per available core.
     progress
         Wraps the range of generations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
     runner_options
@@ -157,10 +201,8 @@ def tune(
     population = integer("population", population, 4, 1000)
     seconds = number("seconds", seconds, 0.05, 600.0, "seconds")
     for name in {"params", "discretization"} & runner_options.keys():
-        problem, remedy = (
-            "is chosen by the search, which is for explicit gains",
-            "bp.design_gains makes implicit gains",
-        )
+        problem = "is chosen by the search, which is for explicit gains"
+        remedy = "bp.design_gains makes implicit gains"
         raise InvalidArgumentError(name, problem, remedy=remedy)
     if motors is not None and runner_options.get("actuators") is not None:
         remedy = (
@@ -169,48 +211,49 @@ def tune(
         )
         raise InvalidArgumentError("actuators", "is given with motors", remedy=remedy)
     weights = Weights() if weights is None else weights
-    options: Document = {
-        "substeps": SUBSTEPS,
-        "workers": workers,
-        "cluster": cluster,
-    } | runner_options
+    build = runner_options.get("build")
+    engine = tuning_engine(build) if engine is None else engine
+    scene: Document = {"engine": engine, "workers": workers, **runner_options}
+    options: Document = {"substeps": SUBSTEPS, **scene}
 
     is_varied = randomization is not None or robot.actuators is not None or motors is not None
-    unseen, scene = None, Document()
+    unseen, fast = None, Document()
     if moves is None:
         unseen = random_moves(robot, FINAL_MOVES, seed + FINAL_SEED)
-        count = VARIED_MOVES if motors is None else DRAWN_MOVES
-        moves = (
-            tutorial_move(robot) + random_moves(robot, count, seed)
-            if is_varied
-            else search_moves(robot, seed)
-        )
-        if robot.fixed_base and runner_options.get("build") is None:
-            scene = SEARCH_SCENE
+        moves = search_moves(robot, seed)
+        if is_varied:
+            count = VARIED_MOVES if motors is None else DRAWN_MOVES
+            moves = tutorial_move(robot) + random_moves(robot, count, seed)
+        if robot.fixed_base and build is None:
+            fast = SEARCH_SCENE
 
     def candidates(moves: Moves, headroom: float) -> Candidates:
-        options: Document = {
-            "headroom": headroom,
-            "varied": is_varied and motors is None,
-            "motors": motors,
-        }
-        return Candidates(robot, gain_units, per_joint, moves, seconds, weights, **options)
+        return Candidates(
+            robot,
+            gain_units,
+            per_joint,
+            moves,
+            seconds,
+            weights,
+            headroom=headroom,
+            varied=is_varied and motors is None,
+            motors=motors,
+        )
 
+    # Search, from the designed gains or from designs for the loop's delay.
     searched = candidates(moves, 1.0 if is_varied else HEADROOM)
     start = searched.params(np.zeros((1, searched.dimension)))
     designs = None
     if is_varied:
         dt = float(runner_options.get("timestep", RunnerOptions.timestep))
-        delay = loop_delay(
-            robot, randomization, dt + float(np.max(start.derivative_filter_time)), motors
-        )
+        filter_time = float(np.max(start.derivative_filter_time))
+        delay = loop_delay(robot, randomization, dt + filter_time, motors)
         designs = searched.points(first_gains(delay))
-    options = options | {"params": start}
-    with searched.runner(
-        population, options | {"randomization": reseeded(randomization, seed)} | scene
-    ) as runner:
+    options["params"] = start
+    options["randomization"] = reseeded(randomization, seed)
+    with searched.runner(population, options | fast) as runner:
         points, history = _evolve(
-            searched, runner, seed, generations, population, designs, time_limit, progress
+            searched, runner, seed, generations, population, designs, progress
         )
 
     # Final round: the designed gains against the candidates that beat them.
@@ -224,7 +267,7 @@ def tune(
         )
     elif unseen is not None:
         final = candidates(unseen, 1.0)
-        options = options | {"randomization": reseeded(randomization, seed + FINAL_SEED)}
+        options["randomization"] = reseeded(randomization, seed + FINAL_SEED)
         with final.runner(1 + len(finalists), options) as runner:
             judged = final.costs(runner, points[[0, *finalists]])
         best = [0, *finalists][int(np.argmin(judged))]
@@ -235,21 +278,30 @@ def tune(
 
     settings: Document = {
         **robot.describe(),
-        **{"seed": seed, "generations": len(history), "population": population, "seconds": seconds},
-        **{
-            "gain_units": gain_units,
-            "per_joint": per_joint,
-            "weights": asdict(weights),
-            "moves": list(moves.names),
-        },
+        "seed": seed,
+        "generations": len(history),
+        "population": population,
+        "seconds": seconds,
+        "gain_units": gain_units,
+        "per_joint": per_joint,
+        "weights": asdict(weights),
+        "moves": list(moves.names),
         "randomization": None if randomization is None else randomization.to_dict(),
+        "engine": engine,
         **{name: _plain(value) for name, value in runner_options.items()},
-        "versions": package_versions(
-            ("batchpid", runner_options.get("engine", DEFAULT_ENGINE), "numpy", "cmaes")
-        ),
+        "versions": package_versions(("batchpid", engine, "numpy", "cmaes")),
     }
-    params = searched.params(points[[best]])
-    return Tuning(params, float(costs[best]), start, history[0][0], history, settings, rejected)
+    return Tuning(
+        robot=robot,
+        params=searched.params(points[[best]]),
+        cost=float(costs[best]),
+        start_params=start,
+        start_cost=history[0][0],
+        history=history,
+        settings=settings,
+        rejected=rejected,
+        scene=scene | {"randomization": randomization},
+    )
 
 
 def _evolve(
@@ -259,7 +311,6 @@ def _evolve(
     generations: int,
     population: int,
     designs: Float64 | None,
-    time_limit: float | None,
     progress: Callable[[Any], Any] | None,
 ) -> tuple[Float64, tuple[tuple[float, ...], ...]]:
     """Return all points (n, dimension), the first of which is 0, and their costs by generation.
@@ -277,7 +328,6 @@ def _evolve(
     optimizer = optimizer_at(start)
     points = list[Float64]()
     history = list[tuple[float, ...]]()
-    began = time.monotonic()
     bar = (progress or (lambda items: items))(range(generations))
     with warnings.catch_warnings():
         warnings.simplefilter(
@@ -296,8 +346,6 @@ def _evolve(
             history.append(tuple(costs.tolist()))
             if hasattr(bar, "set_postfix"):
                 bar.set_postfix(cost=f"{np.min(history):.4f}", start=f"{history[0][0]:.4f}")
-            if time_limit is not None and time.monotonic() - began > time_limit:
-                break
     return np.concatenate(points), tuple(history)
 
 

@@ -1,5 +1,5 @@
 """Page on localhost that shows robots as they move, and films of recorded runs; see
-docs/view.md.
+docs/files.md.
 """
 
 from batchpid.sim.view.page import View

@@ -22,8 +22,8 @@ from batchpid.arrays.array_types import Float64, Rows
 from batchpid.checks.validate import file_path, integer, number
 from batchpid.errors import BatchPIDError, MissingDependencyError
 from batchpid.io.files import replacing
-from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.playback import Playback, rows_at
 from batchpid.sim.view.scene import FIELD_OF_VIEW, MAX_ROBOTS, TILE, RobotScene
 from batchpid.task_space.rotations import rotate
@@ -141,7 +141,7 @@ def write_film(
     out
         File that ends in .mp4 or .gif.
     robot
-        Robot of the run; default the bundled one of its name.
+        Robot of the run; default :func:`batchpid.sim.view.playback.recorded_robot`.
     fps, width, height
         Frames per second; size in pixels.
     progress
@@ -149,9 +149,8 @@ def write_film(
 
     Raises
     ------
-    InvalidArgumentError, RobotNotFoundError
-        An argument is out of range, the run has another number of joints, or its robot is not
-        bundled.
+    InvalidArgumentError
+        An argument is out of range, or the run has another number of joints, or no robot.
     MissingDependencyError
         The package imageio-ffmpeg is missing.
     BatchPIDError

@@ -15,9 +15,9 @@ import numpy as np
 
 from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.errors import MissingDependencyError
-from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.shapes import Surface
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.panel import Panel, ViewData
 from batchpid.sim.view.playback import HISTORY_SECONDS
 from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from batchpid.errors import BatchPIDError
-from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.playback import Playback
 from batchpid.sim.view.simulation import GAINS, LiveSimulation
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.scene import MAX_ROBOTS
 
 HISTORY_SECONDS = 8.0
@@ -20,21 +20,20 @@ HISTORY_SECONDS = 8.0
 class Playback:
     """Recorded run as the data of a page, from the first row to the last and then again.
 
-    ``robot`` is by default the bundled one of the run's name. Frames are ``period`` [s] apart, or a
-    tick of the run.
+    ``robot`` is by default :func:`recorded_robot`. Frames are ``period`` [s] apart, or a tick of
+    the run.
 
     Raises
     ------
     InvalidArgumentError
-        The run has more robots than fit on a page, or another number of joints than the robot.
-    RobotNotFoundError
-        The robot of the run is not bundled.
+        The run has more robots than fit on a page, or another number of joints than the robot; or
+        it holds no description of its robot, which is not bundled.
     """
 
     def __init__(
         self, rollout: Rollout, robot: Robot | None = None, *, period: float = 1 / 30
     ) -> None:
-        robot = Robot.load(rollout.info.robot) if robot is None else robot
+        robot = recorded_robot(rollout) if robot is None else robot
         joints = rollout.qpos.shape[2]
         if joints != robot.dof:
             raise InvalidArgumentError(
@@ -81,6 +80,23 @@ class Playback:
         """Return the rows from a time [s] to the present one."""
         first, last = rows_at(self._rollout, np.array([start, self._now])).tolist()
         return self._rollout.for_ticks(slice(first, last + 1))
+
+
+def recorded_robot(rollout: Rollout) -> Robot:
+    """Return the robot of a run in this process, or the bundled one that was recorded.
+
+    Raises InvalidArgumentError if it is neither.
+    """
+    info = rollout.info
+    if isinstance(info.description, Robot):
+        return info.description
+    problem = f"{info.robot!r} of the recording is not bundled"
+    if info.robot in Robot.bundled():
+        bundled = Robot.load(info.robot, fixed_base=info.fixed_base)
+        if info.digest in (None, bundled.digest):
+            return bundled
+        problem = f"{info.robot!r} of the recording is another one than the bundled robot"
+    raise InvalidArgumentError("robot", problem, remedy="name its URDF or MJCF file")
 
 
 def rows_at(rollout: Rollout, seconds: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, integer, number
-from batchpid.sim.observation import Observation, Rollout
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner import Runner
+from batchpid.sim.runner.runner import Runner
+from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.view.playback import HISTORY_SECONDS
 from batchpid.sim.view.scene import MAX_ROBOTS
 
@@ -70,7 +71,7 @@ class LiveSimulation:
         self._runner = Runner(robot, num_envs, substeps=substeps, **options)
         self.ground = self._runner.options.ground
         """True if the scenes have a ground at height 0."""
-        self._info = robot.run_info(ground=self.ground)
+        self._info = RunInfo.of(robot, ground=self.ground)
         self.reset()
 
     def reset(self) -> None:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, WorkerError
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.failure import Failure, failure_of
-from batchpid.sim.ray_options import Ray
+from batchpid.sim.options.groups import Ray
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.placement import split_in_shares
 from batchpid.sim.workers.requests import Build, Request, Start
@@ -79,7 +79,7 @@ class Node:
         pool_type, start, ticks = pickle.loads(message)
 
         def open_pool() -> Answer:
-            options = start.options.with_values(workers=workers, cluster=None)
+            options = start.options.changed(workers=workers, cluster=None)
             self._pool = pool_type(options, start.params, start.envs, ticks)
             # The caller replaces a node that has lost a worker: it keeps the requests to replay.
             self._pool.max_losses = 1

@@ -19,7 +19,7 @@ from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import ClosedError
 from batchpid.sim.loop.arrays import Arrays, Ticks
 from batchpid.sim.loop.failure import Failure, order
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeInfo, NodeWorker
 from batchpid.sim.workers.placement import pinned_cores, split_in_shares
@@ -29,8 +29,10 @@ from batchpid.sim.workers.worker import LocalWorker, ProcessWorker, Worker, Work
 MAX_LOSSES = 5
 """Number of losses of one worker during the same request after which the pool gives up."""
 _MAX_STEPS = 8000
-"""Largest number of sim steps times envs of one request to a worker, except for one tick: a fifth
-of a second.
+"""Sim steps times envs of one request to a worker: a fifth of a second."""
+_LEAST_STEPS = 64
+"""Sim steps of one request with more envs: at each request the scenes of all envs pass through the
+cache.
 """
 _CLOSED = "this Runner was closed during a call"
 
@@ -96,7 +98,8 @@ class WorkerPool(SingleOwner):
         else:
             slices = split_in_shares(num_envs, [1] * max(1, min(count or 0, num_envs)))
             widest, most_steps = -(-num_envs // len(slices)), _MAX_STEPS
-        ticks = ticks or max(1, most_steps // (options.substeps * widest))
+        steps = max(_LEAST_STEPS, most_steps // widest)
+        ticks = ticks or max(1, steps // options.substeps)
         layout = Arrays.layout(
             ticks, num_envs, options.robot.dof, options.command.size, options.observed
         )
@@ -204,8 +207,10 @@ class WorkerPool(SingleOwner):
         return Outcome(results, failure, count, self.ticks)
 
     def start_replay_from(self, request: Request | None) -> None:
-        """Drop the kept requests, because ``request`` brings a new worker to the present state."""
-        self._replay = [Build()] if request is None else [Build(), request.copy()]
+        """Drop the kept requests, because ``request``, whose arrays no one changes, brings a new
+        worker to the present state.
+        """
+        self._replay = [Build()] if request is None else [Build(), request]
 
     def close(self) -> None:
         """End all workers at once. May be called again, as after an interrupt."""

@@ -1,17 +1,16 @@
-"""Requests to workers (:mod:`batchpid.sim.operations`), and the start of a loop."""
+"""Requests to workers (:mod:`batchpid.sim.runner.operations`), and the start of a loop."""
 
 from __future__ import annotations
 
 import pickle
 from abc import ABC, abstractmethod
-from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, Self
 
 import batchpid as bp
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Loop
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 
 
 class Request(ABC):
@@ -41,10 +40,6 @@ class Request(ABC):
             return value.for_envs(envs) if hasattr(value, "for_envs") else value[envs]
 
         return type(self)(*map(part, vars(self).values()))
-
-    def copy(self) -> Self:
-        """Return a copy that later writes to the caller's arrays do not change."""
-        return deepcopy(self)
 
     def write(self, arrays: Arrays, envs: slice) -> None:  # noqa: B027
         """Write the rows of some envs to the shared arrays (ticks, envs, ...)."""

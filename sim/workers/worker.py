@@ -32,7 +32,7 @@ from batchpid.sim.engine import native
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.failure import Failure, failure_of
 from batchpid.sim.loop.loop import Loop
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.requests import Build, Request, Start
 

@@ -243,22 +243,6 @@ def test_jaco2_fingers_2_and_3_are_mirror_images(tmp_path: Path) -> None:
         np.testing.assert_allclose(second, mirrored, atol=1e-6)
 
 
-@pytest.mark.parametrize("finger", [1, 2, 3])
-def test_jaco2_fingers_close_with_positive_angles(finger: int, tmp_path: Path) -> None:
-    world = World(xml("jaco2"), tmp_path)
-
-    def reach(angle: float) -> float:
-        """Return the distance of the finger tip's frame from the palm's axis."""
-        qpos = np.array(START["jaco2"], np.float32)
-        qpos[6 + finger] = angle
-        world.robot.set_qpos(qpos)
-        links = {link.name: link.entity_pose for link in world.robot.links}
-        tip = links["j2s7s300_link_7"].inv() * links[f"j2s7s300_link_finger_tip_{finger}"]
-        return float(np.linalg.norm(tip.p[:2]))
-
-    assert reach(0.0) > reach(0.5) > reach(1.0)
-
-
 def test_no_links_touch_at_start_or_target_or_between(name: str, world: World) -> None:
     start, target = np.array(START[name]), np.array(TARGET[name])
     touching = {

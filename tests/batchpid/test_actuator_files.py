@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_actuator_effects import ALL, random_options
+from motor_cases import ALL, random_options
 
 import batchpid as bp
 

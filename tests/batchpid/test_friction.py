@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from batchpid import motors
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import friction
 
@@ -86,29 +85,6 @@ def test_a_joint_at_rest_holds_its_load_and_lets_go_above_its_friction(damping):
     np.testing.assert_allclose(velocity[-1], implicit, rtol=1e-9)  # backward Euler
 
 
-def test_it_is_the_implicit_step_where_the_load_is_constant():
-    """M (v+ - v) = dt (tau - h - B v+ - f) with f in F Sgn(v+): v+ lies between the solutions for
-    both ends of Sgn.
-    """
-    inertia, damping, coulomb, load = 0.02, 3.0, 0.7, 0.2
-    mass, model = (
-        np.full((1, 1, 1), inertia),
-        Friction(np.full((1, 1), coulomb), np.full((1, 1), damping)),
-    )
-    rng = np.random.default_rng(0)
-    efforts = np.repeat(rng.normal(size=(40, 1, 1)), 50, axis=0)
-    velocity, _ = simulate(mass, model, efforts, load=load)
-    exact, v = [], 0.0
-    for effort in efforts[:, 0, 0]:
-        ends = [
-            (inertia * v + DT * (effort - load - sign * coulomb)) / (inertia + DT * damping)
-            for sign in (1, -1)
-        ]
-        v = max(ends[0], 0.0) + min(ends[1], 0.0)
-        exact.append(v)
-    assert np.abs(velocity[:, 0, 0] - exact).max() < 0.02 * np.abs(exact).max()
-
-
 @pytest.mark.parametrize("viscous", [None, 4.0])
 @pytest.mark.parametrize(
     ("damping", "stiffness"), [(0.0, 0.0), (30.0, 0.0), (0.0, 3e4), (30.0, 3e4)]
@@ -156,36 +132,6 @@ def test_a_static_friction_holds_until_the_joint_yields_and_again_after_it_has_s
     assert abs(stops[-1]) < 1e-9
     assert np.abs(held_again).max() < 1e-9
     np.testing.assert_allclose(total[-1], 0.0, atol=1e-9)
-
-
-def test_joints_with_friction_share_the_gain_by_their_correlations():
-    mass, zero = np.array([[[0.02, 0.009], [0.009, 0.01]]]), np.zeros((1, 2))
-    inverse = np.linalg.inv(mass[0])
-    deadbeat = friction.SHARE / (DT * np.diag(inverse))
-    correlation = abs(inverse[0, 1]) / np.sqrt(inverse[0, 0] * inverse[1, 1])
-    both = friction.init(Friction(np.ones((1, 2))), zero, zero, mass, DT)
-    one = friction.init(Friction(np.array([[1.0, 0.0]])), zero, zero, mass, DT)
-    np.testing.assert_allclose(both.memory[0], deadbeat / (1 + correlation))
-    np.testing.assert_allclose(one.memory[0], [deadbeat[0], 0.0])
-
-
-def test_envs_do_not_affect_each_other_and_are_reset_alone():
-    rng = np.random.default_rng(0)
-    mass = np.concatenate([np.eye(3)[None] * scale for scale in (0.1, 1e-4, 3.0)])
-    model = Friction(rng.uniform(0, 1, (3, 3)), rng.uniform(0, 1, (3, 3)))
-    efforts = rng.normal(size=(50, 3, 3))
-    together, _ = simulate(mass, model, efforts)
-    for env in range(3):
-        part = slice(env, env + 1)
-        alone, _ = simulate(
-            mass[part], Friction(*(leaf[part] for leaf in model[:2])), efforts[:, part]
-        )
-        np.testing.assert_array_equal(alone, together[:, part])
-    fresh = friction.init(model, rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), mass, DT)
-    old = friction.init(model, rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), mass, DT)
-    mixed = motors.reset(old, fresh, np.array([True, False, True]))
-    for new, before, after in zip(fresh, old, mixed, strict=True):
-        np.testing.assert_array_equal(after, np.stack([new[0], before[1], new[2]]))
 
 
 def test_a_refresh_takes_another_mass_matrix_and_keeps_the_rest():

@@ -154,15 +154,6 @@ def test_an_inertia_that_the_model_overestimates_has_a_bound(wdt, largest):
         assert (radius < 1) == stable
 
 
-@pytest.mark.parametrize("backend", ["numpy", "jax"])
-def test_a_controller_without_a_mass_matrix_refuses_it(backend):
-    if backend == "jax":
-        pytest.importorskip("jax")
-    p = bp.make_params(3, 4e3, 2e3, [90.0, 1.0, 0.0], **IMPLICIT)
-    with pytest.raises(InvalidArgumentError, match=r"gain_units.*designed\('effort'\)"):
-        bp.BatchPID(p, 4, 0.01, backend=backend)
-
-
 def test_options_that_it_does_not_have_are_refused():
     p = bp.make_params(2, 1.0, derivative_filter_time=0.0, **IMPLICIT)
     assert (p.kd == 0).all()

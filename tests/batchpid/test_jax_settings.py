@@ -7,12 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax_debugging import SETTINGS, changed
-from quick_jit import quick_jit
 
 import batchpid as bp
 from batchpid import backends
-from batchpid import motors as actuators
-from batchpid.motors import friction
 
 
 def controller():
@@ -109,50 +106,3 @@ def stepped(rows):
     """Return arguments of bp.step, with a NaN."""
     params = bp.make_params(2, 3.0, ki=1.0, dtype=np.float32)
     return params, bp.init(params, rows), rows, rows * np.float32(np.nan), 0.01
-
-
-@pytest.mark.parametrize("wide", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_pure_functions_obey_the_strict_modes(wide):
-    """All functions that programs of the caller may trace; functions of float32 stay in float32
-    under 64-bit types.
-    """
-
-    def run(rows, mask, mass):
-        dtype = rows.dtype
-        params = bp.make_params(
-            3, 5.0, ki=1.0, kd=0.1, effort_limit=3.0, integral_limit=2.0, dtype=dtype
-        )
-        start = bp.init(params, rows)
-        state, target = bp.drive_target(params, start, rows, rows, 0.01)
-        found = [
-            state,
-            target,
-            bp.track(params, state, rows, rows, rows),
-            bp.reset(params, state, rows, mask),
-        ]
-        model = friction.Friction(*(rows[:1] ** 2 for _ in range(3)))
-        rubbing = friction.init(model, rows, rows, mass, 0.01)
-        found += [
-            friction.advance(model, rubbing, rows, rows),
-            actuators.reset(rubbing, rubbing, mask),
-        ]
-        found += [friction.compensation(rows[:1] ** 2, rows, rows, rows[:1] ** 2)]
-        motors = bp.make_actuators(
-            3, command_delay=0.02, sensor_delay=0.01, strength=0.9, effort_limit=6.0, velocity_noise=1e-2, seed=1,
-            saturation_effort=8.0, no_load_speed=4.0, position_limit=([-1.0, 0.0], [4.0, 7.0]), dtype=dtype,
-        )  # fmt: skip
-        motors = jax.tree.map(jnp.asarray, motors)
-        begun = actuators.init(motors, rows, 0.01, episode=jnp.arange(len(rows)), samples=4)
-        k = actuators.discretise(motors, begun, 0.01, len(rows))
-        found += [
-            actuators.advance_effort(k, begun, rows, rows, rows),
-            actuators.advance_measurement(k, begun, rows, rows),
-        ]
-        return [*found, actuators.reset(begun, begun, mask)]
-
-    rows = np.linspace(-1.0, 1.0, 12, dtype=np.float32).reshape(4, 3)
-    strict = {"jax_numpy_rank_promotion": "raise", "jax_numpy_dtype_promotion": "strict"}
-    mass = np.broadcast_to(np.eye(3, dtype=np.float32), (4, 3, 3))
-    with changed(**strict, jax_enable_x64=wide):
-        found = quick_jit(run)(rows, np.array([True, False, True, False]), mass)
-    assert {str(leaf.dtype) for leaf in jax.tree.leaves(found)} == {"float32", "uint32"}

@@ -1,7 +1,7 @@
 """Every executor of the law agrees with a scalar controller (scalar_pid.py), for params of any
 combination of options.
 
-The native extension and the exported C are bit-identical to NumPy.
+Native programs and exported C: test_compiled_law.py and test_c_header.py.
 """
 
 from __future__ import annotations
@@ -12,13 +12,11 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
-from law_cases import DT, ENVS, JOINTS, Inputs, generated_options, made_up_inputs, read_only
+from law_cases import DT, JOINTS, Inputs, generated_options, made_up_inputs, read_only
 from quick_jit import quick_jit
 from scalar_pid import ScalarPID, scalar_pids
 
 import batchpid as bp
-from batchpid.export import to_c
-from tests.c_programs import COMPILERS, efforts_in_c
 
 RATES = ("measurement_rate", "setpoint_rate", "feedforward")
 GIVEN = [
@@ -73,12 +71,6 @@ def by_numpys_controller(params, inputs):
         return by_controller(params, inputs)
 
 
-def by_native_code(params, inputs):
-    if not bp.BatchPID(params, ENVS, DT).native:
-        pytest.skip("there is no native extension")
-    return by_controller(params, inputs)
-
-
 def by_jaxs_controller(params, inputs):
     """Return the efforts of BatchPID with backend "jax", which has all of JAX's optimisations."""
     return by_controller(params, inputs, "jax")
@@ -101,8 +93,6 @@ EXECUTORS = {
     "numpy": Executor(by_steps, seeds=24),
     "numpy float32": Executor(by_steps, np.float32),
     "controller": Executor(by_numpys_controller, bits=True),
-    "native": Executor(by_native_code, bits=True),
-    "native float32": Executor(by_native_code, np.float32, bits=True),
     "jax": Executor(by_jax, seeds=3),
     "jax float32": Executor(by_jax, np.float32, seeds=3),
     "jax controller": Executor(by_jaxs_controller, np.float32, seeds=2),
@@ -165,21 +155,6 @@ def test_efforts_with_each_option_alone_on_any_inputs(options, given, inputs):
         params,
         Inputs(*inputs[:2], **{each: getattr(inputs, each) for each in given}),
     )
-
-
-@pytest.mark.skipif(not COMPILERS, reason="no C compiler")
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("seed", range(4))
-def test_exported_c_has_the_bytes_of_numpy(seed, dtype, tmp_path):
-    """Test one env; test_c_header.py tests the other settings of an export."""
-    params = bp.make_params(JOINTS, **generated_options(seed, envs=1), dtype=dtype)
-    given = GIVEN[seed]
-    inputs = made_up_inputs(envs=1)
-    inputs = Inputs(*inputs[:2], **{each: getattr(inputs, each) for each in given})
-    columns = {name: x[:, 0] for name, x in inputs._asdict().items() if x is not None}
-    found = efforts_in_c(tmp_path, params, to_c(params, DT, inputs=given).text, columns)
-    np.testing.assert_array_equal(found, by_steps(params, inputs)[:, 0])
-    assert np.abs(found).max() > 0.1
 
 
 def test_terms_add_up_and_say_what_saturates(options, inputs):

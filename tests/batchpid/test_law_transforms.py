@@ -156,23 +156,6 @@ def test_gains_may_be_traced_through_make_params_and_replace(build, inputs, x64)
     ]
 
 
-@pytest.mark.quick_rows(4)
-def test_params_whose_leaves_are_all_traced_can_be_changed(options):
-    """The arguments of a compiled function: replace gives the same result as outside."""
-    params = bp.make_params(JOINTS, **options, dtype=np.float32)
-    expected = params.replace(kp=2.0, effort_limit=3.0)
-    changed = quick_jit(lambda params, kp: params.replace(kp=kp, effort_limit=3.0))(
-        params, jnp.float32(2.0)
-    )
-    assert [type(leaf) for leaf in changed if isinstance(leaf, tuple)] == [
-        type(leaf) for leaf in expected if isinstance(leaf, tuple)
-    ]
-    for name, leaf in changed._asdict().items():
-        if isinstance(getattr(expected, name), np.ndarray):
-            assert leaf.dtype == np.float32
-            np.testing.assert_array_equal(leaf, getattr(expected, name), err_msg=name)
-
-
 def test_traced_gains_have_their_shapes_checked_and_give_the_params_their_dtype():
     def gains(kp, **options):
         return jax.eval_shape(lambda kp: bp.make_params(2, kp, **options), kp)

@@ -58,16 +58,6 @@ def test_critically_damped_rise_time_and_integrals():
     assert m.steady_state_error[0, 0] < 1e-12
 
 
-def test_first_order_is_resampled_to_the_same_figures_within_a_sample():
-    fine, coarse = np.linspace(0, 5, 50_001), np.linspace(0, 5, 501)
-    figures = [
-        step_metrics(t[1], [1.0], (1 - np.exp(-3 * t))[:, None, None]) for t in (fine, coarse)
-    ]
-    assert figures[0].rise_time[0, 0] == pytest.approx(np.log(9) / 3, rel=1e-5)
-    for a, b in zip(*figures, strict=True):
-        np.testing.assert_allclose(a, b, rtol=2e-3, atol=1e-6)
-
-
 def test_start_is_prepended_at_time_zero():
     t = np.linspace(0, 2, 201)
     y = (1 - np.exp(-5 * t))[:, None, None]

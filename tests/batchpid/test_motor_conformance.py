@@ -18,7 +18,6 @@ from batchpid import motors
 from batchpid.motors import friction, guard
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
-from batchpid.native.compiled import compiled_stages
 from batchpid.native.tracing import trace
 
 DT, STEPS, ENVS, JOINTS = 1 / 500, 40, 5, 3
@@ -159,10 +158,10 @@ class MotorCase(GuardCase):
         lengths = [leaf.shape[1] for leaf in self.samples if leaf is not None and leaf.ndim == 3]
         return motors.init(model, start, DT, samples=lengths[0] if lengths else None)
 
-    def step(self, model, state, effort, qpos, qvel, stages=motors.STAGES, k=None):
+    def step(self, model, state, effort, qpos, qvel, k=None):
         k = motors.discretise(model, state, DT, ENVS) if k is None else k
-        state, *seen = motors.advance_measurement(k, state, qpos, qvel, stages=stages)
-        state, delivered = motors.advance_effort(k, state, effort, qpos, qvel, stages)
+        state, *seen = motors.advance_measurement(k, state, qpos, qvel)
+        state, delivered = motors.advance_effort(k, state, effort, qpos, qvel)
         return state, (*seen, delivered)
 
     def oracle(self, env, joint):
@@ -197,17 +196,8 @@ def by_jax(case, dtype):
 
 
 def by_programs(case, dtype):
-    """Motors by their stages, as the control step runs them; guard and friction traced as a
-    whole.
-    """
+    """Guard and friction, each traced as a whole."""
     state, found = case.begin(case.model, case.start), []
-    if isinstance(case, MotorCase):
-        k = motors.discretise(case.model, state, DT, ENVS)
-        stages = compiled_stages(k, SHAPE)
-        for row in zip(*case.inputs, strict=True):
-            state, seen = case.step(case.model, state, *row, stages=stages, k=k)
-            found.append(seen)
-        return found
     constants = [leaf for leaf in case.model if leaf is not None]
     kept = [leaf for leaf in state if leaf is not None]
 
@@ -238,6 +228,7 @@ ROWS = [
     for case in CASES
     for name, (_, seeds) in EXECUTORS.items()
     for seed in range(seeds)
+    if (case, name) != ("motors", "programs")  # tests/sim/test_conformance.py
 ]
 
 
@@ -272,25 +263,3 @@ def test_signals_are_those_of_plain_numbers(case, name, seed, request):
             for row in by_numpy(made, dtype)
         ]
         np.testing.assert_array_equal(found, np.moveaxis(np.array(plain), 0, 1))
-
-
-@pytest.mark.skipif(bool(obstacle()), reason="there are no programs")
-def test_programs_of_stages_hold_for_their_coefficients_alone():
-    qpos = np.zeros(SHAPE)
-    weak, strong = (
-        bp.make_actuators(JOINTS, strength=strength, bias=0.1, lag=0.01) for strength in (0.5, 2.0)
-    )
-    state = motors.init(weak, qpos, DT)
-    k, other = (motors.discretise(each, state, DT, ENVS) for each in (weak, strong))
-    stages = compiled_stages(k, SHAPE)
-    assert stages is not motors.STAGES
-    for each in (k, other):
-        wanted = motors.STAGES.delivered(each, qpos, qpos + 1.0, qpos, qpos)
-        np.testing.assert_array_equal(stages.delivered(each, qpos, qpos + 1.0, qpos, qpos), wanted)
-
-
-def test_without_the_extension_stages_are_numpys(monkeypatch):
-    monkeypatch.setenv("BATCHPID_NATIVE", "0")
-    actuators = bp.make_actuators(JOINTS, strength=0.5)
-    k = motors.discretise(actuators, motors.init(actuators, np.zeros(SHAPE), DT), DT, ENVS)
-    assert compiled_stages(k, SHAPE) is motors.STAGES

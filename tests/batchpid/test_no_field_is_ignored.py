@@ -182,9 +182,6 @@ INERTIA = [1.0, 0.5, 0.2]
 TARGETS = {
     "C": lambda p: to_c(p, DT),
     "trajectory": lambda p: to_ros2_control(p, JOINTS, DT, inertia=INERTIA),
-    "pid_controller": lambda p: to_ros2_control(
-        p, JOINTS, DT, controller="pid_controller", inertia=INERTIA
-    ),
 }
 PART_OF = {name: "ki" for name in ("integral_min", "integral_max", "tracking_time", "conditional")}
 """Fields of a term, which its own difference contains."""

@@ -141,13 +141,9 @@ def test_about_survives_and_does_not_affect_the_params(tmp_path, suffix):
     [
         *(
             '!!int ""',
-            "!!int _",
-            "!!float _",
             "!!bool x",
-            "!!timestamp x",
             "!!binary '=='",
             "!!omap [a]",
-            "!!merge x",
         ),
         *(
             "2001-13-45",
@@ -157,8 +153,7 @@ def test_about_survives_and_does_not_affect_the_params(tmp_path, suffix):
             "{<<: 1}",
             "!!python/object/apply:os.abort []",
         ),
-        pytest.param("[" * 2_000, marks=pytest.mark.slow),
-        *("{a: " * 2_000, "- " * 2_000, "? " * 2_000, "'" + "a\n" * 2_000, "!" * 2_000, "\x00"),
+        *("{a: " * 2_000, "- " * 2_000, "'" + "a\n" * 2_000, "\x00"),
     ],
 )
 def test_values_that_the_parser_trips_over_are_refused(value):

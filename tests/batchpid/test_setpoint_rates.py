@@ -88,12 +88,3 @@ def test_a_continuous_joint_follows_through_its_turns(options):
             )
             rows.append(terms.effort)
         np.testing.assert_allclose(rows[1], rows[0], rtol=1e-9, atol=1e-6)
-
-
-def test_manual_control_hands_over_to_a_moving_setpoint():
-    """The next step after ``track`` on these inputs gives the effort, also with a rate."""
-    params = bp.make_params(2, **GAINS, setpoint_weight=0.2)
-    y, r, rate, effort = np.random.default_rng(0).normal(size=(4, 3, 2))
-    state = bp.track(params, bp.init(params, y), r, y, effort, dt=DT, setpoint_rate=rate)
-    _, got = bp.step(params, state, r, y, DT, setpoint_rate=rate, measurement_rate=0 * y)
-    np.testing.assert_allclose(got, effort, atol=1e-9)

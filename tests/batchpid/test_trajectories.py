@@ -6,7 +6,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.trajectories import Trajectory, jerk_limited, minimum_jerk, trapezoidal
+from batchpid.task_space.rotations import rotate
+from batchpid.trajectories import (
+    Trajectory,
+    minimum_jerk,
+    sine,
+    straight_line,
+    trapezoidal,
+)
 
 DT = 0.004
 LIMITS = {"max_velocity": [1.0, 2.0, np.inf], "max_acceleration": [3.0, 8.0, 5.0]}
@@ -131,36 +138,25 @@ def test_trajectories_can_be_joined_and_held():
         there.then(minimum_jerk([0.0], [1.0], DT, duration=0.1))
 
 
-JERK_LIMITS = {"max_velocity": [1.0, 2.0], "max_acceleration": [3.0, 8.0], "max_jerk": 40.0}
+def test_a_sine_grows_from_rest_to_its_amplitude():
+    wave = sine([0.5, -1.0], [0.2, 0.1], DT, frequency=0.5, duration=5.0, fade=1.5)
+    steps = np.diff(wave.position, axis=0) / DT
+    np.testing.assert_allclose(steps, wave.velocity[1:], atol=2 * DT)
+    np.testing.assert_allclose(np.diff(wave.velocity, axis=0) / DT, wave.acceleration[1:], atol=0.1)
+    np.testing.assert_allclose(wave.position[0], [0.5, -1.0], atol=1e-6)
+    late = wave.position[wave.time > 2.0] - [0.5, -1.0]
+    np.testing.assert_allclose(np.abs(late).max(0), [0.2, 0.1], rtol=1e-3)
 
 
-class TestJerkLimited:
-    @pytest.fixture(autouse=True)
-    def _needs_ruckig(self):
-        pytest.importorskip("ruckig")
-
-    def test_limits_and_ends(self):
-        rng = np.random.default_rng(1)
-        start, target = rng.uniform(-2, 2, (2, 6, 2))
-        t = jerk_limited(start, target, DT, **JERK_LIMITS)
-        np.testing.assert_allclose(t.position[-1], target)
-        assert not t.velocity[-1].any()
-        assert (np.abs(t.velocity) <= np.array([1.0, 2.0]) + 1e-9).all()
-        assert (np.abs(t.acceleration) <= np.array([3.0, 8.0]) + 1e-9).all()
-        jerk = np.diff(t.acceleration, axis=0, prepend=0) / DT
-        assert (np.abs(jerk) <= 40 + 1e-6).all()
-
-    def test_it_is_no_faster_than_the_trapezoid_without_a_jerk_limit(self):
-        loose = {name: limit for name, limit in JERK_LIMITS.items() if name != "max_jerk"}
-        target = np.array([1.0, -2.0])
-        smooth = jerk_limited(np.zeros(2), target, DT, **JERK_LIMITS)
-        assert smooth.position.shape == (smooth.ticks, 2)
-        assert smooth.time[-1] >= trapezoidal(np.zeros(2), target, DT, **loose).time[-1]
-
-    def test_it_can_begin_in_motion(self):
-        t = jerk_limited([0.0, 0.0], [1.0, 1.0], DT, start_velocity=[0.5, 0.0], **JERK_LIMITS)
-        np.testing.assert_allclose(t.position[0], [0.5 * DT, 0.0], atol=1e-5)
-
-    def test_an_impossible_start_is_an_error(self):
-        with pytest.raises(InvalidArgumentError, match="start, env 0"):
-            jerk_limited([0.0, 0.0], [1.0, 1.0], DT, start_velocity=[1e300, 0.0], **JERK_LIMITS)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_tool_moves_on_a_straight_line_and_turns_about_one_axis(sign):
+    start = np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
+    target = np.array([0.4, 0.0, 0.3, *(sign * np.array([np.cos(0.6), 0.0, np.sin(0.6), 0.0]))])
+    path = straight_line(start, target, DT, duration=0.8)
+    assert np.hstack(path[1:]).shape == (200, 19)
+    np.testing.assert_allclose(path.position[-1, :3], target[:3], atol=1e-12)
+    ends = rotate(np.stack([path.position[-1, 3:], target[3:]]), np.array([1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(*ends, atol=1e-12)
+    angle = 2 * np.arccos(path.position[:, 3])  # about y, from 0 to 1.2 rad
+    np.testing.assert_allclose(np.diff(angle) / DT, path.velocity[1:, 4], atol=0.05)
+    np.testing.assert_allclose(path.velocity[-1], 0, atol=1e-12)

@@ -157,7 +157,7 @@ COMBINATIONS = [
     (ts.make_osc_params, "limit_stiffness", {"limit_stiffness": [10.0, 20.0]}),
     (ts.make_osc_params, "damping_ratio", {"damping": 9.0, "damping_ratio": 0.7}),
     *((ts.make_osc_params, name, {name: "other"}) for name in osc_params.TASK_CHOICES),
-    (motors.dumps_actuators, "actuators", {"actuators": {}}),
+    (motors.dumps_actuators, "actuators", {"record": {}}),
     (bp.drive_target, "state", {"state": 3}),
     (bp.drive_target, "measurement_rate", {"measurement_rate": np.ones((1, 3))}),
     (bp.drive_target, "params.deadband", {"params": bp.make_params(2, 4.0, deadband=0.1)}),
@@ -295,7 +295,7 @@ VALUES = {
 }  # fmt: skip
 """Values of required arguments, by their names."""
 OWN = {
-    "batchpid": {"state": bp.init(PARAMS, Y)},
+    "batchpid": {"state": bp.init(PARAMS, Y), "record": PARAMS},
     "batchpid.task_space": {
         "params": OSC,
         "state": ts.init(OSC, Y),
@@ -303,7 +303,7 @@ OWN = {
         "dynamics": ts.task_dynamics(TREE, Y, Y, "tip"),
     },
     "batchpid.metrics": {"setpoint": np.ones((9, 1, 2)), "measurement": np.zeros((9, 1, 2))},
-    "batchpid.motors": {"state": motors.init(MOTORS, Y, 0.01)},
+    "batchpid.motors": {"state": motors.init(MOTORS, Y, 0.01), "record": MOTORS},
     "batchpid.motors.guard": {"state": guard.init(GUARD, Y)},
     "batchpid.motors.friction": {
         "mass_matrix": np.eye(2)[None],
@@ -402,8 +402,6 @@ def rows():
 
 @pytest.mark.parametrize(("module", "function", "argument"), sorted(rows(), key=lambda row: row.id))
 def test_arguments_of_every_public_function(module, function, argument):
-    if function is trajectories.jerk_limited:
-        pytest.importorskip("ruckig")
     good = needed(function, module=module)
     function(**good)
     for value in WRONG[argument]:

@@ -21,8 +21,8 @@ NAMES = ["panda", "jaco2", 0, 1, 2]
 def robot_of(name: str | int) -> Robot:
     if isinstance(name, str):
         return load_bundled(name)
-    with tempfile.TemporaryDirectory() as folder:
-        return Robot.load(write(Path(folder), robot(*random_tree(np.random.default_rng(name), 12))))
+    folder = Path(tempfile.mkdtemp())  # kept, since an export reads the file again
+    return Robot.load(write(folder, robot(*random_tree(np.random.default_rng(name), 12))))
 
 
 @functools.cache

@@ -226,9 +226,14 @@ SMALL = (
 @pytest.mark.usefixtures("quick_compilation")
 def test_a_short_training_ends_with_a_picture(run, tmp_path):
     picture = tmp_path / "curve.png"
-    text = run("train_reach.py", *SMALL, "--epochs", "1", "--picture", str(picture))
+    policy = str(tmp_path / "policy.npz")
+    files = ("--picture", str(picture), "--out", policy)
+    text = run("train_reach.py", *SMALL, "--epochs", "1", *files)
     assert "of 4 episodes end at the goal" in text
     assert picture.stat().st_size > 10_000
+    # The file holds the policy: it does the same once more, without a training.
+    again = run("train_reach.py", *SMALL, "--policy", policy)
+    assert again.splitlines()[-1] == text.splitlines()[-2]
 
 
 @needs_training

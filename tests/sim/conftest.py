@@ -20,7 +20,7 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     name: str = request.param
     if name == "mujoco":
         pytest.importorskip("mujoco.batch")
-        monkeypatch.setattr(type(load_engine("mujoco")), "group_size", 4)
+        monkeypatch.setattr(load_engine("mujoco"), "group_size", 4)
     original = RunnerOptions.__init__
 
     def init(options: RunnerOptions, *args: Any, **given: Any) -> None:
@@ -34,7 +34,7 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 def small_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """Give runners in this process several groups of envs."""
     for name in ("sapien", "mujoco"):
-        monkeypatch.setattr(type(load_engine(name)), "group_size", 3)
+        monkeypatch.setattr(load_engine(name), "group_size", 3)
 
 
 @pytest.fixture(scope="session")

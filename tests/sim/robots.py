@@ -6,6 +6,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import sysconfig
+from pathlib import Path
+
+import pytest
 
 from batchpid.sim import Robot
 
@@ -26,3 +30,19 @@ def load_bundled(name: str) -> Robot:
         for joint, friction in rows
     )
     return dataclasses.replace(panda, joints=joints)
+
+
+PUBLISHED = Path(sysconfig.get_path("purelib")) / "cmeel.prefix/share/example-robot-data/robots"
+
+
+def load_published(name: str) -> Robot:
+    """Return a bundled robot, or one of the package example-robot-data without joint friction:
+    these files give a torque, PhysX takes a dimensionless coefficient.
+    """
+    if not name.endswith(".urdf"):
+        return load_bundled(name)
+    if not (PUBLISHED / name).is_file():
+        pytest.skip("example-robot-data is not installed")
+    robot = Robot.load(PUBLISHED / name, missing_meshes="skip")
+    joints = tuple(dataclasses.replace(joint, friction=0.0) for joint in robot.joints)
+    return dataclasses.replace(robot, joints=joints)

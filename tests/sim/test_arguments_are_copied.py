@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Mapping
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from identical import assert_identical
 from robots import load_bundled
 
 import batchpid as bp
-from batchpid.sim import Randomization, Runner, RunnerOptions, Uniform
+from batchpid.sim import Runner, RunnerOptions
 
 ROBOT = load_bundled("panda")
 N, DOF = 4, ROBOT.dof
@@ -53,104 +49,6 @@ def motors(lag=0.002):
 
 def gains(kp):
     return own(ROBOT.params(kp=kp))._replace(kd=np.full((1, DOF), 4.0))
-
-
-def execute(runner, command, rng, disturb):
-    """Execute a command on arrays that are overwritten afterwards, if ``disturb``; return its
-    result.
-    """
-    setpoint = np.clip(ROBOT.start + rng.uniform(-0.1, 0.1, (3, N, DOF)), ROBOT.lower, ROBOT.upper)
-    arrays = SimpleNamespace(
-        setpoint=setpoint[0],
-        setpoints=setpoint,
-        rate=rng.uniform(-0.1, 0.1, (N, DOF)),
-        feedforward=rng.uniform(-0.1, 0.1, (N, DOF)),
-        mask=rng.random(N) < 0.5,
-        params=gains(rng.uniform(20, 40)),
-        actuators=motors(rng.uniform(0.001, 0.003)),
-    )
-    result = None
-    if command == "step":
-        result = runner.step(
-            arrays.setpoint, setpoint_rate=arrays.rate, feedforward=arrays.feedforward
-        )
-    elif command == "send":
-        runner.send(arrays.setpoint, setpoint_rate=arrays.rate, feedforward=arrays.feedforward)
-        if disturb:
-            scribble(vars(arrays))
-        result = runner.recv()
-    elif command == "rollout":
-        result = runner.rollout(
-            arrays.setpoints, progress=lambda ticks: between(ticks, arrays, disturb)
-        )
-    elif command == "reset":
-        result = runner.reset(arrays.setpoint, arrays.rate, arrays.mask)
-    elif command == "params":
-        runner.params = arrays.params
-    elif command == "actuators":
-        runner.actuators = arrays.actuators
-    elif command == "snapshot":
-        arrays.snapshot = runner.snapshot()
-        result = runner.restore(arrays.snapshot)
-    if disturb:
-        scribble(vars(arrays))
-    return result
-
-
-def between(ticks, arrays, disturb):
-    for tick in ticks:
-        yield tick
-        if disturb:
-            scribble(vars(arrays))
-
-
-def run(commands, seed, workers, disturb):
-    """Return the results of the commands, then those after a lost worker."""
-    rng = np.random.default_rng(seed)
-    given_ = SimpleNamespace(
-        params=gains(30.0),
-        guard=limits(),
-        actuators=motors(),
-        speed_limit=np.full((1, DOF), 50.0),
-        control="pid",
-    )
-    names = {f"panda_joint{joint}": Uniform(0.0, 0.1) for joint in (1, 2)}
-    randomization = Randomization(friction=names, params={"kp": names})
-    with Runner(
-        ROBOT, N, workers=workers, substeps=3, randomization=randomization, **vars(given_)
-    ) as runner:
-        if disturb:
-            scribble(vars(given_))
-            names.clear()
-        results = [execute(runner, command, rng, disturb) for command in commands]
-        for pid in runner.pids:
-            os.kill(pid, signal.SIGKILL)
-        results += [runner.step(ROBOT.start), runner.params, runner.actuators, runner.options.guard]
-    return results
-
-
-COMMANDS = ("step", "send", "rollout", "reset", "params", "actuators", "snapshot")
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings(
-    "ignore::batchpid.sim.RecoveryWarning", "ignore::batchpid.sim.SetpointWarning"
-)
-@settings(max_examples=4, deadline=None)
-@given(
-    commands=st.permutations(COMMANDS),
-    seed=st.integers(0, 2**32 - 1),
-    workers=st.sampled_from([0, 1]),
-)
-def test_a_runner_keeps_nothing_of_the_callers(commands, seed, workers):
-    for ours, theirs in zip(
-        *(run(commands, seed, workers, disturb) for disturb in (False, True)), strict=True
-    ):
-        if isinstance(ours, tuple):
-            for one, other in zip(ours, theirs, strict=True):
-                np.testing.assert_array_equal(one, other)
-        elif ours is not None:
-            assert_identical(ours, theirs)
 
 
 def test_a_runner_keeps_params_and_options_read_only():
@@ -263,31 +161,3 @@ def test_the_functions_of_law_guard_and_actuators_keep_nothing(law, seed):
     ]
     for one, other in zip(copies, after, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-class Gain:
-    """Controller with an array of the caller's."""
-
-    def __init__(self):
-        self.stiffness = np.full(DOF, 20.0)
-
-    def init(self, robot, num_envs):
-        return None
-
-    def __call__(self, state, setpoint, qpos, qvel, passive):
-        return state, passive + self.stiffness * (setpoint - qpos) - qvel
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
-def test_a_worker_that_is_replaced_gets_the_controller_as_it_was():
-    ends = []
-    for disturb in (False, True):
-        controller = Gain()
-        with Runner(ROBOT, 2, workers=1, control=controller, substeps=10) as runner:
-            runner.step(ROBOT.start)
-            if disturb:
-                scribble(controller)
-                os.kill(runner.pids[0], signal.SIGKILL)
-            ends.append(runner.step(ROBOT.start + 0.1))
-    assert_identical(*ends)

@@ -31,14 +31,14 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import (
     LogUniform,
     Normal,
+    OperationalSpace,
     Randomization,
     Robot,
     Runner,
-    RunnerKeywords,
     Snapshot,
     Uniform,
 )
-from batchpid.sim.loop.numpy_executor import NumPyExecutor
+from batchpid.sim.options.options import OPTIONS
 
 N, TICKS, SPLIT, FAILING = 5, 5, 3, 2
 """Envs and ticks of the program, ticks before its snapshot, and the env that fails."""
@@ -158,6 +158,10 @@ def motors(*effects: dict[str, Any], joints: int = 2) -> dict[str, Any]:
     }
 
 
+def osc(**options: Any) -> dict[str, Any]:
+    return {"control": OperationalSpace(ARM, "hand", **options)}
+
+
 FEATURES: dict[str, Feature] = {
     "default gains": Feature(),
     "accelerations": Feature(accelerations=True),
@@ -176,6 +180,8 @@ FEATURES: dict[str, Feature] = {
     "drive with an integral": Feature({"control": "drive"}, EFFORTS, exact=True),
     "efforts": Feature({"control": "effort"}, exact=True),
     "osc": Feature({"control": "osc", "tool": "hand"}),
+    "osc with an integral": Feature(osc(integral_gain=20.0, integral_limit=5.0, frame="tool")),
+    "implicit osc": Feature(osc(discretization="implicit", point=[0, 0, 0.1], limit_margin=0.2)),
     "own controller": Feature({"control": Damped()}, exact=True),
     "guard": Feature({"guard": GUARD}),
     "guarded drive": Feature({"control": "drive", "guard": GUARD}, exact=True),
@@ -428,13 +434,20 @@ def in_python(case: tuple[str, str]) -> None:
 def in_numpy(case: tuple[str, str]) -> None:
     """The NumPy executor, with mass matrices and passive forces from native code: bit-identical."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("batchpid.sim.loop.env_group.NativeExecutor", NumPyExecutor)
+        patch.setattr("batchpid.sim.loop.env_group.runs_natively", lambda setup: False)
         with make(case) as runner:
             check_equal(program(runner, case), reference(case))
 
 
+def overwrite(arrays: dict[str, np.ndarray]) -> None:
+    for rows in arrays.values():
+        rows[...] = 77.0
+
+
 def tick_by_tick(case: tuple[str, str]) -> None:
-    """Single ticks, by step and by send and recv in turn, are bit-identical to a rollout."""
+    """Single ticks, by step and by send and recv in turn, are bit-identical to a rollout; arrays of
+    the caller are overwritten after each call.
+    """
 
     def rollout(runner: Runner, given: dict[str, np.ndarray]) -> Any:
         seen = []
@@ -442,7 +455,9 @@ def tick_by_tick(case: tuple[str, str]) -> None:
             row = {name.removesuffix("s"): rows[tick] for name, rows in given.items()}
             if tick % 2:
                 runner.send(**row)
+                overwrite(row)
             seen.append(runner.recv() if tick % 2 else runner.step(**row))
+            overwrite(row)
         return type(seen[0]).join([each.map(lambda rows: rows[None]) for each in seen])
 
     with make(case) as runner:
@@ -489,11 +504,20 @@ def again(case: tuple[str, str]) -> None:
 
 
 def in_workers(case: tuple[str, str]) -> None:
-    """Two workers, one of which is killed and replaced."""
+    """Two workers, one of which is killed and replaced; its replay does not see later writes to the
+    caller's arrays.
+    """
+
+    def rollout(runner: Runner, given: dict[str, np.ndarray]) -> Any:
+        seen = runner.rollout(**given)
+        overwrite(given)
+        return seen
+
+    def kill(runner: Runner) -> None:
+        os.kill(runner.pids[1], signal.SIGKILL)
+
     with make(case, workers=2) as runner:
-        result = program(
-            runner, case, disturb=lambda runner: os.kill(runner.pids[1], signal.SIGKILL)
-        )
+        result = program(runner, case, rollout, kill)
         assert runner.recoveries == 1
     check_equal(result, reference(case))
 
@@ -576,4 +600,4 @@ def test_every_option_has_a_row() -> None:
     }
     of_programs = {"timestep", "substeps", "on_invalid_input"}
     options = {name for feature in FEATURES.values() for name in feature.options}
-    assert options >= RunnerKeywords.__annotations__.keys() - of_paths - of_programs
+    assert options >= OPTIONS.keys() - of_paths - of_programs

@@ -8,7 +8,9 @@ of a file is ignored. A missing key has its default.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
 import io
 import json
 import os
@@ -24,11 +26,11 @@ from hypothesis import strategies as st
 from option_values import ARM, MOTORS
 
 import batchpid as bp
-from batchpid.errors import BatchPIDError
+from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.sim import Robot, Runner, Snapshot
 from batchpid.sim.identification import read_logs
 from batchpid.sim.recording.setpoint_files import read_setpoints
-from batchpid.sim.tuning import load_randomization, random_moves
+from batchpid.sim.tuning import load_randomization
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of unusual values
 JOINTS = list(ARM.joint_names)
@@ -67,7 +69,21 @@ def write_run(path: Path) -> None:
         runner.snapshot().save(path)
 
 
-MOVES = random_moves(ARM, 1, 0)
+@functools.cache
+def runner() -> Runner:
+    """Return a runner that is given every snapshot."""
+    return Runner(ARM, 2, params=PARAMS, **SHORT)
+
+
+def restored(path: Path) -> Snapshot:
+    """Return the snapshot of a file, which the runner takes or refuses."""
+    snapshot = Snapshot.load(path)
+    with contextlib.suppress(InvalidArgumentError):
+        runner().restore(snapshot)
+        runner().step(ARM.start)
+    return snapshot
+
+
 KINDS = {
     "params.yaml": Kind(
         lambda path: bp.save_params(path, PARAMS, JOINTS), lambda path: bp.load_params(path, JOINTS)
@@ -88,7 +104,7 @@ KINDS = {
         lambda path: write_table(path, "setpoint_rate"),
         lambda path: read_setpoints(ARM, path, timestep=1e-3),
     ),
-    "snapshot.npz": Kind(write_run, Snapshot.load),
+    "snapshot.npz": Kind(write_run, restored),
 }
 
 

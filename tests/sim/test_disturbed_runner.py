@@ -1,4 +1,6 @@
-"""A runner under kills, stops and Ctrl-C is bit-identical to an undisturbed one in this process."""
+"""A runner under kills, stops, signals and errors: bit-identical to an undisturbed one in this process,
+or closed.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ from identical import assert_identical
 from processes import have_ended, send
 from robots import load_bundled
 
-from batchpid.errors import WorkerError
-from batchpid.sim import RecoveryWarning, Runner
+from batchpid.errors import ClosedError, WorkerError
+from batchpid.sim import Recorder, RecoveryWarning, Robot, Runner, read_recording
 
 ROBOT = load_bundled("panda")
 N, SUBSTEPS = 4, 5
@@ -145,7 +147,7 @@ def count_open() -> tuple[int, int]:
     "seed", [0, *[pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, PROGRAMS)]]
 )
 def test_commands_in_any_order_under_disturbances(seed, monkeypatch):
-    monkeypatch.setattr("batchpid.sim.runner.CHECKPOINT_STEPS", 40)
+    monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 40)
     before = count_open()
     run_program(seed, length=10, engine=("sapien", "mujoco")[seed % 2])
     descriptors, children = count_open()
@@ -154,127 +156,198 @@ def test_commands_in_any_order_under_disturbances(seed, monkeypatch):
 
 
 class Acts:
-    """Controller that calls ``act`` in the worker whose envs have a setpoint beyond 0.5."""
+    """Controller of the passive force that calls ``act`` with the number of each sim step."""
 
-    def __init__(self, act):
+    def __init__(self, act: Callable[[int], object]) -> None:
         self.act = act
 
-    def init(self, robot, num_envs):
-        return None
+    def init(self, robot: Any, num_envs: int) -> Any:
+        return np.zeros(num_envs, int)
 
-    def __call__(self, state, setpoint, qpos, qvel, passive):
-        if (setpoint[:, 0] > 0.5).any():
-            self.act()
-        return state, passive
-
-
-MARKED = np.where((np.arange(N) == 0)[:, None], 1.0, 0.0) * np.ones(ROBOT.dof)
-"""Setpoints at which the first worker acts."""
+    def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:
+        self.act(int(state[0]))
+        return state + 1, passive
 
 
-def test_a_lost_worker_is_named_and_the_others_stay():
+def acting(act: Callable[[int], object], workers: int, **options: Any) -> Runner:
+    options = {"control": Acts(act), "substeps": SUBSTEPS, "workers": workers, **options}
+    return Runner(ROBOT, 2, **options)
+
+
+def test_a_lost_worker_is_named_and_the_others_stay() -> None:
     with make(2) as runner:
         lost, other = runner.pids
         send(lost, signal.SIGKILL)
-        with pytest.warns(
-            RecoveryWarning,
-            match=rf"worker 0 \(pid {lost}, envs 0 to 1\) died \(Killed\); replaced",
-        ):
+        named = rf"worker 0 \(pid {lost}, envs 0 to 1\) died \(Killed\); replaced"
+        with pytest.warns(RecoveryWarning, match=named):
             runner.step(NEAR)
-        assert runner.recoveries == 1
-        assert runner.pids[1] == other
+        assert (runner.recoveries, runner.pids[1]) == (1, other)
         assert not psutil.pid_exists(lost)
+        # A warning as an error leaves the tick done.
+        send(other, signal.SIGKILL)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            with pytest.raises(RecoveryWarning):
+                runner.step(NEAR)
+        assert runner.time == 2 * SUBSTEPS * runner.timestep
+        send(runner.pids[0], signal.SIGSTOP)
+        runner.send(NEAR)
+        began = time.monotonic()
+    assert time.monotonic() - began < 2.0, "closing is quick while a worker is stopped in a tick"
 
 
-def test_a_worker_without_an_answer_is_stuck_after_the_timeout(capfd, monkeypatch):
+def test_a_worker_without_an_answer_is_stuck_after_the_timeout(capfd, monkeypatch) -> None:
     monkeypatch.setattr("batchpid.sim.workers.pool.MAX_LOSSES", 1)
 
-    def work_for_ever():
+    def work_for_ever(step: int) -> None:
         while True:
             pass
 
-    options = {"workers": 1, "control": Acts(work_for_ever), "timeout": 0.5}
     with (
-        Runner(ROBOT, N, **options) as runner,
-        pytest.raises(Exception, match=r"is stuck: no answer in time; raise timeout="),
+        acting(work_for_ever, 1, timeout=0.5) as runner,
+        pytest.raises(WorkerError, match=r"is stuck: no answer in time; raise timeout="),
     ):
-        runner.step(MARKED)
+        runner.step(NEAR)
     assert "work_for_ever" in capfd.readouterr().err  # its stack
 
 
-def test_a_request_that_kills_every_worker_is_given_up(monkeypatch, tmp_path):
+def test_a_request_that_kills_every_worker_is_given_up(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr("batchpid.sim.workers.pool.MAX_LOSSES", 2)
 
-    def crash():
+    def crash(step: int) -> None:
         (tmp_path / str(os.getpid())).touch()
         os.kill(os.getpid(), signal.SIGSEGV)
 
     with (
-        Runner(ROBOT, N, workers=1, control=Acts(crash)) as runner,
+        acting(crash, 1) as runner,
         pytest.raises(WorkerError, match=r"Segmentation fault.*lost 2 times.*workers=0"),
     ):
-        runner.step(MARKED)
+        runner.step(NEAR)
     assert len(os.listdir(tmp_path)) == 2
     assert runner.closed
 
 
-class WritesDots:
-    """Controller that adds a byte to a file at each sim step."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def init(self, robot, num_envs):
-        return np.zeros(num_envs)
-
-    def __call__(self, state, setpoint, qpos, qvel, passive):
-        with open(self.path, "ab") as file:
-            file.write(b".")
-        return state, passive
-
-
-def test_only_the_requests_since_the_last_checkpoint_are_replayed(tmp_path, monkeypatch):
-    monkeypatch.setattr("batchpid.sim.runner.CHECKPOINT_STEPS", 20)
+def test_only_the_requests_since_the_last_checkpoint_are_replayed(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 20)
     path = tmp_path / "steps"
-    with Runner(ROBOT, 1, workers=1, control=WritesDots(path), substeps=5) as runner:
+
+    def write_a_dot(step: int) -> None:
+        with path.open("ab") as file:
+            file.write(b".")
+
+    with acting(write_a_dot, 1) as runner:
         for _ in range(9):
             runner.step(ROBOT.start)  # checkpoints after 20 and 40 sim steps
         before = path.stat().st_size
         send(runner.pids[0], signal.SIGKILL)
         with pytest.warns(RecoveryWarning):
             runner.step(ROBOT.start)
-    assert before == 45
-    assert path.stat().st_size - before == 10
+    assert (before, path.stat().st_size - before) == (45, 10)
 
 
-def test_a_replay_does_not_see_later_writes_to_the_callers_arrays():
-    start, mask = np.tile(NEAR, (N, 1)), np.arange(N) < 2
-    setpoint = np.tile(NEAR, (N, 1))
-    with make(1) as runner, make(0) as model:
-        for each in (runner, model):
-            each.reset(start, mask=mask)
-            each.step(setpoint)
-        start[...] = setpoint[...] = ROBOT.start
-        mask[...] = ~mask
-        send(runner.pids[0], signal.SIGKILL)
-        with pytest.warns(RecoveryWarning):
-            again = runner.step(NEAR)
-        assert_identical(again, model.step(NEAR))
+# -- Ctrl-C and other signals
 
 
-def test_a_warning_as_an_error_leaves_the_tick_done():
-    with make(1) as runner, make(0) as model, warnings.catch_warnings():
-        warnings.simplefilter("error")
-        send(runner.pids[0], signal.SIGKILL)
-        with pytest.raises(RecoveryWarning):
+def interrupting(*steps: int) -> Callable[[int], None]:
+    """Return an act that sends SIGINT to the process of the test in some sim steps."""
+    pid = os.getpid()
+    return lambda step: os.kill(pid, signal.SIGINT) if step in steps else None
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_ctrl_c_waits_for_the_request_in_progress(workers, tmp_path) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with (
+        acting(interrupting(SUBSTEPS + 2, 3 * SUBSTEPS), workers) as runner,
+        acting(lambda step: None, 0) as model,
+        Recorder(tmp_path / "run.h5", runner) as recorder,
+    ):
+        runner.step(NEAR)
+        with pytest.raises(KeyboardInterrupt):
             runner.step(NEAR)
-        model.step(NEAR)
+        assert signal.getsignal(signal.SIGINT) is before
+        for _ in range(2):
+            last = model.step(NEAR)
+        assert runner.time == model.time
+        assert_identical(runner.observe(), last)
         assert_identical(runner.step(NEAR), model.step(NEAR))
+        with pytest.raises(KeyboardInterrupt):
+            runner.rollout(np.tile(NEAR, (5_000, 1)))
+        ticks = round(runner.time / (SUBSTEPS * runner.timestep))
+        recorder.close()
+    assert 3 < ticks < 2_000
+    assert len(read_recording(tmp_path / "run.h5").time) == ticks
 
 
-def test_closing_is_quick_while_a_worker_is_stopped_in_a_tick():
-    with make(1) as runner:
-        send(runner.pids[0], signal.SIGSTOP)
-        runner.send(NEAR)
-        began = time.monotonic()
-    assert time.monotonic() - began < 2.0
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_second_ctrl_c_ends_the_tick_and_closes_the_runner(workers) -> None:
+    pid = os.getpid()
+
+    def hang(step: int) -> None:
+        while step == SUBSTEPS + 1:
+            time.sleep(0.05)
+            os.kill(pid, signal.SIGINT)
+
+    with acting(hang, workers) as runner:
+        runner.step(NEAR)
+        pids = runner.pids
+        with pytest.raises(KeyboardInterrupt):
+            runner.step(NEAR)
+        with contextlib.suppress(KeyboardInterrupt):  # one more, before the worker has ended
+            assert have_ended(pids)
+        assert runner.closed
+        assert runner.time == SUBSTEPS * runner.timestep
+        with pytest.raises(ClosedError, match="since a call failed"):
+            runner.step(NEAR)
+
+
+@contextlib.contextmanager
+def handler(number: int, act: Callable[..., object]):
+    """Let ``act`` handle a signal; one of SIGALRM comes 0.2 s later."""
+    before = signal.signal(number, act)
+    signal.setitimer(signal.ITIMER_REAL, 0.2 if number == signal.SIGALRM else 0)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(number, before)
+
+
+def test_a_handler_of_the_callers_own_is_called_when_the_tick_is_done() -> None:
+    times = []
+    with acting(interrupting(2), 1) as runner:
+        with handler(signal.SIGINT, lambda *_: times.append(runner.time)):
+            assert runner.step(NEAR).ok.all()
+        assert times == [runner.time]
+
+
+@pytest.mark.parametrize("sensors", [False, True])
+def test_an_exception_of_another_signal_handler_closes_the_runner(sensors) -> None:
+    """Between requests to workers, and between sim steps in this process, where Python reads the
+    sensors of SAPIEN.
+    """
+
+    def fail(*_: Any) -> None:
+        raise TimeoutError
+
+    robot = Robot.load("quadruped", fixed_base=False) if sensors else ROBOT
+    options = {"contacts": [robot.links[-1].name], "engine": "sapien"} if sensors else {}
+    with (
+        Runner(robot, 2, workers=int(not sensors), **options) as runner,
+        handler(signal.SIGALRM, fail),
+        pytest.raises(TimeoutError),
+    ):
+        runner.step(robot.start, substeps=1_000_000)
+    assert runner.closed
+    assert runner.time == 0
+
+
+def test_calls_in_another_thread_leave_ctrl_c_to_the_main_thread() -> None:
+    seen = []
+    with make(0) as runner:
+        work = lambda: seen.append((runner.step(NEAR), signal.getsignal(signal.SIGINT)))  # noqa: E731
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+    assert seen[0][0].ok.all()
+    assert seen[0][1] is signal.getsignal(signal.SIGINT)

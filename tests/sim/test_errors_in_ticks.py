@@ -4,9 +4,6 @@ number of workers.
 
 from __future__ import annotations
 
-import os
-import signal
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -72,17 +69,12 @@ def run(runner, way):
             runner.recv()
 
 
-def outcome(workers, controller, *, kill=False, way="rollout", **options):
+def outcome(workers, controller, way="rollout", **options):
     """Return the error of a run, and the remaining state of the runner."""
     with Runner(
         ROBOT, ENVS, workers=workers, control=controller, substeps=SUBSTEPS, timeout=20.0, **options
     ) as runner:
         recorder = runner.recorder = ListRecorder()
-        if kill and workers:
-            runner.step(MARKS)
-            os.kill(runner.pids[-1], signal.SIGKILL)
-        elif kill:
-            runner.step(MARKS)
         with pytest.raises(BatchPIDError) as info:
             run(runner, way)
         assert runner.closed
@@ -123,13 +115,6 @@ def test_any_number_of_workers_ends_in_the_same_error_and_state(workers, failure
         (first - 1) // SUBSTEPS * SUBSTEPS / 2000
     )  # the whole ticks before
     assert len(one[4]) == (first - 1) // SUBSTEPS
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
-def test_a_lost_worker_does_not_change_the_error():
-    controller = FailsLater([(3, 11), (17, 14)])
-    assert_same(outcome(0, controller, kill=True), outcome(2, controller, kill=True))
 
 
 @pytest.mark.parametrize("workers", [0, 1])

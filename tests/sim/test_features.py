@@ -21,7 +21,6 @@ from batchpid.sim import OperationalSpace, Robot, Runner, write_recording
 from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
 from batchpid.sim.identification import identify
 from batchpid.sim.robot.urdf_export import to_urdf
-from batchpid.sim.tuning import tune
 from batchpid.trajectories import minimum_jerk
 from tests.c_programs import COMPILERS, TABLE, compiled
 
@@ -53,15 +52,20 @@ def reach(robot: Robot, control: str, engine: str) -> None:
         np.testing.assert_allclose(pose[:3], setpoint[:3], rtol=0, atol=2e-3)
         assert abs(pose[3:] @ setpoint[3:]) > 1 - 1e-6  # cosine of half the angle
     else:
-        left = last - goal
-        left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
-        np.testing.assert_allclose(left[robot.independent], 0.0, atol=0.02)
+        np.testing.assert_allclose(off(robot, last, goal), 0.0, atol=0.02)
     followers = robot.coupling.followers
     rates = robot.coupling.rates(seen.qvel[-20:])[..., followers]
     np.testing.assert_allclose(seen.qvel[-20:, :, followers], rates, atol=0.02)
     turning = robot.continuous[robot.coupling.leader] | robot.continuous
     still = [joint for joint in followers if not turning[joint]]
     np.testing.assert_allclose(last[still], robot.coupling.positions(last)[still], atol=1e-4)
+
+
+def off(robot: Robot, qpos: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Return the errors of the independent joints, within a turn of each continuous joint."""
+    left = qpos - goal
+    left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
+    return left[..., robot.independent]
 
 
 def check(features: tuple[str, ...], command: str, engine: str) -> None:
@@ -141,11 +145,8 @@ def test_every_feature_is_followed_along_a_trajectory(feature, engine):
     with Runner(robot, 1, workers=0, engine=engine, ground=False) as runner:
         runner.reset(start)
         seen = runner.rollout(move.position, setpoint_rates=move.velocity)
-    left = seen.qpos[:, 0] - move.position
-    left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
-    assert np.abs(left[:, robot.independent]).max() < (
-        1e-3 if robot.fixed_base else 0.03
-    )  # a free base moves away
+    most = 1e-3 if robot.fixed_base else 0.03  # a free base moves away
+    assert np.abs(off(robot, seen.qpos[:, 0], move.position)).max() < most
 
 
 @pytest.mark.parametrize(("feature", "engine"), [*in_both_engines(*FEATURES)])
@@ -162,9 +163,7 @@ def test_every_feature_reaches_its_goal_by_efforts(feature, engine):
         for _ in range(3000):
             seen = runner.step(pid(goal[None], seen.qpos.astype(float)))
     assert seen.ok.all()
-    left = seen.qpos[0] - goal
-    left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
-    np.testing.assert_allclose(left[robot.independent], 0.0, atol=0.03)
+    np.testing.assert_allclose(off(robot, seen.qpos[0], goal), 0.0, atol=0.03)
 
 
 @pytest.mark.parametrize("kind", ["urdf", "xml"])
@@ -211,23 +210,6 @@ def test_every_feature_is_identified_or_refused(feature, tmp_path):
     before, after = found.held_out_error
     assert feature != "floating base"
     assert after < 0.1 * before
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("feature", FEATURES)
-def test_every_feature_is_tuned(feature):
-    """The gains found settle in the moves of the search."""
-    robot = robot_with(feature)
-    found = tune(robot, generations=1, population=4, seconds=1.0, workers=0)
-    assert np.isfinite(found.cost)
-    assert found.cost <= found.start_cost
-    start, goal = poses(robot)
-    with Runner(robot, 1, workers=0, ground=False, params=found.params) as runner:
-        runner.reset(start)
-        seen = runner.rollout(np.tile(goal, (250, 1)))
-    left = seen.qpos[-1, 0] - goal
-    left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
-    np.testing.assert_allclose(left[robot.independent], 0.0, atol=0.03)
 
 
 @pytest.mark.skipif(not COMPILERS, reason="no C compiler")

@@ -109,25 +109,6 @@ def test_the_twist_is_that_of_the_root_link_in_the_world(quadruped, engine):
     np.testing.assert_allclose(rates[:, 1], 0.5 * (wx * w + wy * z - wz * y), atol=0.01)
 
 
-@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
-def test_an_env_that_fails_is_placed_where_it_began(quadruped, engine):
-    options = {
-        "params": quadruped.params(**GAINS),
-        "workers": 0,
-        "engine": engine,
-        "on_invalid_input": "contain",
-    }
-    with Runner(quadruped, 2, on_fault="reset", **options) as runner:
-        runner.reset(base_pose=[0, 0, 0.36, 1, 0, 0, 0])
-        bad = np.tile(quadruped.start, (2, 1))
-        runner.step(bad)
-        bad[0] = np.nan
-        seen = runner.step(bad)
-    assert seen.ok.tolist() == [False, True]
-    assert abs(seen.base_pose[0, 2] - 0.36) < 5e-3
-    assert np.isfinite(seen.base_twist).all()
-
-
 class Counted(Uniform):
     """Uniform distribution that counts its draws."""
 

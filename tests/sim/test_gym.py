@@ -1,7 +1,5 @@
 """Gymnasium environments: Gymnasium's own checks, and the vector env against single envs."""
 
-import gc
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +11,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence  # noqa: E40
 from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
 from batchpid.errors import CallOrderError, InvalidArgumentError  # noqa: E402
-from batchpid.sim import CommandSpec, FaultWarning, Randomization, Robot, Runner, Uniform  # noqa: E402
+from batchpid.sim import CommandSpec, FaultWarning, Randomization, Robot, Uniform  # noqa: E402
 from batchpid.sim.gym import ReachEnv, ReachVectorEnv  # noqa: E402
 from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write  # noqa: E402
 
@@ -159,15 +157,6 @@ def test_dlpack_shares_observations_without_a_copy():
     np.testing.assert_array_equal(np.asarray(theirs), obs)
     assert np.from_dlpack(obs).__array_interface__["data"] == obs.__array_interface__["data"]
     env.close()
-
-
-def test_closing_a_single_env_closes_its_runner():
-    env = ReachEnv()
-    runner = env.runner
-    assert isinstance(runner, Runner)
-    env.close()
-    gc.collect()
-    assert runner.closed
 
 
 def test_actions_and_observations_are_those_of_independent_joints(tmp_path):

@@ -1,5 +1,5 @@
-"""Calls of a runner from the wrong place or moment raise an error that says so, and change
-nothing.
+"""Calls of a runner in another order, or from another place or moment, complete the tick or raise an
+error that says so, and change nothing.
 """
 
 from __future__ import annotations
@@ -7,26 +7,39 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from identical import assert_identical
+from option_values import ARM
+from processes import have_ended
 
-from batchpid.errors import ClosedError, InUseError
+from batchpid.errors import CallOrderError, ClosedError, InUseError, InvalidArgumentError
 from batchpid.sim import Runner
+
+N, LONG = 4, 100_000
+PARAMS = ARM.params(kp=20.0, ki=1.0, kd=2.0)
+TABLE = np.random.default_rng(0).uniform(-0.2, 0.2, (4, N, ARM.dof))
+
+
+def make(workers: int = 0, num_envs: int = N) -> Runner:
+    return Runner(ARM, num_envs, params=PARAMS, workers=workers, substeps=5)
 
 
 @pytest.fixture(params=[0, 1])
-def runner(request, panda):
-    with Runner(panda, 8, params=panda.params(), workers=request.param) as made:
+def runner(request: pytest.FixtureRequest) -> Any:
+    with make(request.param) as made:
         yield made
 
 
 @pytest.fixture
-def on_alarm():
+def on_alarm() -> Any:
     """Function that makes another one the handler of a signal that arrives 0.1 s later."""
 
-    def on_alarm(act):
+    def on_alarm(act: Callable[[], object]) -> None:
         signal.signal(signal.SIGALRM, lambda *_: act())
         signal.setitimer(signal.ITIMER_REAL, 0.1)
 
@@ -36,7 +49,7 @@ def on_alarm():
     signal.signal(signal.SIGALRM, before)
 
 
-def memory_files():
+def memory_files() -> int:
     """Return the number of this process's descriptors of memory that it shares with workers, or
     with itself.
     """
@@ -44,18 +57,77 @@ def memory_files():
     return sum(link.startswith("/memfd:batchpid") for link in links)
 
 
-def test_a_closed_runner_gives_its_memory_back(runner):
-    before = memory_files()
+# -- send and recv
+
+
+def test_halves_in_turns_are_bit_identical_to_the_whole() -> None:
+    halves = [make(1, N // 2) for _ in range(2)]
+    for half in halves:
+        half.send(half.observe().qpos + 0.1)
+    for _ in range(3):
+        for half in halves:
+            half.send(half.recv().qpos + 0.1)
+    ends = [half.recv() for half in halves]
+    with make() as whole:
+        for _ in range(4):
+            end = whole.step(whole.observe().qpos + 0.1)
+    assert_identical(type(end).join(ends), end)
+    for half in halves:
+        half.close()
+
+
+def test_another_call_completes_the_tick_first_and_recv_still_returns_it(runner: Runner) -> None:
+    calls: tuple[Callable[[Runner], object], ...] = (
+        lambda each: each.snapshot(),
+        lambda each: setattr(each, "params", PARAMS.replace(kp=33.0)),
+        lambda each: each.observe(),
+    )
+    with make() as model:
+        for other in calls:
+            runner.send(TABLE[0])
+            sent = model.step(TABLE[0])
+            other(runner)
+            other(model)
+            assert_identical(runner.recv(), sent)
+            assert_identical(runner.observe(), model.observe())
+        runner.send(TABLE[0])
+        assert runner.time == pytest.approx(model.time + 5 * model.timestep)
+
+
+def test_calls_out_of_order_are_named(runner: Runner) -> None:
+    snapshot = runner.snapshot()
+    with pytest.raises(CallOrderError, match="send"):
+        runner.recv()
+    with pytest.raises(InvalidArgumentError, match="setpoint"):
+        runner.send(np.nan)
+    runner.send(TABLE[0])
+    changing = {"step": TABLE[1], "reset": TABLE[2], "rollout": TABLE[:3], "restore": snapshot}
+    for name, argument in (changing | {"send": TABLE[1]}).items():
+        with pytest.raises(CallOrderError, match=rf"{name}: .*recv"):
+            getattr(runner, name)(argument)
+    with make() as model:
+        assert_identical(runner.recv(), model.step(TABLE[0]))
+    with pytest.raises(CallOrderError, match="send"):
+        runner.recv()
+    runner.send(TABLE[0])
+    pids, before = runner.pids, memory_files()
     runner.close()
+    assert have_ended(pids)
     assert memory_files() < before
+    runner.settle()
+    with pytest.raises(ClosedError):
+        runner.recv()
 
 
-def test_a_call_from_another_thread_raises(runner, panda):
+# -- threads, signal handlers, children
+
+
+def test_a_call_from_another_thread_raises(runner: Runner) -> None:
     done = threading.Event()
 
-    def work():
+    def work() -> None:
         while not done.is_set():
-            runner.step(panda.start, substeps=200)
+            runner.step(TABLE[0], substeps=200)
 
     thread = threading.Thread(target=work)
     thread.start()
@@ -66,79 +138,52 @@ def test_a_call_from_another_thread_raises(runner, panda):
     finally:
         done.set()
         thread.join()
-    assert runner.step(panda.start).ok.all()
+    assert runner.step(TABLE[0]).ok.all(), "they may take turns"
 
 
-@pytest.mark.quick_rows(1)
-def test_threads_may_take_turns(runner, panda):
-    steps = []
-    lock = threading.Lock()
-
-    def work():
-        for _ in range(5):
-            with lock:
-                steps.append(runner.step(panda.settings.target))
-
-    threads = [threading.Thread(target=work) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    with Runner(panda, 8, params=panda.params(), workers=0) as other:
-        for step in steps:
-            assert_identical(other.step(panda.settings.target), step)
-
-
-@pytest.mark.quick_rows(1)
-def test_a_call_from_a_signal_handler_raises(runner, panda, on_alarm):
+def test_a_call_from_a_signal_handler_raises(runner: Runner, on_alarm: Any) -> None:
     raised = []
 
-    def handler():
+    def handler() -> None:
         for _ in range(2):  # the first error does not end the call that is in progress
             with pytest.raises(InUseError, match="that this one interrupted"):
-                runner.step(panda.start)
+                runner.step(TABLE[0])
         raised.append(True)
 
     on_alarm(handler)
     while not raised:
-        obs = runner.step(panda.start, substeps=500)
-    assert obs.ok.all()
+        seen = runner.step(TABLE[0], substeps=500)
+    assert seen.ok.all()
 
 
-def test_a_signal_handler_may_close_the_runner(runner, panda, on_alarm):
-    before = memory_files()
+def test_a_signal_handler_may_close_the_runner(runner: Runner, on_alarm: Any) -> None:
     on_alarm(runner.close)
     with pytest.raises(ClosedError):  # noqa: PT012
         while True:
-            runner.step(panda.start, substeps=500)
-    assert memory_files() < before
+            runner.step(TABLE[0], substeps=500)
     with pytest.raises(ClosedError):
         runner.observe()
 
 
-def test_another_thread_may_close_the_runner(panda):
-    with Runner(panda, 8, params=panda.params(), workers=1) as runner:
+def test_another_thread_may_close_the_runner() -> None:
+    with make(1) as runner:
         pids = runner.pids
         timer = threading.Timer(0.2, runner.close)
         timer.start()
         with pytest.raises(ClosedError, match="during a call"):
-            runner.step(panda.start, substeps=100_000)
+            runner.step(TABLE[0], substeps=LONG)
         timer.join()
-    for pid in pids:
-        with pytest.raises(ProcessLookupError):
-            os.kill(pid, 0)
+    assert have_ended(pids)
 
 
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
-@pytest.mark.filterwarnings(
-    "ignore:os.fork:RuntimeWarning"
-)  # of JAX, which other tests may have loaded
-def test_a_call_from_a_forked_child_raises(runner, panda):
-    before = runner.step(panda.settings.target)
+@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # of JAX, if other tests loaded it
+def test_a_call_from_a_forked_child_raises(runner: Runner) -> None:
+    before = runner.step(TABLE[0])
     read, write = os.pipe()
     if (child := os.fork()) == 0:
         try:
-            runner.step(panda.start)
+            runner.step(TABLE[0])
         except BaseException as error:
             os.write(write, f"{type(error).__name__}: {error}".encode())
         os._exit(0)
@@ -147,4 +192,4 @@ def test_a_call_from_a_forked_child_raises(runner, panda):
     with os.fdopen(read) as message:
         assert message.read().startswith("InUseError: this Runner belongs to process")
     assert_identical(runner.observe(), before)
-    assert runner.step(panda.start).ok.all()
+    assert runner.step(TABLE[0]).ok.all()

@@ -29,6 +29,7 @@ from batchpid.sim import (
 )
 from batchpid.sim.cli import parse
 from batchpid.sim.engine.protocol import SceneSpec
+from batchpid.sim.options.options import GROUPS
 
 PANDA = load_bundled("panda")
 OWN = bp.make_actuators(PANDA.dof, coulomb=0.3, armature=0.05, command_delay=0.002)
@@ -36,54 +37,46 @@ GEARED = dataclasses.replace(PANDA, actuators=OWN)
 
 
 def test_every_keyword_is_an_option_and_is_shown_with_its_default():
-    robot, num_envs, *options = fields(RunnerKeywords)
-    shown = inspect.signature(Runner).parameters
-    assert list(shown) == [robot.name, num_envs.name, *(each.name for each in options)]
-    for each in options:
-        assert shown[each.name].kind is inspect.Parameter.KEYWORD_ONLY
-        assert shown[each.name].default == each.default, each.name
+    robot, num_envs, *options = inspect.signature(Runner).parameters.values()
+    assert (robot.name, num_envs.name) == ("robot", "num_envs")
+    defaults = {entry.name: entry.default for entry in fields(RunnerKeywords)}
+    assert {*DECLARED} == {"robot", "num_envs", *(parameter.name for parameter in options)}
+    for parameter in options:
+        assert parameter.kind is inspect.Parameter.KEYWORD_ONLY
+        assert parameter.default == defaults[parameter.name], parameter.name
 
 
 def test_a_missing_jax_is_named_with_its_extra_before_a_worker_starts(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax", None)
     with pytest.raises(
-        MissingDependencyError, match=r"backend='jax' needs the package 'jax'.*batchpid\[jax\]"
+        MissingDependencyError, match=r"backend='jax' needs the package 'jax'.*\.\[jax\]"
     ):
         Runner(PANDA, 1, backend="jax")
 
 
 def test_a_flag_of_an_option_has_its_default_and_reaches_the_runner():
-    given = parse(["rollout"]).runner.options()
     flags = {each.name: each.default for each in fields(RunnerKeywords) if DECLARED[each.name].flag}
-    assert given == {name: value for name, value in flags.items() if name != "ground"}, (
-        "on or off, or neither"
-    )
-    words = ["--no-collisions", "--ground", "off", "--workers", "2", "--backend", "jax"]
-    given = parse(["rollout", *words]).runner.options()
-    assert (given["collisions"], given["ground"], given["workers"], given["backend"]) == (
-        False,
-        False,
-        2,
-        "jax",
-    )
+    _, values = parse(["rollout"])
+    assert flags.items() <= vars(values).items()
+    _, values = parse(["rollout", "--ground", "off", "--workers", "2", "--backend", "jax"])
+    assert (values.ground, values.workers, values.backend) == ("off", 2, "jax")
 
 
 def test_every_option_is_documented_where_it_is_declared():
-    body = ast.parse(inspect.getsource(RunnerKeywords)).body[0].body
-    pairs = {
-        one.target.id: next_one
-        for one, next_one in pairwise(body)
-        if isinstance(one, ast.AnnAssign)
-    }
-    assert pairs.keys() == {each.name for each in fields(RunnerKeywords)}
-    assert not [name for name, text in pairs.items() if not isinstance(text, ast.Expr)]
+    texts = {}
+    for group in (*GROUPS, RunnerKeywords):
+        for declaration, text in pairwise(ast.parse(inspect.getsource(group)).body[0].body):
+            if isinstance(declaration, ast.AnnAssign):
+                texts[declaration.target.id] = text
+    assert texts.keys() == DECLARED.keys()
+    assert all(isinstance(text, ast.Expr) for text in texts.values())
 
 
 def test_commands_and_recordings_take_switches_from_their_declaration():
     """A new switch changes its declaration and the code where it acts, and no other module."""
     switches = [each.name for each in fields(RunnerKeywords) if isinstance(each.default, bool)]
     assert "collisions" in switches
-    root = Path(inspect.getfile(RunnerKeywords)).parent
+    root = Path(inspect.getfile(RunnerKeywords)).parents[1]
     texts = {
         path.name: path.read_text()
         for folder in ("cli", "recording")
@@ -146,7 +139,7 @@ def test_options_cannot_be_changed():
     options = RunnerOptions(PANDA, 2, guard=True)
     with pytest.raises(dataclasses.FrozenInstanceError):
         options.timestep = 1e-3
-    other = options.with_values(workers=3)
+    other = options.changed(workers=3)
     assert (other.workers, other.guard, other.timestep) == (3, options.guard, options.timestep)
     assert options.workers != 3
 
@@ -155,14 +148,14 @@ def test_options_travel_to_workers_as_they_are():
     options = RunnerOptions(GEARED, 2, actuators=bp.Actuators(), guard=True)
     received = pickle.loads(pickle.dumps(options))
     assert received.actuators is None
-    assert received.describe() == options.describe()
+    assert received.described == options.described
 
 
 def test_marked_options_are_fields_of_what_keeps_them():
     options = RunnerOptions(PANDA, 2)
     assert options.values_for("scene").keys() <= {each.name for each in fields(SceneSpec)}
     assert options.values_for("recording").keys() <= {each.name for each in fields(RunInfo)}
-    assert options.values_for("snapshot").keys() <= options.describe().keys()
+    assert options.values_for("snapshot").keys() <= options.described.keys()
     assert {"timestep", "collisions", "ground"} <= options.values_for("scene").keys()
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +17,7 @@ from option_values import ARM, box, label
 from robots import load_bundled
 
 import batchpid as bp
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.sim import (
     CommandSpec,
     MujocoSolver,
@@ -22,17 +25,27 @@ from batchpid.sim import (
     Physics,
     Randomization,
     Ray,
+    Recorder,
     Robot,
     Runner,
-    RunnerKeywords,
+    Snapshot,
     Uniform,
+    read_recording,
 )
+from batchpid.sim.options.options import OPTIONS
 
 pytest.importorskip("mujoco.batch")
 DOF, N = ARM.dof, 2
-JUNK = (object(), b"bytes", "no such value", -1.5, float("nan"), [object()], {"a": 1}, 1j)
 FREE = robot_with("floating base")
 SAPIENS_OWN = dataclasses.replace(ARM, dissipation="sapien")
+ROW, ROWS, NAN = np.zeros(DOF), np.zeros((N, DOF)), np.array([[0.0, 0.0], [np.nan, 0.0]])
+
+
+class Odd:
+    """Object that cannot be converted to an array."""
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        raise RuntimeError("cannot be an array")
 
 
 class Hold:
@@ -58,11 +71,62 @@ def named(call: Callable[[], Any]) -> str:
     return str(caught.value.argument)
 
 
-# -- each option by itself
-# ---------------------------------------------------------------------------------------------
+# -- each argument by itself
+
+JUNK = (object(), b"bytes", "no such value", -1.5, float("nan"), [object()], {"a": 1}, 1j)
+ODD = (*JUNK, Odd(), int, range(3), [None], [[1.0], [1.0, 2.0]], ..., np.float64("-inf"), True)
+ODD += (np.zeros(DOF + 1), np.zeros((2, 2, 2, 2)), np.zeros(DOF, "M8[s]"), NAN)
+ODD += (None, "", (), np.zeros((0, DOF)))
+PARAMS = ARM.params(kp=9.0, ki=1.0, kd=2.0)
+PID = bp.BatchPID(PARAMS, N, 1e-3)
+SAMPLE = {"measurement": ROWS, "setpoint": ROWS}
+BOUND = {"mass_matrix": np.eye(DOF), "kp": 1.0, "kd": 1.0, "dt": 1e-3}
+NOT_CHECKED = {"keep_integral", "delay", "lag", "model"}
+"""Arguments that a function uses as they are."""
+ENTRIES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
+    "make_params": (bp.make_params, {"joints": DOF, "kp": 1.0}),
+    "make_actuators": (bp.make_actuators, {"joints": DOF}),
+    "BatchPID": (bp.BatchPID, {"params": PARAMS, "num_envs": N, "dt": 1e-3}),
+    "BatchPID.__call__": (PID.__call__, SAMPLE),
+    "BatchPID.reset": (PID.reset, {"measurement": ROWS}),
+    "BatchPID.track": (PID.track, SAMPLE | {"effort": ROWS}),
+    "stability_bound": (bp.stability_bound, BOUND),
+    "spectral_radius": (bp.spectral_radius, BOUND | {"ki": 1.0}),
+    "load_params": (bp.load_params, {"path": "none.yaml"}),
+    "Robot.load": (Robot.load, {"name_or_path": "panda"}),
+    "Robot.params": (ARM.params, {"kp": 1.0}),
+    "Robot.designed": (ARM.designed, {}),
+    "Robot.check": (ARM.check, {}),
+    "Snapshot.load": (Snapshot.load, {"path": "none.npz"}),
+    "read_recording": (read_recording, {"path": "none.h5"}),
+}
+"""Public functions with good values of the arguments that they need."""
 
 
-@pytest.mark.parametrize("name", ["robot", "num_envs", "params", *RunnerKeywords.__annotations__])
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_a_value_of_any_kind_is_accepted_or_refused_by_name(
+    entry: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    function, good = ENTRIES[entry]
+    bp.save_params("none.yaml", PARAMS, ARM.joint_names)
+    for name, parameter in inspect.signature(function).parameters.items():
+        if parameter.kind is parameter.VAR_KEYWORD or name in NOT_CHECKED:
+            continue
+        for value in ODD:
+            PID.reset(ROWS)
+            before = PID.state
+            try:
+                function(**{**good, name: value})
+            except (BatchPIDError, FileNotFoundError, IsADirectoryError) as error:
+                assert all(map(np.array_equal, PID.state, before))
+                text = str(error)
+                is_named = name.removesuffix("s") in text or "joint" in text or "path" in good
+                assert is_named or isinstance(value, str), (name, value, text)
+
+
+@pytest.mark.parametrize("name", [*OPTIONS])
 def test_values_of_no_use_are_refused_for_every_option(name: str) -> None:
     options = {"robot": ARM, "num_envs": N, "workers": 0}
     if name in ("tool", "cluster"):
@@ -77,8 +141,49 @@ def test_values_of_no_use_are_refused_for_every_option(name: str) -> None:
     assert {*refused} == {name}
 
 
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("contain", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_call_with_any_value_changes_nothing_if_it_is_refused(contain: bool) -> None:
+    options = {"on_invalid_input": "contain"} if contain else {}
+    command = {"setpoint": ROW, "setpoint_rate": ROW, "feedforward": ROW, "substeps": 2}
+    table = {f"{name}s": command[name][None] for name in [*command][:3]}
+    with Runner(ARM, N, workers=0, substeps=2, params=PARAMS, **options) as runner:
+        methods: list[tuple[Callable[..., Any], dict[str, Any]]] = [
+            (runner.step, command),
+            (lambda **given: runner.send(**given) or runner.recv(), command),
+            (runner.rollout, table),
+            (runner.reset, {"qpos": ROW, "qvel": ROW, "mask": np.ones(N, bool), "seed": None}),
+            (runner.restore, {"snapshot": None}),
+            (lambda params: setattr(runner, "params", params), {"params": PARAMS}),
+            (lambda actuators: setattr(runner, "actuators", actuators), {"actuators": None}),
+        ]
+        for function, good in methods:
+            for name in good:
+                for value in ODD:
+                    call = partial(function, **{**good, name: value})
+                    is_usable = value is None or (isinstance(value, float) and value == -1.5)
+                    assert is_refused(runner, call, name) or is_usable or contain, (name, value)
+
+
+def is_refused(runner: Runner, call: Callable[[], Any], name: str) -> bool:
+    """Make a call: if it is refused, it changes nothing, and the runner goes on in any case."""
+    before, time, refused = runner.observe(), runner.time, False
+    try:
+        call()
+    except BatchPIDError as error:
+        refused = True
+        assert name.removesuffix("s") in str(error), name  # noqa: PT017
+        assert runner.time == time
+        assert_identical(runner.observe(), before)
+    seen = runner.observe()
+    assert np.isfinite(seen.qpos[seen.ok]).all()
+    runner.reset()
+    runner.params = PARAMS
+    assert runner.step(ROW).ok.all()
+    return refused
+
+
 # -- options that exclude each other
-# -----------------------------------------------------------------------------------
 
 MOTORS = bp.make_actuators(DOF, strength=0.9)
 PUSHES = {"push": Uniform(0, 1), "push_interval": Uniform(1, 2)}
@@ -151,17 +256,8 @@ def test_options_that_do_not_go_together_are_refused_by_name(
 
 
 # -- calls of a runner
-# -------------------------------------------------------------------------------------------------
 
-ROW, ROWS, NAN = np.zeros(DOF), np.zeros((N, DOF)), np.array([[0.0, 0.0], [np.nan, 0.0]])
 CALLS: list[tuple[str, dict[str, Any], str]] = [
-    ("step", {"setpoint": None}, "setpoint"),
-    ("step", {"setpoint": NAN}, "setpoint"),
-    ("step", {"setpoint": np.zeros(3)}, "setpoint"),
-    ("step", {"setpoint": ROW, "setpoint_rate": NAN}, "setpoint_rate"),
-    ("step", {"setpoint": ROW, "setpoint_rate": np.zeros(3)}, "setpoint_rate"),
-    ("step", {"setpoint": ROW, "feedforward": NAN}, "feedforward"),
-    ("step", {"setpoint": ROW, "feedforward": np.zeros(3)}, "feedforward"),
     ("step", {"setpoint": ROW, "setpoint_acceleration": ROW}, "setpoint_acceleration"),
     (
         "step",
@@ -169,23 +265,15 @@ CALLS: list[tuple[str, dict[str, Any], str]] = [
         "setpoint_acceleration",
     ),
     ("step", {"setpoint": ROW, "substeps": 0}, "substeps"),
-    ("send", {"setpoint": NAN}, "setpoint"),
     ("rollout", {"setpoints": ROW}, "setpoints"),
     ("rollout", {"setpoints": np.zeros((4, 3, DOF))}, "setpoints"),
-    ("rollout", {"setpoints": NAN[None]}, "setpoints"),
-    ("rollout", {"setpoints": ROWS[None], "setpoint_rates": np.zeros(3)}, "setpoint_rates"),
-    ("reset", {"qpos": NAN}, "qpos"),
-    ("reset", {"qvel": np.zeros(3)}, "qvel"),
     ("reset", {"mask": [True]}, "mask"),
     ("reset", {"seed": 0}, "seed"),
     ("reset", {"base_pose": np.zeros(7)}, "base_pose"),
     ("reset", {"base_twist": np.zeros(6)}, "base_twist"),
-    ("restore", {"snapshot": ROW}, "snapshot"),
     ("poses", {}, "build"),
     ("bodies", {"names": ["ball"]}, "names"),
-    ("params", {"value": 3}, "params"),
     ("params", {"value": load_bundled("panda").params()}, "params"),
-    ("actuators", {"value": "strong"}, "actuators"),
     ("actuators", {"value": bp.make_actuators(3, strength=0.9)}, "actuators"),
 ]
 
@@ -274,7 +362,6 @@ def test_a_refused_command_of_entries_names_the_entry() -> None:
 
 
 # -- constructors
-# --------------------------------------------------------------------------------------------------
 
 MADE: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     *(
@@ -303,3 +390,11 @@ def test_refused_constructors_name_their_argument(
     make: Callable[..., Any], options: dict[str, Any], argument: str
 ) -> None:
     assert argument in named(lambda: make(**options))
+
+
+@pytest.mark.parametrize("arguments", [("run.txt",), (3,), ("run.h5", None)])
+def test_a_recorder_that_is_refused_is_not_attached(runner: Runner, arguments: Any) -> None:
+    path, recorded = (*arguments, runner)[:2]
+    with pytest.raises(BatchPIDError):
+        Recorder(path, recorded)
+    assert runner.recorder is None

@@ -90,6 +90,6 @@ def test_its_repr_fits_two_lines(panda):
 def test_every_tick_is_run_whatever_shows_the_progress(hinge, progress, monkeypatch):
     setpoints = np.linspace(0, 0.2, 5)[:, None]
     with Runner(hinge, 1, workers=0) as runner, Runner(hinge, 1, workers=0) as other:
-        monkeypatch.setattr("batchpid.sim.runner.CHECKPOINT_STEPS", 40)
+        monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 40)
         shown, plain = runner.rollout(setpoints, progress=progress), other.rollout(setpoints)
     np.testing.assert_allclose(shown.qpos, plain.qpos, atol=1e-5)

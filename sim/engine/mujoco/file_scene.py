@@ -18,7 +18,6 @@ import numpy as np
 from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.mjcf.mjcf_compiler import Names, attempt
 from batchpid.sim.robot.mjcf.mjcf_reader import content_of, home
@@ -122,9 +121,8 @@ def check_links(spec: SceneSpec, file: MjcfFile, links: Iterable[str]) -> None:
     """Raise RobotError for a link that MuJoCo does not have: several joints of one body have links
     between them.
     """
-    placements = place_links(spec.urdf, spec.separate)
     for link in links:
-        if placements[link].link not in file.bodies:
+        if spec.simulated.links[link].link not in file.bodies:
             problem = (
                 f"link {link!r} lies between two joints of one body, and is no body of its own in"
                 " MuJoCo"
@@ -184,7 +182,7 @@ def _frames(
 
     A body's link has the body's axes, and its origin at the anchor of the body's last hinge.
     """
-    placements, names = place_links(spec.urdf, spec.separate), dict[str, str]()
+    placements, names = spec.simulated.links, dict[str, str]()
     frames: dict[str, BodyFrame] = {}
     for body, name in robot.items():
         if name not in placements:  # the world, if the robot does not include it

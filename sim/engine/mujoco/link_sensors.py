@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import MjModel, MjSpec
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.merging import place_links
 
 _FOUND_AND_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND) | 1 << int(
     mujoco.mjtConDataField.mjCONDATA_FORCE
@@ -28,8 +27,7 @@ a wrench.
 
 def contact_bodies(spec: SceneSpec) -> list[str]:
     """Return the simulated link of each link of ``spec.contacts``."""
-    bodies = place_links(spec.urdf, spec.separate)
-    return [bodies[link].link for link in spec.contacts or ()]
+    return [spec.simulated.links[link].link for link in spec.contacts or ()]
 
 
 def add_link_sensors(

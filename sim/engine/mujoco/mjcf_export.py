@@ -20,7 +20,7 @@ from batchpid.export.pd_drive import Drive
 from batchpid.law.params import PIDParams, make_params
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.friction import Friction
-from batchpid.motors.guard import Guard, check_guard
+from batchpid.motors.guard import Guard
 from batchpid.sim.engine.mujoco.mjcf_actuators import FAR, MjcfActuators
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.physics import SOLVERS
@@ -28,7 +28,6 @@ from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_fricti
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.link_repair import nearest_physical
 from batchpid.sim.robot.robot_model import base_start
-from batchpid.sim.robot.simulated_links import body_inertias
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
 
@@ -75,14 +74,14 @@ def to_mjcf(
     """
     law = make_params(robot.dof, 0.0, measurement_rate="measured") if params is None else params
     if guard is not None:
-        check_guard(guard, 1, robot.joint_names)
+        guard.check(1, robot.joint_names)
         if params is None:
             raise InvalidArgumentError(
                 "guard", "limits setpoints of a law", remedy="pass params, or leave it out"
             )
     drive = Drive(law, robot.joint_names, dt, inertia, actuators)
     spec = SceneSpec(
-        robot.urdf,
+        robot.tables,
         robot.ignored_pairs,
         robot.joints,
         drive.dt,
@@ -94,11 +93,10 @@ def to_mjcf(
     )
     # The bodies are those that the engine simulates; inertias and efforts are then written with all
     # their digits.
-    inertias = body_inertias(spec.urdf, spec.separate)
-    scene, names = robot_spec(spec, inertias)
+    scene, names = robot_spec(spec)
     scene.modelname, scene.option.disableflags = robot.name, 0
-    for link, name in names.items():
-        _set_inertia(scene.body(name), inertias[link], link, drive)
+    for row in spec.simulated.bodies:
+        _set_inertia(scene.body(names[row.name]), row.spatial_inertia, row.name, drive)
     motors = MjcfActuators(drive, robot.independent, params is not None, guard)
     motors.compare(robot.continuous)
     _set_joints(

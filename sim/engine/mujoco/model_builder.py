@@ -15,6 +15,7 @@ MuJoCo computes the damping of the file.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -23,7 +24,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from lxml import etree
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Document, MjModel, MjSpec
@@ -32,11 +32,8 @@ from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene
 from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
 from batchpid.sim.engine.physics import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.collision_shapes import add_geom, link_shapes
-from batchpid.sim.robot.parts import CONTACT_FRICTION, MOVING_TYPES, MjcfFile
-from batchpid.sim.robot.simulated_links import body_inertias, simulated
-from batchpid.sim.robot.xml import numbers
-from batchpid.task_space.rotations import from_rpy
+from batchpid.sim.robot.collision_shapes import add_geom
+from batchpid.sim.robot.parts import CONTACT_FRICTION, Joint, MjcfFile
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
 FLOATING = 6
@@ -93,8 +90,7 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     """
     if spec.mjcf is not None:
         return _file_model(spec, spec.mjcf, drives)
-    inertias = body_inertias(spec.urdf, spec.separate)
-    scene, names = robot_spec(spec, inertias)
+    scene, names = robot_spec(spec)
     if drives:
         _add_drives(scene, spec)
     try:
@@ -102,11 +98,9 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     except ValueError as error:
         raise _refusal(error) from error
     bodies = {link: model.body(name).id for link, name in names.items()}
-    for (
-        link,
-        body,
-    ) in bodies.items():  # the compiler refuses some inertias that both engines simulate
-        model.body_inertia[body] = np.linalg.eigh(inertias[link].tensor)[0]
+    for row in spec.simulated.bodies:  # the compiler refuses some inertias that both simulate
+        moments, _ = principal_inertia(row.spatial_inertia)
+        model.body_inertia[bodies[row.name]] = moments
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return RobotMj(model, *_places(model, spec), bodies, base=None if spec.fixed_base else (0, 0))
 
@@ -158,11 +152,10 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     return RobotMj(model, qpos, qvel, bodies, found.own, found.frames, base, is_file=True)
 
 
-def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[Any, dict[str, str]]:
+def robot_spec(spec: SceneSpec) -> tuple[Any, dict[str, str]]:
     """Return the ``mujoco.MjSpec`` of ``spec``, and the name of the body of each simulated link.
 
-    The bodies have the links' mass and center from ``inertias``; their inertia tensors are
-    placeholders.
+    The inertia tensors of the bodies are placeholders.
 
     Raises RobotError if MuJoCo refuses a part of the robot.
     """
@@ -171,7 +164,7 @@ def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[An
     scene.option.disableflags |= off.mjDSBL_SPRING | off.mjDSBL_DAMPER
     scene.compiler.fusestatic, scene.compiler.degree = False, False
     try:
-        names = _add_links(scene, spec, inertias)
+        names = _add_links(scene, spec)
         if spec.collisions:
             _add_shapes(scene, spec, names)
         add_link_sensors(scene, spec, names, {})
@@ -217,75 +210,59 @@ def _set_options(scene: MjSpec, spec: SceneSpec) -> None:
     option.disableflags |= off.mjDSBL_AUTORESET | off.mjDSBL_ACTUATION
 
 
-def _add_links(
-    scene: MjSpec, spec: SceneSpec, inertias: dict[str, SpatialInertia]
-) -> dict[str, str]:
-    """Add the simulated links of ``spec`` as bodies; return the name of the body of each."""
-    root = etree.fromstring(simulated(spec.urdf, spec.separate).urdf.encode())
-    above = {joint.find("child").get("link"): joint for joint in root.findall("joint")}
-    names = {
-        link: _unused("world_link", inertias) if link == "world" else link for link in inertias
-    }
-    limits = {joint.name: (joint.lower, joint.upper) for joint in spec.joints}
-    damping = {joint.name: joint.damping for joint in spec.joints}
-    continuous = {joint.name for joint in spec.joints if joint.continuous}
-    added: Document = {}
-
-    def add(link: str) -> Any:
-        if link in added:
-            return added[link]
-        inertia, joint = inertias[link], above.get(link)
-        moments, wxyz = principal_inertia(inertia)
-        parent, origin = (
-            scene.worldbody if joint is None else add(joint.find("parent").get("link")),
-            None,
-        )
-        if joint is not None:
-            origin = joint.find("origin")
+def _add_links(scene: MjSpec, spec: SceneSpec) -> dict[str, str]:
+    """Add the simulated bodies of ``spec``; return MuJoCo's name of each."""
+    rows = spec.simulated.bodies
+    names = {row.name: row.name for row in rows}
+    if "world" in names:
+        names["world"] = _unused("world_link", names)
+    for row in rows:
+        parent = scene.worldbody
+        if row.joint is not None:
+            parent = scene.body(names[row.joint.parent_link])
+        moments, axes = principal_inertia(row.spatial_inertia)
         body = parent.add_body(
-            name=names[link],
-            pos=numbers(origin, "xyz", "0 0 0", link),
-            quat=from_rpy(numbers(origin, "rpy", "0 0 0", link)),
-            mass=inertia.mass,
-            ipos=inertia.center,
-            iquat=wxyz,
+            name=names[row.name],
+            pos=row.position,
+            quat=row.wxyz,
+            mass=row.mass,
+            ipos=row.center,
+            iquat=axes,
             inertia=np.full(3, max(moments.max(), 1e-12)),  # replaced after compilation
             explicitinertial=True,
         )
-        if joint is None and not spec.fixed_base:
+        if row.joint is None and not spec.fixed_base:
             body.add_freejoint()
-        elif joint is not None and joint.get("type") in MOVING_TYPES:
-            name, slides = joint.get("name"), joint.get("type") == "prismatic"
-            axis = np.array(numbers(joint.find("axis"), "xyz", "1 0 0", name))
-            lower, upper = np.clip(limits[name], -_FARTHEST, _FARTHEST)
-            limited = name not in continuous and bool(np.isfinite(limits[name]).any())
-            body.add_joint(
-                name=name,
-                type=mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE,
-                axis=axis / np.linalg.norm(axis),
-                limited=limited,
-                range=[lower, max(upper, lower + _NARROWEST)],
-                solref_limit=[max(spec.physics.limit_time, 2 * spec.timestep), 1.0],
-                solimp_limit=_HARD,
-                armature=spec.timestep * damping[name],
-            )
-        added[link] = body
-        return body
-
-    for link in inertias:
-        add(link)
+        elif row.joint is not None and row.joint.moves:
+            joint = next(joint for joint in spec.joints if joint.name == row.joint.name)
+            _add_joint(body, joint, spec)
     return names
+
+
+def _add_joint(body: Any, joint: Joint, spec: SceneSpec) -> None:
+    """Add a degree of freedom to a body."""
+    ends = np.array([joint.lower, joint.upper])
+    lower, upper = np.clip(ends, -_FARTHEST, _FARTHEST)
+    body.add_joint(
+        name=joint.name,
+        type=getattr(mujoco.mjtJoint, f"mjJNT_{'SLIDE' if joint.unit == 'm' else 'HINGE'}"),
+        axis=np.array(joint.axis) / np.linalg.norm(joint.axis),
+        limited=not joint.continuous and bool(np.isfinite(ends).any()),
+        range=[lower, max(upper, lower + _NARROWEST)],
+        solref_limit=[max(spec.physics.limit_time, 2 * spec.timestep), 1.0],
+        solimp_limit=_HARD,
+        armature=spec.timestep * joint.damping,
+    )
 
 
 def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
     """Add the collision shapes, the pairs of bodies that do not collide, and the ground."""
-    shapes = link_shapes(spec.urdf, spec.separate)
-    owners = {
-        link: list(dict.fromkeys(shape.owner for shape in of_link))
-        for link, of_link in shapes.items()
-    }
+    owners: dict[str, list[str]] = defaultdict(list)
+    for shape in spec.simulated.shapes:
+        if shape.owner not in owners[shape.body]:
+            owners[shape.body].append(shape.owner)
     ignored = {frozenset(pair) for pair in spec.ignored}
-    solid, split = [link for link in owners if owners[link]], set[str]()
+    solid, split = [*owners], set[str]()
     for first, second in combinations(solid, 2):
         pairs = [frozenset(pair) in ignored for pair in product(owners[first], owners[second])]
         if any(pairs) and not all(pairs):
@@ -302,9 +279,8 @@ def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
     }
     for first, second in sorted(sorted(pair) for pair in pairs_of_bodies if len(pair) == 2):
         scene.add_exclude(bodyname1=first, bodyname2=second)
-    for of_link in shapes.values():
-        for shape in of_link:
-            add_geom(scene, scene.body(bodies[shape.owner]), shape, mass=0.0, **_contact(spec))
+    for shape in spec.simulated.shapes:
+        add_geom(scene, scene.body(bodies[shape.owner]), shape, mass=0.0, **_contact(spec))
     if spec.ground:
         scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **_contact(spec))
 

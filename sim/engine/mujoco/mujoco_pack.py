@@ -61,11 +61,9 @@ class MujocoPack(ModelPack):
         size: int,
         first_env: int = 0,
         variation: Variation | None = None,
-        carrier: str = "",
-        links: Sequence[str] = (),
         workspace: dict[Any, Any] | None = None,
     ) -> None:
-        super().__init__(spec, size, first_env, variation, carrier, links, not obstacle())
+        super().__init__(spec, size, first_env, variation, not obstacle())
         self._workspace = {} if workspace is None else workspace
         varied = self._variation
         self._worlds_vary = varied.ground_friction is not None or varied.gravity is not None
@@ -81,8 +79,8 @@ class MujocoPack(ModelPack):
                 reads = spec.fixed_base and self.steps_read_force(True, True)
                 self._constraint.use(self._joint_model, None if reads else self._bias_model)
         if spec.mjcf is not None:
-            sensed = (*(spec.contacts or ()), *(spec.wrenches or ()))
-            check_links(spec, spec.mjcf, [*sensed, carrier] if carrier else sensed)
+            links = *(spec.contacts or ()), *(spec.wrenches or ()), spec.carrier
+            check_links(spec, spec.mjcf, filter(None, links))
         self._stiffness = self._rate_gain = self._target_rate = np.zeros((1, self.dof))
         self._make_data(robot_model(spec))
         if variation is not None:

@@ -164,37 +164,35 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   return capsule_of(std::move(bound));
 }
 
-// Return the programs of a tick from a tuple; set an exception if they do not fit the group.
-std::vector<BoundProgram *> programs_of(Tick const *arrays, Group const *group, PyObject *tuple) {
-  std::vector<BoundProgram *> programs;
-  bool fits = arrays != nullptr && group != nullptr && arrays->dof == group->dof;
-  for (Py_ssize_t i = 0; fits && i < PyTuple_Size(tuple); ++i) {
-    auto *bound = held<BoundProgram>(PyTuple_GetItem(tuple, i));
-    fits = bound != nullptr && bound->program->rows == static_cast<Index>(group->robots) &&
-           bound->program->columns == static_cast<Index>(group->dof);
-    programs.push_back(bound);
+// bind_ticks(bound programs, address of a Tick): the caller keeps both alive.
+PyObject *bind_ticks(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  auto bound = std::make_unique<BoundTicks>();
+  bound->tick = structure<Tick>(arguments[1]);
+  if (bound->tick == nullptr) return nullptr;
+  for (Py_ssize_t i = 0; i < PyTuple_Size(arguments[0]); ++i) {
+    auto *program = held<BoundProgram>(PyTuple_GetItem(arguments[0], i));
+    if (program == nullptr) return nullptr;
+    bound->programs.push_back(program);
   }
-  if (!fits && !PyErr_Occurred()) misfit();
-  return programs;
+  return capsule_of(std::move(bound));
 }
 
-// ticks(bound programs, address of a Tick, address of a Group, tick, step, until, steps, drawn, whole)
-//   -> (tick, step, Status); see run_ticks
+// ticks(bound ticks of groups, until, steps, whole): see run_ticks; place and status are in the structures.
 PyObject *ticks(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  auto *arrays = structure<Tick>(arguments[1]);
-  auto *group = structure<Group>(arguments[2]);
-  std::vector<BoundProgram *> const programs = programs_of(arrays, group, arguments[0]);
-  auto const number = [&](int i) { return static_cast<std::int64_t>(PyLong_AsLongLong(arguments[i])); };
-  Place place{number(3), number(4)};
-  std::int64_t const until = number(5), steps = number(6), drawn = number(7), whole = number(8);
+  std::vector<BoundTicks *> groups;
+  for (Py_ssize_t i = 0; i < PyTuple_Size(arguments[0]); ++i) {
+    groups.push_back(held<BoundTicks>(PyTuple_GetItem(arguments[0], i)));
+    if (groups.back() == nullptr) return nullptr;
+    Tick const &tick = *groups.back()->tick;
+    for (BoundProgram const *bound : groups.back()->programs) {
+      if (bound->program->rows != tick.group->robots || bound->program->columns != tick.group->dof) return misfit();
+    }
+  }
+  std::int64_t const until = PyLong_AsLongLong(arguments[1]), steps = PyLong_AsLongLong(arguments[2]);
+  bool const whole = PyObject_IsTrue(arguments[3]) == 1;
   if (PyErr_Occurred()) return nullptr;
-  std::int32_t status = 0;
-  auto const run = [&] {
-    status = run_ticks(programs.data(), *arrays, *group, place, until, steps, drawn, whole != 0);
-  };
-  return without_gil(run, [&] {
-    return Py_BuildValue("LLi", static_cast<long long>(place.tick), static_cast<long long>(place.step),
-                         static_cast<int>(status));
+  return without_gil([&] {
+    for (BoundTicks *bound : groups) bound->tick->status = run_ticks(*bound, until, steps, whole);
   });
 }
 
@@ -262,6 +260,7 @@ PyMethodDef METHODS[] = {
     {"step", step, METH_O, nullptr},
     {"sim_step", method(step_group), METH_FASTCALL, nullptr},
     {"bind", method(bind), METH_FASTCALL, nullptr},
+    {"bind_ticks", method(bind_ticks), METH_FASTCALL, nullptr},
     {"ticks", method(ticks), METH_FASTCALL, nullptr},
     {"joint_matrices", method(joint_matrices), METH_FASTCALL, nullptr},
     {"forces", method(forces), METH_FASTCALL, nullptr},

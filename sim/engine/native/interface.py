@@ -174,10 +174,12 @@ class Tick(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("gain", "memory", "age", "target", "target_rate")),
         *((name, ctypes.c_void_p) for name in ("base_pose", "base_twist", "left")),
         ("noise", 2 * ctypes.c_void_p),
+        ("group", ctypes.c_void_p),
         ("timestep", ctypes.c_double),
         *((name, ctypes.c_int64) for name in ("dof", "stage_count", "transfer_count")),
+        *((name, ctypes.c_int64) for name in ("tick", "step", "drawn", "ran")),
         *((name, ctypes.c_int32) for name in ("matrix_steps",)),
-        *((name, ctypes.c_int32) for name in ("gravity", "coriolis", "late", "unused")),
+        *((name, ctypes.c_int32) for name in ("gravity", "coriolis", "late", "status", "unused")),
     ]
 
 

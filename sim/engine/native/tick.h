@@ -40,6 +40,11 @@ struct Transfer {
   TransferKind kind;
 };
 
+// Place in ticks: a tick, and the sim steps of it that are done.
+struct Place {
+  std::int64_t tick, step;
+};
+
 // Arrays (robots, dof) of double, which Python owns: Tick in interface.py.
 struct Tick {
   Stage const *stages;
@@ -64,16 +69,16 @@ struct Tick {
   double *base_pose, *base_twist;  // (robots, 7) and (robots, 6) in MuJoCo after a tick, or null
   double *left;                   // time from the moment of the law's setpoint to the end of the tick [s], or null
   double const *noise[2];         // (steps, robots, dof): noise of the sensors in the next steps, or null
+  Group *group;                   // the robots
   double timestep;
   std::int64_t dof, stage_count, transfer_count;
+  Place place;                    // where the ticks are
+  std::int64_t drawn;             // sim steps that the noise is for; -1 without noise
+  std::int64_t ran;               // sim steps that ran
   std::int32_t matrix_steps;
   std::int32_t gravity, coriolis;  // parts of the passive force
   std::int32_t late;              // the law takes its setpoint at the end of a sim step
-};
-
-// Place in ticks: a tick, and the sim steps of it that are done.
-struct Place {
-  std::int64_t tick, step;
+  std::int32_t status;            // of the last sim step
 };
 
 // A program with its arrays.
@@ -83,6 +88,14 @@ struct BoundProgram {
   std::unique_ptr<Program> program;
   std::vector<Input> inputs;
   std::vector<Output> outputs;
+};
+
+// The programs and arrays of a group's ticks.
+struct BoundTicks {
+  static constexpr char CAPSULE[] = "batchpid.bound_ticks";
+
+  std::vector<BoundProgram *> programs;
+  Tick *tick;
 };
 
 // Write M + armature + dt B of each robot, at the pose half way through the next `steps` sim steps.
@@ -175,21 +188,24 @@ inline void write_observation(Tick const &arrays, std::int64_t tick) {
   }
 }
 
-// Run sim steps from `place` on, in ticks of `steps` up to the tick `until`; advance `place`. Stop after a sim step whose
-// status is not 0, or where `drawn` steps have used up the noise of the sensors. With `whole`, commands and observations
-// are those of the tables: stop also in a tick whose command is not finite, before its first step, and in one after which
-// velocities are not finite. Without it, stop at the end of a tick. Return the status.
-inline std::int32_t run_ticks(BoundProgram *const *programs, Tick const &tick, Group &group, Place &place,
-                              std::int64_t until, std::int64_t steps, std::int64_t drawn, bool whole) {
-  for (std::int64_t done = 0; place.tick < until; ++place.tick, place.step = 0) {
+// Run sim steps in ticks of `steps` up to the tick `until`; return the status of the last one. Stop after a sim step whose
+// status is not 0, or where the noise of the sensors is used up. With `whole`, commands and observations are those of the
+// tables: stop also in a tick whose command is not finite, before its first step, and in one after which velocities are
+// not finite. Without it, stop at the end of a tick.
+inline std::int32_t run_ticks(BoundTicks const &bound, std::int64_t until, std::int64_t steps, bool whole) {
+  Tick &tick = *bound.tick;
+  Group &group = *tick.group;
+  Place &place = tick.place;
+  std::int64_t &done = tick.ran = 0;
+  for (; place.tick < until; ++place.tick, place.step = 0) {
     if (whole && place.step == 0 && !read_commands(tick, place.tick)) return 0;
     for (std::int64_t const first = place.step; place.step < steps; ++done) {
-      if (done == drawn) return NO_NOISE;
+      if (done == tick.drawn) return NO_NOISE;
       if (tick.left != nullptr) *tick.left = static_cast<double>(steps - place.step - tick.late) * tick.timestep;
       std::int32_t status = 0;
       for (Stage const *stage = tick.stages; stage != tick.stages + tick.stage_count; ++stage) {
         bool const due = stage->every > 0 ? place.step % stage->every == 0 : place.step == first;
-        if (due) status |= run_stage(*stage, programs, tick, group, place.step, steps, done);
+        if (due) status |= run_stage(*stage, bound.programs.data(), tick, group, place.step, steps, done);
       }
       ++place.step;
       if (status != 0) return status;

@@ -4,15 +4,11 @@ tree in PhysX.
 
 from __future__ import annotations
 
-import importlib
-import os
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from threading import RLock
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -20,43 +16,18 @@ from numpy.typing import NDArray
 from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
-from batchpid.arrays.array_types import Document, Float64
+from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
-from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
+from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene, MirroringBuilder
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.collision_groups import link_groups
-from batchpid.sim.robot.merging import place_links
+from batchpid.sim.robot.collision_groups import Words, link_groups
 from batchpid.sim.robot.meshes import note_meshes
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
-from batchpid.sim.robot.simulated_links import simulated
+from batchpid.sim.robot.tables import Shape
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.rotations import from_rpy
 from batchpid.task_space.spatial_inertia import SpatialInertia
-
-
-class LazyModule(ModuleType):
-    """Module that is imported at the first use of a name in it."""
-
-    def __getattr__(self, name: str) -> Any:
-        if sys.modules.get(self.__name__) is self:  # within the block
-            del sys.modules[self.__name__]
-        return getattr(importlib.import_module(self.__name__), name)
-
-
-@contextmanager
-def imported_lazily(name: str) -> Iterator[None]:
-    """Give a :class:`LazyModule` to modules that import the package ``name`` within the block."""
-    if name in sys.modules:
-        yield
-        return
-    sys.modules[name] = lazy = LazyModule(name)
-    try:
-        yield
-    finally:
-        if sys.modules.get(name) is lazy:
-            del sys.modules[name]
-
 
 FASTEST = 1000.0
 """Largest speed of links and joints [m/s or rad/s]. PhysX's defaults stop links at 10 m/s and 50
@@ -69,77 +40,109 @@ _building = RLock()
 shared.
 """
 
-with imported_lazily(
-    "trimesh"
-):  # for meshes that are not loaded here: two fifths of the start of a worker
-    # Its packages suppress Ctrl-C during their import, so they are imported before a run.
-    import sapien.wrapper.urdf_loader  # noqa: F401
+_JOINT_TYPES = {
+    "fixed": "fixed",
+    "revolute": "revolute_unwrapped",
+    "continuous": "revolute",
+    "prismatic": "prismatic",
+}
+"""SAPIEN's types of joints; "undefined" is that of a root that floats."""
+_ALONG_Z = Pose(q=[0.7071068, 0.0, 0.7071068, 0.0])
+"""Pose of SAPIEN's capsules and cylinders, which lie along x, in a shape along z."""
 
 
 @lru_cache(maxsize=8)
-def parse(spec: SceneSpec) -> ArticulationBuilder:
+def articulation_builder(spec: SceneSpec) -> ArticulationBuilder:
     """Return a builder that makes any number of copies of the robot, the same object for equal
     specs.
 
-    Raises RobotError if SAPIEN's loader refuses the description, or finds other than one
-    articulated robot in it.
+    Raises RobotError for a body whose moments of inertia are not positive.
     """
-    with _building:
-        builder = _load(simulated(spec.urdf, spec.separate).urdf, spec.fixed_base)
-        if not spec.collisions:
-            for link in builder.link_builders:
-                link.collision_records = []
-        return builder
+    builder, tables = MirroringBuilder(), spec.simulated
+    links: dict[str, Any] = {}
+    for body in tables.bodies:
+        joint = body.joint
+        parent = None if joint is None else links[joint.parent_link]
+        links[body.name] = link = builder.create_link_builder(parent)
+        link.set_name(body.name)
+        moments, axes = _principal(body.inertia, body.name)
+        frame = _pose(body.center, matrix_of(body.inertia_wxyz))
+        link.set_mass_and_inertia(body.mass, frame * _pose(np.zeros(3), axes), moments)
+        if joint is None:
+            kind = "fixed" if spec.fixed_base else "undefined"
+            link.set_joint_properties(kind, [], Pose(), Pose())
+            continue
+        link.set_joint_name(joint.name)
+        limits = [joint.lower, joint.upper] if joint.moves else []
+        # SAPIEN's joints turn about x.
+        turn = _pose(np.zeros(3), _axes_along(joint.axis))
+        link.set_joint_properties(
+            _JOINT_TYPES[joint.type],
+            limits,
+            _pose(body.position, matrix_of(body.wxyz)) * turn,
+            turn,
+            damping=joint.damping,
+        )
+    for shape in tables.shapes if spec.collisions else ():
+        _add_shape(links[shape.body], shape)
+    note_meshes(shape.file for shape in tables.shapes if shape.file)
+    return builder
+
+
+def _add_shape(link: Any, shape: Shape) -> None:
+    material = physx.PhysxMaterial(CONTACT_FRICTION, CONTACT_FRICTION, RESTITUTION)
+    place, size = _pose(shape.position, matrix_of(shape.wxyz)), shape.size
+    if shape.kind == "box":
+        link.add_box_collision(place, size, material)
+    elif shape.kind == "sphere":
+        link.add_sphere_collision(place, *size, material)
+    elif shape.kind == "capsule":
+        link.add_capsule_collision(place * _ALONG_Z, *size, material)
+    elif shape.kind == "cylinder":
+        link.add_cylinder_collision(place * _ALONG_Z, *size, material)
+    else:
+        link.add_convex_collision_from_file(shape.file, place, shape.scale, material)
+
+
+def _pose(position: Float64, axes: Float64) -> Pose:
+    """Return SAPIEN's pose by a matrix, which it rounds as its loader of URDFs does, unlike a
+    quaternion.
+    """
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = axes, position
+    return Pose(matrix)
+
+
+def _axes_along(axis: tuple[float, ...]) -> Float64:
+    """Return axes (3, 3), as columns, of which the first is that of a joint."""
+    first = np.array(axis) / np.linalg.norm(axis)
+    second = np.cross(first, [0, 0, 1] if abs(first[0]) > 0.9 else [1, 0, 0])
+    second /= np.linalg.norm(second)
+    return np.column_stack([first, second, np.cross(first, second)])
+
+
+def _principal(inertia: Float64, name: str) -> tuple[Float64, Float64]:
+    """Return the principal moments (3,) and axes (3, 3), those of the frame if they are
+    principal.
+    """
+    moments, axes = np.diag(inertia), np.eye(3)
+    if not np.array_equal(np.diag(moments), inertia):
+        moments, axes = np.linalg.eigh(inertia)
+        axes[:, 2] *= np.sign(np.linalg.det(axes))
+    if not (moments > 0).all():
+        raise RobotError(
+            f"link {name!r}: moments of inertia {moments} must be positive; correct <inertia>"
+        )
+    return moments, axes
 
 
 def set_inertia(link: Any, inertia: SpatialInertia) -> None:
     """Give one of SAPIEN's links this inertia, in the frame of the link."""
     principal, axes = np.linalg.eigh(inertia.tensor)
-    at = np.eye(4)
-    at[:3, :3], at[:3, 3] = (
-        axes * np.linalg.det(axes),
-        inertia.center,
-    )  # a rotation, not a reflection
     link.set_mass(inertia.mass)
-    link.set_cmass_local_pose(Pose(at))
+    # A rotation, not a reflection.
+    link.set_cmass_local_pose(_pose(inertia.center, axes * np.linalg.det(axes)))
     link.set_inertia(principal)
-
-
-def shape_owners(spec: SceneSpec) -> dict[str, list[str]]:
-    """Return the link of the URDF that owns each collision shape of each simulated link, in the
-    engine's order.
-    """
-    if not spec.collisions:
-        return {link.name: [] for link in parse(spec).link_builders}
-    return simulated(spec.urdf, spec.separate).owners
-
-
-def _load(urdf: str, fixed_base: bool) -> ArticulationBuilder:
-    loader = HeadlessScene().create_urdf_loader()
-    loader.fix_root_link = fixed_base
-    with _in_memory(urdf) as urdf_path, _in_memory("<robot/>") as srdf_path:
-        try:
-            builders, actors, _ = loader.parse(urdf_path, srdf_path)
-        except Exception as error:
-            raise RobotError(f"SAPIEN cannot load the robot: {error}; correct the URDF") from error
-    if len(builders) != 1 or actors:
-        raise RobotError(
-            "the URDF does not describe one articulated robot; it needs at least one moving joint"
-        )
-    records = (record for link in builders[0].link_builders for record in link.collision_records)
-    note_meshes(record.filename for record in records if record.filename)
-    return builders[0]
-
-
-@contextmanager
-def _in_memory(text: str) -> Iterator[str]:
-    """Provide ``text`` under a path, which SAPIEN's loader requires: an in-memory file, gone after
-    the block.
-    """
-    with open(os.memfd_create("batchpid-text"), "w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        yield f"/proc/self/fd/{file.fileno()}"
 
 
 @contextmanager
@@ -191,37 +194,16 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
     """Return a new scene in ``system`` and the robot in it, with the ground and the dissipation of
     ``spec``.
 
-    Raises RobotError if SAPIEN cannot build a collision shape, which it would silently leave out,
-    or numbers the joints in another order than ours.
+    Raises RobotError if SAPIEN cannot build a collision shape, which it would silently leave out.
     """
-    scene, builder = HeadlessScene(system), parse(spec)
+    scene = HeadlessScene(system)
     with engine_settings(spec):
+        builder = articulation_builder(spec)
         robot = builder.set_scene(scene).build()
         builder.set_scene(None)  # the scene can be freed
         if spec.ground and spec.collisions:
             scene.add_ground(0.0, render=False)
-    asked = {link.name: link.collision_records for link in builder.link_builders}
-    for link in robot.links:
-        if len(link.collision_shapes) != len(records := asked[link.name]):
-            files = ", ".join(record.filename for record in records if record.filename)
-            remedy = "repair the file, or remove that <collision>"
-            raise RobotError(
-                f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}"
-            )
-    ignored = {frozenset(pair) for pair in spec.ignored}
-    words, _ = link_groups(spec.urdf, spec.separate, spec.fixed_base, spec.joints, ignored)
-    owners = shape_owners(spec)
-    for link in robot.links:
-        for shape, owner in zip(link.collision_shapes, owners[link.name], strict=True):
-            shape.set_collision_groups(words[owner])
-    names, ours = (
-        [joint.name for joint in robot.active_joints],
-        [joint.name for joint in spec.joints],
-    )
-    if names != ours:
-        raise RobotError(
-            f"SAPIEN numbers the joints {names}, not {ours}; please report it, with the URDF"
-        )
+    _set_words(spec, robot)
     robot.set_sleep_threshold(0.0)
     dissipation = DISSIPATION[spec.dissipation]
     for link in robot.links:
@@ -241,78 +223,93 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
     return scene, robot
 
 
+def _set_words(spec: SceneSpec, robot: Any) -> None:
+    """Set the filter words of the shapes of a robot."""
+    words = _shape_words(spec)
+    for link in robot.links:
+        shapes = link.collision_shapes
+        if len(shapes) != len(words[link.name]):
+            meshes = [shape.file for shape in spec.simulated.shapes if shape.body == link.name]
+            files = ", ".join(filter(None, meshes))
+            remedy = "repair the file, or remove that <collision>"
+            raise RobotError(
+                f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}"
+            )
+        for shape, groups in zip(shapes, words[link.name], strict=True):
+            shape.set_collision_groups(groups)
+
+
+@lru_cache(maxsize=8)
+def _shape_words(spec: SceneSpec) -> dict[str, list[Words]]:
+    """Return the filter words of the shapes of each simulated link, in the order of its shapes."""
+    ignored = {frozenset(pair) for pair in spec.ignored}
+    words, _ = link_groups(spec.tables, spec.separate, spec.fixed_base, ignored)
+    of_links: dict[str, list[Words]] = {body.name: [] for body in spec.simulated.bodies}
+    for shape in spec.simulated.shapes if spec.collisions else ():
+        of_links[shape.body].append(words[shape.owner])
+    return of_links
+
+
 def link_frames(spec: SceneSpec, robot: Any) -> Frames:
     """Return all links of the URDF, in the entities of ``robot``, which is one of ``spec``."""
     entities = {link.name: link.entity for link in robot.links}
     return {
         name: (entities[at.link], None if at.link == name else Pose(at.position, at.wxyz))
-        for name, at in place_links(spec.urdf, spec.separate).items()
+        for name, at in spec.simulated.links.items()
     }
 
 
 @lru_cache(maxsize=8)
 def scene_tree(spec: SceneSpec) -> RigidTree:
-    """Return the tree of the robot of ``spec``, all joints independent, the same object for equal
-    specs.
+    """Return the tree of the robot of ``spec`` as PhysX rounds it, all joints independent, the same
+    object for equal specs.
 
     Before each link but the base comes a link without mass, "LINK (joint)", in the frame of the
     joint above.
     """
     _scene, robot = build_scene(spec, new_system(spec))
-    rows: list[Document] = []
-    at: dict[Any, int] = {}
+    names: list[str] = []
+    parents: list[int] = []
+    kinds: list[str] = []
+    poses: list[Pose] = []
+    inertias: list[SpatialInertia] = []
+
+    def add(name: str, parent: int, kind: str, pose: Pose, inertia: SpatialInertia) -> None:
+        names.append(name)
+        parents.append(parent)
+        kinds.append(kind)
+        poses.append(pose)
+        inertias.append(inertia)
+
+    massless = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))
     for link in robot.links:
-        kind, turn = "fixed", np.diag([float(str(one)) for one in link.inertia])
-        axes, center = _place(link.cmass_local_pose)
-        inertia = {"mass": link.mass, "center": center, "inertia": axes @ turn @ axes.T}
+        axes = matrix_of(_wxyz(link.cmass_local_pose))
+        moments = np.diag([float(str(moment)) for moment in link.inertia])
+        inertia = SpatialInertia(link.mass, link.cmass_local_pose.p, axes @ moments @ axes.T)
         if link.parent is None:
-            rows.append(_row(link.name, -1, "fixed", None) | inertia)
-        else:
-            kind = {"fixed": "fixed", "prismatic": "prismatic"}.get(link.joint.type, "revolute")
-            rows.append(
-                _row(f"{link.name} (joint)", at[link.parent], kind, link.joint.pose_in_parent)
-            )
-            rows.append(
-                _row(link.name, len(rows) - 1, "fixed", link.joint.pose_in_child.inv()) | inertia
-            )
-        at[link] = len(rows) - 1
-    columns: Document = {
-        name: np.array([row[name] for row in rows])
-        for name in rows[0]
-        if name not in ("links", "joint_types")
-    }
-    names = tuple(joint.name for joint in spec.joints)
-    links, kinds = (tuple(row[name] for row in rows) for name in ("links", "joint_types"))
+            add(link.name, -1, "fixed", Pose(), inertia)
+            continue
+        kind = link.joint.type if link.joint.type in ("fixed", "prismatic") else "revolute"
+        above = names.index(link.parent.name)
+        add(f"{link.name} (joint)", above, kind, link.joint.pose_in_parent, massless)
+        add(link.name, len(names) - 1, "fixed", link.joint.pose_in_child.inv(), inertia)
     return RigidTree(
-        links,
-        joint_types=kinds,
-        joint_names=names,
-        **columns,
+        tuple(names),
+        np.array(parents),
+        tuple(kinds),
+        tuple(joint.name for joint in spec.joints),
+        position=np.array([pose.p for pose in poses], float),
+        wxyz=np.array([_wxyz(pose) for pose in poses]),
+        axis=np.tile([1.0, 0.0, 0.0], (len(names), 1)),
+        mass=np.array([inertia.mass for inertia in inertias]),
+        center=np.array([inertia.center for inertia in inertias], float),
+        inertia=np.array([inertia.tensor for inertia in inertias]),
         gravity=spec.gravity,
         fixed_base=spec.fixed_base,
     )
 
 
-def _row(name: str, parent: int, kind: str, pose: Any) -> Document:
-    """Return a link without mass at one of SAPIEN's poses in its parent."""
-    position, wxyz = (
-        (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])) if pose is None else (pose.p, _wxyz(pose))
-    )
-    empty = {"mass": 0.0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
-    place = {
-        "position": np.asarray(position, float),
-        "wxyz": wxyz,
-        "axis": np.array([1.0, 0.0, 0.0]),
-    }
-    return {"links": name, "parent": parent, "joint_types": kind, **place, **empty}
-
-
-def _place(pose: Any) -> tuple[Float64, Float64]:
-    """Return axes (3, 3) and position (3,) of one of SAPIEN's poses."""
-    return matrix_of(_wxyz(pose)), np.asarray(pose.p, float)
-
-
-def _wxyz(pose: Any) -> Float64:
+def _wxyz(pose: Pose) -> Float64:
     """Return the rotation of one of SAPIEN's poses, by roll, pitch and yaw, as SAPIEN's own
     dynamics take it.
     """

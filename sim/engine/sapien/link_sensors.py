@@ -16,7 +16,6 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float32, Float64
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.merging import place_links
 
 
 class LinkSensors:
@@ -28,10 +27,8 @@ class LinkSensors:
         self._robots = robots
         self._systems = systems
         self._spec = spec
-        bodies, links = (
-            place_links(spec.urdf, spec.separate),
-            [link.name for link in robots[0].links],
-        )
+        links = [link.name for link in robots[0].links]
+        bodies = spec.simulated.links
         self._contacts = [links.index(bodies[link].link) for link in spec.contacts or ()]
         self._wrenches = [links.index(link) for link in spec.wrenches or ()]
         parents = [

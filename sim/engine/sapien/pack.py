@@ -73,10 +73,9 @@ class Pack(ModelPack):
         size: int,
         first_env: int = 0,
         variation: Variation | None = None,
-        carrier: str = "",
-        links: Sequence[str] = (),
+        workspace: dict[Any, Any] | None = None,
     ) -> None:
-        super().__init__(spec, size, first_env, variation, carrier, links, not obstacle())
+        super().__init__(spec, size, first_env, variation, not obstacle())
         self._shapes: dict[int, list[Any]] = {}
         self._frames: list[tuple[Pose, Pose] | None] = []
         self.systems = [self._system(row) for row in range(size)]

@@ -51,11 +51,13 @@ def efforts_in_numpy(params, columns, guard=None):
         if guard is not None:
             held, changed = guards.advance(guard, held, r, DT)
             r, rate = held.setpoint, None if rate is None else np.where(changed, held.rate, rate)
-        optional = now.get("measurement_rate"), rate, now.get("feedforward")
+        optional = now.get("measurement_rate"), rate
+        added = {"feedforward": now.get("feedforward")}
         if "mass_matrix" in now:
-            state, terms = advance_with_mass_matrix(k, state, r, y, now["mass_matrix"], *optional)
+            matrix = now["mass_matrix"]
+            state, terms = advance_with_mass_matrix(k, state, r, y, matrix, *optional, **added)
         else:
-            state, terms = bp.advance(k, state, r, y, *optional)
+            state, terms = bp.advance(k, state, r, y, *optional, **added)
         efforts.append(terms.effort[0])
     return np.array(efforts)
 

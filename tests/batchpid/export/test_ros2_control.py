@@ -11,12 +11,11 @@ import pytest
 import yaml
 from export_cases import DT, JOINTS, random_params, values
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid.export import to_ros2_control
 
-CONTROLLERS = ("joint_trajectory_controller", "pid_controller")
+CONTROLLER = "joint_trajectory_controller"
 
 
 def target_effort(gains, memory, error, rate, desired_rate, dt):
@@ -37,44 +36,38 @@ def target_effort(gains, memory, error, rate, desired_rate, dt):
         ):
             memory["i"] += dt * gains["i"] * error
     memory["i"] = min(max(memory["i"], gains["i_clamp_min"]), gains["i_clamp_max"])
-    feedforward = gains.get("ff_velocity_scale", gains.get("feedforward_gain", 0.0))
+    feedforward = gains["ff_velocity_scale"]
     return command + feedforward * desired_rate
 
 
-def gains_of(text, controller):
-    return yaml.safe_load(text)[controller]["ros__parameters"]["gains"]
+def gains_of(text):
+    return yaml.safe_load(text)[CONTROLLER]["ros__parameters"]["gains"]
 
 
-def motion(two, steps=150):
-    """A setpoint (steps, joints) and a measurement, with their rates; without rates they begin at
-    one point.
-    """
+def motion(steps=150):
+    """A setpoint (steps, joints) and a measurement, with their rates."""
     t = np.arange(steps)[:, None] * DT
     w, far = np.array([3.0, 7.0, 11.0]), np.array([1.0, 0.5, 2.0])
-    setpoint, measurement = far * np.sin(w * t) + 0.03 * two, 0.7 * far * np.sin(0.8 * w * t)
+    setpoint, measurement = far * np.sin(w * t) + 0.03, 0.7 * far * np.sin(0.8 * w * t)
     return setpoint, measurement, far * w * np.cos(w * t), 0.56 * far * w * np.cos(0.8 * w * t)
 
 
-def target_run(text, controller, two):
-    gains, columns = gains_of(text, controller), motion(two)
-    memory = {joint: {"i": 0.0, "last": 0.0} for joint in gains}
+def target_run(text):
+    gains, columns = gains_of(text), motion()
+    memory = {joint: {"i": 0.0} for joint in gains}
     efforts = np.zeros_like(columns[0])
     for at, (r, y, r_rate, y_rate) in enumerate(zip(*columns, strict=True)):
         for j, (joint, own) in enumerate(gains.items()):
-            error, last = r[j] - y[j], memory[joint]["last"]
-            rate = r_rate[j] - y_rate[j] if two else (error - last) / DT
-            memory[joint]["last"] = error
-            efforts[at, j] = target_effort(
-                own, memory[joint], error, rate, r_rate[j] if two else 0.0, DT
-            )
+            error, rate = r[j] - y[j], r_rate[j] - y_rate[j]
+            efforts[at, j] = target_effort(own, memory[joint], error, rate, r_rate[j], DT)
     return efforts
 
 
-def run(params, two):
-    columns = motion(two)
+def run(params):
+    columns = motion()
     state, efforts = bp.init(params, columns[1][:1]), []
     for r, y, r_rate, y_rate in zip(*(column[:, None] for column in columns), strict=True):
-        rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate} if two else {}
+        rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate}
         state, effort = bp.step(params, state, r, y, DT, **rates)
         efforts.append(effort[0])
     return np.array(efforts)
@@ -97,32 +90,17 @@ EXPRESSIBLE = {
 
 
 @pytest.mark.parametrize("case", EXPRESSIBLE)
-@pytest.mark.parametrize(
-    ("controller", "two"), [*((each, True) for each in CONTROLLERS), ("pid_controller", False)]
-)
-def test_the_targets_law_gives_the_same_efforts(controller, two, case):
-    own = {"measurement_rate": "measured"} if two else {"setpoint_weight_derivative": 1.0}
+def test_the_targets_law_gives_the_same_efforts(case):
+    own = {"measurement_rate": "measured"}
     params = bp.make_params(
         3, [40.0, 20.0, 0.5], [50.0, 5.0, 2.0], [2.0, 0.3, 0.02], **EXPRESSIBLE[case], **own
     )
-    exported = to_ros2_control(params, JOINTS, DT, controller=controller)
+    exported = to_ros2_control(params, JOINTS, DT)
     assert {each.partition(":")[0] for each in exported.differences} <= {
         "effort_limit",
         "anti_windup",
     }
-    np.testing.assert_allclose(
-        target_run(exported.text, controller, two), run(params, two), rtol=0, atol=1e-11
-    )
-
-
-@pytest.mark.parametrize("controller", CONTROLLERS)
-def test_a_derivative_weight_is_a_feedforward_of_the_velocity(controller):
-    own = {"setpoint_weight_derivative": [1.0, 0.3, 0.0], "measurement_rate": "measured"}
-    params = bp.make_params(3, [40.0, 20.0, 0.5], 1.0, [2.0, 0.3, 0.02], **own)
-    exported = to_ros2_control(params, JOINTS, DT, controller=controller)
-    np.testing.assert_allclose(
-        target_run(exported.text, controller, True), run(params, True), rtol=0, atol=1e-11
-    )
+    np.testing.assert_allclose(target_run(exported.text), run(params), rtol=0, atol=1e-11)
 
 
 def test_the_file_is_that_of_a_controller_manager():
@@ -147,18 +125,10 @@ GAINS = dict.fromkeys(
 GAINS |= {"antiwindup_strategy": ("back_calculation", "conditional_integration", "none")}
 GAINS |= {"tracking_time_constant": float, "error_deadband": float}
 SCHEMA = {
-    "joint_trajectory_controller": {
-        "joints": [str],
-        "command_interfaces": ("position", "velocity", "acceleration", "effort"),
-        "state_interfaces": ("position", "velocity", "acceleration"),
-        "gains": GAINS | {"ff_velocity_scale": float},
-    },
-    "pid_controller": {
-        "dof_names": [str],
-        "command_interface": str,
-        "reference_and_state_interfaces": [str],
-        "gains": GAINS | {"feedforward_gain": float, "angle_wraparound": bool},
-    },
+    "joints": [str],
+    "command_interfaces": ("position", "velocity", "acceleration", "effort"),
+    "state_interfaces": ("position", "velocity", "acceleration"),
+    "gains": GAINS | {"ff_velocity_scale": float},
 }
 """Types, or values, of the parameters that the files use, after those that
 generate_parameter_library declares in ros2_controllers 6.9. Its lists are not empty and without
@@ -179,12 +149,11 @@ def fits(value, kind):
     )
 
 
-def check_schema(text, controller):
-    body = yaml.safe_load(text)[controller]["ros__parameters"]
-    schema = SCHEMA[controller]
+def check_schema(text):
+    body = yaml.safe_load(text)[CONTROLLER]["ros__parameters"]
+    schema = SCHEMA
     assert body.keys() == schema.keys()
-    assert set(body["gains"]) == set(body.get("joints", body.get("dof_names")))
-    assert len(body.get("reference_and_state_interfaces", ())) < 3
+    assert set(body["gains"]) == set(body["joints"])
     for key in body.keys() - {"gains"}:
         assert fits(body[key], schema[key]), (key, body[key])
     for gains in body["gains"].values():
@@ -196,32 +165,18 @@ def check_schema(text, controller):
         assert gains["tracking_time_constant"] >= 0
 
 
-def test_the_schema_refuses_what_the_target_refuses():
-    text = to_ros2_control(bp.make_params(3, 1.0), JOINTS, DT).text
-    check_schema(text, CONTROLLERS[0])
-    for before, after in (
-        ("p: 1.0", "p: 1"),
-        ("p: 1.0", "q: 1.0"),
-        ("none", "legacy"),
-        ("[effort]", "[torque]"),
-    ):
-        assert before in text
-        with pytest.raises(AssertionError):
-            check_schema(text.replace(before, after), CONTROLLERS[0])
-
-
 LEAVES = {"p": "kp", "i": "ki", "d": "kd", "u_clamp_min": "effort_min", "u_clamp_max": "effort_max"}
 LEAVES |= {"i_clamp_min": "integral_min", "i_clamp_max": "integral_max"}
 
 
-@given(random_params(), st.sampled_from(CONTROLLERS))
+@given(random_params())
 @settings(max_examples=25, deadline=None)
-def test_every_gain_is_written_or_listed(params, controller):
+def test_every_gain_is_written_or_listed(params):
     inertia = np.array([2.0, 1.0, 0.5])
-    exported = to_ros2_control(params, JOINTS, DT, controller=controller, inertia=inertia)
-    check_schema(exported.text, controller)
+    exported = to_ros2_control(params, JOINTS, DT, inertia=inertia)
+    check_schema(exported.text)
     listed = {each.partition(":")[0] for each in exported.differences}
-    rows = gains_of(exported.text, controller)
+    rows = gains_of(exported.text)
     tolerance = 1e-12 if params.dtype == np.float64 else 1e-6
     for key, name in LEAVES.items():
         expected = np.array(values(params, name))
@@ -233,19 +188,16 @@ def test_every_gain_is_written_or_listed(params, controller):
             ), name
 
 
-@given(random_params(), st.sampled_from(CONTROLLERS))
+@given(random_params())
 @settings(max_examples=25, deadline=None)
-def test_params_without_a_listed_difference_have_the_targets_efforts(params, controller):
+def test_params_without_a_listed_difference_have_the_targets_efforts(params):
     params = params.replace(gain_units="effort", dtype=np.float64)
-    exported = to_ros2_control(params, JOINTS, DT, controller=controller)
+    exported = to_ros2_control(params, JOINTS, DT)
     # Without a feedforward, u_clamp is the effort limit; the motion has no error of exactly 0, and
     # none of half a turn.
     same = ("effort_limit", "continuous: taken", "anti_windup: back-calculation is left out")
     if not all(each.startswith(same) for each in exported.differences):
         return
-    two = controller == "joint_trajectory_controller" or params.measurement_rate is not None
-    ours = run(params, two)
+    ours = run(params)
     atol = 1e-9 * max(1.0, np.abs(ours).max())
-    np.testing.assert_allclose(
-        target_run(exported.text, controller, two), ours, rtol=1e-9, atol=atol
-    )
+    np.testing.assert_allclose(target_run(exported.text), ours, rtol=1e-9, atol=atol)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_compiled_law import bits, numbers
+from native_cases import bits, numbers
 
 from batchpid.arrays.elementwise import (
     matrix_vector,
@@ -228,18 +228,6 @@ def test_an_operation_that_programs_do_not_have_is_an_error():
         trace(lambda a: [a.__array_namespace__().arctan(a)], 0, 1)
 
 
-def test_a_trace_holds_what_its_results_need_and_no_more():
-    def function(a, b):
-        unused = a * b
-        assert isinstance(unused.__array_namespace__(), Namespace)
-        return [a - b, b]
-
-    noted = trace(function, 1, 1)
-    assert len(noted.operations) == 5 * 4
-    assert np.frombuffer(noted.results, np.int32).tolist() == [2, 1]
-    assert noted.literals == ()
-
-
 def test_literals_of_a_trace_keep_their_sign():
     assert [
         repr(number) for number in trace(lambda x: [x + 0.0, x + -0.0, x + 0.0], 0, 1).literals
@@ -264,17 +252,3 @@ def test_a_scalar_that_would_widen_the_result_is_refused():
     assert trace(lambda x: [x * 0.1], 0, 1, np.float32).literals == (0.1,)
     with pytest.raises(TypeError, match="float64"):
         trace(lambda x: [x * np.float64(2)], 0, 1, np.float32)
-
-
-def test_pairs_of_operations_are_one_where_nothing_else_needs_the_first():
-    def count(function):
-        return len(trace(function, 0, 3).operations) // (5 * 4)
-
-    assert count(lambda a, b, c: [a * b + c]) == count(lambda a, b, c: [c + a * b]) == 1
-    assert count(lambda a, b, c: [a * b - c]) == 2
-
-    def both(a, b, c):
-        product = a * b
-        return [product + c, product]
-
-    assert count(both) == 2

@@ -122,50 +122,6 @@ def decay(steps):
     return errors
 
 
-def test_a_rotation_of_74_degrees_has_the_same_course():
-    tree = tree_of("panda")
-    goal = ts.link_poses(tree, START[None], [HAND])[:, 0]
-    tilt = frames.matrix_of(np.array([0.8, 0.0, 0.6, 0.0]))
-    goal[:, 3:] = frames.wxyz_of(frames.multiply(tilt, frames.matrix_of(goal[:, 3:])))
-    params = ts.make_osc_params(tree, rotation_error_limit=np.inf)
-    errors, _, _ = run(tree, HAND, params, START[None], goal, 600, DT)
-    assert np.linalg.norm(errors[0, 0, 3:]) > 1.2
-    np.testing.assert_allclose(errors[..., 3:], decay(600) * errors[0, :, 3:], atol=4e-4)
-
-
-def test_the_null_space_does_not_accelerate_the_tool():
-    """|J M^-1 N^T| <= 1e-12, relative to the same without the projection."""
-    tree = tree_of("panda")
-    qpos, c = poses(tree, HAND, 8), tree.chain(HAND)
-    d = ts.task_dynamics(tree, qpos, 0 * qpos, HAND)
-    k = ts.discretise(ts.make_osc_params(tree), DT)
-    j, mass = d.jacobian[..., c], d.mass_matrix[:, c][..., c]
-    for unit in np.eye(tree.dof)[c]:
-        found = ts.projections.projections(k, d, np.zeros((8, 6)), np.tile(unit, (8, 1)))
-        moved = (j @ np.linalg.solve(mass, found.posture[:, c, None]))[..., 0]
-        whole = np.abs(j) @ np.abs(np.linalg.solve(mass, np.abs(mass @ unit[c])[..., None]))
-        assert np.abs(moved).max() <= 1e-12 * whole.max()
-
-
-def test_near_a_singularity_damping_of_the_posture_enters_the_task_and_springs_do_not():
-    """With an eigenvalue s = s0/2, along its eigenvector: 1 - s^2/s0^2 of the damping, nothing of
-    the springs.
-    """
-    tree, rng = tree_of("panda"), np.random.default_rng(0)
-    qpos, c = poses(tree, HAND, 8), tree.chain(HAND)
-    d = ts.task_dynamics(tree, qpos, 0 * qpos, HAND)
-    j, mass = d.jacobian[..., c], d.mass_matrix[:, c][..., c]
-    values, vectors = np.linalg.eigh(j @ np.linalg.solve(mass, j.swapaxes(1, 2)))
-    k = ts.discretise(ts.make_osc_params(tree, smallest_eigenvalue=2 * values[:, 0]), DT)
-    a_n = c * rng.normal(size=qpos.shape)
-    wanted = (vectors[..., 0] * (d.jacobian @ a_n[..., None])[..., 0]).sum(-1)
-    assert np.abs(wanted).max() > 0.1
-    for springs, share in ((a_n, 0.0), (0 * a_n, 0.75)):
-        found = ts.projections.projections(k, d, np.zeros((8, 6)), a_n, springs=springs)
-        moved = (j @ np.linalg.solve(mass, found.posture[:, c, None]))[..., 0]
-        np.testing.assert_allclose((vectors[..., 0] * moved).sum(-1), share * wanted, atol=1e-10)
-
-
 def test_the_force_on_a_wall_is_the_one_asked_for():
     """A wall of 1e5 N/m in z, and 5 to 40 N: to 0.2 %. The other axes hold their place."""
     tree, asked = tree_of("panda"), np.array([5.0, 10.0, 20.0, 40.0])

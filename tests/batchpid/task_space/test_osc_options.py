@@ -4,12 +4,8 @@ control.
 
 from __future__ import annotations
 
-import dataclasses
-
-import jax
 import numpy as np
 import pytest
-from quick_jit import quick_jit
 from trees import TOOLS, planar, states, tree_of
 
 import batchpid as bp
@@ -197,34 +193,3 @@ def test_transfer_from_a_joint_pid_and_back_is_bumpless(how):
     found = ts.track(stiffer, after, *inputs, again, dt, d)
     _, terms = ts.osc(ts.discretise(stiffer, dt), found, d, ts.OSCInputs(*inputs))
     np.testing.assert_allclose(terms.effort, again, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_jax_computes_the_same(x64):
-    """With every option; native code and NumPy: test_native_rows.py."""
-    tree, dt = dataclasses.replace(planar((1.0, 0.8, 0.5)), lower=-3.0, upper=3.0), 1 / 300
-    qpos, qvel = states(tree, 5)
-    qpos[0, 0] = 2.99
-    goal, options = (
-        ts.link_poses(tree, qpos + 0.1, ["tip"])[:, 0],
-        {"axes": [True, True, *[False] * 4]},
-    )
-    options |= {
-        "integral_gain": [300.0] * 6,
-        "integral_limit": 0.2,
-        "limit_margin": 0.5,
-        "effort_limit": 30.0,
-    }
-    params = ts.make_osc_params(tree, **options, discretization="implicit")
-    state = ts.init(params, qpos)._replace(integral=np.full((5, 6), 0.1))
-
-    def step(params, state, *rest):
-        k, inputs = ts.discretise(params, dt), ts.OSCInputs(*rest, np.full((5, 6), 0.2))
-        new, terms = ts.osc(k, state, ts.Tool(tree, "tip"), inputs)
-        return new.integral, terms.effort
-
-    inputs = params, state, goal, qpos, qvel
-    with jax.numpy_rank_promotion("allow"):
-        traced = quick_jit(step)(*jax.tree.map(jax.numpy.asarray, inputs))
-    for found, wanted in zip(traced, step(*inputs), strict=True):
-        np.testing.assert_allclose(found, wanted, atol=1e-9)

@@ -17,8 +17,8 @@ def test_demo_reports_every_joint_and_where_it_differs_from_the_tutorial(batchpi
     robot, path = load_bundled("panda"), tmp_path / "mine.yaml"
     bp.save_params(path, robot.params(kp=7.0), robot.joint_names)
     titles = {
-        path: "control pid, gains mine.yaml, 2000 Hz",
-        "drive:30,6": "control drive, gains drive (30, 6), 2000 Hz",
+        path: f"gains {path}, 2000 Hz, 2 robots",
+        "drive:30,6": "SAPIEN, gains drive:30,6, 2000 Hz, 2 robots",
     }
     for gains, title in titles.items():
         status, said, _ = batchpid("demo", *SHORT, "--gains", gains, "--force")

@@ -34,10 +34,11 @@ def test_the_header_is_that_of_the_function(batchpid, tmp_path):
         panda.tuned(), 0.001, joint_names=panda.joint_names, guard=panda.guard(), prefix="arm"
     )
     assert (status, out.read_text()) == (0, exported.text)
-    assert said == f"written: {out}: tuned gains of 9 joints at 1000 Hz\n"
+    lines = ["panda: gains tuned, 1000 Hz", "The file differs in nothing.", f"written: {out}"]
+    assert said.splitlines() == lines
 
 
-def test_followers_are_reported_and_refused_with_strict(batchpid, tmp_path):
+def test_followers_are_reported(batchpid, tmp_path):
     names = ("x", "y", "z")
     path = write(
         tmp_path,
@@ -49,16 +50,12 @@ def test_followers_are_reported_and_refused_with_strict(batchpid, tmp_path):
     )
     status, said, _ = batchpid("export", path, "--out", tmp_path / "arm.h")
     assert status == 0
-    assert said.startswith("differs: b: followers are joints of their own")
+    assert "\ndiffers: b: followers are joints of their own" in said
     assert (
         (tmp_path / "arm.h")
         .read_text()
         .startswith("/* differs: b: followers are joints of their own")
     )
-    status, _, complaint = batchpid("export", path, "--out", tmp_path / "strict.h", "--strict")
-    assert status == 2
-    assert "followers" in complaint
-    assert not (tmp_path / "strict.h").exists()
 
 
 def test_controllers_of_ros2_control_are_written(batchpid, tmp_path):
@@ -66,13 +63,10 @@ def test_controllers_of_ros2_control_are_written(batchpid, tmp_path):
     status, said, _ = batchpid(
         "export", "panda", "--to", "ros2_control", "--prefix", "arm", "--limits", "--out", out
     )
-    assert (status, said.splitlines()[-1]) == (
-        0,
-        f"written: {out}: tuned gains of 9 joints at 1000 Hz",
-    )
-    listed = {line.split(":")[1].strip() for line in said.splitlines()[:-1]}
+    assert (status, said.splitlines()[-1]) == (0, f"written: {out}")
+    listed = {line.split(":")[1].strip() for line in said.splitlines()[1:-1]}
     assert {"gain_units", "guard", "effort_limit"} <= listed
-    assert all(f"# {line}\n" in out.read_text() for line in said.splitlines()[:-1])
+    assert all(f"# {line}\n" in out.read_text() for line in said.splitlines()[1:-1])
     panda = Robot.load("panda")
     gains = yaml.safe_load(out.read_text())["arm"]["ros__parameters"]["gains"]
     inertia = np.diagonal(panda.mass_matrix(panda.start)[0])
@@ -107,16 +101,12 @@ def test_a_repaired_urdf_is_written_with_its_changes(batchpid, tmp_path):
     )
     status, said, _ = batchpid("export", path, "--to", "urdf", "--out", tmp_path / "again.urdf")
     assert status == 0
-    assert said.startswith("differs: joint 'a' (3, 1): limits are swapped; swap them\nwritten: ")
+    assert "\ndiffers: joint 'a' (3, 1): limits are swapped; swap them\nwritten: " in said
     assert (
         "<!-- differs: joint 'a' (3, 1): limits are swapped; swap them -->"
         in (tmp_path / "again.urdf").read_text()
     )
     assert Robot.load(tmp_path / "again.urdf", strict=True).joints == Robot.load(path).joints
-    status, _, complaint = batchpid(
-        "export", path, "--to", "urdf", "--out", tmp_path / "b.urdf", "--strict"
-    )
-    assert (status, "swapped" in complaint) == (2, True)
     status, _, complaint = batchpid("export", path, "--to", "urdf", "--gains", "designed")
     assert (status, "gains: has no effect with --to urdf" in complaint) == (2, True)
 
@@ -133,7 +123,7 @@ def test_the_robot_is_written_for_mujoco(batchpid, tmp_path):
     status, said, _ = batchpid(
         "export", "panda", "--to", "mjcf", "--motors", "--force", "--out", out
     )
-    assert (status, said.splitlines()[-1]) == (0, f"written: {out}: motors of 9 joints")
+    assert (status, said.splitlines()[-1]) == (0, f"written: {out}")
     assert mujoco.MjModel.from_xml_path(str(out)).nu == 9
     assert (
         batchpid(

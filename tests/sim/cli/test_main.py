@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import signal
 import subprocess
 import sys
 import time
 import warnings
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import psutil
 import pytest
@@ -19,35 +19,48 @@ from batchpid import __version__ as version
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import cli
+from batchpid.sim.cli.commands import Command
+from batchpid.sim.cli.flags import sections
 
 
-@dataclasses.dataclass(frozen=True)
-class Stub:
-    """A command for tests."""
+class Result(NamedTuple):
+    """Result of the stub."""
 
-    number: Annotated[int, Field(high=255)] = 0
-    """Exit status."""
+    status: int
 
-    imports = ()
-    failure = None
-
-    def run(self) -> int:
-        if self.failure is not None:
-            raise self.failure
-        return self.number
+    def report(self) -> str:
+        """Return a text."""
+        return "done"
 
 
 @pytest.fixture
 def stub(monkeypatch):
-    monkeypatch.setitem(cli.COMMANDS, "stub", Stub)
-    return Stub
+    """Return a list of actions of a command for tests, whose flag is its exit status."""
+    actions = []
+
+    def stub(number: Annotated[int, Field(high=255)] = 0) -> Result:
+        """Test.
+
+        Parameters
+        ----------
+        number
+            Exit status.
+        """
+        for action in actions:
+            action()
+        return Result(number)
+
+    monkeypatch.setitem(cli.COMMANDS, "stub", Command(stub, {}, loading=()))
+    return actions
 
 
-def fields_of(name: str) -> dict[str, dataclasses.Field]:
-    """Return the fields of a command, options of the Runner among them."""
-    own = {field.name: field for field in dataclasses.fields(cli.COMMANDS[name])}
-    options = dataclasses.fields(own.pop("runner").default_factory) if "runner" in own else ()
-    return own | {field.name: field for field in options}
+def raises(failure):
+    """Return a function that raises ``failure``."""
+
+    def action():
+        raise failure
+
+    return action
 
 
 def test_the_overview_lists_every_command_with_one_line(batchpid):
@@ -55,8 +68,8 @@ def test_the_overview_lists_every_command_with_one_line(batchpid):
     assert status == 0
     text = " ".join(out.replace("│", " ").split())
     for name, command in cli.COMMANDS.items():
-        assert len(command.__doc__.splitlines()[0]) < 105
-        assert f"• {name} {command.__doc__.splitlines()[0]}" in text
+        first = " ".join(inspect.getdoc(command.function).partition("\n\n")[0].split())
+        assert f"• {name} {first}" in text
 
 
 def test_a_missing_or_unknown_command_lists_those_there_are(batchpid):
@@ -79,38 +92,24 @@ def test_version(batchpid):
 
 
 @pytest.mark.parametrize("name", list(cli.COMMANDS))
-def test_every_command_is_a_frozen_dataclass_with_help(name, batchpid):
-    command = cli.COMMANDS[name]
-    assert dataclasses.is_dataclass(command)
-    assert command.__dataclass_params__.frozen
-    assert command.__name__ == f"{name.title()}Command"
+def test_the_help_has_the_docstring_and_every_flag(name, batchpid):
     status, out, _ = batchpid(name, "--help")
     assert status == 0
-    assert " ".join(command.__doc__.split()) in " ".join(out.split())
-    flags = fields_of(name).keys() - {"weights", "meshes"}  # their fields are flags
+    flags = [field.name for field in dataclasses.fields(cli.COMMANDS[name].record())]
+    upper = out.upper()
     assert all(
-        f"-{flag}".replace("_", "-") in out or flag.upper() in out for flag in flags
-    )  # --flag or --no-flag
-
-
-@pytest.mark.parametrize("name", [name for name in cli.COMMANDS if "robot" in fields_of(name)])
-def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
-    recording = ["run.h5"] if "recording" in fields_of(name) else []
-    parsed = cli.parse(
-        [name, *recording, "jaco2", "--missing-meshes", "error", "--package-dirs", "a", "b"]
+        f"-{flag}".replace("_", "-").upper() in upper or flag.upper() in upper for flag in flags
     )
-    assert parsed.robot == "jaco2"
-    assert vars(parsed.meshes) == {
-        "missing_meshes": "error",
-        "package_dirs": (Path("a"), Path("b")),
-    }
+    about, texts = sections(cli.COMMANDS[name].function)
+    words = "".join(out.replace("│", "").split())
+    for text in (about, *(texts[flag] for flag in flags if flag in texts)):
+        assert "".join(text.split()) in words
 
 
-@pytest.mark.parametrize("name", ["meshes", "seed", "randomize"])
-def test_a_flag_has_the_same_type_and_default_in_every_command(name):
-    fields = [fields_of(command)[name] for command in cli.COMMANDS if name in fields_of(command)]
-    assert len(fields) >= 2
-    assert len({(str(field.type), field.default) for field in fields}) == 1
+def test_a_base_is_free_or_fixed_by_a_flag(batchpid):
+    assert "quadruped: free base, " in batchpid("inspect", "quadruped", "--base", "free")[1]
+    assert "A robot with legs?" in batchpid("inspect", "quadruped")[1]
+    assert "A robot with legs?" not in batchpid("inspect", "panda")[1]
 
 
 def test_flags_reach_the_command_and_its_status_is_returned(batchpid, stub):
@@ -130,8 +129,8 @@ def test_flags_reach_the_command_and_its_status_is_returned(batchpid, stub):
         (PermissionError(13, "Permission denied", "/x/y"), 2, "/x/y: Permission denied"),
     ],
 )
-def test_failures_are_one_line_and_a_status(batchpid, stub, monkeypatch, failure, status, message):
-    monkeypatch.setattr(stub, "failure", failure)
+def test_failures_are_one_line_and_a_status(batchpid, stub, failure, status, message):
+    stub.append(raises(failure))
     got, _, err = batchpid("stub")
     assert got == status
     assert err.startswith("batchpid: ")
@@ -139,20 +138,20 @@ def test_failures_are_one_line_and_a_status(batchpid, stub, monkeypatch, failure
     assert err.count("\n") == 1
 
 
-def test_a_bug_keeps_its_traceback(stub, monkeypatch):
-    monkeypatch.setattr(stub, "failure", ZeroDivisionError())
+def test_a_bug_keeps_its_traceback(stub):
+    stub.append(raises(ZeroDivisionError()))
     with pytest.raises(ZeroDivisionError):
         cli.main(["stub"])
 
 
-def test_warnings_are_one_line(batchpid, stub, monkeypatch):
-    def run(self):
+def test_warnings_are_one_line(batchpid, stub):
+    def action():
         warnings.simplefilter("always")
         warnings.warn("joint 4 cannot reach 1", UserWarning, stacklevel=1)
 
-    monkeypatch.setattr(stub, "run", run)
+    stub.append(action)
     before = warnings.showwarning
-    assert batchpid("stub") == (0, "", "batchpid: warning: joint 4 cannot reach 1\n")
+    assert batchpid("stub") == (0, "done\n", "batchpid: warning: joint 4 cannot reach 1\n")
     assert warnings.showwarning is before
 
 
@@ -186,7 +185,7 @@ def test_ctrl_c_ends_a_command_in_one_line_and_its_processes(seconds, tmp_path):
         stdout=subprocess.PIPE,
         cwd=tmp_path,
     )
-    assert "2 robots in" in process.stdout.readline().decode()  # the packages are imported
+    assert "2 robots" in process.stdout.readline().decode()  # the packages are imported
     time.sleep(seconds)
     family = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(signal.SIGINT)

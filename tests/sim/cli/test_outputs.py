@@ -33,11 +33,12 @@ OUT = {"rollout": ".h5", "excite": ".csv", "export": ".h"}
 
 def output_flags() -> list[tuple[str, str]]:
     """Return every flag of every command that names an output file."""
-    names = {
-        name: {field.name for field in dataclasses.fields(command)}
+    return [
+        (name, flag)
         for name, command in COMMANDS.items()
-    }
-    return [(name, flag) for name, flags in names.items() for flag in SUFFIXES if flag in flags]
+        for flag in SUFFIXES
+        if flag in command.outputs
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +89,9 @@ def test_an_existing_output_is_refused_before_the_run(
 
 def test_every_command_with_outputs_has_force():
     assert WORDS.keys() == {name for name, _ in output_flags()}
-    assert {name for name, command in COMMANDS.items() if hasattr(command, "force")} == WORDS.keys()
+    fields = {name: dataclasses.fields(command.record()) for name, command in COMMANDS.items()}
+    have = {name for name in fields if "force" in {field.name for field in fields[name]}}
+    assert have == WORDS.keys()
 
 
 @pytest.mark.slow
@@ -139,7 +142,7 @@ def test_a_file_that_a_command_reads_is_never_replaced(
     name, flag, make, files, batchpid, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    names = {field.name for field in dataclasses.fields(COMMANDS[name])}
+    names = {field.name for field in dataclasses.fields(COMMANDS[name].record())}
     words = [
         *WORDS[name],
         *(word for each, file in INPUTS.items() if each in names for word in (f"--{each}", file)),
@@ -189,5 +192,5 @@ def test_make_can_repeat_its_runs():
     assert all("--force" in words for words in runs)
     demo = next(words for words in runs if words[0] == "demo")
     assert demo.pop() == "$(ARGS)"  # last, so that they win
-    command = parse([*demo, "--picture", "mine.png"])
+    _, command = parse([*demo, "--picture", "mine.png"])
     assert (command.force, command.picture) == (True, Path("mine.png"))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 
-from batchpid.sim import Observation, Rollout
+from batchpid.sim import Observation, Rollout, RunInfo
 from batchpid.sim.cli import report
 
 TICKS, ENVS = 200, 5
@@ -33,16 +31,14 @@ def first_order_lag(panda, setpoint, time_constant=0.05):
             guarded=np.zeros(shape, bool),
         ),
         tick=0.01,
-        info=panda.run_info(),
+        info=RunInfo.of(panda),
     )
     return rollout
 
 
 def report_of(panda, rollout):
     """Return the lines of the report, and those of the table by joint."""
-    lines = report.run_report(
-        SimpleNamespace(robot=panda, timestep=5e-4), rollout, 1.0
-    ).splitlines()
+    lines = report.Run(panda, rollout, timestep=5e-4, wall=1.0).report().splitlines()
     return lines, {
         name: next(line for line in lines if line.startswith(name)) for name in panda.joint_names
     }

@@ -69,8 +69,6 @@ def test_start_poses_are_near_and_within_limits_and_do_not_depend_on_their_numbe
     [
         ("--control", "drive"),
         ("--compensate", "none"),
-        ("--physics", "fast"),
-        ("--dissipation", "sapien"),
         ("--timestep", "0.001"),
         ("--spread", "0.1"),
         ("--randomize", "payload.yaml"),
@@ -87,7 +85,7 @@ def test_every_flag_changes_the_motion(flags, saved):
 def test_the_default_gains_settle_and_the_tutorial_s_do_not(batchpid):
     flags = ("--num-envs", 1, "--workers", 0, "--seconds", 1.2)
     assert "Every joint of every env settled" in batchpid("rollout", *flags)[1]
-    assert "NOT SETTLED" in batchpid("rollout", *flags, "--gains", "tutorial")[1]
+    assert "NOT SETTLED" in batchpid("rollout", *flags, "--gains", "sapien-tutorial")[1]
 
 
 def test_the_efforts_of_a_drive_are_unknown(saved):
@@ -127,11 +125,10 @@ def test_picture(batchpid, tmp_path):
     assert "panda_joint7" in path.read_text()
 
 
-@pytest.mark.parametrize("command", ["demo", "rollout"])
-def test_the_figures_are_those_of_the_table(command, batchpid, tmp_path):
+def test_the_figures_are_those_of_the_table(batchpid, tmp_path):
     files = ("--json", tmp_path / "a.json", "--picture", tmp_path / "a.svg")
     status, said, error = batchpid(
-        command, "--num-envs", 3, "--workers", 0, "--seconds", 1.2, *files
+        "rollout", "--num-envs", 3, "--workers", 0, "--seconds", 1.2, *files
     )
     assert status == 0, error
     figures = json.loads((tmp_path / "a.json").read_text())
@@ -206,7 +203,7 @@ def test_a_trajectory_is_followed_as_by_a_runner_with_its_rates(
     path, further = tmp_path / "motion.csv", ["setpoint_rate"] if source == "from the file" else []
     path.write_text(csv(panda, motion, *further))
     run, said = saved("--trajectory", path, "--spread", 0, short=ONE)
-    assert f"Rates of the setpoints: {source}.\n" in said
+    assert f"Rates of the setpoints: {source}." in said
     rows = np.loadtxt(path, delimiter=",", skiprows=1)[:, 1:]
     rates = rows[:, 9:] if further else np.gradient(rows, 0.005, axis=0)
     with Runner(panda, 1, workers=0, params=panda.tuned(), substeps=10) as runner:
@@ -385,8 +382,8 @@ def test_a_wrong_trajectory_is_refused(batchpid, tmp_path, panda, motion, change
     [
         (("--seconds", 1), "seconds: is as --trajectory says"),
         (("--setpoint", 0, 0), "setpoint: is as --trajectory says"),
-        (("--control", "osc"), "trajectory: excludes --control osc"),
-        (("--gains", "tutorial"), "setpoint_accelerations: is for gains in accelerations"),
+        (("--control", "osc"), "excludes --control osc"),
+        (("--gains", "sapien-tutorial"), "setpoint_accelerations: is for gains in accelerations"),
         (("--control", "drive"), "setpoint_accelerations: is for gains in accelerations"),
     ],
 )
@@ -404,7 +401,7 @@ def test_a_trajectory_without_rates_is_a_log(saved, panda, tmp_path, motion):
     """It has no accelerations either, so that gains in efforts follow it."""
     path = tmp_path / "motion.csv"
     path.write_text(csv(panda, motion, "setpoint_rate", "setpoint_acceleration"))
-    run, said = saved("--trajectory", path, "--no-rates", "--gains", "tutorial", short=ONE)
+    run, said = saved("--trajectory", path, "--no-rates", "--gains", "sapien-tutorial", short=ONE)
     assert "not given" in said
     assert run.info.rates is False
 

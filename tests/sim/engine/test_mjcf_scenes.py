@@ -3,7 +3,6 @@ state of an env.
 """
 
 import dataclasses
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -163,28 +162,6 @@ def test_the_law_drives_the_joints_and_the_arm_pushes_the_cube(load, control):
         0.05 if control == "pid" else 0.1
     )  # a drive has no integral
     assert np.linalg.norm((after - before)[0, 0, :2]) > 0.01
-
-
-@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
-def test_workers_and_other_envs_change_no_bit(load):
-    robot = load(ARM)
-    targets = np.stack([np.linspace(0.2, 0.8, 5), np.full(5, 0.25), np.linspace(0, 0.3, 5)], axis=1)
-    kept = []
-    for workers in (0, 1, 2):
-        with Runner(robot, 5, workers=workers, engine="mujoco") as runner:
-            for _ in range(60):
-                obs = runner.step(targets)
-            kept.append((runner.bodies(OBJECTS), obs.qpos))
-    with Runner(robot, 1, workers=0, engine="mujoco") as runner:
-        for _ in range(60):
-            obs = runner.step(targets[3])
-        kept.append((runner.bodies(OBJECTS), obs.qpos))
-    assert np.ptp(kept[0][0][:, 0], axis=0).max() > 0.01  # the cubes differ
-    for one, other in pairwise(kept[:3]):
-        for ours, theirs in zip(one, other, strict=True):
-            np.testing.assert_array_equal(ours, theirs)
-    for ours, theirs in zip(kept[0], kept[3], strict=True):
-        np.testing.assert_array_equal(ours[3], theirs[0])
 
 
 def test_objects_belong_to_snapshots_resets_and_faults(load, tmp_path):
@@ -477,40 +454,6 @@ def test_random_files_in_contact_move_as_in_mujoco(load, monkeypatch, seed):
     np.testing.assert_allclose(seen[0], in_mujoco(robot, model, rows, 20), rtol=0, atol=1e-6)
 
 
-def test_a_snapshot_holds_the_integration_state(load):
-    """Also what a keyframe places, and what a run may change: mocap bodies, equality constraints,
-    user data.
-    """
-    robot = load(
-        ARM.replace(
-            "<worldbody>", '<size nuserdata="2"/><worldbody><body name="target" mocap="true"/>'
-        )
-        .replace('<key name="home"', '<key name="home" mpos=".3 0 .35"')
-        .replace(
-            "<actuator>",
-            '<equality><weld body1="cube" body2="lid" active="false"/></equality><actuator>',
-        )
-    )
-    whole, kept = int(mujoco.mjtState.mjSTATE_INTEGRATION), []
-    spec = SceneSpec(
-        robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
-    )
-    packs = [ENGINE.make_pack(spec, 2) for _ in range(2)]
-    rng = np.random.default_rng(0)
-    for data in packs[0]._data:
-        assert list(data.mocap_pos[0]) == [0.3, 0, 0.35]
-        row = np.empty(mujoco.mj_stateSize(packs[0].models[0], whole))
-        mujoco.mj_getState(packs[0].models[0], data, row, whole)
-        mujoco.mj_setState(packs[0].models[0], data, row + rng.uniform(0.1, 0.2, len(row)), whole)
-    packs[1].write_state_rows(packs[0].read_state())
-    for pack in packs:
-        kept.append([])
-        for data in pack._data:
-            mujoco.mj_getState(pack.models[0], data, row := np.empty(len(row)), whole)
-            kept[-1].append(row)
-    np.testing.assert_array_equal(*kept)
-
-
 BLOCK = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 OPENED = {
     "scene.xml": (
@@ -650,7 +593,7 @@ def test_ground_friction_is_drawn_around_that_of_the_file(load, draw, ground, ar
     text = ARM.replace(LINK, LINK[:-2] + ' friction=".4"/>')
     robot = load(text.replace('type="plane"', 'type="plane" friction=".8"'))
     spec = SceneSpec(
-        robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
+        robot.tables, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
     )
     nominal = nominal_values("ground_friction", robot, robot.mjcf)
     pack = ENGINE.make_pack(

@@ -289,13 +289,10 @@ class KeepsDynamics:
         return state, (self.dynamics.mass_matrix(qpos) * acceleration[:, None]).sum(-1) + passive
 
 
-@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
-def test_a_controller_that_has_run_here_can_be_sent_to_workers(panda, engine):
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
+def test_a_controller_that_has_run_here_can_be_sent_to_workers(panda):
     controller = KeepsDynamics()
-    here = rollout(panda, controller, engine=engine)
-    assert_identical(rollout(panda, controller, engine=engine, workers=2), here)
+    here = rollout(panda, controller)
+    assert_identical(rollout(panda, controller, workers=2), here)
 
 
 def test_an_error_names_the_option_that_cannot_be_sent(panda):

@@ -39,25 +39,6 @@ def test_one_set_of_gains_settles_every_arm_joint_of_every_robot(name):
     assert (m.steady_state_error[0, arm] < 1e-3).all()
 
 
-@pytest.mark.slow
-def test_gain_units_change_in_flight_without_a_bump(panda):
-    """Integrals that carry the robot's weight carry on in the unit of the new gains, back and
-    forth.
-    """
-    gains = {"kp": 400.0, "ki": 800.0, "kd": 40.0, "derivative_filter_time": 2e-3}
-    per_effort = panda.params(**gains, effort_limit=None)
-    per_mass_matrix = panda.params(**gains, effort_limit=None, gain_units="mass_matrix")
-    setpoint = panda.settings.target * [[1.0], [0.9]]
-    with Runner(panda, 2, workers=0, compensate="none", params=per_effort) as runner:
-        runner.reset(setpoint)
-        before = runner.rollout(np.broadcast_to(setpoint, (400, 2, 9))).effort[-1]
-        assert np.abs(before).max() > 10.0
-        for params in (per_mass_matrix, per_effort):
-            runner.params = params
-            after = runner.step(setpoint, substeps=1).effort
-            np.testing.assert_allclose(after, before, atol=0.1)
-
-
 @pytest.mark.parametrize("substeps", [5, 20])
 def test_a_fast_arm_stays_on_its_line_where_its_axes_are_nearly_in_line(substeps, jaco2):
     """Near upright jaco2's mass matrix changes fast: matrices that are ahead on average put it 18

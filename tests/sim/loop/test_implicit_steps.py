@@ -6,12 +6,11 @@ import warnings
 
 import numpy as np
 import pytest
-from robots import load_bundled
+from robots import load_bundled, load_published
 from tiny_urdf import random_tree, robot, write
 
 from batchpid.sim import Robot, Runner, StabilityWarning
 from batchpid.trajectories import minimum_jerk
-from tests.sim.robot.test_design_on_robots import load
 
 PUBLISHED = [
     f"{name}_description/urdf/{file}.urdf"
@@ -29,7 +28,7 @@ DURATION, HELD = 1.0, 0.3
 )
 def arm(request, tmp_path_factory):
     if request.param != "tree":
-        return load(request.param)
+        return load_published(request.param)
     path = write(tmp_path_factory.mktemp("tree"), robot(*random_tree(np.random.default_rng(5), 12)))
     return Robot.load(path, self_collision="none")
 

@@ -13,7 +13,7 @@ from identical import assert_identical
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Robot, Runner, Snapshot, read_recording, write_recording
+from batchpid.sim import Robot, Runner, read_recording, write_recording
 
 N = 5
 
@@ -68,23 +68,6 @@ def test_actuators_that_are_off_change_no_bit(panda):
         assert_identical(ideal.observation, runner.rollout(table).observation)
 
 
-def test_a_masked_reset_forgets_histories_of_its_envs_alone(panda):
-    chosen, table = actuators(panda), commands(panda, 4)
-    mask, quiet = (
-        np.array([True, False, True, False, False]),
-        chosen.replace(position_noise=None, velocity_noise=None),
-    )
-    for each, same in ((quiet, True), (chosen, False)):  # an episode has its own noise
-        with Runner(panda, N, workers=0, actuators=each) as runner:
-            first = runner.rollout(table)
-            runner.reset(mask=mask)
-            again = runner.rollout(table)
-        assert np.array_equal(first.for_envs(mask).qpos, again.for_envs(mask).qpos) == same
-        with Runner(panda, N, workers=0, actuators=each) as runner:
-            runner.rollout(table)
-            assert_identical(runner.rollout(table).for_envs(~mask), again.for_envs(~mask))
-
-
 def test_the_effort_is_that_delivered(panda):
     """Late by the delay, times the strength, under control "effort"."""
     asked = np.zeros((6, 1, panda.dof))
@@ -119,38 +102,7 @@ def test_a_joint_is_saturated_exactly_where_its_motor_is(panda, strength, contro
     np.testing.assert_array_equal(saturated, np.abs(effort) > limit * (1 - 1e-6))
 
 
-def test_joints_alone_leave_signals_alone_and_are_in_snapshots(panda, tmp_path):
-    """Friction and reflected inertia are the engine's: without other effects no signal is
-    processed.
-    """
-    worn, table = (
-        bp.make_actuators(panda.dof, coulomb=0.3, viscous=0.2, armature=0.1),
-        commands(panda, 8),
-    )
-    with Runner(panda, N, workers=0, actuators=worn) as runner:
-        first = runner.rollout(table[:4])
-        snapshot = runner.snapshot()
-        second = runner.rollout(table[4:])
-    snapshot.save(tmp_path / "worn.npz")
-    assert snapshot.states.actuators == {}
-    with Runner(panda, N, workers=0) as runner:
-        runner.actuators = worn
-        runner.reset()
-        assert_identical(first, runner.rollout(table[:4]))
-        runner.restore(Snapshot.load(tmp_path / "worn.npz"))
-        assert_identical(second, runner.rollout(table[4:]))
-        assert runner.actuators.armature.max() == 0.1
-
-
 def test_drives_take_friction_and_armature_alone(panda):
-    with pytest.raises(InvalidArgumentError, match="drives bypass all three"):
-        Runner(
-            panda,
-            1,
-            workers=0,
-            control="drive",
-            actuators=bp.make_actuators(panda.dof, strength=0.9),
-        )
     heavy = bp.make_actuators(panda.dof, armature=1.0)
     with Runner(panda, 1, workers=0, control="drive") as runner:
         free = runner.rollout(np.tile(panda.settings.target, (5, 1)))

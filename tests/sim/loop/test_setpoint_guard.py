@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from identical import assert_identical
 from tiny_urdf import joint, link, write
 from tiny_urdf import robot as urdf
 
@@ -54,15 +53,6 @@ def test_the_setpoint_ramps_at_the_largest_rate_and_the_observation_tells(tmp_pa
         np.testing.assert_allclose(obs.qpos, 2.0, atol=0.01)
     with Runner(robot, 1, workers=0, timestep=0.001, substeps=100) as runner:
         assert not runner.step([1.0]).guarded.any()
-
-
-def test_a_reset_starts_at_rest_at_the_pose(panda):
-    with Runner(panda, 1, workers=0, guard=panda.guard(rate=0.5)) as runner:
-        first = runner.rollout(panda.settings.target[None].repeat(5, 0)).observation
-        runner.reset()
-        assert_identical(
-            first, runner.rollout(panda.settings.target[None].repeat(5, 0)).observation
-        )
 
 
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])

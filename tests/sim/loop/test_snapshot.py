@@ -10,10 +10,9 @@ import dataclasses
 import json
 import os
 import pickle
+import re
 import subprocess
 import sys
-import tracemalloc
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,11 +20,10 @@ from typing import Any
 import numpy as np
 import pytest
 from identical import assert_identical
-from option_values import ARM, label
+from option_values import ARM
 from robots import load_bundled
 
-import batchpid as bp
-from batchpid.errors import BatchPIDError, InvalidArgumentError
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Randomization, Robot, Runner, Snapshot, Uniform
 
 N = 2
@@ -74,16 +72,6 @@ def test_a_new_process_and_a_copy_go_on_from_it(jaco2: Robot, tmp_path: Path) ->
         [sys.executable, "-W", "ignore", "-c", program, tmp_path], check=True, env=environment
     )
     np.testing.assert_array_equal(np.load(tmp_path / "qpos.npy"), went_on.qpos)
-
-
-def test_in_free_motion_the_barrier_changes_the_last_bits_only(monkeypatch) -> None:
-    results = []
-    for checkpoint_steps in (8000, 40):
-        monkeypatch.setattr("batchpid.sim.runner.CHECKPOINT_STEPS", checkpoint_steps)
-        with make(ground=False) as runner:
-            results.append(runner.rollout(np.tile(GOAL, (20, 1))))
-    np.testing.assert_allclose(results[0].qpos, results[1].qpos, rtol=0, atol=1e-7)
-    assert np.abs(results[0].qpos[-1]).max() > 1e-3
 
 
 def test_it_holds_faults_params_and_time() -> None:
@@ -148,6 +136,17 @@ def array(name: str, change: Callable[[np.ndarray], Any] | None) -> Callable[...
     return damage
 
 
+def params(pattern: str, text: str) -> Callable[..., None]:
+    """Return a damage that changes the text of the params."""
+
+    def damage(head: Any, tables: dict[str, Any]) -> None:
+        head["params"], count = re.subn(pattern, text, head["params"])
+        assert count
+
+    return damage
+
+
+KP = r'(?<="kp": )([-\d.]+|\[[^]]*\])'
 DAMAGES = {
     "an older format": head(format=2),
     "no description": head(about=None),
@@ -155,8 +154,8 @@ DAMAGES = {
     "negative steps": head(steps=-1),
     "half a step": head(steps=1.5),
     "more steps than an integer holds": head(steps=10**30),
-    "an unknown choice": head(choices={"anti_windup": "Evil"}),
-    "the choice of another field": head(choices={"kp": "Everywhere"}),
+    "an unknown choice": params('"explicit"', '"evil"'),
+    "no params": head(params=None),
     "more envs than memory": about(num_envs=10**12),
     "more envs than rows": about(num_envs=10**9),
     "envs as text": about(num_envs="2"),
@@ -179,15 +178,11 @@ DAMAGES = {
     "a joint beyond": array("containment.joint", lambda rows: rows + ARM.dof),
     "a negative joint": array("containment.joint", lambda rows: rows - 1),
     "a cause beyond": array("containment.cause", lambda rows: rows + 99),
-    "gains that are not numbers": array("params.kp", lambda rows: rows * np.nan),
-    "negative gains": array("params.kp", lambda rows: -rows),
-    "whole gains": array("params.kp", lambda rows: rows.astype(int)),
-    "gains as text": array("params.kp", lambda rows: np.array("x")),
+    "gains that are not numbers": params(KP, "NaN"),
+    "negative gains": params(KP, "-1.0"),
+    "gains as text": params(KP, '"x"'),
     "a motion of one row": array("motion", lambda rows: rows[:1]),
     "a motion of another precision": array("motion", np.float32),
-    "numbers in place of a choice": array(
-        "params.integration", lambda rows: np.zeros((1, ARM.dof))
-    ),
 }
 
 
@@ -211,48 +206,6 @@ def test_a_damaged_snapshot_is_refused_before_anything_changes(
     assert runner.step(GOAL).ok.all()
 
 
-class Counts:
-    """Controller with a state: the number of its sim steps."""
-
-    def init(self, robot: Any, num_envs: int) -> Any:
-        return {"steps": np.zeros(num_envs)}
-
-    def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:
-        return {"steps": state["steps"] + 1}, passive + 0.1 * state["steps"][:, None]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"control": Counts()},
-        {"actuators": bp.make_actuators(ARM.dof, command_delay=2e-3)},
-        {"actuators": bp.make_actuators(ARM.dof, sensor_delay=np.full((3, ARM.dof), 2e-3))},
-        {"contacts": ["hand"], "guard": True},
-    ],
-    ids=label,
-)
-def test_a_file_holds_the_state_of_every_part(options: Any, tmp_path: Path) -> None:
-    setpoint = np.outer([1, 2, 3], np.full(ARM.dof, 0.1))
-    with Runner(ARM, 3, workers=0, **options) as runner:
-        runner.step(setpoint)
-        runner.snapshot().save(tmp_path / "s.npz")
-        expected = runner.step(setpoint)
-        runner.restore(Snapshot.load(tmp_path / "s.npz"))
-        assert_identical(runner.step(setpoint), expected)
-        head, tables = read(tmp_path / "s.npz")
-        for name, rows in tables.items():
-            if name.partition(".")[0] in (
-                "controller",
-                "actuators",
-                "guard",
-                "sensors",
-            ) and rows.shape[:1] == (3,):
-                with pytest.raises(InvalidArgumentError):
-                    runner.restore(
-                        Snapshot.load(write(tmp_path / "bad.npz", head, tables | {name: rows[:2]}))
-                    )
-
-
 @pytest.mark.parametrize(
     "damage",
     [
@@ -271,97 +224,6 @@ def test_episodes_that_do_not_agree_are_refused(damage: Any, tmp_path: Path) -> 
         damage(*parts)
         with pytest.raises(InvalidArgumentError):
             runner.restore(Snapshot.load(write(path, *parts)))
-
-
-def tables(snapshot: Snapshot) -> dict[str, Any]:
-    """Return everything in a snapshot by name, as arrays and text."""
-    found = {f"params.{name}": leaf for name, leaf in snapshot.params._asdict().items()}
-    for name, rows in vars(snapshot.states).items():
-        found |= (
-            {f"{name}.{leaf}": each for leaf, each in rows.items()}
-            if isinstance(rows, dict)
-            else {name: rows}
-        )
-    found |= {"about": snapshot.about, "steps": snapshot.steps}
-    return {
-        name: value if isinstance(value, np.ndarray) else repr(value)
-        for name, value in found.items()
-    }
-
-
-def check(path: Path, content: bytes, original: Snapshot) -> None:
-    """Load ``content``: it is refused with our error, or equal to the original, with little
-    memory.
-    """
-    path.write_bytes(content)
-    tracemalloc.start()
-    try:
-        loaded = tables(Snapshot.load(path))
-    except InvalidArgumentError:
-        return
-    finally:
-        _, peak = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        assert peak < 50e6
-    expected = tables(original)
-    assert loaded.keys() == expected.keys()
-    for name, value in expected.items():
-        np.testing.assert_array_equal(loaded[name], value, err_msg=name)
-
-
-@pytest.mark.parametrize("count", [60, pytest.param(4000, marks=pytest.mark.slow)])
-def test_flipped_bits(good: Path, count: int, tmp_path: Path) -> None:
-    whole, original, random = good.read_bytes(), Snapshot.load(good), np.random.default_rng(count)
-    directory = whole.index(b"PK\x01\x02")
-    for number in range(count):
-        data = bytearray(whole)
-        # Every second one hits the directory, which has no checksum.
-        data[random.integers(directory if number % 2 else 0, len(data))] ^= 1 << random.integers(8)
-        check(tmp_path / "flipped.npz", data, original)
-
-
-EXTREMES = (np.nan, np.inf, -np.inf, 0.0, 1e38, -1e38, 1e-45, -1.0, 2.0**31 - 1)
-
-
-@pytest.mark.parametrize("count", [20, pytest.param(1000, marks=pytest.mark.slow)])
-def test_edits_under_right_checksums_are_refused_or_another_state(
-    good: Path, count: int, tmp_path: Path
-) -> None:
-    random, restored = np.random.default_rng(count), 0
-    head, original = read(good)
-    with make() as runner, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for _ in range(count):
-            arrays = {name: rows.copy() for name, rows in original.items()}
-            for name in random.choice(sorted(arrays), random.integers(1, 4)):
-                rows, kind = arrays[name], random.integers(6)
-                if kind < 3 and rows.size:
-                    rows.flat[random.integers(rows.size)] = np.array(
-                        random.choice(EXTREMES)
-                    ).astype(rows.dtype)
-                elif kind == 3:
-                    arrays[name] = rows.astype(random.choice(["f8", "f4", "i8", "?", "U4"]))
-                elif kind == 4:
-                    arrays[name] = rows.reshape(-1)[: random.integers(rows.size + 1)]
-                else:
-                    arrays[name] = np.repeat(rows, 2, axis=-1)
-            try:
-                runner.restore(Snapshot.load(write(tmp_path / "edited.npz", head, arrays)))
-            except BatchPIDError:
-                continue
-            runner.step(GOAL)
-            restored += 1
-        assert 0 < restored < count
-        runner.restore(Snapshot.load(good))
-        assert runner.step(GOAL).ok.all()
-
-
-def test_files_cut_short_or_with_more_at_their_end(good: Path, tmp_path: Path) -> None:
-    whole, original = good.read_bytes(), Snapshot.load(good)
-    for length in np.linspace(0, len(whole) - 1, 30).astype(int):
-        check(tmp_path / "cut.npz", whole[:length], original)
-    check(tmp_path / "long.npz", whole + bytes(1000), original)
-    check(tmp_path / "shifted.npz", bytes(1000) + whole, original)
 
 
 def test_what_is_no_snapshot_is_refused_and_not_executed(good: Path, tmp_path: Path) -> None:

@@ -61,33 +61,12 @@ def expected(case):
     return motion(case)
 
 
-LOGS = {"jax_log_compiles", "jax_explain_cache_misses"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(SETTINGS.keys() - LOGS))
-@pytest.mark.parametrize("case", ["pid", "controller"])
-def test_no_setting_changes_a_motion(case, name):
-    wanted = expected(case)
-    with changed(**{name: SETTINGS[name]}):
-        assert_identical(motion(case), wanted)
-
-
-@pytest.mark.quick_rows(2)
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize("case", OPTIONS)
 def test_all_of_them_at_once(case):
     wanted = expected(case)
     with changed(**SETTINGS):
         assert_identical(motion(case), wanted)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", ["pid", "controller"])
-def test_workers_under_settings_of_their_environment(monkeypatch, case):
-    wanted = expected(case)
-    for name, value in SETTINGS.items():
-        monkeypatch.setenv(name.upper(), "1" if value is True else value)
-    assert_identical(motion(case, workers=1), wanted)
 
 
 def test_the_state_of_a_controller_has_the_precision_of_the_runner():

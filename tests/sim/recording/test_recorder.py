@@ -46,7 +46,7 @@ def test_every_tick_is_recorded_with_robot_options_and_units(tmp_path):
     assert (info.complete, info.seed, info.control, info.timestep) == (True, 7, "pid", 1 / 2000)
     assert recording.tick == rollout.tick
     assert recording.feedforward is None
-    assert (info.robot, info.joint_names, info.urdf) == ("panda", ROBOT.joint_names, ROBOT.urdf)
+    assert (info.robot, info.joint_names, info.digest) == ("panda", ROBOT.joint_names, ROBOT.digest)
     for ours, theirs in zip(info.params, rollout.info.params, strict=True):
         np.testing.assert_array_equal(ours, theirs)
     np.testing.assert_array_equal(info.start, start)

@@ -72,7 +72,7 @@ def test_rollouts_are_read_as_they_were_written(tmp_path, rollout):
 
 
 def test_rollouts_made_by_hand_and_empty_ones_can_be_written(tmp_path, rollout, panda):
-    bare = replace(rollout, info=panda.run_info()).for_ticks(slice(0, 0))
+    bare = replace(rollout, info=RunInfo.of(panda)).for_ticks(slice(0, 0))
     read = read_recording(write_recording(bare, tmp_path / "run.h5"))
     assert_identical(read, bare)
     assert_same_info(read.info, bare.info)

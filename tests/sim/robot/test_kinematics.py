@@ -55,7 +55,7 @@ def random_qpos(robot, count):
 
 def test_link_poses_are_those_of_sapien(robot):
     spec = SceneSpec(
-        robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["accurate"], ground=False
+        robot.tables, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["accurate"], ground=False
     )
     _scene, reference = build_scene(spec, new_system(spec))
     tree, qpos = robot.rigid_tree, random_qpos(robot, 20)

@@ -4,103 +4,17 @@ load.
 
 from __future__ import annotations
 
-import json
 import os
 import struct
 
 import numpy as np
 import pytest
+from mesh_files import GOOD, arm, ascii_stl, dae, glb, obj, stl
 from tiny_urdf import INERTIAL, one_joint, write
 
 from batchpid.errors import RobotError
 from batchpid.sim import Robot, Runner
 
-CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], "<f4")
-FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], "<u4")
-
-
-def stl() -> bytes:
-    """Tetrahedron as binary STL."""
-    facets = (np.zeros(3, "<f4").tobytes() + CORNERS[face].tobytes() + bytes(2) for face in FACES)
-    return bytes(80) + struct.pack("<I", len(FACES)) + b"".join(facets)
-
-
-def ascii_stl() -> bytes:
-    lines = ["solid tetrahedron"]
-    for face in FACES:
-        lines += ["facet normal 0 0 0", " outer loop"]
-        lines += ["  vertex {} {} {}".format(*CORNERS[corner]) for corner in face]
-        lines += [" endloop", "endfacet"]
-    return "\n".join([*lines, "endsolid tetrahedron\n"]).encode()
-
-
-def obj() -> bytes:
-    lines = [
-        *("v {} {} {}".format(*corner) for corner in CORNERS),
-        *("f {} {} {}".format(*face + 1) for face in FACES),
-    ]
-    return "\n".join(lines).encode()
-
-
-def dae() -> bytes:
-    coordinates, indices = (
-        " ".join(map(str, table.ravel().tolist())) for table in (CORNERS, FACES)
-    )
-    return f"""<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset>
-<library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="12">{coordinates}</float_array>
-<technique_common><accessor source="#a" count="4" stride="3"><param name="X" type="float"/><param name="Y"
-type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
-<vertices id="v"><input semantic="POSITION" source="#p"/></vertices><triangles count="4"><input semantic="VERTEX"
-source="#v" offset="0"/><p>{indices}</p></triangles></mesh></geometry></library_geometries>
-<library_visual_scenes><visual_scene id="s"><node><instance_geometry url="#g"/></node></visual_scene>
-</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>""".encode()
-
-
-def glb(**changed: object) -> bytes:
-    binary = FACES.tobytes() + CORNERS.tobytes()
-    content = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 1}, "indices": 0}]}],
-        "accessors": [
-            {"componentType": 5125, "type": "SCALAR", "bufferView": 0, "count": 12},
-            {
-                "componentType": 5126,
-                "type": "VEC3",
-                "bufferView": 1,
-                "count": 4,
-                "min": [0] * 3,
-                "max": [1] * 3,
-            },
-        ],
-        "bufferViews": [
-            {"buffer": 0, "byteLength": 48},
-            {"buffer": 0, "byteOffset": 48, "byteLength": 48},
-        ],
-        "buffers": [{"byteLength": 96}],
-    }
-    text = json.dumps(content | changed).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = (
-        struct.pack("<I4s", len(text), b"JSON")
-        + text
-        + struct.pack("<I4s", len(binary), b"BIN\0")
-        + binary
-    )
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
-
-
-GOOD = {
-    "a.stl": stl(),
-    "b.STL": stl(),
-    "c.stl": ascii_stl(),
-    "d.obj": obj(),
-    "e.dae": dae(),
-    "f.glb": glb(),
-}
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
 CLAIM = 4_000_000_000
 BAD = {
@@ -151,12 +65,6 @@ BAD |= {
 }
 
 
-def arm(name: str) -> str:
-    return one_joint(
-        arm=INERTIAL + f'<collision><geometry><mesh filename="{name}"/></geometry></collision>'
-    )
-
-
 @pytest.mark.parametrize("name", GOOD)
 def test_a_sound_mesh_is_simulated(name, tmp_path):
     (tmp_path / name).write_bytes(GOOD[name])
@@ -195,7 +103,8 @@ def test_a_mesh_is_found_by_the_ways_that_urdfs_name_it(name, tmp_path):
         (folder / each).mkdir(parents=True)
     (folder / "meshes" / "arm.stl").write_bytes(stl())
     loaded = Robot.load(write(folder / "urdf", arm(name.format(folder=folder))), strict=True)
-    assert str(folder / "meshes" / "arm.stl") in loaded.urdf.replace("urdf/../", "")
+    (shape,) = loaded.tables.shapes
+    assert shape.file.replace("urdf/../", "") == str(folder / "meshes" / "arm.stl")
 
 
 @pytest.mark.parametrize(
@@ -213,10 +122,10 @@ def test_packages_of_a_ros_environment_are_found(variable, path, package, tmp_pa
     elsewhere.mkdir()
     file.write_bytes(stl())
     urdf = write(elsewhere, arm("package://arm_description/meshes/my%20arm.stl"))
-    with pytest.raises(RobotError, match=r"package_dirs=\[...\] \(--package-dirs"):
+    with pytest.raises(RobotError, match=r"package_dirs=\[...\] with .*ROS_PACKAGE_PATH"):
         Robot.load(urdf, missing_meshes="error")
     monkeypatch.setenv(variable, path.format(tmp_path))
-    assert str(file) in Robot.load(urdf, strict=True).urdf
+    assert [shape.file for shape in Robot.load(urdf, strict=True).tables.shapes] == [str(file)]
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -275,6 +184,6 @@ def test_robots_of_other_content_differ_in_what_they_say_about_themselves(tmp_pa
     moved = Robot.load(write(tmp_path / "other", one_joint(arm=arm)))
     assert moved.describe() == first.describe(), "equal but for the folder"
     (tmp_path / "m.stl").write_bytes(ascii_stl())
-    assert Robot.load(path).describe()["urdf"] != first.describe()["urdf"]
+    assert Robot.load(path).describe()["content"] != first.describe()["content"]
     for name, value in (("fixed_base", False), ("self_collision", "none")):
         assert Robot.load(path, **{name: value}).describe()[name] == value != first.describe()[name]

@@ -7,11 +7,9 @@ from __future__ import annotations
 import random
 import sys
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
-from lxml import etree
 
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.batch")
@@ -22,9 +20,7 @@ from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
 from batchpid.sim.engine.protocol import SceneSpec  # noqa: E402
 from batchpid.sim.robot.shapes import surfaces  # noqa: E402
-from batchpid.sim.robot.xml import numbers  # noqa: E402
 from batchpid.sim.tuning import gain_set  # noqa: E402
-from batchpid.task_space.rotations import from_rpy, rotate  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
@@ -119,7 +115,7 @@ def spec_of(robot, **options):
         "ground": False,
     } | options
     return SceneSpec(
-        robot.urdf, robot.ignored_pairs, robot.joints, 5e-4, SOLVERS["accurate"], **options
+        robot.tables, robot.ignored_pairs, robot.joints, 5e-4, SOLVERS["accurate"], **options
     )
 
 
@@ -184,34 +180,6 @@ def test_swings_as_in_mujoco(load, engine):
     np.testing.assert_allclose(moved, data.qpos, atol=1e-4)
 
 
-@pytest.mark.slow
-def test_both_engines_agree_and_settle(load):
-    robot = load(ARM)
-    target, ends = np.array([0.2, 0.05, 0.6]), []
-    for engine in ("sapien", "mujoco"):
-        with Runner(robot, num_envs=2, workers=0, engine=engine, substeps=20) as runner:
-            runner.reset()
-            for _ in range(100):
-                observation = runner.step(target)
-        assert observation.ok.all()
-        ends.append(observation.qpos)
-    np.testing.assert_allclose(ends[0], ends[1], atol=1e-4)
-    np.testing.assert_allclose(ends[0], np.tile(target, (2, 1)), atol=2e-2)
-
-
-def shapes_of(robot, link):
-    """Return (tag, attributes, position, rotation) of the collision shapes of a link."""
-    root = etree.fromstring(robot.urdf.encode())
-    for collision in root.findall(f"link[@name='{link}']/collision"):
-        origin, (shape,) = collision.find("origin"), collision.find("geometry")
-        yield (
-            shape.tag,
-            shape.attrib,
-            np.array(numbers(origin, "xyz", "0 0 0", "")),
-            from_rpy(numbers(origin, "rpy", "0 0 0", "")),
-        )
-
-
 # of a geom in directions u (n, 3) in its frame, by type: capsule, ellipsoid, cylinder, box, mesh
 EXTENT = {
     3: lambda u, size, vertices: size[0] + size[1] * np.abs(u[:, 2]),
@@ -257,48 +225,6 @@ def test_shapes_are_where_they_are_in_the_file(load):
     errors = np.abs(reach[0] - reach[1]).max(1)
     assert np.count_nonzero(errors < 1e-6) == 4
     assert errors.max() < 0.03 * 0.05  # the ellipsoid's
-
-
-def read_obj(path):
-    """Return the vertices (n, 3) and the corners of the triangles (m, 3, 3) of an OBJ file."""
-    lines = [line.split() for line in Path(path).read_text().splitlines()]
-    vertices, faces = (
-        np.array([line[1:] for line in lines if line[0] == kind], float) for kind in "vf"
-    )
-    return vertices, vertices[faces.astype(int) - 1]
-
-
-def test_a_capsule_has_the_ends_of_the_file(load):
-    ((tag, size, place, turn),) = shapes_of(
-        load(ARM), "upper"
-    )  # not the sphere, which is only drawn
-    half = float(size["length"]) / 2 * rotate(turn, np.array([0.0, 0.0, 1.0]))
-    anchor = np.array([0.02, 0, -0.03])  # the link's origin
-    assert (tag, size["radius"]) == ("capsule", "0.03")
-    ends = sorted((anchor + place + sign * half).tolist() for sign in (1, -1))
-    np.testing.assert_allclose(ends, [[0, 0, 0], [0.3, 0, 0.1]], atol=1e-12)
-
-
-def test_a_mesh_is_its_convex_hull(load, hulls):
-    ((tag, attributes, place, turn),) = shapes_of(load(ARM), "fore")
-    vertices, corners = read_obj(attributes["filename"])
-    placed = rotate(turn, vertices) + place - [0.1, 0, 0]
-    expected = [[0, 0, 0], [0, 0, 0.2], [0, 0.1, 0], [0.1, 0, 0]]  # without the vertex inside
-    np.testing.assert_allclose(sorted(placed.round(6).tolist()), expected, atol=1e-6)
-    assert tag == "mesh"
-    assert Path(attributes["filename"]) in hulls.iterdir()
-    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert (np.einsum("ij,ij->i", outward, corners[:, 0] - vertices.mean(0)) > 0).all()
-
-
-def test_an_ellipsoid_is_inscribed(load):
-    (shape,) = shapes_of(load(ARM), "hand")
-    vertices, corners = (each / [0.02, 0.03, 0.05] for each in read_obj(shape[1]["filename"]))
-    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, atol=1e-6)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    distances = np.einsum("ij,ij->i", normals, corners[:, 0]) / np.linalg.norm(normals, axis=1)
-    assert distances.min() > 0.97
-    assert distances.max() < 1
 
 
 def test_pairs_that_do_not_collide(load):
@@ -799,7 +725,7 @@ def test_a_default_namespace_changes_nothing(load, tmp_path):
         load(text),
         load(text.replace("<mujoco ", '<mujoco xmlns="http://mujoco.org/mjcf" ')),
     )
-    assert (named.urdf, named.repairs) == (plain.urdf, plain.repairs)
+    assert (named.tables, named.repairs) == (plain.tables, plain.repairs)
     assert [each.link for each in surfaces(named)] == [each.link for each in surfaces(plain)]
 
 

@@ -227,14 +227,6 @@ def test_targets_of_velocity_have_a_range(load):
     )
 
 
-def test_a_motor_has_the_narrower_limit(load):
-    robot = load(
-        '<motor joint="j" gear="2" ctrlrange="-3 3" forcerange="-5 5"/><motor joint="k"'
-        ' forcerange="-1 1"/>'
-    )
-    np.testing.assert_array_equal(robot.effort_limit, [6, 1])
-
-
 def test_an_actuator_of_another_object_is_named(load):
     held = '<body name="lid"><joint name="hinge"/><geom size=".1"/></body>'
     robot = load('<motor joint="hinge"/><motor joint="j"/>', beside=held)

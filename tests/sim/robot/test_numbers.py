@@ -102,7 +102,7 @@ def test_a_decimal_comma_is_read_and_quoted(at, key, tmp_path):
     )
     said = f"{written!r}> is read with points in place of decimal commas"
     assert any(said in each.text for each in loaded.repairs) == ("," in written)
-    assert loaded.urdf == whole.urdf
+    assert loaded.tables == whole.tables
     assert loaded.joints == whole.joints
 
 

@@ -159,14 +159,8 @@ def test_a_base_that_is_fixed_too_low_has_no_ground(tmp_path):
         assert runner.options.ground
 
 
-def test_an_effortless_robot_that_overlaps_at_rest_stays_there(tmp_path):
-    loaded = Robot.load(write(tmp_path, sliders(0.0, 0.1)))
-    with Runner(loaded, 1, workers=0, control="effort", substeps=200) as runner:
-        np.testing.assert_allclose(runner.step(np.zeros((1, 2))).qpos, 0.0, atol=1e-6)
-
-
 def spec_of(loaded):
-    return SceneSpec(loaded.urdf, loaded.ignored_pairs, loaded.joints, 1e-3, None, ground=False)
+    return SceneSpec(loaded.tables, loaded.ignored_pairs, loaded.joints, 1e-3, None, ground=False)
 
 
 @given(st.integers(0, 2**32))

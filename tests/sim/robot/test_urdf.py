@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import re
 from itertools import pairwise
 
@@ -10,12 +9,11 @@ import numpy as np
 import pytest
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
-from batchpid.errors import BatchPIDError, RobotError, RobotNotFoundError
+from batchpid.errors import RobotError, RobotNotFoundError
 from batchpid.sim import Robot, Runner, to_mjcf, to_urdf
 
 BASE, ARM, TIP = link("base"), link("arm"), link("tip")
 HINGE = joint("hinge", "base", "arm")
-MESH = '<collision><geometry><mesh filename="{}"/></geometry></collision>'
 
 BAD = {
     "malformed": ("<robot name='x'><link", "not well-formed XML.*correct the file"),
@@ -145,16 +143,9 @@ def test_parts_that_sapien_needs_are_added_and_those_that_it_does_not_need_are_r
             robot(*parts, *joints, fixed, default, "<transmission/>", "<sensor><camera/></sensor>"),
         )
     )
-    assert [link.inertial for link in odd.links] == [True] * 4
+    assert all(link.mass for link in odd.links)
     with Runner(odd, 1, workers=0, params=odd.params(kp=1.0), ground=False) as runner:
         assert runner.step([0.1, 0.1]).ok.all()
-
-
-def test_a_binary_file_is_refused(tmp_path):
-    path = tmp_path / "test.urdf"
-    path.write_bytes(bytes(range(256)) * 10)
-    with pytest.raises(RobotError, match="not well-formed"):
-        Robot.load(path)
 
 
 BOMB = "<!DOCTYPE robot [<!ENTITY a0 'ha'>{}]>".format(
@@ -198,21 +189,7 @@ def test_an_xinclude_is_not_followed(tmp_path):
         '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd" parse="text"/>'
     )
     loaded = Robot.load(write(tmp_path, robot(BASE, ARM, HINGE, include)))
-    assert "root:" not in loaded.urdf
-
-
-def test_joints_are_in_the_order_of_sapien(tmp_path):
-    random_tree = random.Random(0)
-    for _ in range(5):
-        links, joints = ["l0"], []
-        for number in range(1, 14):
-            kind = random_tree.choice(["revolute", "prismatic", "continuous", "fixed"])
-            joints.append(joint(f"j{number}", random_tree.choice(links), f"l{number}", kind))
-            links.append(f"l{number}")
-        random_tree.shuffle(joints)
-        tree = Robot.load(write(tmp_path, robot(*map(link, links), *joints)))
-        with Runner(tree, 1, workers=0, params=tree.params(kp=1.0), ground=False):
-            pass  # building the scene compares the orders
+    assert "root:" not in to_urdf(loaded).text
 
 
 @pytest.mark.parametrize(("multiplier", "offset"), [(1, 0), (-1, 0), (2, 0), (1, 0.1)])
@@ -259,43 +236,6 @@ def test_building_writes_no_file(tmp_path, monkeypatch):
     assert named.srdf is not None
     with Runner(named, 1, workers=0, params=named.params(kp=1.0), ground=False):
         pass
-
-
-def test_missing_meshes_can_be_skipped(tmp_path):
-    path = write(tmp_path, one_joint(arm=INERTIAL + MESH.format("no.stl")))
-    loaded = Robot.load(path)
-    (finding,) = (each for each in loaded.check() if each.code == "missing-mesh")
-    assert finding.text.endswith(": no.stl")
-    with pytest.raises(
-        RobotError, match=r"needs 1 repair, which strict=True refuses:\n  robot: .*no\.stl"
-    ):
-        Robot.load(path, strict=True)
-    with pytest.raises(
-        RobotError, match=r"not readable: no\.stl.*package_dirs.*missing_meshes='skip'"
-    ):
-        Robot.load(path, missing_meshes="error")
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"name_or_path": 3},
-        {"name_or_path": None},
-        {"name_or_path": b"panda"},
-        {"name_or_path": "panda\0"},
-        {"name_or_path": ""},
-        {"name_or_path": "panda", "package_dirs": "folder"},
-        {"name_or_path": "panda", "missing_meshes": "ignore"},
-        {"name_or_path": "panda", "dissipation": None},
-        {"name_or_path": "panda", "package_dirs": 3},
-        {"name_or_path": "panda", "package_dirs": [None]},
-        {"name_or_path": "panda", "fixed_base": "yes"},
-        {"name_or_path": "panda", "strict": "yes"},
-    ],
-)
-def test_invalid_options_of_load_raise(options):
-    with pytest.raises(BatchPIDError):
-        Robot.load(**options)
 
 
 @pytest.mark.parametrize(

@@ -8,17 +8,14 @@ import warnings
 
 import numpy as np
 import pytest
+from osc_arms import START, six
 from robots import load_bundled
-from tiny_urdf import joint, link, robot, write
 
-import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.sim import OperationalSpace, Robot, Runner, StabilityWarning
-from tests.sim.engine.test_coupled_joints import arm as coupled_arm
 
 HAND = "panda_hand"
-START = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02])
 OPTIONS = {"workers": 0, "timestep": 1 / 500, "substeps": 5}
 
 
@@ -27,38 +24,9 @@ def panda():
     return load_bundled("panda")
 
 
-def six(folder, dynamics=""):
-    """Return an arm of six joints: yaw, pitch, pitch, roll, pitch, roll."""
-    inertial = (
-        '<inertial><origin xyz="0 0 0.15"/><mass value="2"/>'
-        '<inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/></inertial>'
-    )
-    limit = f'<limit lower="-3" upper="3" effort="150" velocity="5"/>{dynamics}'
-    parts, axes = [link("l0", inertial)], ("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1")
-    for number, axis in enumerate(axes, 1):
-        one = joint(f"j{number}", f"l{number - 1}", f"l{number}", inner=limit, origin="0 0 0.3")
-        parts += [link(f"l{number}", inertial), one.replace("0 1 0", axis)]
-    return Robot.load(write(folder, robot(*parts)))
-
-
 @pytest.fixture(scope="module")
 def six_joints(tmp_path_factory):
     return six(tmp_path_factory.mktemp("arm"))
-
-
-@pytest.fixture(scope="module")
-def damped(tmp_path_factory):
-    return six(tmp_path_factory.mktemp("arm"), '<dynamics damping="8"/>')
-
-
-@pytest.fixture(scope="module")
-def coupled(tmp_path_factory):
-    return coupled_arm(tmp_path_factory.mktemp("arm"), -0.5, 0.01, joints=6)
-
-
-@pytest.fixture(scope="module")
-def with_friction(tmp_path_factory):
-    return six(tmp_path_factory.mktemp("arm"), '<dynamics damping="8" friction="2"/>')
 
 
 def pose_of(of, qpos, name):
@@ -70,10 +38,6 @@ def pose_of(of, qpos, name):
     [
         ("panda", "sapien"),
         ("six_joints", "mujoco"),
-        *(
-            pytest.param("with_friction", engine, marks=pytest.mark.slow)
-            for engine in ("sapien", "mujoco")
-        ),
     ],
 )
 def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
@@ -115,32 +79,6 @@ def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
     assert np.abs((found[..., 3:] * at[3:]).sum(-1)).min() > 1 - 1e-5
 
 
-def test_results_do_not_depend_on_workers_and_a_snapshot_goes_on(panda):
-    starts = START + 0.1 * np.random.default_rng(0).normal(size=(5, 9)) * (np.arange(9) < 7)
-    goals = pose_of(panda, starts, HAND)
-    goals[:, 0] += 0.05
-    goals[1, :3] = [0.9, 0.3, 0.9]  # out of reach: near a singularity
-    control = OperationalSpace(panda, HAND)
-    assert "panda_hand" in repr(control)
-    courses = []
-    for workers in (0, 2):
-        with Runner(panda, 5, control=control, **OPTIONS | {"workers": workers}) as runner:
-            runner.reset(starts)
-            courses.append(runner.rollout(np.broadcast_to(goals, (20, 5, 7))))
-            if workers == 0:
-                kept = runner.snapshot()
-                first = runner.rollout(np.broadcast_to(goals, (5, 5, 7)))
-                runner.restore(kept)
-                again = runner.rollout(np.broadcast_to(goals, (5, 5, 7)))
-    with Runner(panda, 1, control=control, **OPTIONS) as runner:
-        runner.reset(starts[2:3])
-        alone = runner.rollout(np.broadcast_to(goals[2:3], (20, 1, 7)))
-    for name in ("qpos", "qvel", "effort"):
-        np.testing.assert_array_equal(getattr(courses[0], name), getattr(courses[1], name))
-        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
-        np.testing.assert_array_equal(getattr(alone, name)[:, 0], getattr(courses[0], name)[:, 2])
-
-
 def test_quaternions_have_any_length_but_zero_and_fingers_their_setpoint(panda):
     control = OperationalSpace(panda, HAND, joints=["panda_finger_joint2"], posture_stiffness=400.0)
     assert control.command.labels[7:] == ("panda_finger_joint2 [m]",)
@@ -156,36 +94,6 @@ def test_quaternions_have_any_length_but_zero_and_fingers_their_setpoint(panda):
     np.testing.assert_array_equal(rollout.qpos[:, 0], rollout.qpos[:, 3])
     np.testing.assert_allclose(rollout.qpos[:, 1], rollout.qpos[:, 0], atol=1e-6)
     np.testing.assert_allclose(rollout.qpos[-1, 0, 7:], [panda.start[7], 0.035], atol=1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("quick_compilation")
-def test_xla_computes_the_same(six_joints):
-    start = np.array([0.3, 0.4, 0.9, 0.2, 0.7, 0.1])
-    control = OperationalSpace(six_joints, "l6", twist=True)
-    setpoint = (
-        np.concatenate([pose_of(six_joints, start, "l6"), np.zeros(6)]) + np.eye(13)[1] * 0.02
-    )
-    ends = []
-    for backend in ("numpy", "jax"):
-        with Runner(six_joints, 1, control=control, backend=backend, **OPTIONS) as runner:
-            runner.reset(start)
-            ends.append(runner.rollout(np.broadcast_to(setpoint, (10, 13))).qpos[-1])
-    assert np.abs(ends[0] - start).max() > 1e-3
-    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
-
-
-def test_later_writes_to_params_have_no_effect(panda):
-    params = ts.make_osc_params(panda.kinematic_tree(), effort_limit=panda.effort_limit)
-    own = params._replace(stiffness=np.array(params.stiffness))
-    control = OperationalSpace(panda, "panda_hand", params=own)
-    target = np.add(control.command.neutral, 0.02)
-    with Runner(panda, 1, control=control, workers=0) as runner:
-        effort = runner.step(target).effort
-        own.stiffness[:] = 1.0
-        runner.reset()
-        again = runner.step(target).effort
-    np.testing.assert_array_equal(effort, again)
 
 
 def test_a_tool_has_a_point_and_the_neutral_setpoint_is_its_pose(panda):
@@ -209,20 +117,12 @@ def test_a_tool_has_a_point_and_the_neutral_setpoint_is_its_pose(panda):
         ("point", {"point": [1.0, 2.0]}),
         ("posture", {"posture": np.full(9, np.nan)}),
         ("stifness", {"stifness": 1.0}),
-        ("tool", {"control": "osc", "tool": "hand"}),
-        ("tool", {"tool": HAND}),  # is for control "osc"
-        ("control", {"control": "ocs"}),
     ],
 )
 def test_arguments_are_checked(panda, argument, options):
-    of_runner = {"control", "tool"} & options.keys()
     with pytest.raises(InvalidArgumentError) as caught:
-        (
-            Runner(panda, 1, workers=0, **options)
-            if of_runner
-            else OperationalSpace(panda, **{"link": HAND} | options)
-        )
-    assert caught.value.argument in (argument, "link" if "tool" in options else argument)
+        OperationalSpace(panda, **{"link": HAND} | options)
+    assert caught.value.argument == argument
 
 
 def test_gains_that_the_time_step_makes_unstable_are_a_warning_unless_implicit(panda):
@@ -310,99 +210,6 @@ class Called(OperationalSpace):
     """The same controller, called by Python at every sim step."""
 
 
-LOOPS = {
-    "default": {},
-    "with parts": {
-        "twist": True,
-        "acceleration": True,
-        "wrench": True,
-        "joints": ["panda_finger_joint1"],
-    },
-    "integral": {
-        "integral_gain": 20.0,
-        "integral_limit": 5.0,
-        "limit_margin": 0.2,
-        "frame": "tool",
-    },
-    "implicit": {"discretization": "implicit", "point": [0.0, 0.0, 0.1]},
-}
-MORE = [
-    {"compensate": "gravity"},
-    {"compensate": "none"},
-    {"actuators": bp.make_actuators(9, command_delay=0.001, effort_limit=60.0)},
-    {
-        "actuators": bp.make_actuators(
-            9, sensor_delay=0.001, position_noise=1e-4, velocity_noise=1e-3
-        )
-    },
-    {"arm": "damped", "link": "l6"},
-    {"arm": "with_friction", "link": "l6", "compensate": "gravity+coriolis"},
-    {"arm": "with_friction", "link": "l6"},
-    {
-        "compensate": "gravity+coriolis+friction",
-        "actuators": bp.make_actuators(9, coulomb=0.3, viscous=0.1),
-    },
-    {"feedforward": 3.0},
-    {"feedforward": 3.0, "compensate": "none"},
-    {"feedforward": 3.0, "arm": "coupled", "link": "l5"},
-]
-
-
-ALL = [*((case, {}) for case in LOOPS), *(("default", more) for more in MORE)]
-
-
-@pytest.mark.quick_rows(4)
-@pytest.mark.parametrize(
-    ("engine", "case", "more"),
-    [
-        *(("sapien", *each) for each in (ALL[0], *ALL[7:])),
-        *(pytest.param("sapien", *each, marks=pytest.mark.slow) for each in ALL[1:7]),
-        *(("mujoco", *each) for each in (ALL[2], ALL[3], ALL[6], ALL[7], ALL[9])),
-    ],
-)
-@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
-def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(
-    request, engine, case, more
-):
-    """Also with resets, an env that fails, a snapshot and setpoints that change."""
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
-    options, seen = {"substeps": 10, "workers": 0, "engine": engine, **more}, []
-    arm, link = request.getfixturevalue(options.pop("arm", "panda")), options.pop("link", HAND)
-    noise = 0.05 * np.random.default_rng(0).normal(size=(5, 9)) * (np.arange(9) < 7)
-    starts = arm.coupled(np.clip((START + noise)[:, : arm.dof], arm.lower, arm.upper))
-    forward = options.pop("feedforward", 0.0) * np.random.default_rng(2).normal(
-        size=(6, 5, arm.dof)
-    )
-    for kind in (OperationalSpace, Called):
-        control = kind(arm, link, **LOOPS[case])
-        rng, size = np.random.default_rng(1), control.command.size
-        goals = np.tile(control.command.neutral, (6, 5, 1))
-        goals[..., :3] += 0.05 * rng.normal(size=(6, 5, 3))
-        goals[3:, ..., 7:] += 0.05 * np.abs(rng.normal(size=(3, 5, size - 7)))
-        with Runner(arm, 5, control=control, **options) as runner:
-            runner.reset(starts)
-            parts = [runner.rollout(goals[:2], feedforwards=forward[:2] if forward.any() else None)]
-            runner.reset(starts, mask=np.arange(5) == 2)
-            snapshot = runner.snapshot()
-            parts.append(
-                runner.rollout(goals[2:], feedforwards=forward[2:] if forward.any() else None)
-            )
-            runner.restore(snapshot)
-            goals[0, 3, 3:7] = 0.0  # a quaternion without direction
-            parts.append(runner.rollout(goals))
-            seen.append(
-                [
-                    leaf
-                    for part in parts
-                    for leaf in (part.qpos, part.qvel, part.effort, part.saturated, part.ok)
-                ]
-            )
-    for native, called in zip(*seen, strict=True):
-        np.testing.assert_array_equal(native, called)
-    assert np.flatnonzero(~seen[0][-1].all(0)).tolist() == [3]
-
-
 @pytest.mark.parametrize("kind", [OperationalSpace, Called])
 @pytest.mark.parametrize("backend", ["numpy", pytest.param("jax", marks=pytest.mark.slow)])
 def test_joints_with_limited_efforts_are_reported(panda, kind, backend):
@@ -419,20 +226,3 @@ def test_joints_with_limited_efforts_are_reported(panda, kind, backend):
     assert not rollout.saturated[:, 0].any()
     assert rollout.saturated[0, 1, :7].any()
     assert not rollout.saturated[0, 1, 7:].any()
-
-
-@pytest.mark.parametrize("twist", [False, True])
-def test_native_friction_is_that_of_numpy(with_friction, twist, monkeypatch):
-    control = OperationalSpace(with_friction, "l6", twist=twist).in_runner(1 / 2000, "friction")
-    rng, rows = np.random.default_rng(0), 9
-    qpos, qvel, passive = rng.normal(size=(3, rows, with_friction.dof))
-    setpoint = np.tile(control.command.neutral, (rows, 1)) + 0.1 * rng.normal(
-        size=(rows, control.command.size)
-    )
-    state, efforts = control.init(with_friction, rows), []
-    for switch in ("1", "0"):
-        monkeypatch.setenv("BATCHPID_NATIVE", switch)
-        efforts.append(control(state, setpoint, qpos, qvel, passive)[1])
-    np.testing.assert_allclose(*efforts, rtol=1e-9, atol=1e-9)
-    idle = OperationalSpace(with_friction, "l6", twist=twist).in_runner(1 / 2000, "none")
-    assert np.abs(efforts[0] - idle(state, setpoint, qpos, qvel, passive)[1]).max() > 1.0

@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from osc_arms import START, six
 from robots import load_bundled
 
 import batchpid.task_space as ts
 from batchpid.sim import OperationalSpace, Runner
-from tests.sim.tool_space.test_osc_controller import START, six
 
 DT = 1 / 2000
 OUT, STOPS, BACK, END = 0.6, 1.0, 2.6, 4.4

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from batchpid import make_actuators
 from batchpid.sim import Randomization, Uniform
-from batchpid.sim.tuning import Weights, random_moves, tune
+from batchpid.sim.tuning import Weights, random_moves
 from batchpid.sim.tuning.candidates import (
     FASTEST,
     PHASE_MARGIN,
@@ -85,17 +85,3 @@ def test_delay_of_the_loop_is_that_of_the_latest_joint_and_draw(panda):
     assert loop_delay(late, None, 0.002) == pytest.approx(0.016)
     assert loop_delay(late, drawn, 0.002) == pytest.approx(0.036)
     assert loop_delay(panda, drawn, 0.0) == pytest.approx(0.02)
-
-
-@pytest.mark.slow
-def test_first_generation_of_robots_that_differ_are_designs_for_their_delay(panda):
-    late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
-    options = {"moves": random_moves(panda, 1, 0), "workers": 0, "seconds": 0.2, "population": 4}
-    found = tune(late, generations=1, **options)
-    own = 1 / 2000 + float(np.max(found.start_params.derivative_filter_time))
-    designs = [*first_gains(0.003 + own)[:3]]
-    gains = np.array([leaf[0, 0] for leaf in (found.params.ki, found.params.kp, found.params.kd)])
-    assert (
-        min(np.abs(gains / design - 1).max() for design in designs) < 1e-9
-        or found.cost == found.start_cost
-    )

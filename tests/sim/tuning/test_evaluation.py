@@ -79,74 +79,13 @@ def test_shipped_gains_meet_the_demands_on_moves_that_the_search_did_not_see(nam
     moves = tutorial_move(robot) + random_moves(robot, 8, seed=11)
     evaluation = evaluate_gains(robot, robot.tuned(), moves, workers=0)
     assert evaluation.rollout.ok.all()
-    assert not evaluation.shortfalls(arm_joints(robot))
-
-
-def test_shortfalls_of_the_tutorials_gains_are_listed(panda):
-    evaluation = evaluate_gains(panda, panda.params(), tutorial_move(panda), workers=0)
-    shortfalls = evaluation.shortfalls(arm_joints(panda))
-    assert shortfalls
-    assert "settling time of move 'tutorial'" in "".join(shortfalls)
-
-
-@pytest.mark.slow
-def test_evaluations_are_ordered_by_the_moves_that_fall_short(panda):
-    moves, arm = random_moves(panda, 2, seed=4), arm_joints(panda)
-    tuned, weak = (
-        evaluate_gains(panda, params, moves, workers=0, seconds=1.5)
-        for params in (panda.tuned(), panda.params(kp=1.0, ki=0.0, kd=0.1))
-    )
-    assert weak.drawback(tuned, arm)
-    assert tuned.drawback(weak, arm) is None
-    assert tuned.drawback(tuned, arm) is None
-    assert max(np.max(figure) for figure in weak.demands(arm).values()) > 1
-    assert weak.drawback(tuned, np.zeros(panda.dof, bool)) is None  # no joint, no demand
-
-
-def test_a_drawback_names_the_criterion_that_decides_and_both_figures(panda):
-    moves, arm = random_moves(panda, 2, seed=4), np.ones(panda.dof, bool)
-    good = evaluate_gains(panda, panda.tuned(), moves, workers=0, seconds=0.05, name="designed")
-    zeros = np.zeros((2, panda.dof))
-
-    def performing(name, settling, overshoot):
-        figures = {
-            "settling_time": zeros + settling,
-            "steady_state_error": zeros,
-            "overshoot": zeros.copy(),
-        }
-        figures["overshoot"][:, 3] = overshoot
-        metrics = good.metrics._replace(**figures)
-        return good._replace(name=name, metrics=metrics, chatter=zeros, settling_limit=np.ones(2))
-
-    designed = performing("designed", 0.5, [0, 0.1])
-    for settling, overshoot, text in (
-        (3.0, [0, 0], "moves that settle too late: tuned 2 of 2, designed 0 of 2"),
-        (0.5, [0.1, 0.1], "moves that miss a demand: tuned 2 of 2, designed 1 of 2"),
-        (0.5, [0.2, 0], "largest excess over a demand: tuned overshoot of move"),
-    ):
-        assert performing("tuned", settling, overshoot).drawback(designed, arm).startswith(text)
-    last = performing("tuned", 0.5, [0.2, 0]).drawback(designed, arm)
-    assert last.count("joint 'panda_joint4': 4.00 x limit, designed overshoot of move") == 1
-    assert last.endswith("joint 'panda_joint4': 2.00 x limit")
-
-
-@pytest.mark.slow
-def test_a_randomization_draws_the_same_at_every_evaluation_and_for_any_number_of_workers(panda):
-    moves = random_moves(panda, 2, 2)
-    drawn, actuators = (
-        Randomization(payload=Uniform(0, 1)),
-        bp.make_actuators(panda.dof, command_delay=5e-4),
-    )
-    plain, *varied = (
-        evaluate_gains(panda, panda.designed(), moves, seconds=0.15, workers=workers, **options)
-        for workers, options in (
-            (0, {}),
-            (0, {"randomization": drawn, "actuators": actuators}),
-            (2, {"randomization": drawn, "actuators": actuators}),
-        )
-    )
-    assert varied[0].rollout.qpos.tobytes() == varied[1].rollout.qpos.tobytes()
-    assert np.abs(varied[0].rollout.qpos - plain.rollout.qpos).max() > 1e-3
+    arm = arm_joints(robot)
+    metrics = evaluation.metrics
+    slowest = np.nan_to_num(metrics.settling_time[:, arm], nan=0.0, posinf=np.inf).max(1)
+    assert (slowest <= evaluation.settling_limit).all()
+    assert np.nanmax(metrics.overshoot[:, arm]) <= 0.05
+    assert np.nanmax(metrics.steady_state_error[:, arm]) <= 1e-3
+    assert np.nanmax(evaluation.chatter[:, arm]) <= 2
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ def test_names_stand_for_the_robots_own_gains(panda):
     for name, params in (
         ("tuned", panda.tuned()),
         ("designed", panda.designed()),
-        ("tutorial", panda.params()),
+        ("sapien-tutorial", panda.params()),
     ):
         gains = gain_set(panda, name)
         assert (gains.name, gains.control) == (name, "pid")

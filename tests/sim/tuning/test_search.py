@@ -11,7 +11,7 @@ from robots import load_bundled
 
 from batchpid import make_actuators
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Randomization, Runner, Uniform
+from batchpid.sim import Randomization, Uniform
 from batchpid.sim.tuning import (
     Weights,
     arm_joints,
@@ -61,24 +61,6 @@ def test_same_seed_gives_bit_identical_gains_for_any_number_of_workers(few_moves
         *sorted(cost for row in found.history for cost in row)[:3],
         found.start_cost,
     ]
-
-
-@pytest.mark.slow
-def test_robots_touch_things_in_the_final_and_where_the_moves_are_given(
-    panda, few_moves, monkeypatch
-):
-    options = []
-
-    def runner(*args, **kwargs):
-        options.append((kwargs.get("collisions", True), kwargs.get("physics")))
-        return Runner(*args, **kwargs)
-
-    monkeypatch.setattr("batchpid.sim.tuning.candidates.Runner", runner)
-    tune(panda, workers=0, physics="fast", **SMALL)
-    assert options == [(False, "fast"), (True, "fast")]
-    options.clear()
-    tune(panda, moves=random_moves(panda, 1, 0), workers=0, physics="fast", **SMALL)
-    assert options == [(True, "fast")]
 
 
 def test_cost_is_linear_in_the_weight_of_the_following_error():
@@ -140,18 +122,6 @@ def test_moves_are_made_with_different_motors_of_which_the_worst_counts():
 
 
 @pytest.mark.slow
-def test_randomization_and_actuators_make_another_search(panda):
-    moves, drawn = random_moves(panda, 1, 0), Randomization(payload=Uniform(0, 1))
-    late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
-    plain, varied, late = (
-        tune(robot, moves=moves, workers=0, randomization=randomization, **SMALL)
-        for robot, randomization in ((panda, None), (panda, drawn), (late, None))
-    )
-    assert len({plain.history, varied.history, late.history}) == 3
-    assert varied.settings["randomization"] == drawn.to_dict()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "least"), [("panda", 19), ("jaco2", 17)])
 def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(name, least):
     robot = load_bundled(name)
@@ -164,8 +134,9 @@ def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(
     judged = evaluate_gains(
         robot, found.params, moves, randomization=dataclasses.replace(payload, seed=1)
     )
-    late = judged.demands(arm_joints(robot))["settling time"].max(1) > 1
-    assert len(late) - late.sum() >= least
+    settling = judged.metrics.settling_time[:, arm_joints(robot)]
+    slowest = np.nan_to_num(settling, nan=0.0, posinf=np.inf).max(1)
+    assert (slowest <= judged.settling_limit).sum() >= least
 
 
 @pytest.mark.slow
@@ -179,11 +150,6 @@ def test_gains_of_the_search_follow_unseen_motions_more_closely_than_designed_on
     arm = arm_joints(panda)
     assert tuned.following_error[:, arm].max() < 0.8 * designed.following_error[:, arm].max()
     assert tuned.metrics.settling_time[:, arm].max() <= designed.metrics.settling_time[:, arm].max()
-
-
-def test_time_limit_ends_the_search_after_a_generation():
-    found = tune(ARM, moves=random_moves(ARM, 1, 0), workers=0, time_limit=0.0, **SMALL)
-    assert len(found.history) == found.settings["generations"] == 1
 
 
 @pytest.mark.parametrize("weight", [float("nan"), float("inf"), -1.0])

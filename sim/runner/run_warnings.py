@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import batchpid as bp
 from batchpid.checks.warn import warn
+from batchpid.sim.diagnosis.loop_stability import StabilityCheck
+from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
-from batchpid.sim.options import RunnerOptions
-from batchpid.sim.robot.loop_stability import StabilityCheck
-from batchpid.sim.robot.run_checks import MovingSetpointCheck, SetpointCheck
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContactLog, MissedContactWarning
 from batchpid.sim.workers.pool import RecoveryWarning
@@ -47,19 +47,16 @@ class RunWarnings:
         """Watch the next ticks for what these gains may lead to."""
         if self._moving is not None:
             self._moving.set_params(params)
-        self._update()
+            self.is_watching = self._moving.is_watching
 
     def see(self, command: Command, num_ticks: int, seconds: float) -> None:
         """Look at the first ticks of a command (ticks, envs, ...), of ``seconds`` each, and warn of
         what is found.
         """
         if self._moving is not None:
-            self._moving.see(
-                command.setpoint[:num_ticks], command.setpoint_rate is not None, seconds
-            )
-            if self._moving.found is not None:
-                self._moving.warn()
-                self._update()
+            rated = command.setpoint_rate is not None
+            self._moving.see(command.setpoint[:num_ticks], rated, seconds)
+            self.is_watching = self._moving.is_watching
 
     def issue(self, faults: FaultLog, contacts: MissedContactLog | None, lost: list[str]) -> None:
         """Warn of lost workers (the messages ``lost``, which are removed), faults and missed
@@ -74,6 +71,3 @@ class RunWarnings:
         if contacts is not None and contacts.contacts and not self._has_warned_of_contact:
             self._has_warned_of_contact = True
             warn(contacts.message(), MissedContactWarning)
-
-    def _update(self) -> None:
-        self.is_watching = self._moving is not None and self._moving.is_watching

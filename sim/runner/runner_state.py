@@ -9,7 +9,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.loop.faults import FaultLog
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.workers.contact_log import MissedContactLog
 

@@ -30,30 +30,17 @@ class StabilityReport(NamedTuple):
     """Share of the stability range that the gains use at one pose.
 
     ``robot_ratio``: 1 is the bound; ``participation`` (dof,): share of each joint in the mode that
-        is the first to
-    become unstable; a follower has its leader's.
+    is the first to become unstable; a follower has its leader's.
     """
 
     robot_ratio: float
     participation: Float64
     env: int
     """Env of the params and actuators that is the least stable."""
-    late: bool
-    """True if efforts or measurements are late."""
-
-    @property
-    def effect(self) -> str:
-        """Motion of a robot beyond the bound."""
-        if self.late:
-            return "with motors as late as these the joint oscillates or diverges"
-        return "efforts alternate from step to step, and the joint chatters or diverges"
-
-    @property
-    def remedy(self) -> str:
-        """Gains that would be stable."""
-        if np.isinf(self.robot_ratio):
-            return "use a kd that is larger than kp times the delay and lag"
-        return f"use at most {0.5 / self.robot_ratio:.1g} times these gains"
+    effect: str
+    """Motion of a robot beyond the bound."""
+    remedy: str
+    """Gains that would be stable, and other ways to make the loop stable."""
 
 
 def _loop(
@@ -69,43 +56,40 @@ def _loop(
     Arrays are (1 or envs, n, ...) of the independent joints. Strength of the motors is part of the
     gains, or of the model.
     """
-    params, motors, coupling = (
-        as_explicit(params, timestep),
-        actuators or bp.Actuators(),
-        robot.coupling,
-    )
+    params = as_explicit(params, timestep)
+    motors = actuators or bp.Actuators()
+    coupling = robot.coupling
 
     def column(leaf: Array, neutral: float = 0.0) -> Float64:
         rows = np.full((1, robot.dof), neutral) if leaf is None else np.asarray(leaf, np.float64)
         return np.broadcast_to(rows, (len(rows), robot.dof))[:, coupling.independent]
 
     def matrix(armature: Array) -> Float64:
-        rows = np.atleast_2d(
-            np.zeros(robot.dof) if armature is None else np.asarray(armature, np.float64)
-        )
-        return coupling.reduced(robot.mass_matrix(qpos) + rows[:, None] * np.eye(robot.dof))
+        rows = np.zeros(robot.dof) if armature is None else np.asarray(armature, np.float64)
+        inertia = np.atleast_2d(rows)[:, None] * np.eye(robot.dof)
+        return coupling.reduced(robot.mass_matrix(qpos) + inertia)
 
     loop: Document = {name: column(getattr(params, name)) for name in ("kp", "ki", "kd")}
-    loop["filter_time"] = column(params.derivative_filter_time)
-    loop |= {
-        "delay": column(motors.command_delay) + column(motors.sensor_delay),
-        "lag": column(motors.lag),
-    }
-    eye, strength = np.eye(loop["kp"].shape[1]), column(motors.strength, 1.0)
+    eye = np.eye(loop["kp"].shape[1])
+    strength = column(motors.strength, 1.0)
     viscous = np.zeros((1, robot.dof)) if motors.viscous is None else motors.viscous
     damping = np.stack([coupling.reduced_damping(robot.damping + row) for row in viscous])
     if params.gain_units is None:
-        loop |= {name: strength * loop[name] for name in ("kp", "ki", "kd")}
-        return loop | {"mass_matrix": matrix(motors.armature), "damping": damping}
-    if actuators is None:  # the law knows the plant
-        return loop | {"mass_matrix": eye[None]}
-    # The law knows the damping, too, as part of its matrix.
-    joints = known_joints(robot)
-    model = matrix(joints.armature) + timestep * eye * coupling.reduced_damping(
-        robot.damping + joints.viscous
-    )
-    plant = matrix(motors.armature) + timestep * eye * damping[:, None]
-    return loop | {"mass_matrix": plant, "model": strength[..., None] * model}
+        loop = {name: strength * gain for name, gain in loop.items()}
+        loop |= {"mass_matrix": matrix(motors.armature), "damping": damping}
+    elif actuators is None:  # the law knows the plant
+        loop["mass_matrix"] = eye[None]
+    else:
+        # The law knows the damping, too, as part of its matrix.
+        joints = known_joints(robot)
+        implicit = coupling.reduced_damping(robot.damping + joints.viscous)
+        model = matrix(joints.armature) + timestep * eye * implicit
+        plant = matrix(motors.armature) + timestep * eye * damping[:, None]
+        loop |= {"mass_matrix": plant, "model": strength[..., None] * model}
+    loop["filter_time"] = column(params.derivative_filter_time)
+    loop["delay"] = column(motors.command_delay) + column(motors.sensor_delay)
+    loop["lag"] = column(motors.lag)
+    return loop
 
 
 def stability_report(
@@ -127,9 +111,20 @@ def stability_report(
     mass_matrix = np.broadcast_to(loop.pop("mass_matrix"), (rows, *loop["kp"].shape[1:] * 2))
     bound = bp.stability_bound(mass_matrix, dt=timestep, **loop)
     worst = int(np.argmax(bound.ratio))
-    is_late = bool(loop["delay"].any() or loop["lag"].any())
+    ratio = float(bound.ratio[worst])
+    effect = "efforts alternate from step to step, and the joint chatters or diverges"
+    remedy = f"use at most {0.5 / ratio:.1g} times these gains" if ratio else ""
+    if np.isinf(ratio):
+        remedy = "use a kd that is larger than kp times the delay and lag"
+    if loop["delay"].any() or loop["lag"].any():
+        effect = "with motors as late as these the joint oscillates or diverges"
+    elif params.gain_units is None:
+        # A drive integrates these gains implicitly, as MuJoCo does with a servo's kv.
+        remedy += ", control='drive'"
+    else:
+        remedy += ", discretization='implicit'"
     shares = robot.coupling.of_all(bound.participation[worst])
-    return StabilityReport(float(bound.ratio[worst]), shares, worst, is_late)
+    return StabilityReport(ratio, shares, worst, effect, f"{remedy} or robot.designed()")
 
 
 def slow_oscillation(
@@ -144,21 +139,9 @@ def slow_oscillation(
     return slowest._replace(participation=robot.coupling.of_all(slowest.participation))
 
 
-def implicit_remedy(params: bp.PIDParams) -> str:
-    """Return the way to act with the gains of ``params`` implicitly, as part of a list of
-    remedies.
-    """
-    if params.gain_units is None:
-        return (
-            "control='drive', which integrates these gains implicitly, as MuJoCo does with a"
-            " servo's kv, "
-        )
-    return "discretization='implicit', "
-
-
 class StabilityWarning(UserWarning):
     """The gains pass the stability bound of the sampled PID loop, see
-    :mod:`batchpid.sim.robot.loop_stability`.
+    :mod:`batchpid.sim.diagnosis.loop_stability`.
 
     The bound holds at the start pose, and counts delays, lag, strength, armature and viscous
     friction of the actuators. It does not count noise and effort limits: beyond the bound, a joint
@@ -171,10 +154,9 @@ MOST = 64
 """Largest number of envs with late motors that are checked one by one; of more, the ends of their
 ranges are.
 """
-_LEAST_STABLE = {
-    name: np.max for name in ("kp", "kd", "command_delay", "sensor_delay", "lag", "strength")
-} | {name: np.min for name in ("derivative_filter_time", "armature", "viscous")}
-"""Ends of the ranges at which a loop is the least stable."""
+_LARGEST = "kp", "kd", "command_delay", "sensor_delay", "lag", "strength"
+_SMALLEST = "derivative_filter_time", "armature", "viscous"
+"""Columns of which the largest or smallest value of all envs makes a loop the least stable."""
 
 
 class StabilityCheck:
@@ -188,46 +170,44 @@ class StabilityCheck:
     """
 
     def __init__(self, robot: RobotDescription, timestep: float) -> None:
-        self._robot, self._timestep = robot, timestep
+        self._robot = robot
+        self._timestep = timestep
         self._has_warned = False
 
     def check(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
         """Warn if ``params`` pass the bound."""
+        if not DISSIPATION[self._robot.dissipation].modelled:
+            return
         motors = None if actuators is None or actuators.is_ideal else actuators
         rows = max(params.num_envs, 1 if motors is None else motors.num_envs)
         if motors is not None and rows > MOST:
             params, motors, rows = _extreme(params), _extreme(motors), 1
-        beyond = False
-        if DISSIPATION[self._robot.dissipation].modelled:
-            try:
-                report = stability_report(
-                    self._robot, params, self._robot.start, self._timestep, motors
-                )
-                beyond = report.robot_ratio >= 1
-            except InvalidArgumentError:  # the robot's mass matrix is not positive definite
-                beyond = False
-        if beyond and not self._has_warned:
+        start = self._robot.start
+        try:
+            report = stability_report(self._robot, params, start, self._timestep, motors)
+        except InvalidArgumentError:  # the robot's mass matrix is not positive definite
+            return
+        is_beyond = report.robot_ratio >= 1
+        if is_beyond and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
             env = f", env {report.env}" if rows > 1 else ""
             warn(
                 f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the"
                 f" sampled PID loop, mostly of joint {joint!r}{env}, at the start pose with a time"
-                f" step of {self._timestep:g} s: {report.effect}; {report.remedy}, a"
-                f" derivative_filter_time, {'' if report.late else implicit_remedy(params)}or"
-                " robot.designed()",
+                f" step of {self._timestep:g} s: {report.effect}; {report.remedy}",
                 StabilityWarning,
             )
-        self._has_warned = beyond
+        self._has_warned = is_beyond
 
 
 def _extreme(record: Any) -> Any:
     """Return params or actuators of one env with the end of the range of all envs that is the least
     stable.
     """
-    leaves = {
-        name: leaf
-        for name, leaf in record._asdict().items()
-        if name in _LEAST_STABLE and leaf is not None
-    }
-    ends = {name: _LEAST_STABLE[name](leaf, 0, keepdims=True) for name, leaf in leaves.items()}
+    ends = {}
+    for names, reduce in ((_LARGEST, np.max), (_SMALLEST, np.min)):
+        for name in names:
+            leaf = getattr(record, name, None)
+            if leaf is not None:
+                ends[name] = reduce(leaf, 0, keepdims=True)
     return record.for_envs(slice(0, 1))._replace(**ends)

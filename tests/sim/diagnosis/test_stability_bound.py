@@ -10,7 +10,7 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.sim import Runner
-from batchpid.sim.robot.loop_stability import stability_report
+from batchpid.sim.diagnosis.loop_stability import stability_report
 
 DT = 1 / 2000
 DIVERGED = 50.0  # rad/s; PhysX stops joints at 100 rad/s

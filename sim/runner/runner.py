@@ -1,6 +1,6 @@
 """Runner: N robots in N headless scenes, stepped by worker processes under one batch controller.
 
-Each method makes an operation of its arguments (:mod:`batchpid.sim.operations`), and
+Each method makes an operation of its arguments (:mod:`batchpid.sim.runner.operations`), and
 :meth:`Runner._execute` runs it.
 
 Longer than 350 lines because the public signatures and their documentation are spelled out for
@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from inspect import Signature, signature
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from time import strftime
@@ -27,13 +28,14 @@ from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.checks.warn import warn
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
 from batchpid.io.versions import package_versions
-from batchpid.sim.command import CommandSpec
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation
-from batchpid.sim.operations import (
+from batchpid.sim.options.groups import DEFAULT_ENGINE
+from batchpid.sim.options.options import KINDS, OPTIONS, RunnerOptions, arguments_of, checked_option
+from batchpid.sim.runner.arguments import count_ticks, read_command
+from batchpid.sim.runner.operations import (
     Operation,
     ReadPoses,
     ReadStateSizes,
@@ -46,17 +48,11 @@ from batchpid.sim.operations import (
     restored,
     snapshot_of,
 )
-from batchpid.sim.options import RunnerOptions
-from batchpid.sim.run_warnings import RunWarnings
-from batchpid.sim.runner_arguments import count_ticks, read_command
-from batchpid.sim.runner_keywords import (
-    DEFAULT_ENGINE,
-    KINDS,
-    OPTIONS,
-    arguments_of,
-    checked_option,
-)
-from batchpid.sim.runner_state import RunnerState
+from batchpid.sim.runner.run_warnings import RunWarnings
+from batchpid.sim.runner.runner_state import RunnerState
+from batchpid.sim.signals.command import CommandSpec
+from batchpid.sim.signals.observation import Observation, empty_observation
+from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
@@ -154,7 +150,7 @@ class Runner(SingleOwner):
         workers = len(self.pids)
         nodes = len(self.nodes)
         where = "closed" if self.closed else f"{workers} workers" if workers else "in this process"
-        further = "".join(f", {name} {value}" for name, value in options.switched.items())
+        further = "" if options.collisions else ", no collisions"
         where = f"{nodes} nodes" if nodes else where
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control"
@@ -451,7 +447,7 @@ class Runner(SingleOwner):
         """
         self._ready("restore")
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
-        restore = restored(self.options, self._state, snapshot, self._read(ReadStateSizes()))
+        restore = restored(self.options, self._state, snapshot, self._state_sizes)
         self._execute(restore)
         self._pool.start_replay_from(restore)
         self._warnings.set_params(self._state.params)
@@ -472,7 +468,8 @@ class Runner(SingleOwner):
         state = self._state
         options = self.options
         draws = None if options.randomization is None else state.draws
-        return options.robot.run_info(
+        return RunInfo.of(
+            options.robot,
             **options.values_for("recording"),
             own_command=options.own_command,
             params=state.params,
@@ -488,6 +485,11 @@ class Runner(SingleOwner):
             ),
             episodes=None if draws is None else draws.episodes.copy(),
         )
+
+    @cached_property
+    def _state_sizes(self) -> list[int]:
+        """Number of values in the engine's state of each env."""
+        return [*chain.from_iterable(self._execute(ReadStateSizes()).results)]
 
     @cached_property
     def _versions(self) -> dict[str, str]:
@@ -742,7 +744,7 @@ class Runner(SingleOwner):
         """
         state = self._state
         snapshot = snapshot_of(self.options, state, self._read(TakeSnapshot()))
-        self._pool.start_replay_from(Restore(snapshot, state.draws))
+        self._pool.start_replay_from(Restore(snapshot.copy(), state.draws))
         return snapshot
 
     def _max_ticks(self) -> int:

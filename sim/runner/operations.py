@@ -19,16 +19,16 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.validate import env_mask
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.custom import initial_state
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
-from batchpid.sim.observation import untouched
-from batchpid.sim.options import IDEAL, RunnerOptions
+from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
-from batchpid.sim.robot.run_checks import SetpointCheck
-from batchpid.sim.runner_arguments import accelerated, base_rows, joint_rows
-from batchpid.sim.runner_state import RunnerState
+from batchpid.sim.runner.arguments import accelerated, base_rows, joint_rows
+from batchpid.sim.runner.runner_state import RunnerState
+from batchpid.sim.signals.observation import untouched
 from batchpid.sim.workers.pool import Outcome
 from batchpid.sim.workers.requests import Request
 
@@ -245,9 +245,6 @@ class ReadStateSizes(Operation):
     def apply(self, loop: Loop) -> list[int]:
         return loop.state_sizes()
 
-    def join(self, results: list[list[int]]) -> list[int]:
-        return [*chain.from_iterable(results)]
-
 
 @dataclass(frozen=True)
 class ReadPoses(Operation):
@@ -278,7 +275,7 @@ def snapshot_of(options: RunnerOptions, state: RunnerState, states: EnvStates) -
         motion = np.stack([last, np.zeros_like(last) if rate is None else rate], axis=1)
     episodes = None if options.randomization is None else state.draws.episodes.copy()
     return Snapshot(
-        options.describe(), state.steps, state.params, states, state.actuators, episodes, motion
+        options.described, state.steps, state.params, states, state.actuators, episodes, motion
     )
 
 
@@ -313,4 +310,4 @@ def restored(
         sensors=untouched(options.num_envs, options.observed),
     )
     snapshot.states.check(fresh, options.command.size, sizes)
-    return Restore(replace(snapshot, params=params, actuators=actuators), draws).copy()
+    return Restore(replace(snapshot.copy(), params=params, actuators=actuators), draws)

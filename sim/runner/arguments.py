@@ -14,13 +14,13 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.checks.validate import array, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.command import POSE_UNITS, TWIST_UNITS
+from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FARTHEST, ORIGIN
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot_model import base_start
-from batchpid.sim.robot.run_checks import SetpointCheck
-from batchpid.sim.runner_state import Motion, RunnerState
+from batchpid.sim.runner.runner_state import Motion, RunnerState
+from batchpid.sim.signals.command import POSE_UNITS, TWIST_UNITS
 
 _SHORTEST = 1e-9
 """Smallest length of a quaternion: a shorter one has large rounding errors."""

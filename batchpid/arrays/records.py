@@ -1,0 +1,293 @@
+"""Records of arrays: named tuples whose fields are declared once, and their constructors.
+
+A record is a class beside a ``NamedTuple``: ``class Guard(Record, GuardFields)``. So it is a pytree
+that JAX knows without registration. A leaf is an array (1 | envs, joints), None (off), or a choice
+without a number (:mod:`batchpid.arrays.choices`). Unit, bounds and neutral value of a field stand
+in its annotation, a :class:`batchpid.arrays.field_tables.Field`; checks, files, randomizations and
+the tables of the guides come from there.
+
+Inside jax.jit, jax.grad and jax.vmap the entries of an array are not known. Of such a traced array
+the shape is checked alone, and it stays a leaf even where it might turn out to be off.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
+from typing import Any, ClassVar, ParamSpec, TypeVar
+
+import numpy as np
+
+from batchpid.arrays.array_types import Array, Document, DType, Rows
+from batchpid.arrays.display import array_summary
+from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.field_tables import Field
+from batchpid.arrays.trees import mapped, parts
+from batchpid.checks.validate import check_keywords, entries, integer, is_traced, names, read_array
+from batchpid.errors import InvalidArgumentError
+
+P = ParamSpec("P")
+R = TypeVar("R", bound="Record")
+T = TypeVar("T")
+MOST_JOINTS = 100_000
+Ends = tuple[Array, Array]
+"""A lower and an upper limit, each None for none."""
+
+
+class Record(tuple[Any, ...]):
+    """Mixin beside a named tuple of leaves: parts, sizes, checks and representation."""
+
+    __slots__ = ()
+    NAME: ClassVar[str] = ""
+    """Name of a record in errors, as in "params"."""
+    FIELDS: ClassVar[Mapping[str, Field]] = {}
+    """Declared fields of numbers, by name."""
+    TABLES: ClassVar[Mapping[str, Field]] = {}
+    """Fields with a table of numbers for each joint, (1 | envs, joints, points)."""
+    WHOLE: ClassVar[tuple[str, ...]] = ()
+    """Leaves with one value for all joints."""
+
+    def options(self) -> Document:
+        """Return the options that are on, as arguments of the constructor that build this record
+        again.
+        """
+        return self.leaves()
+
+    def leaves(self) -> Document:
+        """Return the arrays by name."""
+        return {
+            name: leaf for name, leaf in parts(self).items() if not isinstance(leaf, tuple | None)
+        }
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints; 0 where all fields are off."""
+        shapes = [leaf.shape for name, leaf in self.leaves().items() if name not in self.WHOLE]
+        return int(shapes[0][1]) if shapes else 0
+
+    @property
+    def num_envs(self) -> int:
+        """Number of envs with separate values; 1 where all envs share them."""
+        return max((leaf.shape[0] for leaf in self.leaves().values()), default=1)
+
+    @property
+    def dtype(self) -> DType:
+        """Dtype of the arrays."""
+        return next(leaf.dtype for leaf in self.leaves().values())
+
+    def for_envs(self: R, envs: slice | Rows | Sequence[int]) -> R:
+        """Return the part of some envs (a slice or an index array); shared rows stay shared."""
+        part: R = mapped(lambda leaf: leaf if leaf.shape[0] == 1 else leaf[envs], self)
+        return part
+
+    def for_joints(self: R, joints: Rows | Sequence[int] | slice) -> R:
+        """Return the part of some joints (an index array, a mask or a slice)."""
+        whole = {name: leaf for name, leaf in self.leaves().items() if name in self.WHOLE}
+        part: Any = mapped(lambda leaf: leaf[:, joints], self)
+        chosen: R = part._replace(**whole)
+        return chosen
+
+    def matched_to(self: R, fresh: R) -> R:
+        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the
+        others dropped.
+        """
+        both = zip(self, fresh, strict=True)
+        return type(self)(*(new if new is None or old is None else old for old, new in both))
+
+    def check(self, num_envs: int, joint_names: Sequence[str] | None = None) -> None:
+        """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits
+        by hand.
+
+        A leaf without a declared field may hold any numbers.
+        """
+        joints = self.num_joints if joint_names is None else len(joint_names)
+        shapes = (1, joints), (num_envs, joints)
+        of = f", of {', '.join(joint_names)}" if joint_names else ""
+        for name, leaf in self.leaves().items():
+            if name in self.WHOLE:
+                continue
+            is_table = name in self.TABLES
+            if (leaf.shape[:2] if is_table else leaf.shape) not in shapes:
+                problem = f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}"
+                remedy = f"give one row, or one row per env{of}"
+                raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy=remedy)
+            if not is_traced(leaf):
+                field = self.TABLES.get(name) or self.FIELDS.get(name, Field(low=-math.inf))
+                least = leaf.min(2) if is_table else np.asarray(leaf)
+                field.checked(f"{self.NAME}.{name}", least, joint_names, infinite=True)
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
+
+
+def with_fields(
+    fields: Mapping[str, Field], **choices: str
+) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Decorate a constructor that takes the declared ``fields`` as ``**options``, besides its own
+    arguments.
+
+    Its signature shows the fields, with their defaults, and the ``choices`` with theirs. Other
+    keywords are refused, with the nearest name.
+    """
+    defaults = {name: field.default for name, field in fields.items()} | choices
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        own = inspect.signature(function)
+        shown = [one for one in own.parameters.values() if one.kind is not one.VAR_KEYWORD]
+        shown += [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default)
+            for name, default in defaults.items()
+            if name not in own.parameters
+        ]
+        signature = own.replace(parameters=shown)
+
+        @wraps(function)
+        def build(*args: P.args, **options: P.kwargs) -> T:
+            check_keywords(function.__name__, options, signature.parameters)
+            return function(*args, **options)
+
+        build.__signature__ = signature  # type: ignore[attr-defined]
+        return build
+
+    return decorate
+
+
+class LeafBuilder:
+    """Builder of the leaves of a record, which agree in joints, envs and dtype."""
+
+    def __init__(
+        self,
+        joints: int,
+        joint_names: Sequence[str] | None,
+        dtype: DType = None,
+        values: Iterable[object] = (),
+    ) -> None:
+        """Without a ``dtype``, use the dtype of the traced arrays among ``values``, else
+        float64.
+        """
+        self.joints, self.num_envs = integer("joints", joints, 1, MOST_JOINTS), 1
+        self.names = None if joint_names is None else names("joint_names", joint_names, self.joints)
+        if dtype is None:
+            traced: list[Array] = [value for value in values if is_traced(value)]
+            floats = [value for value in traced if value.dtype.kind == "f"]
+            xp = namespace(*traced)
+            dtype = xp.result_type(*floats) if floats else xp.asarray(0.0).dtype
+        try:
+            self.dtype: DType = np.dtype(dtype)
+        except TypeError:
+            self.dtype = np.dtype(object)
+        if self.dtype not in (np.float32, np.float64):
+            remedy = "use float32 or float64"
+            raise InvalidArgumentError("dtype", "unknown dtype", value=str(dtype), remedy=remedy)
+
+    def array(self, name: str, value: Array, field: Field) -> Array:
+        """Return ``value`` as (1 | envs, joints) with every entry within the bounds of ``field``;
+        None stays.
+        """
+        if value is None:
+            return None
+        with np.errstate(over="ignore"):
+            array = read_array(name, value, traced=True).astype(self.dtype)
+        return field.checked(name, self.rows(name, array), self.names)
+
+    def option(self, name: str, value: Array, field: Field) -> Array:
+        """Return an option's leaf: None where it is neutral on every joint of every env."""
+        array = self.array(name, value, field)
+        return None if is_everywhere(array, field.neutral) else self.freeze(array)
+
+    def options(self, fields: Mapping[str, Field], values: Mapping[str, Array]) -> Document:
+        """Return the leaves of all ``fields``."""
+        return {name: self.option(name, values.get(name), field) for name, field in fields.items()}
+
+    def limits(self, size: str, low: str, high: str, values: Mapping[str, Array]) -> Ends:
+        """Return the leaves of a lower and an upper limit, each None where it is infinite
+        everywhere.
+
+        ``size``, ``low`` and ``high`` name the options of both ends, the lower and the upper one.
+        """
+        end = Field(neutral=math.inf, low=-math.inf)
+        fields = {size: end._replace(low=0.0), low: end, high: end}
+        read = {name: self.array(name, values.get(name), field) for name, field in fields.items()}
+        least, most = checked_ends(read, self.names)
+        least = None if is_everywhere(least, -math.inf) else least
+        return least, None if is_everywhere(most, math.inf) else most
+
+    def mask(self, name: str, value: Array) -> Array:
+        """Return a mask of 1.0 and 0.0, None where it is False everywhere."""
+        if value is None:
+            return None
+        array = self.rows(name, read_array(name, value, "b", traced=True))
+        return None if is_everywhere(array, False) else self.freeze(array.astype(self.dtype))
+
+    def freeze(self, array: Array) -> Array:
+        """Return the leaf in the record's dtype and read-only: records are replaced, not edited."""
+        return array if array is None or is_traced(array) else frozen_array(array, self.dtype)
+
+    def rows(self, name: str, array: Array) -> Array:
+        """Return a scalar, (joints,) or (envs, joints) as (1 | envs, joints)."""
+        expected = f"(), ({self.joints},) or (envs, {self.joints})"
+        rows = array[None] if array.ndim == 1 else array
+        fits = array.ndim == 0 or rows.shape[1:] in ((1,), (self.joints,))
+        if fits and array.size:
+            envs = rows.shape[0] if rows.ndim else 1
+            if envs == 1 or self.num_envs in (1, envs):
+                self.num_envs = max(self.num_envs, envs)
+                return namespace(array).broadcast_to(rows, (envs, self.joints)).copy()
+            expected = f"({self.num_envs}, {self.joints}), as another option has it"
+        problem = f"has shape {array.shape}, not {expected}"
+        remedy = "give one value, one per joint, or one per env and joint"
+        raise InvalidArgumentError(name, problem, remedy=remedy)
+
+
+def checked_ends(values: Mapping[str, Array], joint_names: Sequence[str] | None) -> Ends:
+    """Return the lower and the upper end of limits, None for no limit.
+
+    ``values`` are the size of both, the lower and the upper end, by the names of their arguments.
+
+    Raises InvalidArgumentError if the size is given with an end, or the lower end exceeds the upper
+    one.
+    """
+    size_name, low_name, high_name = values
+    size, low, high = values.values()
+    if size is not None:
+        if low is not None or high is not None:
+            problem = f"is given together with {low_name} or {high_name}"
+            remedy = "give the symmetric limit, or the two ends"
+            raise InvalidArgumentError(size_name, problem, remedy=remedy)
+        return -size, size
+    if low is not None and high is not None and not (is_traced(low) or is_traced(high)):
+        least, most = np.broadcast_arrays(low, high)
+        entries(low_name, least, least <= most, f"exceeds {high_name}", joint_names)
+    return low, high
+
+
+def frozen(record: R) -> R:
+    """Return a record with read-only NumPy arrays, which later writes by the caller do not
+    change.
+
+    Writeable arrays and views are copied. If all arrays are read-only, ``record`` itself is
+    returned.
+    """
+    exposed = [leaf for leaf in record if isinstance(leaf, np.ndarray) and _can_be_written(leaf)]
+    if not exposed:
+        return record
+    copied: R = mapped(lambda leaf: frozen_array(leaf) if _can_be_written(leaf) else leaf, record)
+    return copied
+
+
+def frozen_array(array: Array, dtype: DType = None) -> Array:
+    """Return a read-only copy, in ``dtype`` unless that is None."""
+    copy = np.array(array, dtype=dtype)
+    copy.setflags(write=False)
+    return copy
+
+
+def is_everywhere(array: Array, value: float | bool | str) -> bool:
+    """Return whether an array is left out, or known to be ``value`` in all entries."""
+    return array is None or (not is_traced(array) and bool((array == value).all()))
+
+
+def _can_be_written(leaf: Array) -> bool:
+    return isinstance(leaf, np.ndarray) and (leaf.flags.writeable or not leaf.flags.owndata)

@@ -1,0 +1,382 @@
+"""Programs of native code for the stages of a sim step: see tick.h.
+
+Stages that are pure functions of arrays are traced, and neighbours become one program. The others
+have a native function.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.arrays.array_types import Array, Pytree, Rows
+from batchpid.arrays.trees import filled, leaves, mapped, structure
+from batchpid.native.array_program import ArrayProgram
+from batchpid.native.symbols import Symbol
+from batchpid.native.tracing import Trace, trace
+from batchpid.sim.engine import native
+from batchpid.sim.engine.native import interface
+from batchpid.sim.engine.protocol import CompiledPack
+from batchpid.sim.engine.robot_model import scene_tree
+from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
+from batchpid.sim.loop.control_step import COUPLING_STEPS, STAGES, SimStage
+from batchpid.sim.loop.step_setup import Setup, moves_drives
+from batchpid.sim.loop.step_values import (
+    Layout,
+    Measured,
+    Model,
+    Outputs,
+    Step,
+    StepState,
+    Values,
+)
+
+
+class Table(NamedTuple):
+    """Commands and observations of the ticks of a run, and arrays of its last observation."""
+
+    arrays: Arrays
+    """(ticks, envs, ...), the same in every run."""
+    effort: NDArray[np.float32]
+    """Of the last tick (envs, dof), as the next two."""
+    saturated: NDArray[np.bool_]
+    guarded: NDArray[np.bool_]
+    fault: FaultArrays
+    """Last fault of each env (envs,)."""
+
+
+class Buffers(NamedTuple):
+    """Arrays that native code reads and writes in each sim step."""
+
+    state: StepState
+    command: Command
+    measured: Measured
+    before: Rows
+    """Positions before the last sim step (M, dof)."""
+
+
+class TickProgram:
+    """Stages and arrays of the ticks of a group.
+
+    ``reads_force`` says whether the engine's sim step reads the passive force, and ``noise`` is
+    that of positions and velocities in a sim step.
+
+    Attributes
+    ----------
+    tick
+        Structure of native code: place in the ticks, noise, status.
+    bound
+        Capsule of the programs and ``tick``, for the extension.
+    outputs
+        Results of the last sim step.
+    control
+        Native controller, or None.
+    """
+
+    def __init__(
+        self, setup: Setup, buffers: Buffers, table: Table, noise: Any, reads_force: bool
+    ) -> None:
+        _, pack, layout, constants, _ = setup
+        assert isinstance(pack, CompiledPack)
+        self._setup, self._buffers = setup, buffers
+        self._native = native.extension("_gateway")
+        self._programs, self._stages = list[Any](), list[interface.Stage]()
+        self._references = list[Any]()  # keeps arrays alive that native code has addresses of
+        self.control: Any = None
+        # The structure has the addresses of all arrays.
+        self.tick = interface.Tick(
+            timestep=constants.timestep,
+            dof=pack.dof,
+            late=layout.late,
+            matrix_steps=1 if layout.law is None else layout.law.matrix_steps,
+            gravity=layout.gravity,
+            coriolis=layout.coriolis,
+        )
+        left = np.zeros(()) if layout.moves else None
+        self._place(**buffers.measured._asdict(), before=buffers.before, left=left)
+        if layout.gravity and (layout.measures or not reads_force):
+            field = "measured_force" if layout.measures else "read_force"
+            setattr(self.tick, field, pack.force_model().address)
+        # Programs have no key of the noise, counts, or state of a controller.
+        state, motors = buffers.state, buffers.state.motors
+        if motors is not None:
+            state = state._replace(motors=motors._replace(key=None, step=None))
+        law = None if layout.control == "custom" else state.law
+        values = Values(
+            state=state._replace(law=law, age=None),
+            command=buffers.command,
+            measured=buffers.measured,
+            step=Step(0, 1, left),
+            seen=buffers.measured,
+            noise=noise,
+        )
+        self.outputs = self._add_stages(values).outputs
+        self._place(qf=self.outputs.qf)
+        stages = (interface.Stage * len(self._stages))(*self._stages)
+        self.tick.stages, self.tick.stage_count = ctypes.addressof(stages), len(stages)
+        transfers = self._transfers(table)
+        self.tick.transfers = ctypes.addressof(transfers)
+        self.tick.transfer_count = len(transfers)
+        self._references += stages, transfers, table
+        self.bound = self._native.bind_ticks(tuple(self._programs), ctypes.addressof(self.tick))
+
+    def _place(self, **arrays: Rows | None) -> None:
+        """Let fields of the structure of native code point to these arrays."""
+        for name, array in arrays.items():
+            if array is None:
+                continue
+            dtype = np.dtype(_TYPES.get(name, np.float64))
+            if array.dtype != dtype or not array.flags.c_contiguous:
+                raise ValueError(f"{name} is not a contiguous array of {dtype}")
+            setattr(self.tick, name, array.ctypes.data)
+            self._references.append(array)
+
+    # -- commands and observations
+
+    def _transfers(self, table: Table) -> ctypes.Array[interface.Transfer]:
+        """Return the copies between the tables of the ticks and the arrays of a sim step."""
+        command, seen, fault = table.arrays
+        outputs, measured = self.outputs, self._buffers.measured
+        none = np.zeros(measured.qpos.shape, bool)
+        saturated = none if outputs.saturated is None else outputs.saturated
+        guarded = none if outputs.guarded is None else outputs.guarded
+        copies: list[tuple[str, Rows, Rows]] = [
+            *[
+                ("read", rows, row)
+                for rows, row in zip(command, self._buffers.command, strict=True)
+            ],
+            ("write_floats", seen.qpos, measured.qpos),
+            ("write_floats", seen.qvel, measured.qvel),
+            ("write_floats", seen.effort, outputs.motor),
+            ("write_bytes", seen.saturated, saturated),
+            ("write_bytes", seen.guarded, guarded),
+            ("write_bytes", seen.ok, np.ones(len(none), bool)),
+            # One row, which each tick overwrites.
+            ("write_floats", table.effort[None], outputs.motor),
+            ("write_bytes", table.saturated[None], saturated),
+            ("write_bytes", table.guarded[None], guarded),
+            *[("write_bytes", rows, row) for rows, row in zip(fault, table.fault, strict=True)],
+        ]
+        if seen.base_pose is not None and seen.base_twist is not None:
+            pose, twist = np.zeros((len(none), 7)), np.zeros((len(none), 6))
+            self._place(base_pose=pose, base_twist=twist)
+            copies.append(("write_floats", seen.base_pose, pose))
+            copies.append(("write_floats", seen.base_twist, twist))
+        transfers = [
+            self._transfer(kind, rows, row) for kind, rows, row in copies if row is not None
+        ]
+        return (interface.Transfer * len(transfers))(*transfers)
+
+    def _transfer(self, kind: str, table: Rows, row: Rows) -> interface.Transfer:
+        dtype = {"read": np.float64, "write_floats": np.float32}.get(kind, row.dtype)
+        is_fit = table.dtype == dtype and row.flags.c_contiguous and table[0].flags.c_contiguous
+        if not is_fit or table.shape[1:] != row.shape:
+            raise ValueError(f"a {table.dtype} table {table.shape} does not fit rows {row.shape}")
+        self._references += table, row
+        return interface.Transfer(
+            table=table.ctypes.data,
+            row=row.ctypes.data,
+            stride=0 if len(table) == 1 else table.strides[0],
+            size=row.nbytes if kind == "write_bytes" else row.size,
+            kind=interface.TRANSFERS.index(kind),
+        )
+
+    # -- stages
+
+    def _add_stages(self, values: Values) -> Values:
+        """Add the stages that apply; return the values after them."""
+        _, _, layout, constants, _ = self._setup
+        stages = [stage for stage in STAGES if stage.applies(layout, constants)]
+        waiting = list[SimStage]()
+        for stage in stages:
+            if stage.name not in _NATIVE:
+                waiting.append(stage)
+                continue
+            if waiting:
+                values = self._add_program(tuple(waiting), values)
+                waiting = []
+            values = _NATIVE[stage.name](self, values)
+        return values
+
+    def _add_program(self, stages: tuple[SimStage, ...], values: Values) -> Values:
+        """Add a program of stages; return ``values`` with the arrays that it writes.
+
+        State is changed in place. Other results have arrays of their own.
+        """
+        shape = self._buffers.before.shape
+        constants = mapped(_split, self._setup.constants)
+        inputs, state = leaves(values), leaves(values.state)
+        layout = self._setup.layout._replace(model=Model())
+        histories = tuple(array.ndim == 3 for array in state)
+        traced = _trace(stages, layout, histories, structure(constants), structure(values))
+        outputs = [np.zeros(shape, bool if is_mask else float) for is_mask in traced.program.masks]
+        for array, place in zip(state, traced.places, strict=False):  # the state comes first
+            if place.is_result:
+                outputs[place.number] = array
+        arrays = ((outputs if place.is_result else inputs)[place.number] for place in traced.places)
+        after = values._replace(**filled(traced.values, arrays)._asdict(), noise=None)
+        if outputs:
+            program = ArrayProgram(traced.program, leaves(constants), len(inputs), shape)
+            pairs = tuple([(array, _row_size(array)) for array in inputs])
+            drawn = [id(block) for block in leaves(values.noise)]
+            noise = [at for at, array in enumerate(inputs) if id(array) in drawn]
+            self._add_stage("program", program=len(self._programs), noise=(*noise, -1, -1)[:2])
+            self._programs.append(self._native.bind(program.arguments, pairs, tuple(outputs)))
+            self._references += inputs, outputs
+        return after
+
+    def _add_stage(self, kind: str, every: int = 1, **fields: Any) -> None:
+        self._stages.append(
+            interface.Stage(kind=interface.STAGES.index(kind), every=every, **fields)
+        )
+
+    def _add_force(self, values: Values) -> Values:
+        self._place(pose=values.seen.qpos, rate=values.seen.qvel)
+        self._add_stage("force")
+        return values
+
+    def _add_inertia(self, values: Values) -> Values:
+        refresh, state = self._setup.layout.model.refresh, self._buffers.state
+        self.tick.refresh = refresh.address
+        self._references.append(refresh)
+        self._place(age=state.age, gain=state.friction.gain, memory=state.friction.memory)
+        self._add_stage("inertia")
+        return values
+
+    def _add_mass_matrix(self, values: Values) -> Values:
+        _, pack, layout, constants, _ = self._setup
+        assert layout.law is not None
+        tree, bodies = scene_tree(pack.spec).tables
+        self._place(pose=values.seen.qpos, rate=values.seen.qvel, tree=tree, bodies=bodies)
+        self._place(matrix=self._buffers.state.matrix, armature=constants.armature)
+        self._place(damping=constants.damping, **constants.coupling.native())
+        self._add_stage("mass_matrix", layout.law.matrix_steps)
+        return values
+
+    def _add_controller(self, values: Values) -> Values:
+        controller: Any = self._setup.options.control
+        self.control = controller.bound(*values.seen)
+        self.control.set_state(self._buffers.state.law)
+        self.tick.control = self.control.address
+        self._add_stage("controller")
+        outputs = values.outputs._replace(returned=self.control.effort)
+        return values._replace(limited=self.control.limited, outputs=outputs)
+
+    def _add_targets(self, values: Values) -> Values:
+        self._place(target=values.outputs.target, target_rate=values.outputs.target_rate)
+        # Writing the targets costs a call for each joint.
+        _, _, layout, constants, _ = self._setup
+        self._add_stage("targets", int(moves_drives(layout, constants)))
+        return values
+
+    def _add_constraint(self, values: Values) -> Values:
+        self._add_stage("constraint", COUPLING_STEPS)
+        return values
+
+    def _add_engine(self, values: Values) -> Values:
+        self._add_stage("engine")
+        return values
+
+
+_NATIVE: dict[str, Callable[[TickProgram, Values], Values]] = {
+    "passive force": TickProgram._add_force,
+    "inertia": TickProgram._add_inertia,
+    "mass matrix": TickProgram._add_mass_matrix,
+    "controller": TickProgram._add_controller,
+    "targets": TickProgram._add_targets,
+    "constraint": TickProgram._add_constraint,
+    "engine": TickProgram._add_engine,
+}
+"""Stages that are no programs, or have a native function."""
+
+_TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
+"""Dtypes of arrays that are not float64."""
+
+
+class _Changed(NamedTuple):
+    """Values that programs change."""
+
+    state: StepState
+    seen: Measured
+    outputs: Outputs
+
+
+class _Place(NamedTuple):
+    """Place of an array of the values after a program."""
+
+    is_result: bool
+    """Whether the program computes it; otherwise it is one of its inputs."""
+    number: int
+
+
+class _Traced(NamedTuple):
+    """Program of some stages."""
+
+    program: Trace
+    values: Pytree
+    """Structure of the :class:`_Changed` values after it."""
+    places: tuple[_Place, ...]
+    """Places of the arrays in these."""
+
+
+@lru_cache(maxsize=64)
+def _trace(
+    stages: tuple[SimStage, ...],
+    layout: Layout,
+    histories: tuple[bool, ...],
+    constants: Any,
+    inputs: Any,
+) -> _Traced:
+    """Return the program of stages.
+
+    ``constants`` and ``inputs`` are structures of the constants and of the values before it.
+    ``histories`` says which arrays of the state are histories, which a program changes in place.
+    """
+    first, count = len(leaves(constants)), len(leaves(inputs))
+    result_parts: list[Any] = []
+
+    def function(*symbols: Symbol) -> list[Any]:
+        remaining = iter(symbols)
+        k = filled(constants, remaining)
+        values = filled(inputs, remaining)
+        for stage in stages:
+            assert stage.function is not None
+            values = stage.function(layout, k, values)
+        changed = _Changed(values.state, values.seen, values.outputs)
+        numbers = {symbol: number for number, symbol in enumerate(symbols[first:])}
+        outputs = set(map(id, leaves(changed.outputs)))
+        results, places = list[Any](), list[_Place]()
+        for at, leaf in enumerate(leaves(changed)):
+            is_state, number = at < len(histories), numbers.get(leaf)
+            if is_state and (number == at or histories[at]):
+                places.append(_Place(False, at))
+            # An output that is an input is copied, since the next sim step changes the input.
+            elif number is not None and not is_state and id(leaf) not in outputs:
+                places.append(_Place(False, number))
+            else:
+                places.append(_Place(True, len(results)))
+                results.append(leaf)
+        result_parts[:] = structure(changed), tuple(places)
+        return results
+
+    program = trace(function, first, count)
+    return _Traced(program, *result_parts)
+
+
+def _split(array: Array) -> Any:
+    """Return an array (n, envs, dof) as a tuple of n arrays, and other arrays unchanged."""
+    return tuple(array) if array.ndim == 3 else array
+
+
+def _row_size(array: Rows) -> int:
+    """Return the numbers in each row of a table (rows, ...), as the extension counts them: 0 for
+    as many as joints, -1 for an input that is one number.
+    """
+    if array.ndim == 0:
+        return -1
+    return 0 if array.ndim == 2 else array[0].size

@@ -1,0 +1,534 @@
+"""Options of a Runner in five groups, each declared once.
+
+An option is a field of :class:`Scene`, :class:`Timing`, :class:`Control`, :class:`Faults` or
+:class:`Workers`. The field has its type, default, bounds and text, the places that keep it, and the
+help of its flag. The signature of :class:`batchpid.sim.Runner`, the checks of plain values, the
+table of options in docs/runner.md, the flags, and what snapshots and recordings hold come from it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from importlib.util import find_spec
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, Self, get_args, get_type_hints
+
+from numpy.typing import ArrayLike
+
+import batchpid as bp
+from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.field_tables import Field, plain
+from batchpid.arrays.read_only import read_only
+from batchpid.checks.validate import choice, instance, joint_speeds, names
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim.engine.physics import MujocoSolver, Physics
+from batchpid.sim.engine.protocol import Engine, load_engine, require
+from batchpid.sim.randomization.checks import check_robot
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.robot.merging import place_links
+from batchpid.sim.robot.parts import MjcfFile
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.command import own_command
+from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
+
+EngineName = Literal["sapien", "mujoco"]
+DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
+"""SAPIEN where it is installed, which is on Linux with x86-64; elsewhere MuJoCo."""
+PhysicsPreset = Literal["accurate", "fast"]
+ControlMode = Literal["pid", "drive", "effort"]
+Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
+Backend = Literal["numpy", "jax"]
+FaultAction = Literal["hold", "reset"]
+InvalidInputAction = Literal["raise", "contain"]
+Place = Literal["snapshot", "recording", "scene", "restored", "processes", "next commands"]
+"""Place that keeps an option, or the reason for which a snapshot may be restored in a runner with
+another value of it.
+
+- "snapshot": it must be the same in the runner that restores the snapshot;
+- "recording": a field of :class:`batchpid.sim.RunInfo`;
+- "scene": a field of :class:`batchpid.sim.engine.scene_spec.SceneSpec`;
+- "restored": the snapshot holds the value, and the runner takes it over;
+- "processes": the value decides where and how fast the envs run; results are bit-identical for all
+  values;
+- "next commands": the value is a default of later commands (``substeps``), or decides which of them
+  are refused.
+"""
+
+
+class Option(NamedTuple):
+    """Where an argument of a Runner is kept and shown, by :func:`option`."""
+
+    kept: Mapping[str, str]
+    """Attribute of :class:`batchpid.sim.RunnerOptions` that each :data:`Place` keeps; "" for the
+    attribute of the argument's name.
+    """
+    flag: str
+    """Help of the flag of `batchpid rollout` with the argument's name; "" for no flag."""
+
+
+def option(*kept: Place, flag: str = "", **kept_as: str) -> Option:
+    """Return the option that the places ``kept`` keep; ``kept_as`` are further places and the
+    attributes they keep.
+    """
+    return Option(dict.fromkeys(kept, "") | kept_as, flag)
+
+
+def check_plain(record: object) -> None:
+    """Convert the fields of a frozen dataclass to their declared types, and check their bounds."""
+    kinds = get_type_hints(type(record), include_extras=True)
+    for name, value in vars(record).items():
+        vars(record)[name] = plain(name, kinds[name], value)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Group:
+    """Base of the groups of options."""
+
+    def __post_init__(self) -> None:
+        check_plain(self)
+
+    def fit(self, robot: Robot) -> Self:
+        """Return these options for ``robot``, checked, with a value for each default.
+
+        Raises InvalidArgumentError for an option that is out of range, or not for this robot.
+        """
+        return self
+
+    def changed(self, **values: Any) -> Self:
+        """Return the options with other ``values``."""
+        made = object.__new__(type(self))
+        vars(made).update(vars(self) | values)
+        return made
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scene(Group):
+    """Engine, ground, contacts, and content of the scenes."""
+
+    engine: Annotated[
+        EngineName,
+        option(
+            "snapshot",
+            "recording",
+            "scene",
+            flag="Physics engine; mujoco is several times as fast, and its contacts differ.",
+        ),
+    ] = DEFAULT_ENGINE
+    """Physics engine: ``"sapien"``, the reference and the default where it is installed, or
+    ``"mujoco"``, several times as fast (docs/performance.md).
+    """
+    physics: Annotated[
+        PhysicsPreset | Physics | MujocoSolver,
+        option(
+            "recording",
+            snapshot="solver",
+            scene="solver",
+        ),
+    ] = "accurate"
+    """Solver settings: ``"accurate"`` (the default: those of SAPIEN), ``"fast"`` (fewer
+    iterations), a :class:`batchpid.sim.Physics` for SAPIEN, or a :class:`batchpid.sim.MujocoSolver`
+    for MuJoCo.
+    """
+    collisions: Annotated[
+        bool,
+        option(
+            "snapshot",
+            "recording",
+            "scene",
+        ),
+    ] = True
+    """Robots have collision shapes; default True. False removes the shapes and the ground, for free
+    motion only. Masses, inertias and joint limits stay. A
+    :class:`batchpid.sim.MissedContactWarning` names the robots that would have touched
+    something.
+    """
+    ground: Annotated[
+        bool | None,
+        option(
+            "snapshot",
+            "recording",
+            "scene",
+            flag=(
+                "Ground at height 0. Default: on, unless links of a fixed robot reach it at the"
+                " start pose."
+            ),
+        ),
+    ] = None
+    """Add a ground plane at height 0 to every scene. Default :attr:`Robot.has_ground`: True, unless
+    the base is fixed so low that other links reach the ground at the start pose. With engine
+    "mujoco" the planes in the world of an MJCF file replace the ground; by default they are as in
+    the file.
+    """
+    contacts: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
+    """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``; default
+    none. Links that are connected by fixed joints count as one. A fixed base is refused. SAPIEN
+    needs ``dissipation="urdf"``.
+    """
+    wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
+    """Links with a sensor of the force and torque that the parent exerts on the link:
+    ``obs.wrench``; default none. SAPIEN needs ``dissipation="urdf"``.
+    """
+    build: Annotated[Callable[[Any, int], Any] | None, option("snapshot", "scene")] = None
+    """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env.
+    Visuals and lights are ignored, so code that was written for a screen runs unchanged. It may
+    return the entities that :meth:`batchpid.sim.Runner.poses` reports. A reset returns the content
+    to the poses that ``build`` gave it.
+    """
+    randomization: Annotated[Randomization | None, option("snapshot", "recording")] = None
+    """Distributions from which payload, masses, friction, gains and more are drawn for each env and
+    episode (docs/randomization.md); default none.
+    """
+
+    def load_engine(self) -> Engine:
+        """Return the physics engine of the robots, with its packages imported.
+
+        Raises
+        ------
+        InvalidArgumentError
+            No engine has this name.
+        MissingDependencyError
+            The engine's package is not installed.
+        """
+        return load_engine(self.engine)
+
+    @property
+    def solver(self) -> Physics | MujocoSolver:
+        """Solver settings for the option ``physics``."""
+        if isinstance(self.physics, str):
+            return self.load_engine().physics[self.physics]
+        return self.physics
+
+    def file_of(self, robot: Robot) -> MjcfFile | None:
+        """Return the MJCF file that the engine simulates as it is; None for others, and in
+        SAPIEN.
+        """
+        return robot.mjcf if self.engine == "mujoco" else None
+
+    def fit(self, robot: Robot) -> Self:
+        engine = self.load_engine()
+        if not engine.is_physics(self.physics):
+            choice("physics", self.physics, engine.physics)
+        if robot.dissipation == "sapien":
+            require(engine, "sapien_dissipation", "robot")
+        if self.build is not None:
+            require(engine, "build", "build")
+            if not callable(self.build):
+                remedy = "define build(scene, env)"
+                raise InvalidArgumentError("build", "must be a function", remedy=remedy)
+        self._check_randomization(robot)
+        ground = self.ground
+        if not self.collisions:
+            self._check_without_collisions(robot)
+            ground = False
+        elif ground is None:
+            file = self.file_of(robot)
+            ground = robot.has_ground or (file is not None and file.has_floor)
+        contacts = self._sensed_links("contacts", self.contacts, robot)
+        wrenches = self._sensed_links("wrenches", self.wrenches, robot)
+        return self.changed(ground=ground, contacts=contacts, wrenches=wrenches)
+
+    def _check_randomization(self, robot: Robot) -> None:
+        """Raise InvalidArgumentError for draws that robot or scenes do not take."""
+        if self.randomization is None:
+            return
+        remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
+        draws = instance("randomization", self.randomization, Randomization, remedy)
+        check_robot(draws, robot, self.file_of(robot))
+        if draws.ground_friction is not None and not self.collisions:
+            problem = "has no effect without collisions"
+            raise InvalidArgumentError("ground_friction", problem, remedy="leave it out")
+        if draws.gravity is not None and self.build is not None:
+            problem = "cannot change in scenes of build, which SAPIEN does not build anew"
+            raise InvalidArgumentError("gravity", problem, remedy="leave out one of them")
+
+    def _check_without_collisions(self, robot: Robot) -> None:
+        """Raise InvalidArgumentError for what needs the collisions that are off."""
+        file = self.file_of(robot)
+        falling = [] if file is None else [*file.falling]
+        if not robot.fixed_base:
+            falling.append("the floating base")
+        if falling:
+            problem = f"are False, and nothing holds {', '.join(falling)}"
+            raise InvalidArgumentError("collisions", problem, remedy="leave it out")
+        for argument in ("ground", "contacts"):
+            if getattr(self, argument):
+                problem = "need collisions, which are off"
+                raise InvalidArgumentError(argument, problem, remedy="leave out collisions=False")
+
+    def _sensed_links(
+        self, argument: str, value: Sequence[str] | None, robot: Robot
+    ) -> tuple[str, ...] | None:
+        """Return the links of the option "contacts" or "wrenches"; None without any.
+
+        Raises InvalidArgumentError for a link that is unknown, or has no sensor of this kind.
+        """
+        links = () if value is None else tuple(names(argument, value))
+        if not links:
+            return None
+        if self.engine == "sapien" and robot.dissipation == "sapien":
+            problem = "need a robot without SAPIEN's link damping, which acts like a contact"
+            remedy = "load the robot with dissipation='urdf'"
+            raise InvalidArgumentError(argument, problem, remedy=remedy)
+        bodies = place_links(robot.tables, links if argument == "wrenches" else ())
+        root = next(place.link for place in bodies.values())
+        for link in links:
+            choice(argument, link, [link.name for link in robot.links])
+            if bodies[link].link == root and (argument == "wrenches" or robot.fixed_base):
+                problem, remedy = f"names {link!r}, which no joint moves", "name one further along"
+                raise InvalidArgumentError(argument, problem, remedy=remedy)
+        return links
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Timing(Group):
+    """Time step and ticks."""
+
+    timestep: Annotated[
+        float,
+        Field("seconds, not a rate: 1/2000", low=1e-6, high=0.1),
+        option("snapshot", "recording", "scene"),
+    ] = 1 / 2000
+    """Time step of simulation and control [s]; default 1/2000."""
+    substeps: Annotated[int, Field(low=1, high=1_000_000), option("recording", "next commands")] = (
+        20
+    )
+    """Sim steps of one tick, all under the same setpoint; default 20. The control runs at every sim
+    step.
+    """
+
+
+class Controller(Protocol):
+    """Controller of the caller's own, for the option ``control``; arrays are (envs, dof), as in
+    ``robot.joint_names``.
+
+    It is called at every sim step, in the worker processes, for some of the envs at a time: the
+    effort of an env must depend on its own rows alone. It travels to the workers by cloudpickle,
+    and may call NumPy or a jitted function.
+
+    A setpoint has a number for each joint, unless the controller has an attribute ``command``: a
+    :class:`batchpid.sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is
+    (envs, size).
+
+    A snapshot fits a controller of the same class, whose attribute ``version`` is the same where it
+    has one.
+    """
+
+    def init(self, robot: Robot, num_envs: int) -> Any:
+        """Return the state of ``num_envs`` envs at their start: None, an array, or tuples and dicts
+        of these.
+
+        Every array has the envs as its first axis: states are reset by mask, and kept in snapshots.
+        Later states have the same structure, shapes and dtypes.
+        """
+
+    def __call__(
+        self,
+        state: Any,
+        setpoint: Rows,
+        qpos: Rows,
+        qvel: Rows,
+        passive: Rows,
+    ) -> tuple[Any, Any]:
+        """Return the new state, and the joint efforts [N m or N], which the runner clips to the
+        params' limits.
+
+        An env that has failed is given the ``neutral`` setpoint of the command, by default zeros
+        within its bounds. ``passive`` is the passive force that the runner's ``compensate``
+        selects, plus the caller's feedforward. The arrays are read-only copies, which the
+        controller may keep.
+        """
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Control(Group):
+    """Law, gains, motors and guard."""
+
+    params: Annotated[bp.PIDParams | None, option("restored")] = None
+    """PID parameters of one row, or one row per env. Default: see
+    :func:`batchpid.sim.options.options.default_params`.
+    """
+    control: Annotated[
+        ControlMode | Literal["osc"] | Controller,
+        option("snapshot", recording="control_name"),
+    ] = "pid"
+    """``"pid"``, the default; ``"drive"``: the engine's internal PD drive, with the params' kp and
+    kd as stiffness and damping; ``"effort"``: the setpoint is the joint effort; ``"osc"``:
+    operational-space control of the link ``tool``, whose setpoints are poses (7,), a
+    :class:`batchpid.sim.OperationalSpace` with its defaults; or a :class:`Controller`.
+    """
+    tool: Annotated[str | None, option("snapshot", "recording")] = None
+    """Link that control "osc" moves; default the last link of the robot's longest chain."""
+    backend: Annotated[
+        Backend,
+        option(
+            "snapshot", flag="Library of the law: NumPy, or JAX, as one program with the steps."
+        ),
+    ] = "numpy"
+    """Library of the law: ``"numpy"``, the default, or ``"jax"``, which compiles law and sim steps
+    of a tick, and a :class:`Controller`, into one XLA program for the CPU (docs/performance.md). It
+    needs native code, control "pid", "effort" or a :class:`Controller`, and has no coupled joints,
+    actuators, randomization and guard. The last bits of results differ between the two, and between
+    processors.
+    """
+    compensate: Annotated[
+        Compensation,
+        option(
+            "snapshot",
+            "recording",
+            flag="Passive force and known friction, added at every sim step.",
+        ),
+    ] = "gravity+coriolis+friction"
+    """Compensation added to the effort at every sim step: the passive force (gravity, Coriolis and
+    centrifugal forces) and the known Coulomb friction in the direction of the setpoint.
+    ``"gravity+coriolis+friction"``, the default, or a part of it; under control "effort" friction
+    is not compensated. On a floating base the passive force is computed as if the base were fixed:
+    the weight of the base on the legs depends on their contacts, and the law carries it.
+    """
+    actuators: Annotated[bp.Actuators | None, option("restored")] = None
+    """Delays, limits, friction and errors of motors and sensors: :func:`batchpid.make_actuators`,
+    of one row, or one row per env. None, the default, selects the robot's actuators; control
+    "drive" uses only their friction and armature. ``bp.Actuators()`` is ideal. The control gets
+    measured positions and velocities. Observations hold the true ones, and the delivered effort.
+    """
+    guard: Annotated[bool | bp.Guard | None, option("snapshot")] = None
+    """Limits of setpoints, applied at every sim step: True for :meth:`batchpid.sim.Robot.guard`, or
+    :func:`batchpid.make_guard`; default none. ``obs.guarded`` is True where a setpoint was
+    changed.
+    """
+
+    def fit(self, robot: Robot) -> Self:
+        control, tool = self.control, self.tool
+        if control == "osc":
+            if not robot.fixed_base:
+                problem = f"'osc' needs a fixed base, which {robot.name!r} does not have"
+                remedy = "load the robot with fixed_base=True, or control its joints"
+                raise InvalidArgumentError("control", problem, remedy=remedy)
+            if tool is None:
+                tool = default_tool(robot)
+            control = OperationalSpace(robot, choice("tool", tool, robot.kinematic_tree().links))
+        elif callable(control) and callable(getattr(control, "init", None)):
+            own_command(control)  # raises for an invalid command
+        else:
+            choice("control", control, (*get_args(ControlMode), "osc"))
+        link = control.link if isinstance(control, OperationalSpace) else None
+        if tool not in (None, link):
+            problem = "is for control 'osc'"
+            raise InvalidArgumentError("tool", problem, value=tool, remedy="leave it out")
+        return self.changed(control=control, tool=link)
+
+    @property
+    def control_name(self) -> str:
+        """Name of the control; of a :class:`Controller` its class."""
+        return self.control if isinstance(self.control, str) else type(self.control).__name__
+
+    @property
+    def sets_positions(self) -> bool:
+        """True if setpoints are joint positions."""
+        return self.control in ("pid", "drive")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Faults(Group):
+    """What makes an env fail, and what happens then."""
+
+    on_fault: Annotated[FaultAction, option("snapshot")] = "hold"
+    """Action when an env fails: ``"hold"`` (default) keeps it at rest in its last valid state, with
+    ``ok`` False until it is reset; ``"reset"`` returns it to its last start, with ``ok`` False for
+    that tick. An env fails when its state, or the effort of a :class:`Controller`, is not finite,
+    when a position is beyond 1e6 rad or m, or by ``speed_limit``. The other envs are not
+    affected.
+    """
+    speed_limit: Annotated[ArrayLike | None, option("snapshot")] = None
+    """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
+    on_invalid_input: Annotated[InvalidInputAction, option("next commands")] = "raise"
+    """Response to NaN or infinity in a command or in a pose to reset to: ``"raise"`` (default)
+    raises an error, and ``"contain"`` lets only the env concerned fail.
+    """
+
+    def fit(self, robot: Robot) -> Self:
+        if self.speed_limit is None:
+            return self
+        limit = joint_speeds("speed_limit", self.speed_limit, robot.joint_names)
+        return self.changed(speed_limit=read_only(limit.copy()))
+
+
+@dataclass(frozen=True, eq=False)
+class Ray:
+    """Ray cluster, for the option ``cluster`` of :class:`batchpid.sim.Runner`; ``"ray"`` means
+    ``Ray()``.
+
+    Raises
+    ------
+    InvalidArgumentError
+        An option is out of range.
+    """
+
+    address: str | None = None
+    """Address of the cluster, "HOST:PORT" as ``ray start`` prints it, or "local" for a new one of
+    this machine alone, which ends with this process. Default: the environment variable RAY_ADDRESS,
+    else a cluster that runs on this machine, else "local".
+    """
+    _: KW_ONLY
+    nodes: Annotated[int | None, Field(low=1, high=100_000)] = None
+    """Largest number of machines. Default: all that have enough CPUs."""
+    cpus_per_node: Annotated[int | None, Field(low=1, high=100_000)] = None
+    """Workers on each machine, each on one CPU of Ray's count. Machines with fewer CPUs are not
+    used. Default: all CPUs that Ray counts.
+    """
+    runtime_env: Document | None = None
+    """Ray's ``runtime_env`` of the processes on the machines, such as ``{"working_dir": "."}``."""
+
+    def __post_init__(self) -> None:
+        check_plain(self)
+        if "://" in instance("address", self.address or "", str, "pass HOST:PORT"):
+            problem, remedy = "must be HOST:PORT, 'auto' or 'local'", "leave out the protocol"
+            raise InvalidArgumentError("address", problem, value=self.address, remedy=remedy)
+        instance("runtime_env", self.runtime_env or {}, dict, "pass a dict as for ray.init")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Workers(Group):
+    """Processes and machines that run the envs."""
+
+    first_env: Annotated[int, Field(high=1e9), option("snapshot")] = 0
+    """Number of the first env; default 0. With ``first_env=100`` a runner is bit-identical to envs
+    100, ... of a larger one: sensor noise, the streams of a randomization and ``build`` depend on
+    the number of the env.
+    """
+    workers: Annotated[
+        int | None,
+        Field(high=1024),
+        option(
+            "processes",
+            flag="Processes that step the scenes; 0: this one. Default: one per available core.",
+        ),
+    ] = None
+    """Processes that step the scenes; 0 runs the same code in this process. Default: one per
+    available core, each pinned to its core. Results are bit-identical for any number of workers.
+    """
+    timeout: Annotated[float, Field("seconds", low=1e-3, high=1e9), option("processes")] = 60.0
+    """Time [s], beyond an upper bound of the work's duration, after which a worker counts as stuck,
+    and is replaced; default 60.
+    """
+    cluster: Annotated[
+        Literal["ray"] | Ray | None,
+        option(
+            "processes",
+        ),
+    ] = None
+    """``"ray"`` or :class:`batchpid.sim.Ray`: the workers run on the machines of a Ray cluster,
+    with bit-identical results (docs/reliability.md).
+    """
+
+    def fit(self, robot: Robot) -> Self:
+        if self.cluster is None:
+            workers = self.workers
+            return self.changed(
+                workers=len(os.sched_getaffinity(0)) if workers is None else workers
+            )
+        cluster = Ray() if self.cluster == "ray" else self.cluster
+        if self.workers is not None:
+            problem, remedy = "is not for a cluster", "pass cluster=Ray(cpus_per_node=...)"
+            raise InvalidArgumentError("workers", problem, value=self.workers, remedy=remedy)
+        return self.changed(cluster=instance("cluster", cluster, Ray, "pass 'ray' or Ray(...)"))

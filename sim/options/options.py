@@ -1,0 +1,391 @@
+"""Options of a runner, checked: one record for :class:`batchpid.sim.Runner`, its loops, snapshots
+and recordings.
+
+A group checks its options by themselves and for the robot. Here are the checks of options that
+depend on options of another group, or on the number of envs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import Annotated, Any, Concatenate, ParamSpec, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+from batchpid.arrays.array_types import Document, Kind, Rows
+from batchpid.arrays.choices import PerMassMatrix
+from batchpid.arrays.digest import digest
+from batchpid.arrays.field_tables import Field, declared, plain
+from batchpid.arrays.jax_settings import require_jax
+from batchpid.arrays.records import frozen
+from batchpid.checks.validate import AxisKind, instance
+from batchpid.errors import InvalidArgumentError
+from batchpid.law.computed_torque import check_gain_units
+from batchpid.law.input_checks import check_drive
+from batchpid.motors.coupling import Coupling
+from batchpid.motors.friction import Friction
+from batchpid.sim.engine.native import xla
+from batchpid.sim.engine.protocol import require
+from batchpid.sim.engine.scene_spec import added_friction
+from batchpid.sim.options.groups import (
+    Control,
+    Controller,
+    ControlMode,
+    Faults,
+    Option,
+    Place,
+    Ray,
+    Scene,
+    Timing,
+    Workers,
+    option,
+)
+from batchpid.sim.randomization.checks import check_params, prepared_actuators
+from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
+from batchpid.sim.robot.parts import MjcfFile
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.setpoint_limits import fit_guard
+from batchpid.sim.signals.command import CommandSpec, joint_command, own_command
+from batchpid.sim.signals.observation import Quantity, observed
+from batchpid.sim.signals.rollout import RunInfo
+from batchpid.sim.tool_space.osc_controller import OperationalSpace
+
+P = ParamSpec("P")
+IDEAL = bp.Actuators()
+"""Actuators without any effect."""
+GROUPS = (Scene, Timing, Control, Faults, Workers)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunnerKeywords(Scene, Timing, Control, Faults, Workers):
+    """Arguments of a :class:`batchpid.sim.Runner`, as they are passed; all but the first two may be
+    left out.
+
+    A snapshot and the runner that restores it must agree in the options that snapshots keep.
+    """
+
+    robot: Annotated[Robot, option("snapshot")] = field(kw_only=False)
+    """From :meth:`batchpid.sim.Robot.load`."""
+    num_envs: Annotated[int, Field(low=1, high=1_000_000), option("snapshot")] = field(
+        kw_only=False
+    )
+    """Number of robots, one in each scene."""
+
+
+OPTIONS = declared(RunnerKeywords, Option)
+"""Where each argument is kept and shown."""
+KINDS: dict[str, Kind] = get_type_hints(RunnerKeywords, include_extras=True)
+"""Declared type of each argument, with its bounds."""
+
+
+class RunnerOptions(RunnerKeywords):
+    """Options of a :class:`batchpid.sim.Runner`, checked, copied, and with a value for each
+    default. Immutable.
+
+    Arguments and attributes are the same as in :class:`RunnerKeywords`; the attributes below have a
+    narrower type. ``workers`` is None on a cluster, ``tool`` unless setpoints are poses, and
+    ``actuators`` if every effect is off.
+
+    Raises
+    ------
+    InvalidArgumentError
+        An option is out of range.
+    """
+
+    params: bp.PIDParams
+    control: ControlMode | Controller
+    ground: bool
+    contacts: tuple[str, ...] | None
+    wrenches: tuple[str, ...] | None
+    speed_limit: NDArray[np.float64] | None
+    guard: bp.Guard | None
+    cluster: Ray | None
+    actuators: bp.Actuators | None
+
+    def __post_init__(self) -> None:
+        values = vars(self)
+        values["num_envs"] = checked_option("num_envs", self.num_envs)
+        remedy = "load one with Robot.load('panda') or a URDF path"
+        robot = instance("robot", self.robot, Robot, remedy)
+        for group in GROUPS:
+            options = group(**{entry.name: values[entry.name] for entry in fields(group)})
+            values.update(vars(options.fit(robot)))
+        # What follows takes options of several groups, in an order in which each is fitted once.
+        if self.control == "drive":
+            require(self.load_engine(), "drive", "control")
+        if isinstance(self.control, OperationalSpace):
+            self._check_tree("control", self.control, "control the joints")
+            values["control"] = self.control.in_runner(self.timestep, self.compensate)
+        values["guard"] = fit_guard(
+            self.guard, robot.joints, self.num_envs, self.control_name, self.sets_positions
+        )
+        if self.backend == "jax":
+            self._check_program()
+        values["actuators"] = self.check_actuators(self.actuators)
+        if self.params is None:
+            values["params"] = default_params(robot, self.control, self.loops)
+        values["params"] = self.check_params(self.params)
+
+    def _check_program(self) -> None:
+        """Raise InvalidArgumentError for an option that the program of backend "jax" does not
+        have.
+        """
+        require_jax()
+        engine, robot = self.load_engine(), self.robot
+        reads_force = robot.fixed_base or "base_state" in engine.capabilities
+        if "coriolis" not in self.compensate and "partial_force" not in engine.capabilities:
+            reads_force = False
+        obstacle = f"{engine.title} has no compiled sim steps"
+        if "compiled_steps" in engine.capabilities:
+            obstacle = engine.native_obstacle() or xla.obstacle()
+        floats_with_friction = not robot.fixed_base and robot.friction.any()
+        lacking = {
+            "backend": obstacle and f"is 'jax'; {obstacle}",
+            "control": self.control == "drive" and "has no law to compile",
+            "compensate": "gravity" in self.compensate
+            and not reads_force
+            and "needs a passive force of NumPy",
+            "randomization": self.randomization is not None and "is given",
+            "guard": self.guard is not None and "is given",
+            "robot": (not robot.coupling.is_identity and "has coupled joints")
+            or (floats_with_friction and "has a floating base, and joints with friction")
+            or (robot.actuators is not None and "has actuators"),
+        }
+        for argument, problem in lacking.items():
+            if problem:
+                raise _not_in_program(argument, problem)
+
+    def _check_tree(self, argument: str, value: object, remedy: str) -> None:
+        """Raise InvalidArgumentError for an option that needs a kinematic tree, if the robot has
+        closed loops.
+        """
+        if self.loops:
+            names = ", ".join(self.loops)
+            problem = f"needs a kinematic tree, and {names} of the file closes a loop of links"
+            raise InvalidArgumentError(argument, problem, value=value, remedy=remedy)
+
+    @property
+    def mjcf(self) -> MjcfFile | None:
+        """MJCF file that the engine simulates as it is; None for others, and in SAPIEN."""
+        return self.file_of(self.robot)
+
+    @property
+    def loops(self) -> tuple[str, ...]:
+        """Equality constraints that close loops of the simulated robot's links."""
+        return () if self.mjcf is None else self.mjcf.loops
+
+    @cached_property
+    def observed(self) -> dict[str, Quantity]:
+        """Quantities that the loop observes."""
+        return observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
+
+    @property
+    def misses_contacts(self) -> bool:
+        """True if robots have no collision shapes, and contacts that they would have had are
+        reported.
+        """
+        return not self.collisions
+
+    @cached_property
+    def own_command(self) -> CommandSpec | None:
+        """Command that a :class:`Controller` declares; None for commands of joints."""
+        return own_command(self.control)
+
+    @cached_property
+    def command(self) -> CommandSpec:
+        """Names and units of the setpoint's entries."""
+        robot = self.robot
+        return self.own_command or joint_command(robot.joint_names, robot.units, self.control)
+
+    @cached_property
+    def command_columns(self) -> tuple[tuple[AxisKind, tuple[str, ...]], ...]:
+        """Last axis of each array of a command: the kind of its columns, and their names."""
+        kind: AxisKind = "joint" if self.own_command is None else "entry"
+        return (*[(kind, self.command.names)] * 3, ("joint", self.robot.joint_names))
+
+    @cached_property
+    def command_coupling(self) -> Coupling | None:
+        """Coupling of the joints that setpoints are for; None where there is none."""
+        is_coupled = self.sets_positions and not self.robot.independent.all()
+        return self.robot.coupling if is_coupled else None
+
+    @property
+    def tool_pose(self) -> Callable[[Rows], NDArray[np.float32]] | None:
+        """Function from positions (..., dof) to poses of the tool (..., 7); None where setpoints
+        are not poses.
+        """
+        return self.control.tool_pose if isinstance(self.control, OperationalSpace) else None
+
+    def has_stiction(self, actuators: bp.Actuators | None) -> bool:
+        """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
+        if self.robot.friction.any() or getattr(self.randomization, "friction", None) is not None:
+            return True
+        return added_friction(Friction(), actuators).coulomb is not None
+
+    @property
+    def has_pushes(self) -> bool:
+        """True if floating bases are pushed."""
+        return self.randomization is not None and self.randomization.push is not None
+
+    def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
+        """Return ``params``, as a read-only copy, if they fit the robot, the number of envs and the
+        control.
+
+        Raises
+        ------
+        InvalidArgumentError
+            They do not fit.
+        """
+        robot = self.robot
+        instance("params", params, bp.PIDParams, "build them with robot.params() or make_params()")
+        if params.gain_units is not None and self.control != "pid":
+            problem = f"have no meaning under control {self.control_name!r}"
+            remedy = "use control 'pid', or params with gain_units 'effort'"
+            raise InvalidArgumentError("gain_units", problem, remedy=remedy)
+        if isinstance(params.gain_units, PerMassMatrix):
+            self._check_tree("gain_units", "mass_matrix", 'use robot.designed("effort")')
+        check_gain_units(params)
+        if self.control == "drive":
+            check_drive(params)
+        params.check(self.num_envs, robot.joint_names)
+        if self.randomization is not None:
+            check_params(self.randomization, params, robot)
+        return frozen(params)
+
+    def check_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
+        """Return ``actuators`` as :func:`batchpid.sim.robot.actuator_checks.fit_actuators` does;
+        None if every effect is off.
+
+        None selects the robot's own actuators; control "drive" uses only their friction and
+        armature.
+
+        Raises
+        ------
+        InvalidArgumentError
+            They do not fit.
+        """
+        if actuators is None:
+            actuators = self.robot.actuators or IDEAL
+            if self.control == "drive":
+                actuators = actuators.joint_side()
+        fitted: bp.Actuators | None = fit_actuators(
+            actuators, self.robot, self.num_envs, self.control
+        )
+        if fitted is not None and fitted.is_ideal:
+            fitted = None
+        if self.randomization is not None:
+            fitted = prepared_actuators(self.randomization, fitted, self.robot, self.control)
+        if fitted is None:
+            return None
+        if self.backend == "jax":
+            raise _not_in_program("actuators", "are given")
+        return frozen(fitted)
+
+    def values_for(self, place: Place) -> Document:
+        """Return the options that are marked with ``place``, by name.
+
+        - "snapshot": values that two runners must share to restore each other's snapshots;
+        - "recording": fields of :class:`batchpid.sim.RunInfo`, and in its field "options" the
+          values without a field;
+        - "scene": fields of :class:`batchpid.sim.engine.scene_spec.SceneSpec`.
+        """
+        values = {}
+        for name, entry in OPTIONS.items():
+            if place in entry.kept:
+                values[name] = getattr(self, entry.kept[place] or name)
+        if place == "recording":
+            values["physics"] = str(self.physics)
+            if self.randomization is not None:
+                values["randomization"] = self.randomization.to_dict()
+            if further := sorted(values.keys() - RunInfo.__annotations__):
+                values["options"] = {name: values.pop(name) for name in further}
+        return values
+
+    @cached_property
+    def described(self) -> Document:
+        """Robot and options that two runners must share to restore each other's snapshots, as plain
+        values.
+        """
+        robot, command = self.robot, self.own_command
+        options = {name: _plain(value) for name, value in self.values_for("snapshot").items()}
+        return options | {
+            **robot.describe(),
+            "joints": list(robot.joint_names),
+            "ignored_pairs": digest(robot.ignored_pairs),
+            "robot_actuators": digest(known_joints(robot)),
+            "command": None if command is None else list(command.names),
+        }
+
+
+def default_params(
+    robot: Robot, control: ControlMode | Controller = "pid", loops: tuple[str, ...] = ()
+) -> bp.PIDParams:
+    """Return the params of a runner that is given none.
+
+    - ``"pid"``: ``robot.tuned()`` where the robot ships them, else ``robot.designed()``, or with
+      closed ``loops`` ``robot.designed("effort")``;
+    - ``"drive"``: the drive gains of a bundled robot's settings, else the gains of
+      ``robot.designed("effort")`` without ki, setpoint weight and filter, which a drive does not
+      have: the integral would overshoot;
+    - ``"effort"``, and a :class:`Controller`: zero gains and the robot's effort limits.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The robot ships no gains and none can be designed: its mass matrix is not positive definite.
+    """
+    if control not in ("pid", "drive"):
+        return robot.params(kp=0.0, ki=0.0, kd=0.0)
+    settings = robot.settings
+    if control == "drive":
+        if settings is None:
+            return robot.designed("effort").replace(
+                ki=0.0, setpoint_weight=None, derivative_filter_time=None
+            )
+        return robot.params(
+            kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None
+        )
+    return robot.tuned() if robot.has_tuned else robot.designed("effort" if loops else None)
+
+
+def checked_option(name: str, value: Any) -> Any:
+    """Return the value of an argument in the canonical form of its declared type.
+
+    Raises InvalidArgumentError if a number is out of bounds, or the value is of another type.
+    """
+    return plain(name, KINDS[name], value)
+
+
+def arguments_of(
+    record: Callable[P, object],
+) -> Callable[[Callable[..., None]], Callable[Concatenate[Any, P], None]]:
+    """Decorate an ``__init__`` that forwards its arguments to ``record``, so that editors show that
+    signature.
+    """
+    return lambda init: init
+
+
+def _plain(value: Any) -> object:
+    """Return the value of an option in JSON's types, equal for options that are equal.
+
+    A controller or a function counts by its name and its attribute ``version``, other objects by
+    their digest.
+    """
+    if callable(value):
+        name = getattr(value, "__qualname__", type(value).__qualname__)
+        return f"{name} {getattr(value, 'version', '')}"
+    if type(value) is tuple:
+        return list(value)
+    if value is None or isinstance(value, str | int | float):
+        return value
+    return value.name if isinstance(value, Robot) else digest(value)
+
+
+def _not_in_program(argument: str, problem: str) -> InvalidArgumentError:
+    """Return the error for an option that the program of backend "jax" does not have."""
+    problem = f"{problem}, which the program of backend 'jax' does not have"
+    return InvalidArgumentError(argument, problem, remedy="use backend='numpy'")

@@ -1,0 +1,124 @@
+"""Record of a robot: bodies with their joints, and collision shapes, as rows of arrays and names.
+
+A :class:`Tables` is made once, by the reader of a URDF (:mod:`batchpid.sim.robot.urdf`) or of an
+MJCF file (:mod:`batchpid.sim.robot.mjcf.mjcf_reader`). Everything else reads it: engines, rigid
+trees, distances and exports.
+
+:func:`batchpid.sim.robot.merging.merge_fixed` makes the tables that engines simulate, with one body
+for all links that fixed joints hold together. :attr:`batchpid.sim.engine.scene_spec.SceneSpec.tables`
+has a row for each link of the file, ``SceneSpec.simulated`` the merged rows.
+
+Limits, damping and friction are those of the file. The degrees of freedom of a robot,
+``SceneSpec.joints``, are the same joints with limits, friction and damping of followers moved to
+their leaders. Reflected inertia of motors is in the robot's actuators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from batchpid.arrays.array_types import Float64
+from batchpid.arrays.digest import digest
+from batchpid.arrays.read_only import read_only
+from batchpid.sim.robot.parts import Joint, Placement
+from batchpid.task_space.frames import matrix_of
+from batchpid.task_space.spatial_inertia import SpatialInertia
+
+ORIGIN = read_only(np.zeros(3))
+NO_TURN = read_only(np.array([1.0, 0.0, 0.0, 0.0]))
+NO_INERTIA = read_only(np.zeros((3, 3)))
+
+
+class Body(NamedTuple):
+    """Rigid body, and the joint above it. Its frame is the frame of the joint at position 0."""
+
+    name: str
+    joint: Joint | None
+    """Joint between the parent and this body: type, axis in the frame of the joint (not
+    normalised), limits, damping, friction, mimic; ``joint.parent_link`` names the parent. None for
+    the base.
+    """
+    position: Float64 = ORIGIN
+    """Origin of the joint in the frame of the parent (3,) [m]."""
+    wxyz: Float64 = NO_TURN
+    """Orientation of the joint in the frame of the parent (4,)."""
+    mass: float = 0.0
+    """Mass [kg]. 0 in a row of the file without ``<inertial>``; merged rows have a positive mass."""
+    center: Float64 = ORIGIN
+    """Center of mass in the frame of the body (3,) [m]."""
+    inertia: Float64 = NO_INERTIA
+    """Inertia tensor about the center of mass (3, 3) [kg m^2], in the axes of ``inertia_wxyz``."""
+    inertia_wxyz: Float64 = NO_TURN
+    """Orientation of the axes of ``inertia`` in the frame of the body (4,)."""
+
+    @property
+    def spatial_inertia(self) -> SpatialInertia:
+        """Inertia of the body in its frame."""
+        turn = matrix_of(self.inertia_wxyz)
+        return SpatialInertia(self.mass, self.center, turn @ self.inertia @ turn.T)
+
+
+class Shape(NamedTuple):
+    """Convex collision shape."""
+
+    body: str
+    """Body that has the shape."""
+    owner: str
+    """Link of the file that has the shape; another than ``body`` after a merge."""
+    kind: Literal["sphere", "box", "capsule", "cylinder", "mesh"]
+    size: tuple[float, ...]
+    """Radius; half lengths of a box's sides; radius and half length, without the ends of a capsule
+    [m]; () for a mesh. Capsules and cylinders lie along the z axis of the shape.
+    """
+    position: Float64
+    """Place of the shape in the frame of the body (3,) [m]."""
+    wxyz: Float64
+    """Orientation of the shape in the frame of the body (4,)."""
+    file: str = ""
+    """Absolute path of a mesh, which counts as its convex hull; "" for other shapes."""
+    scale: tuple[float, ...] = (1.0, 1.0, 1.0)
+    """Factors of the vertices of the file; an odd number of negative ones mirrors the mesh."""
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether a factor of a mesh is negative: SAPIEN builds such shapes last."""
+        return min(self.scale) < 0
+
+
+@dataclass(frozen=True, eq=False)
+class Tables:
+    """Tables of a robot. Equal content makes them equal, in any process; they can be pickled."""
+
+    bodies: tuple[Body, ...]
+    """Breadth first from the base, siblings in the order of the file."""
+    shapes: tuple[Shape, ...]
+    """In the order of the bodies and of the file; after a merge the mirrored shapes of a body are its
+    last.
+    """
+    links: Mapping[str, Placement]
+    """Body and place in it of each link of the file, in the order of the file's rows."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Tables) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of the content, with the paths of mesh files."""
+        return digest(self.bodies, self.shapes, self.links)
+
+    def shapes_of(self, link: str) -> list[Shape]:
+        """Return the shapes of a link of the file."""
+        return [shape for shape in self.shapes if shape.owner == link]
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """Joints of all bodies but the base, in their order."""
+        return tuple(body.joint for body in self.bodies if body.joint is not None)

@@ -1,0 +1,1 @@
+"""Runner: N robots under one batch controller, and its operations."""

@@ -1,0 +1,1 @@
+"""What goes into robots and comes out: commands, observations, rollouts."""

@@ -1,0 +1,179 @@
+"""Observations. A sensor is one line of :class:`Observation`: dtype, text, unit, columns, and the
+option that it belongs to.
+
+Shared memory, snapshots, recordings and rollouts take names and shapes from that line. Its value
+comes from ``EnvGroup.observe``, from the engine's sensors of links, or, if it follows from other
+quantities, from the runner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from operator import itemgetter
+from typing import Annotated, Any, NamedTuple, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.arrays.array_types import Bool, DType, Float32, Rows
+from batchpid.sim.signals.command import FORCE_UNITS, POSE_UNITS, TWIST_UNITS, WRENCH_UNITS
+
+
+class Quantity(NamedTuple):
+    """Declaration of an observed quantity."""
+
+    dtype: DType
+    meaning: str
+    unit: str = "1"
+    """Unit; "rad|m" is the unit of the joint's position."""
+    columns: Mapping[str, str] | None = None
+    """Names and units of columns; {} for one value. None: a column for each joint."""
+    part: str = ""
+    """Part of a run without which there is no such quantity: "base", a floating one, "tool", or an
+    option that lists links, each with a row.
+    """
+    links: tuple[str, ...] | None = None
+    """These links."""
+
+    def shape(self, joints: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the shape of this quantity where that of a quantity per joint is ``joints`` (...,
+        envs, dof).
+        """
+        if self.columns is None:
+            return joints
+        rows = () if self.links is None else (len(self.links),)
+        columns = (len(self.columns),) if self.columns else ()
+        return (*joints[:-1], *rows, *columns)
+
+    def unit_for(self, position: str) -> str:
+        """Return the unit for a joint whose position is in ``position``, "rad" or "m"."""
+        rotational, _, linear = self.unit.partition("|")
+        return linear if linear and position == "m" else rotational
+
+
+class Observation(NamedTuple):
+    """State of every env after a tick, (envs, dof) in the robot's joint order; ``ok`` is (envs,).
+
+    ``effort``, ``saturated`` and ``guarded`` are from the last sim step; under control "drive" the
+    effort is qf alone, since PhysX does not report drive efforts. ``ok`` is False for an env that
+    failed in this tick, or that is suspended since an earlier one: see
+    :attr:`batchpid.sim.Runner.faults`. ``tool_pose`` (envs, 7) is the pose of the tool at ``qpos``,
+    where setpoints are poses: position [m] and unit quaternion (w, x, y, z); else None.
+
+    ``base_pose`` (envs, 7) is the pose of the robot's root link in the world, where the base
+    floats, and ``base_twist`` (envs, 6) the velocity of that link's origin and its angular velocity
+    [m/s, rad/s], along the axes of the world; else None.
+
+    ``contact_force`` (envs, links, 3) is the net force of all contacts on each link of the option
+    ``contacts`` [N], along the axes of the world, as the mean over the sim steps of the tick, and
+    ``touching`` (envs, links) whether it had a contact in one of them. ``wrench`` (envs, links, 6)
+    is the mean force and torque that its parent exerts on each link of the option ``wrenches`` [N,
+    N m], at the origin and along the axes of the link's frame. They are 0 after a reset, and None
+    without these options.
+    """
+
+    qpos: Annotated[Float32, Quantity(np.float32, "joint position", "rad|m")]
+    qvel: Annotated[Float32, Quantity(np.float32, "joint velocity", "rad/s|m/s")]
+    effort: Annotated[Float32, Quantity(np.float32, "applied joint effort", "N m|N")]
+    saturated: Annotated[Bool, Quantity(np.bool_, "effort at its limit")]
+    ok: Annotated[Bool, Quantity(np.bool_, "state is finite", columns={})]
+    guarded: Annotated[Bool, Quantity(np.bool_, "setpoint changed by the guard")]
+    tool_pose: Annotated[
+        Float32 | None, Quantity(np.float32, "pose of the tool", "m|1", POSE_UNITS, "tool")
+    ] = None
+    base_pose: Annotated[
+        Float32 | None, Quantity(np.float32, "pose of the base", "m|1", POSE_UNITS, "base")
+    ] = None
+    base_twist: Annotated[
+        Float32 | None, Quantity(np.float32, "twist of the base", "m/s|rad/s", TWIST_UNITS, "base")
+    ] = None
+    contact_force: Annotated[
+        Float32 | None,
+        Quantity(np.float32, "contact force on the link", "N", FORCE_UNITS, "contacts"),
+    ] = None
+    touching: Annotated[
+        Bool | None, Quantity(np.bool_, "link had a contact", "1", {}, "contacts")
+    ] = None
+    wrench: Annotated[
+        Float32 | None,
+        Quantity(np.float32, "wrench of the parent on the link", "N|N m", WRENCH_UNITS, "wrenches"),
+    ] = None
+
+    def for_envs(self, envs: slice | int | Rows | Sequence[int]) -> Observation:
+        """Return the observation of some envs (a slice or an index array)."""
+        return self.map(itemgetter(envs))
+
+    def map(self, function: Callable[[Rows], Rows]) -> Observation:
+        """Return an observation with ``function`` applied to each array that there is."""
+        return Observation._make([None if array is None else function(array) for array in self])
+
+    def copied(self, tool_pose: Callable[[Rows], NDArray[np.float32]] | None = None) -> Observation:
+        """Return a copy with arrays of its own; ``tool_pose`` gives the pose of the tool at
+        positions (..., dof).
+        """
+        rows = list[Any]()
+        for array in self:  # no comprehension, which is a call of Python in the path of a tick
+            rows.append(None if array is None else array.copy())
+        if tool_pose is not None:
+            rows[_TOOL_POSE] = tool_pose(rows[0])
+        return Observation(*rows)
+
+    @staticmethod
+    def join(parts: Sequence[Observation]) -> Observation:
+        """Return the observations as one, along the first axis."""
+        columns = zip(*parts, strict=True)
+        return Observation._make(
+            [None if arrays[0] is None else np.concatenate(arrays) for arrays in columns]
+        )
+
+    def __repr__(self) -> str:
+        envs, dof = self.qpos.shape[-2:]
+        return f"Observation({envs} envs, {dof} joints, {failed_envs(self.ok)})"
+
+
+_TOOL_POSE = Observation._fields.index("tool_pose")
+_HINTS = get_type_hints(Observation, include_extras=True)
+QUANTITIES: dict[str, Quantity] = {name: hint.__metadata__[0] for name, hint in _HINTS.items()}
+"""Quantity of each field of :class:`Observation`."""
+
+
+def observed(
+    fixed_base: bool | None = None,
+    tool: str | None = None,
+    **links: tuple[str, ...] | None,
+) -> dict[str, Quantity]:
+    """Return the quantities of a run, by name; ``links`` are the options that list some."""
+    parts = {"": True, "base": fixed_base is False, "tool": tool is not None}
+    present = {}
+    for name, quantity in QUANTITIES.items():
+        rows = links.get(quantity.part)
+        if rows or parts.get(quantity.part):
+            present[name] = quantity._replace(links=rows)
+    return present
+
+
+OBSERVED = observed()
+"""Quantities of every run."""
+
+
+def empty_observation(*shape: int, observed: Mapping[str, Quantity]) -> Observation:
+    """Return unset arrays for observations of ``shape`` (..., envs, dof)."""
+    rows: dict[str, Rows] = {}
+    for name, quantity in observed.items():
+        rows[name] = np.empty(quantity.shape(shape), quantity.dtype)
+    return Observation(**rows)
+
+
+def untouched(num_envs: int, observed: Mapping[str, Quantity]) -> dict[str, Rows]:
+    """Return the quantities of links in ``observed`` before the first tick, 0."""
+    rows: dict[str, Rows] = {}
+    for name, quantity in observed.items():
+        if quantity.links:
+            rows[name] = np.zeros(quantity.shape((num_envs, 0)), quantity.dtype)
+    return rows
+
+
+def failed_envs(ok: Bool) -> str:
+    """Return in words how many envs failed in ``ok`` (..., envs)."""
+    failed = int((~ok.reshape(-1, ok.shape[-1]).all(0)).sum()) if ok.size else 0
+    return f"{failed} failed" if failed else "all ok"

@@ -1,0 +1,374 @@
+"""Rollouts: the arrays of a run, and the info of its robot, options and origin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from operator import itemgetter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.arrays.array_types import Float64, Rows
+from batchpid.errors import InvalidArgumentError
+from batchpid.law.params import PIDParams
+from batchpid.motors import Actuators
+from batchpid.sim.signals.command import CommandSpec, joint_command
+from batchpid.sim.signals.observation import (
+    QUANTITIES,
+    Observation,
+    Quantity,
+    failed_envs,
+    observed,
+)
+
+RECORDED = {
+    "setpoint": Quantity(np.float64, "setpoint", "rad|m"),
+    "feedforward": Quantity(np.float64, "effort added before saturation", "N m|N"),
+} | QUANTITIES
+"""Quantity of each array of a :class:`Rollout`, ``time`` aside."""
+
+
+class Redraw(NamedTuple):
+    """Beginning of an episode during a run: a randomization drew for an env again."""
+
+    time: float
+    """End of the first tick [s]."""
+    env: int
+    stream: int
+    episode: int
+
+
+_OF_ROBOT = (
+    *("joint_names", "units", "lower", "upper", "effort_limit"),
+    *("digest", "dissipation", "fixed_base"),
+)  # fields of RunInfo that are attributes of a robot
+_OF_ENVS = ("params", "actuators", "start", "episodes")  # fields with a row for each env
+
+
+@dataclass(frozen=True, eq=False)
+class RunInfo:
+    """Robot, options and origin of a run; None where unknown.
+
+    :meth:`batchpid.sim.Runner.rollout` and :func:`batchpid.sim.read_recording` fill it;
+    :meth:`of` makes one by hand.
+    """
+
+    robot: str
+    """Name of the robot."""
+    joint_names: tuple[str, ...]
+    units: tuple[str, ...]
+    """Unit of each joint's position: "rad" or "m"."""
+    lower: Float64
+    """Lower position limits (joints,) [rad or m]."""
+    upper: Float64
+    """Upper position limits (joints,) [rad or m]."""
+    effort_limit: Float64
+    """Effort limits (joints,) [N m or N]."""
+    digest: str | None = None
+    """Digest of the robot's bodies, joints and shapes."""
+    dissipation: str | None = None
+    """Source of joint friction and damping: "urdf" or "sapien"."""
+    fixed_base: bool | None = None
+    """False if the base floats."""
+    timestep: float | None = None
+    """Time step of simulation and control [s]."""
+    substeps: int | None = None
+    """Sim steps of a tick."""
+    control: str | None = None
+    """One of "pid", "drive", "effort"; of the caller's own controller the name of its class."""
+    tool: str | None = None
+    """Link of the tool that setpoints move; None where they are not poses."""
+    own_command: CommandSpec | None = None
+    """Names and units of setpoints that are not one number for each joint."""
+    compensate: str | None = None
+    """Efforts added by the runner: "gravity+coriolis+friction", "gravity+coriolis", "gravity" or
+    "none".
+    """
+    engine: str | None = None
+    """Physics engine: "sapien"."""
+    physics: str | None = None
+    """Solver settings: "accurate", "fast", or the text of a :class:`batchpid.sim.Physics`."""
+    collisions: bool | None = None
+    """False if the robots had no collision shapes."""
+    ground: bool | None = None
+    """True if the scenes had a ground at height 0."""
+    contacts: tuple[str, ...] | None = None
+    """Links whose contact forces were observed."""
+    wrenches: tuple[str, ...] | None = None
+    """Links with a wrench sensor."""
+    rates: bool | None = None
+    """True if setpoints were given with rates, and moved within the ticks; None if unknown, as
+    after a kill.
+    """
+    params: PIDParams | None = None
+    """PID parameters at the start."""
+    params_changed: bool = False
+    """True if they were changed in the run, or a snapshot was restored; known of a complete
+    recording.
+    """
+    actuators: Actuators | None = None
+    """Motors and sensors at the start, before draws of a randomization; None for ideal ones."""
+    start: Rows | None = None
+    """Positions before the first tick (envs, joints) [rad or m]."""
+    seed: int | None = None
+    """Seed of the run."""
+    versions: Mapping[str, str] | None = None
+    """Versions of the packages that results depend on, by name."""
+    begun: str | None = None
+    """Local date and time of the start, ISO 8601."""
+    complete: bool = True
+    """False for a recording that was cut short, or is still being written."""
+    faults: tuple[Any, ...] = ()
+    """Faults (:class:`batchpid.sim.Fault`) of the runner up to the end of the run."""
+    randomization: Mapping[str, Any] | None = None
+    """Distributions, as :meth:`batchpid.sim.Randomization.to_dict` returns them."""
+    draws: Mapping[str, Float64] | None = None
+    """Draws at the start, by field: (envs, joints or links)."""
+    episodes: NDArray[np.int64] | None = None
+    """Stream and episode of each env at the start (envs, 2)."""
+    redraws: tuple[Redraw, ...] = ()
+    """Episodes that began after that."""
+    description: Any = field(default=None, repr=False)
+    """Robot (:class:`batchpid.sim.Robot`) of the run, for :meth:`Rollout.findings`; not
+    recorded.
+    """
+    options: Mapping[str, Any] | None = None
+    """Further options of the runner that recordings keep, by name."""
+
+    @classmethod
+    def of(cls, robot: Any, **options: Any) -> RunInfo:
+        """Return the info of a run of a :class:`batchpid.sim.Robot`; ``options`` are further
+        fields.
+        """
+        values = {name: getattr(robot, name) for name in _OF_ROBOT}
+        return cls(robot=robot.name, description=robot, **values, **options)
+
+    @property
+    def command(self) -> CommandSpec:
+        """Names and units of the setpoint's entries."""
+        return self.own_command or joint_command(self.joint_names, self.units, self.control)
+
+    @property
+    def sets_positions(self) -> bool:
+        """True if setpoints are joint positions."""
+        own = self.own_command
+        return (
+            self.control != "effort"
+            if own is None
+            else (own.names, own.units) == (self.joint_names, self.units)
+        )
+
+    @property
+    def recorded(self) -> dict[str, Quantity]:
+        """Quantities of :data:`RECORDED` that this run has."""
+        links = {"contacts": self.contacts, "wrenches": self.wrenches}
+        commands = {name: RECORDED[name] for name in ("setpoint", "feedforward")}
+        return commands | observed(self.fixed_base, self.tool, **links)
+
+    def units_of(self, name: str) -> tuple[str, ...]:
+        """Return the unit of each column of the quantity ``name`` of :data:`RECORDED`; none if it
+        has no columns.
+        """
+        quantity = RECORDED[name]
+        if name == "setpoint":
+            return self.command.units
+        if quantity.columns is None:
+            return tuple(map(quantity.unit_for, self.units))
+        return tuple(quantity.columns.values())
+
+    def row_shape(self, name: str, num_envs: int) -> tuple[int, ...]:
+        """Return the shape of the quantity ``name`` of :attr:`recorded` after a tick: (envs,
+        columns) or (envs,).
+
+        A quantity of links has their number in between.
+        """
+        return self.recorded[name].shape((num_envs, len(self.units_of(name))))
+
+    def for_envs(self, envs: NDArray[np.int64]) -> RunInfo:
+        """Return the info of the envs with these numbers."""
+
+        def rows(value: Any) -> Any:
+            if isinstance(value, PIDParams | Actuators):
+                return value.for_envs(envs)
+            return None if value is None else value[envs]
+
+        def events(values: tuple[Any, ...]) -> tuple[Any, ...]:
+            """Return the events of these envs, under their new numbers."""
+            renumbered = []
+            for event in values:
+                numbers = np.flatnonzero(envs == event.env).tolist()
+                renumbered += [event._replace(env=number) for number in numbers]
+            return tuple(renumbered)
+
+        draws = self.draws
+        if draws is not None:
+            draws = {name: rows(table) for name, table in draws.items()}
+        tables = {name: rows(getattr(self, name)) for name in _OF_ENVS}
+        faults, redraws = events(self.faults), events(self.redraws)
+        return replace(self, draws=draws, faults=faults, redraws=redraws, **tables)
+
+    def for_ticks(self, start: Rows | None, begin: float, end: float) -> RunInfo:
+        """Return the info of the ticks between two times [s], where the first begins at the
+        positions ``start``.
+        """
+        earlier = [redraw for redraw in self.redraws if redraw.time <= begin]
+        episodes = self.episodes
+        if episodes is not None and earlier:
+            episodes = episodes.copy()
+            for redraw in earlier:
+                episodes[redraw.env] = redraw.stream, redraw.episode
+        return replace(
+            self,
+            start=start,
+            draws=None if earlier else self.draws,  # they are known of the first episodes alone
+            episodes=episodes,
+            faults=tuple([fault for fault in self.faults if fault.time <= end]),
+            redraws=tuple([redraw for redraw in self.redraws if begin < redraw.time <= end]),
+        )
+
+    def __repr__(self) -> str:
+        control = f", control {self.control!r}" if self.control else ""
+        return f"RunInfo({self.robot}, {len(self.joint_names)} joints{control})"
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """Record of a run. Row k is the state at the end of tick k, at ``time[k]``.
+
+    The fields of :class:`Observation` are attributes, with the ticks first: ``qpos`` (ticks, envs,
+    dof), ..., ``ok`` (ticks, envs).
+    """
+
+    time: Float64
+    """End of each tick (ticks,) [s], since the start of the runner; a reset does not set it
+    back.
+    """
+    setpoint: Float64
+    """(ticks, envs, dof) [rad or m]; under control "effort" the effort asked for [N m or N]. For a
+    control that defines its command (ticks, envs, size), in the order of ``info.command.names``.
+    """
+    observation: Observation
+    """Observations, stacked."""
+    tick: float
+    """Time from one row to the next [s]."""
+    info: RunInfo
+    """Robot, options and origin of the run."""
+    feedforward: Float64 | None = None
+    """Joint efforts added before saturation (ticks, envs, dof) [N m or N]; None if none were
+    given.
+    """
+
+    def __getattr__(self, name: str) -> Rows:
+        if name not in QUANTITIES:
+            names = ", ".join(QUANTITIES)
+            raise AttributeError(
+                f"a Rollout has no {name!r}; it has time, setpoint, tick, info, {names}"
+            )
+        array: Rows = getattr(self.observation, name)
+        return array
+
+    @property
+    def num_envs(self) -> int:
+        """Number of envs."""
+        return int(self.qpos.shape[1])
+
+    def arrays(self) -> dict[str, Rows]:
+        """Return time, setpoint, feedforward if one was given, and every quantity that was
+        observed, by name.
+        """
+        seen = {
+            name: array for name, array in self.observation._asdict().items() if array is not None
+        }
+        if self.feedforward is not None:
+            seen["feedforward"] = self.feedforward
+        return {"time": self.time, "setpoint": self.setpoint, **seen}
+
+    def for_envs(self, envs: slice | Sequence[int] | Rows) -> Rollout:
+        """Return the rollout of some envs (a slice or an index array)."""
+        numbers = np.arange(self.num_envs)[envs]
+        return self._mapped(lambda array: array[:, numbers], info=self.info.for_envs(numbers))
+
+    def for_ticks(self, ticks: slice) -> Rollout:
+        """Return the rollout of some ticks."""
+        numbers = np.arange(len(self.time))[ticks]
+        time, info = self.time[ticks], self.info
+        if len(numbers):
+            first = numbers[0]
+            start, begin = info.start, -np.inf
+            if first:
+                start, begin = self.qpos[first - 1], float(self.time[first - 1])
+            info = info.for_ticks(start, begin, float(time[-1]))
+        tick = self.tick * (ticks.step or 1)
+        return self._mapped(itemgetter(ticks), time=time, tick=tick, info=info)
+
+    def _mapped(self, function: Callable[[Rows], Rows], **others: Any) -> Rollout:
+        """Return a rollout with ``function`` applied to each array but the times, and with other
+        fields.
+        """
+        feedforward = None if self.feedforward is None else function(self.feedforward)
+        setpoint, seen = function(self.setpoint), self.observation.map(function)
+        return replace(self, setpoint=setpoint, observation=seen, feedforward=feedforward, **others)
+
+    @staticmethod
+    def join(parts: Sequence[Rollout]) -> Rollout:
+        """Return successive rollouts of one run as one, with the info of the first, and the faults
+        of the last, which include the earlier ones.
+        """
+        first, last = parts[0], parts[-1]
+        feedforward = None
+        if first.feedforward is not None:
+            feedforward = np.concatenate([part.feedforward for part in parts])
+        return replace(
+            first,
+            time=np.concatenate([part.time for part in parts]),
+            setpoint=np.concatenate([part.setpoint for part in parts]),
+            observation=Observation.join([part.observation for part in parts]),
+            info=replace(first.info, faults=last.info.faults, redraws=last.info.redraws),
+            feedforward=feedforward,
+        )
+
+    def __repr__(self) -> str:
+        ticks, envs, dof = self.qpos.shape
+        end = f"up to {self.time[-1]:g} s" if ticks else "empty"
+        return f"Rollout({ticks} ticks {end}, {envs} envs, {dof} joints, {failed_envs(self.ok)})"
+
+    def findings(self, robot: Any = None) -> Any:
+        """Return the causes for which joints do not settle; an empty list if all settle.
+
+        Each is a :class:`batchpid.sim.Finding` with ``code``, ``text``, ``remedy``, ``envs``,
+        ``time`` [s], and a joint or a detail.
+
+        Parameters
+        ----------
+        robot
+            Robot of the run, a :class:`batchpid.sim.Robot`; needed for a recording, which does not
+            hold its meshes.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The robot is not known, or has other joints than the run.
+        """
+        from batchpid.sim.diagnosis.findings import unsettled_findings
+
+        robot = self.info.description if robot is None else robot
+        if robot is None:
+            problem, remedy = (
+                "of this run is not known",
+                "pass it: rollout.findings(Robot.load(...))",
+            )
+            raise InvalidArgumentError("robot", problem, remedy=remedy)
+        return unsettled_findings(self, robot)
+
+    def plot(self, **options: Any) -> Any:
+        """Return a Matplotlib figure of the run, which a notebook shows: positions above efforts
+        for each joint.
+
+        ``options`` are arguments of :func:`batchpid.sim.plots.step_responses`: joints, band, mark,
+        title.
+        """
+        from batchpid.sim.plots import step_responses
+
+        return step_responses(self, **options)

@@ -1,0 +1,248 @@
+"""Comparison of sets of gains on the same moves, as a table, as figures and as a picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from tabulate import tabulate
+
+from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.field_tables import Field
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim.engine.protocol import load_engine
+from batchpid.sim.options.groups import EngineName
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.tuning.evaluation import Evaluation, arm_joints, evaluate_gains, tuning_engine
+from batchpid.sim.tuning.gain_sets import GainSet, gain_set
+from batchpid.sim.tuning.moves import random_moves, tutorial_move
+from batchpid.sim.tuning.randomization_files import at_the_joints, reseeded
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LISTED = 3
+"""Causes that a report lists."""
+HEADERS = (
+    "gains",
+    "settling",
+    "following error",
+    "overshoot",
+    "final error",
+    "chatter",
+    "settled /\nin time",
+)
+ABOUT = """\
+Median / worst over the arm's joints and all moves, made as steps of the setpoint. following error: largest
+|qpos - setpoint| of a joint [rad or m] on the same moves as smooth motions, with setpoint rates. overshoot: of joints
+that settled. chatter: variation of the effort over that of the smooth move. settled / in time: moves of which every
+joint settled, within the run and within a second or 1.2 times the shortest that the effort limits allow."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Evaluations of sets of gains on the same moves; result of :func:`compare`."""
+
+    robot: Robot
+    evaluations: tuple[Evaluation, ...]
+    """One for each set and engine; the engines of a set follow each other."""
+    engines: tuple[EngineName, ...]
+
+    def report(self) -> str:
+        """Return a table of the sets, the causes for which moves did not settle, and with two
+        engines the largest differences between them.
+        """
+        robot = self.robot
+        names = {None, *np.array(robot.joint_names)[arm_joints(robot)]}
+        lines = [
+            table([self._row(each) for each in self.evaluations], HEADERS, "lrrrrrr"),
+            ABOUT,
+        ]
+        for evaluation in self.evaluations:
+            causes = evaluation.rollout.findings(robot)
+            causes = [cause for cause in causes if cause.joint in names]
+            if causes:
+                lines += [f"\nNot settled under {evaluation.name} (each env makes one move):"]
+                lines += cause_lines(causes)
+        if len(self.engines) == 2:
+            lines.append("\nLargest difference of a position between the engines:")
+            pairs = zip(self.evaluations[::2], self.evaluations[1::2], strict=True)
+            lines += [self._difference(*pair) for pair in pairs]
+        return "\n".join(lines)
+
+    def document(self) -> Document:
+        """Return the figures of each set (moves, dof)."""
+        figures = {}
+        for evaluation in self.evaluations:
+            figures[evaluation.name] = {
+                "metrics": evaluation.metrics,
+                "chatter": evaluation.chatter,
+                "settling_limit": evaluation.settling_limit,
+                "following_error": evaluation.following_error,
+            }
+        moves = self.evaluations[0].moves.names
+        return {"joints": self.robot.joint_names, "moves": moves, "gains": figures}
+
+    def figure(self) -> Figure:
+        """Draw the first two evaluations on their first move."""
+        from batchpid.sim import plots
+
+        shown = self.evaluations[:2]
+        runs = [evaluation.rollout.for_envs(slice(0, 1)) for evaluation in shown]
+        title = f"{self.robot.name}, {shown[0].moves.names[0]} move"
+        if len(runs) == 1:
+            return plots.step_responses(runs[0], title=title)
+        return plots.comparison(*runs, labels=(shown[0].name, shown[1].name), title=title)
+
+    def _row(self, evaluation: Evaluation) -> list[str]:
+        """Return the row of an evaluation in the table."""
+        arm = arm_joints(self.robot)
+        metrics, error = evaluation.metrics, evaluation.following_error
+        settling = metrics.settling_time[:, arm]
+        settled = np.isfinite(settling).all(1).sum()
+        # A joint without a move has no settling time, and is in time.
+        slowest = np.nan_to_num(settling, nan=0.0, posinf=np.inf).max(1)
+        in_time = (slowest <= evaluation.settling_limit).sum()
+        return [
+            evaluation.name,
+            median_and_worst(settling, "{:.2f} s"),
+            "-" if error is None else median_and_worst(error[:, arm].max(1), "{:.2g}"),
+            median_and_worst(overshoot_of_settled(metrics.overshoot[:, arm], settling), "{:.1%}"),
+            median_and_worst(metrics.steady_state_error[:, arm], "{:.1e}"),
+            median_and_worst(evaluation.chatter[:, arm], "{:.1f}"),
+            f"{settled} / {in_time} of {len(settling)}",
+        ]
+
+    def _difference(self, first: Evaluation, second: Evaluation) -> str:
+        """Return a line with the largest difference of a position between two evaluations."""
+        difference = np.abs(first.rollout.qpos - second.rollout.qpos)
+        largest = np.nan_to_num(difference, nan=np.inf).max(0)
+        move, joint = np.unravel_index(int(largest.argmax()), largest.shape)
+        place = f"joint {self.robot.joint_names[joint]!r}, move {first.moves.names[move]!r}"
+        unit = self.robot.units[joint]
+        return f"  {first.name} / {second.name}: {largest.max():.1e} {unit} ({place})"
+
+
+def compare(
+    robot: Robot,
+    gains: tuple[str, ...] | Sequence[GainSet] = (),
+    moves: Annotated[int, Field(high=100_000)] = 20,
+    seed: Annotated[int, Field(high=2**31 - 1)] = 0,
+    seconds: Annotated[float, Field("simulated time, s", low=1e-6, high=1e6)] = 2.0,
+    engine: tuple[EngineName, ...] | None = None,
+    randomization: Randomization | None = None,
+    workers: int | None = None,
+    progress: Callable[[Any], Any] | None = None,
+    **runner_options: Any,
+) -> Comparison:
+    """Compare sets of gains on the same seeded moves: settling, overshoot, final error and chatter
+    of each.
+
+    In two engines every set runs in both, on the same moves, and the report has the largest
+    difference of their motions.
+
+    Parameters
+    ----------
+    gains
+        Sets of gains: tuned, designed, sapien-tutorial, mjcf, drive, drive:STIFFNESS,DAMPING,
+        params files (.yaml or .json) that `batchpid tune` or batchpid.save_params wrote, or MJCF
+        files (.xml). Default: tuned, sapien-tutorial and drive for a bundled robot, else designed
+        and drive.
+    moves
+        Number of random moves, the tutorial's aside.
+    seed
+        Seed of the moves; no search of `batchpid tune` with the same seed sees them.
+    seconds
+        Simulated time of each move [s].
+    engine
+        Physics engines, one or both. Default: mujoco.
+    randomization
+        Draw the robot of each move: a YAML file (docs/randomization.md), e.g. `payload: {uniform:
+        [0, 0.5]}`.
+    workers
+        Processes that step the scenes; 0: this one. Default: one per available core.
+    progress
+        Wraps the sets, e.g. ``tqdm.tqdm``.
+    runner_options
+        More options of :class:`batchpid.sim.Runner`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        A set of gains is unknown, or no move is left.
+    """
+    engines = tuning_engine(runner_options.get("build")) if engine is None else engine
+    engines = (engines,) if isinstance(engines, str) else tuple(dict.fromkeys(engines))
+    if not engines:
+        raise InvalidArgumentError("engine", "is missing", remedy="name sapien, mujoco or both")
+    if not moves and robot.settings is None:
+        remedy = "use 1 or more: the robot has no move of a tutorial"
+        raise InvalidArgumentError("moves", "leaves none", value=moves, remedy=remedy)
+    sets = [gain_set(robot, name) if isinstance(name, str) else name for name in gains]
+    sets = sets or [gain_set(robot, name) for name in default_sets(robot)]
+    titles = {name: load_engine(name).title for name in engines}
+    unseen = tutorial_move(robot) + random_moves(robot, moves, seed + 1)
+    draws = reseeded(randomization, seed + 1)
+    pairs = list(product(sets, titles))
+    evaluations = []
+    for chosen, name in pairs if progress is None else progress(pairs):
+        evaluation = evaluate_gains(
+            robot,
+            chosen.params,
+            unseen,
+            name=chosen.name if len(titles) == 1 else f"{chosen.name}, {titles[name]}",
+            seconds=seconds,
+            follow=True,
+            control=chosen.control,
+            # Of the actuators, those at the joints act on drives.
+            randomization=at_the_joints(draws) if chosen.control == "drive" else draws,
+            engine=name,
+            workers=workers,
+            **runner_options,
+        )
+        evaluations.append(evaluation)
+    return Comparison(robot, tuple(evaluations), engines)
+
+
+def default_sets(robot: Robot) -> tuple[str, ...]:
+    """Return the names of the sets that are compared by default."""
+    return ("tuned", "sapien-tutorial", "drive") if robot.settings else ("designed", "drive")
+
+
+def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:
+    """Return ``rows`` under ``headers`` as text; ``align`` has one letter per column, "l" or
+    "r".
+    """
+    sides = tuple("left" if side == "l" else "right" for side in align)
+    return tabulate(rows, headers, disable_numparse=True, colalign=sides)
+
+
+def cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
+    """Yield a line for each of the first causes, the most likely first."""
+    for cause in findings[:LISTED]:
+        yield f"WHY: {cause.where}: {cause.text} ({cause.figures}); {cause.remedy}."
+    if len(findings) > LISTED:
+        yield f"and {len(findings) - LISTED} more, which rollout.findings() lists."
+
+
+def overshoot_of_settled(overshoot: Rows, settling: Rows) -> Rows:
+    """Return the overshoots of joints that settled; NaN for the others, of which it says
+    nothing.
+    """
+    return np.where(np.isinf(settling) & np.isfinite(overshoot), np.nan, overshoot)
+
+
+def median_and_worst(figures: Rows, style: str) -> str:
+    """Return the median and the worst of ``figures``, "never" for infinity, and "-" where none is
+    defined.
+    """
+    if np.isnan(figures).all():
+        return "-"
+    quantiles = np.nanquantile(figures, [0.5, 1.0], method="higher")
+    return " / ".join("never" if math.isinf(value) else style.format(value) for value in quantiles)
