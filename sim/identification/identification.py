@@ -35,6 +35,8 @@ FOLLOWS = 0.01
 """Ratio of the standard deviation of positions to the setpoints', up to which a joint counts as
 stuck.
 """
+BEYOND = 3.0
+"""Effort over the robot's limit from which it looks like another unit."""
 LEAD = 5e-3
 """Time by which setpoints act before they were logged that is an error of the log [s]."""
 DETOUR = 0.1
@@ -258,8 +260,12 @@ def _regress(data: Data, has_slew: bool) -> tuple[Data, list[Guess]]:
         others = _guesses(exact, has_slew)
         if others[0].cost < guesses[0].cost - DETOUR:
             parts, guesses = exact, others
-    if guesses[0].is_odd:
-        names = [data.robot.joint_names[joint] for joint in parts[0].log.joints]
+    log = parts[0].log
+    limits = data.robot.effort_limit[list(log.joints)]
+    beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > BEYOND * limits
+    is_odd = guesses[0].odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any())
+    if is_odd:
+        names = [data.robot.joint_names[joint] for joint in log.joints]
         words = better_reading(parts[0], names)
         if words:
             remedy = "correct the log or its options"

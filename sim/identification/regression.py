@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Bool, Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.sim.identification.log import Log, interpolated
 from batchpid.sim.identification.simulator import (
@@ -97,17 +97,19 @@ class Guess(NamedTuple):
 
     values: dict[str, Float64]
     """Values (joints,) or (1,) by kind of unknown."""
-    cost: float
-    """Mean over the joints of log(mean square of the residual / mean square of the motor's
-    effort).
-    """
+    costs: Float64
+    """log(mean square of the residual / mean square of the motor's effort) of each joint."""
 
     @property
-    def is_odd(self) -> bool:
-        """True if the motors explain little of the efforts, or a strength is far from 1."""
-        low, high = STRENGTHS
+    def cost(self) -> float:
+        """Mean of the costs."""
+        return float(self.costs.mean())
+
+    @property
+    def odd(self) -> Bool:
+        """Mask (joints,): the motor explains little of the efforts, or its strength is far from 1."""
         strength = self.values["strength"]
-        return self.cost > WORST or bool(((strength < low) | (strength > high)).any())
+        return (self.costs > WORST) | (strength < STRENGTHS[0]) | (strength > STRENGTHS[1])
 
 
 def smooth(log: Log, timestep: float) -> Motion:
@@ -181,10 +183,10 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
             for joint, fast in enumerate(moves.T):
                 joints.append(_solve([column[fast, joint] for column in (*columns, effort)]))
             values = dict(zip(names, np.array(joints).T, strict=True))
-            cost = float(values.pop("cost").mean())
+            costs = values.pop("cost")
             values["delay"] = np.array([delay])
             values["setpoint_delay"] = np.array([setpoint_delay])
-            options.append(Guess(values, cost))
+            options.append(Guess(values, costs))
         guesses.append(min(options, key=_cost))
     # The sum of both delays is certain, but armature and damping make up for their shares.
     least = min(map(_cost, guesses)) + ALIKE
@@ -247,7 +249,7 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     weight = 1e3 if size[4] < LEAST_SHARE * size[3] else WEIGHT
     prior = np.sqrt(len(target)) * weight * size[3] + 1e-12
     rows = np.vstack([columns, [0.0, 0.0, 0.0, prior, prior]])
-    triangle = np.linalg.qr(rows / np.append(size[:4], 1.0), mode="r")
+    triangle: Any = np.linalg.qr(rows / np.append(size[:4], 1.0), mode="r")
     values = nnls(triangle[:, :4], triangle[:, 4])[0] / size[:4]
     residual = columns[:, 4] - columns[:, :4] @ values
     bias = center[4] - center[:4] @ values
@@ -268,20 +270,21 @@ def better_reading(data: LogData, names: Sequence[str]) -> str:
         return regress([data._replace(log=log, motion=smooth(log, data.drive.timestep))])[0]
 
     present = guess(first)
-    costs = {words: guess(changed).cost for words, changed in _readings(first, names)}
+    odd = np.flatnonzero(present.odd).tolist()
+    costs = {words: guess(log).cost for words, log in _readings(first, names, odd)}
     best = min(costs.values())
     if best > min(present.cost - EVIDENCE, WORST):
         return ""
     return next(words for words, cost in costs.items() if cost < best + ALIKE)
 
 
-def _readings(log: Log, names: Sequence[str]) -> Iterator[tuple[str, Log]]:
-    """Yield other readings of a log, in words."""
+def _readings(log: Log, names: Sequence[str], odd: list[int]) -> Iterator[tuple[str, Log]]:
+    """Yield other readings of the ``odd`` joints of a log, in words."""
     eye = np.eye(len(names))
     changes = dict[str, Float64]()
-    for name, row in zip(names, eye, strict=True):
-        changes[f"of {name} with the other sign"] = eye - 2 * np.outer(row, row)
-    for first, second in combinations(range(len(names)), 2):
+    for joint in odd:
+        changes[f"of {names[joint]} with the other sign"] = eye - 2 * np.diag(eye[joint])
+    for first, second in combinations(odd, 2):
         order = np.arange(len(names))
         order[[first, second]] = second, first
         changes[f"of {names[first]} and {names[second]} exchanged"] = eye[order]
