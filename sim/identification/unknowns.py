@@ -1,9 +1,9 @@
 """Unknowns of a fit: objects with a start, a typical size and a prior, and the candidates at their
 values.
 
-A positive unknown x of typical size s has the coordinate c with x = s c^2, in place of a bound.
-Efforts are linear in most unknowns, so that a logarithm would bend the valleys between them. The
-coordinate of the others is x / s.
+A positive unknown x of typical size s has the coordinate c with x / s = (c + sqrt(c^2 + 4 r^2)) / 2
+in place of a bound: x / s itself, but for values near zero. Efforts are linear in most unknowns, so
+that a logarithm would bend the valleys between them. The coordinate of the others is x / s.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from batchpid.motors.actuators import Actuators
 from batchpid.sim.identification.simulator import PAYLOAD, PlantCandidates
 from batchpid.sim.robot.robot import Robot
 
+ROUND = 0.03
+"""Value of a positive unknown, over its typical size, at which its coordinate is 0."""
 LEAST_START = 0.02
 """Least start of a positive unknown, over its typical size: at zero there is no slope."""
 
@@ -118,16 +120,21 @@ class Unknown:
         if not kind.positive:
             return 0.0, kind.spread
         mean = self.coordinate(kind.neutral if kind.neutral == 1.0 else self.start)
-        return mean, 0.5 * kind.spread * max(mean, 1.0)
+        return mean, kind.spread * max(mean, 1.0)
 
     def coordinate(self, value: float) -> float:
         """Return the coordinate of a value in the fit."""
         share = (value - self.floor) / self.size
-        return float(np.sqrt(max(share, 0.0))) if self.is_positive else share
+        if not self.is_positive:
+            return share
+        share = max(share, 0.1 * ROUND)
+        return share - ROUND**2 / share
 
     def values(self, coordinates: Float64) -> Float64:
         """Return the values at some coordinates."""
-        shares = coordinates**2 if self.is_positive else coordinates
+        shares = coordinates
+        if self.is_positive:
+            shares = 0.5 * (coordinates + np.sqrt(coordinates**2 + 4 * ROUND**2))
         return np.minimum(self.floor + self.size * shares, KINDS[self.kind].most)
 
 
