@@ -21,7 +21,14 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.identification.fit import Problem, windows_of
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
 from batchpid.sim.identification.logs import Reading, read_logs
-from batchpid.sim.identification.regression import Guess, LogData, better_reading, regress, smooth
+from batchpid.sim.identification.regression import (
+    SETPOINT_DELAYS,
+    Guess,
+    LogData,
+    better_reading,
+    regress,
+    smooth,
+)
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import Dynamics, LogControl, Plant
 from batchpid.sim.identification.unknowns import BASIC, EXTRAS, LAW, Unknowns
@@ -281,7 +288,7 @@ def _sensible(result: Identification) -> Identification:
     """Return the result; raise InvalidArgumentError if setpoints acted before they were logged."""
     for at, entry in enumerate(result.unknowns.entries):
         delay, _, high = result.row(at)
-        if entry.kind == "setpoint_delay" and high < -LEAD:
+        if entry.kind == "setpoint_delay" and SETPOINT_DELAYS[0] <= delay and high < -LEAD:
             problem = f"make sense with setpoints that were logged {-1e3 * delay:.0f} ms late"
             raise InvalidArgumentError("logs", problem, remedy="correct their times")
     return result
