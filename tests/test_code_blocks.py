@@ -20,38 +20,28 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from tiny_urdf import joint, link, robot, write
+from pages import (
+    BLOCK,
+    PAGES,
+    ROOT,
+    SHORTER,
+    SHORTER_CODE,
+    TWO_JOINTS,
+    blocks,
+    missing,
+    shell_lines,
+)
+from tiny_urdf import write
 
 import batchpid as bp
 import batchpid.sim
 from batchpid.sim import Robot, Runner
 from batchpid.sim.cli import COMMANDS, main, parse
 
-ROOT = Path(__file__).parents[1]
-PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md")])
 TEXTS = sorted({*PAGES, *ROOT.glob("*.md"), ROOT / "assets/README.md"})
-BLOCK = re.compile(
-    r"(?:<!-- needs: (?P<needs>[\w., ]+) -->\n)?```(?P<language>\w*)\n(?P<code>.*?)```", re.DOTALL
-)
-SHORTER = {
-    # command: flags that make it short
-    "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
-    "rollout": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
-    "excite": ["--seconds", "1"],
-    "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1", "--engine", "mujoco"],
-    "view": ["--num-envs", "2", "--workers", "0", "--time-limit", "0.1", "--port", "8765"],
-}
 MJCF = """<mujoco>
 <worldbody><body><joint name="hinge" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/></body></worldbody>
 <actuator><position joint="hinge" kp="100" kv="10"/></actuator></mujoco>"""
-SHORTER_CODE = {
-    # pattern in Python blocks: a smaller size
-    r"\b64\b": "8",
-    r"\brange\(\d{2,}\)": "range(5)",
-    r"\((?:100|150|200), robot\.dof\)": "(10, robot.dof)",
-    r"\b8(?=, robot\.dof\)|, params=params|, substeps=20\))": "2",
-}
-TWO_JOINTS = robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", "c"))
 ON_TWO_JOINTS = ("docs/sim-to-real.md",)  # a fit of all joints of the panda is slow
 RARE = {
     # pages whose blocks seldom change and take seconds: slow
@@ -74,25 +64,10 @@ def name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-def blocks(page: Path, *languages: str) -> list[re.Match]:
-    return [match for match in BLOCK.finditer(page.read_text()) if match["language"] in languages]
-
-
 def pages_with(language: str) -> list:
     """Return the pages with blocks in ``language``, the rare ones marked as slow."""
     marks = {page: [pytest.mark.slow] if name(page) in RARE[language] else [] for page in PAGES}
     return [pytest.param(page, marks=marks[page]) for page in PAGES if blocks(page, language)]
-
-
-def shell_lines(page: Path) -> list[list[str]]:
-    """Return the words of each command in the shell blocks that can be run here."""
-    code = "".join(match["code"] for match in blocks(page, "sh") if not missing(match))
-    return [words for line in code.splitlines() if (words := shlex.split(line, comments=True))]
-
-
-def missing(match: re.Match) -> list[str]:
-    needed = re.findall(r"[\w.]+", match["needs"] or "")
-    return [name for name in needed if importlib.util.find_spec(name) is None]
 
 
 def test_every_block_is_of_a_kind_that_is_run():

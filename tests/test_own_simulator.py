@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_code_blocks import ROOT, blocks
+from pages import ROOT, blocks
 
 PAGE = ROOT / "docs/controllers.md"
 MODEL, PLAIN, MJX = [match["code"] for match in blocks(PAGE, "python")][-3:]

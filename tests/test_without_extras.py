@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
-from test_code_blocks import ROOT, SHORTER, SHORTER_CODE, TWO_JOINTS, blocks, shell_lines
+from pages import ROOT, SHORTER, SHORTER_CODE, TWO_JOINTS, blocks, shell_lines
 from tiny_urdf import write
 
 README, INDEX = ROOT / "README.md", ROOT / "docs/README.md"

@@ -5,16 +5,20 @@ A mesh counts as its convex hull, in both engines.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.arrays.digest import digest
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import RobotError
+from batchpid.io.files import write_atomically
 from batchpid.sim.robot.link_repair import DENSITY
 from batchpid.sim.robot.meshes import note_meshes, read_mesh
 from batchpid.sim.robot.tables import Shape
@@ -26,7 +30,35 @@ def hull(shape: Shape) -> Float64:
 
     Raises RobotError for a file that cannot be read.
     """
+    if shape.vertices is not None:
+        return shape.vertices
     return read_only(mesh_vertices(shape.file) * shape.scale)
+
+
+def mesh_file(shape: Shape) -> str:
+    """Return the path of a mesh file: the shape's, else that of its hull.
+
+    The hull is written to ``batchpid/meshes`` in the user's cache folder, named by its content.
+    Raises RobotError if it cannot be written.
+    """
+    if shape.vertices is None:
+        return shape.file
+    vertices, faces = convex_hull(shape.vertices)
+    lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices.tolist()]
+    lines += ["f {} {} {}".format(*face) for face in (faces + 1).tolist()]
+    content = ("\n".join(lines) + "\n").encode()
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    path = Path(cache, "batchpid", "meshes", f"{digest(content)[:32]}.obj")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.is_file() or path.read_bytes() != content:
+            write_atomically(path, content)
+    except OSError as error:
+        problem = f"{path}: cannot be written: {error.strerror}"
+        raise RobotError(
+            f"{problem}; set XDG_CACHE_HOME to a folder for the hulls of meshes"
+        ) from error
+    return str(path)
 
 
 def half_extents(shape: Shape) -> tuple[Float64, Float64]:
@@ -47,27 +79,40 @@ def mesh_vertices(filename: str) -> Float64:
     """Return the vertices (n, 3) of the convex hull of a mesh file, unscaled [m]. Raises
     RobotError.
     """
-    import mujoco
-
     note_meshes([filename])
     try:
         rows = np.ascontiguousarray(read_mesh(filename).vertices, float) + 0.0  # no -0.0
-        vertices = np.unique(rows.view("V24")).view(
-            float
-        )  # by their bytes, which is much faster than along an axis
-        spec = mujoco.MjSpec()
-        spec.add_mesh(
-            name="mesh", uservert=vertices, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        )
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
-        model = spec.compile()
+        # Unique by their bytes, which is much faster than along an axis.
+        vertices, _ = convex_hull(np.unique(rows.view("V24")).view(float))
     except Exception as error:
         raise RobotError(
             f"{filename}: cannot be read: {error}; repair the file, or remove that <collision>"
         ) from error
+    return vertices
+
+
+def convex_hull(points: Float64) -> tuple[Float64, NDArray[np.int64]]:
+    """Return the vertices (n, 3) of the convex hull of points, and its triangles (m, 3), by MuJoCo.
+
+    Raises ValueError if MuJoCo's compiler refuses the points.
+    """
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    spec.add_mesh(name="mesh", uservert=points.ravel(), inertia=shell)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+    model = spec.compile()
+    # The hull's graph has two counts, the addresses and numbers of the vertices, edges, triangles.
     graph = model.mesh_graph[model.mesh_graphadr[0] :]
-    count = int(graph[0])
-    return read_only(vertices_in_file(model, graph[2 + count : 2 + 2 * count]))
+    corners, triangles = graph[:2].tolist()
+    numbers = graph[2 + corners : 2 + 2 * corners]
+    faces = graph[2 + 3 * corners + 3 * triangles :][: 3 * triangles]
+    row = {number: index for index, number in enumerate(numbers.tolist())}
+    return (
+        read_only(vertices_in_file(model, numbers)),
+        np.array([row[number] for number in faces.tolist()], np.int64).reshape(-1, 3),
+    )
 
 
 def vertices_in_file(model: MjModel, indices: Any) -> Float64:

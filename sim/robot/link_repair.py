@@ -49,6 +49,26 @@ def nearest_physical(tensor: Float64) -> Float64:
     return (axes * moments) @ axes.T
 
 
+def possible_inertia(mass: float, tensor: Float64) -> tuple[Float64, tuple[str, str] | None]:
+    """Return an inertia tensor (3, 3) if PhysX can simulate it, else the nearest that a body of
+    that mass has, with the problem and its figures.
+    """
+    moments = np.linalg.eigvalsh(tensor)
+    if moments[0] >= max(SMALLEST, SMALLEST_RATIO * moments[2]):
+        return tensor, None
+    changed = nearest_physical(tensor) if moments[2] >= SMALLEST else np.zeros((3, 3))
+    done = "the nearest that a body has is used"
+    if changed.max() < SMALLEST:
+        changed = ball(mass)
+        done = f"that of a ball of its mass at {DENSITY:g} kg/m^3 is used"
+    before, after = (
+        " ".join(f"{moment:.3g}" for moment in row)
+        for row in (moments, np.linalg.eigvalsh(changed))
+    )
+    text = f"no body has such an inertia tensor: {done}"
+    return changed, (text, f"moments {before} kg m^2, used {after}")
+
+
 def triangle_excess(tensor: Float64) -> float:
     """Return (c - a - b) / c of the principal moments of a tensor (3, 3): positive if the tensor is
     impossible.
@@ -116,23 +136,9 @@ def _inertial(link: etree._Element) -> Iterator[Finding]:
     tensor = (
         np.zeros((3, 3)) if None in parts else from_entries([part[0] for part in parts if part])
     )
-    moments = np.linalg.eigvalsh(tensor)
-    if moments[0] >= max(SMALLEST, SMALLEST_RATIO * moments[2]):
-        changed = tensor
-    else:
-        changed = nearest_physical(tensor) if moments[2] >= SMALLEST else np.zeros((3, 3))
-        done = "the nearest that a body has is used"
-        if changed.max() < SMALLEST:
-            changed = ball(value[0])
-            done = f"that of a ball of its mass at {DENSITY:g} kg/m^3 is used"
-        before, after = (
-            " ".join(f"{moment:.3g}" for moment in each)
-            for each in (moments, np.linalg.eigvalsh(changed))
-        )
-        text, detail = (
-            f"no body has such an inertia tensor: {done}",
-            f"moments {before} kg m^2, used {after}",
-        )
+    changed, problem_and_detail = possible_inertia(value[0], tensor)
+    if problem_and_detail is not None:
+        text, detail = problem_and_detail
         yield finding_of(link, "warning", "inertia", text, "correct <inertia>", detail)
     if inertia is None:
         inertia = etree.SubElement(inertial, "inertia")

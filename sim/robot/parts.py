@@ -118,15 +118,11 @@ class Settings:
 class FileDefaults:
     """Start pose (dof,) [rad or m] of an MJCF file, and the gains (dof,) of its servos; None
     without servos.
-
-    ``imax`` is the limit of the integral of the error [rad s or m s], infinite without one.
     """
 
     start: Float64
     kp: Float64 | None = None
     kv: Float64 | None = None
-    ki: Float64 | None = None
-    imax: Float64 | None = None
 
 
 @dataclass(frozen=True)

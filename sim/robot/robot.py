@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,13 +22,10 @@ from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Findings, report
 from batchpid.sim.robot.mimics import couple
-from batchpid.sim.robot.parts import DISSIPATION, FileDefaults, Joint, Settings
+from batchpid.sim.robot.parts import DISSIPATION, Joint, Settings
+from batchpid.sim.robot.reader import read_robot
 from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
-from batchpid.sim.robot.urdf import read_robot
 from batchpid.task_space.rigid_tree import RigidTree
-
-if TYPE_CHECKING:
-    from batchpid.sim.robot.mjcf.mjcf_reader import Mjcf
 
 _ASSETS = Path(assets.__file__).parent
 MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
@@ -72,9 +69,10 @@ class Robot(RobotDescription):
             defaults, PhysX's joint friction 0.05 and link damping 0.05, for comparison with its
             tutorial.
         fixed_base
-            True to fix the root link to the world. Default True, unless the root of a URDF is a
-            link without mass and shapes and its only joint is floating or planar: then the base
-            floats, and the root is that joint's child.
+            True to fix the root link to the world. Default True, unless the file has a floating
+            base: the root of an MJCF file has a free joint, or the root of a URDF is a link without
+            mass and shapes and its only joint is floating or planar: then the root is that joint's
+            child.
         self_collision
             ``"auto"``: links that are neighbours, or touch or overlap at the start pose or in
             nearly every sampled pose do not collide (:attr:`self_contact`). ``"urdf"``: all links
@@ -83,8 +81,7 @@ class Robot(RobotDescription):
         actuators
             Motors and sensors that runners of this robot have by default:
             :class:`batchpid.Actuators` of one row, or a file of :func:`batchpid.save_actuators`, in
-            which joints are matched by name. None: ideal ones, with the armature, torque-speed
-            lines and lags of an MJCF file.
+            which joints are matched by name. None: ideal ones, with the armature of an MJCF file.
         strict
             True to refuse a file that needs repairs, which are otherwise made, with a warning, and
             listed by :meth:`check`.
@@ -117,45 +114,36 @@ class Robot(RobotDescription):
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
         source = read_robot(path, fixed_base, folders, missing_meshes)
         report(path, source.repairs, strict)
-        tables, mjcf = source.tables, source.mjcf
-        joints = couple([joint for joint in tables.joints if joint.moves])
+        joints = couple([joint for joint in source.tables.joints if joint.moves])
         if not joints:
             raise RobotError(
                 f"{path}: a robot without moving joints cannot be controlled; check the joint types"
             )
         beside = path.with_suffix(".srdf")
-        srdf = read_srdf(beside, tables.links) if os.path.isfile(beside) else Srdf()
-        if mjcf is not None:
-            srdf = srdf._replace(disabled=(*mjcf.pairs, *srdf.disabled))
+        srdf = Srdf()
+        if os.path.isfile(beside):
+            srdf = read_srdf(beside, source.tables.links)
+        fields = source._asdict()
+        srdf = srdf._replace(disabled=(*fields.pop("pairs"), *srdf.disabled))
         bundled = path.parent == _ASSETS
         robot = cls(
-            name=source.name,
-            tables=tables,
-            repairs=source.repairs,
-            oddities=source.oddities,
+            **fields,
             path=path,
             srdf=srdf,
             self_collision=self_collision,
             joints=joints,
             dissipation=dissipation,
-            fixed_base=source.fixed_base,
             package_dirs=folders,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
-            defaults=None if mjcf is None else _file_defaults(mjcf, joints),
-            mjcf=None if mjcf is None else mjcf.file,
-            base_start=source.base_start,
         )
         # From here on links mean bodies: those that fixed joints hold together are one.
         if (count := len({at.link for at in robot.bodies.values()})) > MAX_LINKS:
             problem = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
             raise RobotError(f"{path}: {problem}; split the robot")
-        if actuators is None and mjcf is not None:
-            actuators = _file_actuators(mjcf, joints)
-        return (
-            robot
-            if actuators is None
-            else replace(robot, actuators=load_robot_actuators(actuators, robot))
-        )
+        motors = source.actuators if actuators is None else actuators
+        if motors is None:
+            return robot
+        return replace(robot, actuators=load_robot_actuators(motors, robot))
 
     @staticmethod
     def bundled() -> tuple[str, ...]:
@@ -295,8 +283,7 @@ class Robot(RobotDescription):
         alone, kd.
 
         Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of
-        the servo's control; a velocity servo has kd alone. For <pid> and <dcmotor> ki and its limit
-        are included.
+        the servo's control; a velocity servo has kd alone.
 
         Raises
         ------
@@ -306,15 +293,11 @@ class Robot(RobotDescription):
         defaults = self.defaults
         if defaults is None or defaults.kp is None or defaults.kv is None:
             problem = (
-                f"{self.name!r} has no servos of an MJCF file (<position>, <pid>, or <general> with"
-                " an affine bias)"
+                f"{self.name!r} has no servos of an MJCF file (<position>, or <general> with an"
+                " affine bias)"
             )
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
-        options: Document = {"ki": 0.0}
-        if defaults.ki is not None and defaults.imax is not None and defaults.ki.any():
-            limit = np.where(defaults.ki > 0, defaults.ki, 1.0) * defaults.imax
-            options = {"ki": defaults.ki, "anti_windup": "none", "integral_limit": limit}
-        return self.params(kp=defaults.kp, kd=defaults.kv, measurement_rate="measured", **options)
+        return self.params(kp=defaults.kp, ki=0.0, kd=defaults.kv, measurement_rate="measured")
 
 
 def _find(name_or_path: str | Path) -> Path:
@@ -331,34 +314,6 @@ def _find(name_or_path: str | Path) -> Path:
         f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a"
         " file; check the spelling, or pass the path of a URDF or MJCF file"
     )
-
-
-def _file_defaults(mjcf: Mjcf, joints: tuple[Joint, ...]) -> FileDefaults:
-    names = [joint.name for joint in joints]
-    start = read_only(np.array([mjcf.start[name] for name in names]))
-    motors = mjcf.motors
-    if not any((*motors.kp.values(), *motors.kv.values(), *motors.ki.values())):
-        return FileDefaults(start)
-    columns = (motors.kp, 0.0), (motors.kv, 0.0), (motors.ki, 0.0), (motors.imax, np.inf)
-    kp, kv, ki, imax = (
-        read_only(np.array([gains.get(name, off) for name in names])) for gains, off in columns
-    )
-    return FileDefaults(start, kp, kv, ki, imax)
-
-
-def _file_actuators(mjcf: Mjcf, joints: tuple[Joint, ...]) -> bp.Actuators | None:
-    """Return the motors of an MJCF file; None if they are ideal."""
-    effects = {"armature": 0.0, "saturation_effort": np.inf, "no_load_speed": np.inf, "lag": 0.0}
-    columns: Document = {
-        name: [getattr(mjcf.motors, name).get(joint.name, off) for joint in joints]
-        for name, off in effects.items()
-    }
-    found: Document = {
-        name: column
-        for name, column in columns.items()
-        if any(each != effects[name] for each in column)
-    }
-    return bp.make_actuators(len(joints), **found) if found else None
 
 
 def _read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings:

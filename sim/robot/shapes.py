@@ -16,12 +16,14 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
+from batchpid.sim.robot.collision_shapes import convex_hull
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.link_repair import SHAPES
 from batchpid.sim.robot.meshes import find_mesh, read_mesh
+from batchpid.sim.robot.reader import is_mjcf
 from batchpid.sim.robot.tables import Shape
-from batchpid.sim.robot.urdf import is_mjcf, read_origin, read_shape
+from batchpid.sim.robot.urdf import read_origin, read_shape
 from batchpid.sim.robot.xml import numbers, parse_xml
 from batchpid.task_space.rotations import rotate
 
@@ -203,8 +205,12 @@ def _mesh(shape: Shape | None, robot: RobotDescription, deviation: float) -> Any
     if shape is None:
         return None
     if shape.kind == "mesh":
-        loaded = _read_mesh(shape.file, robot)
-        mesh: Any = Trimesh(loaded.vertices, loaded.faces, process=False)
+        if shape.vertices is not None:
+            surface = convex_hull(shape.vertices)
+        else:
+            loaded = _read_mesh(shape.file, robot)
+            surface = loaded.vertices, loaded.faces
+        mesh: Any = Trimesh(*surface, process=False)
         mesh.apply_scale(shape.scale)
     elif shape.kind == "box":
         mesh = creation.box([2 * side for side in shape.size])

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
+from batchpid.arrays.read_only import read_only
 from batchpid.sim.robot.collision_shapes import half_extents
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.merging import Separate, link_inertias, merge_fixed, place_links
@@ -90,7 +91,9 @@ def link_masses(tables: Tables, repairs: Iterable[Finding]) -> dict[str, LinkMas
             source = "repaired" if body.name in repaired else "inertial"
         gyration = float(np.sqrt(np.linalg.eigvalsh(inertia.tensor)[-1] / inertia.mass))
         size = _size(tables.shapes_of(body.name))
-        masses[body.name] = LinkMass(inertia.mass, source, gyration, size, inertia)
+        center, tensor = read_only(inertia.center), read_only(inertia.tensor)
+        kept = SpatialInertia(inertia.mass, center, tensor)
+        masses[body.name] = LinkMass(inertia.mass, source, gyration, size, kept)
     return masses
 
 

@@ -15,7 +15,8 @@ their leaders. Reflected inertia of motors is in the robot's actuators.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -32,6 +33,9 @@ from batchpid.task_space.spatial_inertia import SpatialInertia
 ORIGIN = read_only(np.zeros(3))
 NO_TURN = read_only(np.array([1.0, 0.0, 0.0, 0.0]))
 NO_INERTIA = read_only(np.zeros((3, 3)))
+
+
+ShapeKind = Literal["sphere", "box", "capsule", "cylinder", "mesh"]
 
 
 class Body(NamedTuple):
@@ -70,7 +74,7 @@ class Shape(NamedTuple):
     """Body that has the shape."""
     owner: str
     """Link of the file that has the shape; another than ``body`` after a merge."""
-    kind: Literal["sphere", "box", "capsule", "cylinder", "mesh"]
+    kind: ShapeKind
     size: tuple[float, ...]
     """Radius; half lengths of a box's sides; radius and half length, without the ends of a capsule
     [m]; () for a mesh. Capsules and cylinders lie along the z axis of the shape.
@@ -83,6 +87,8 @@ class Shape(NamedTuple):
     """Absolute path of a mesh, which counts as its convex hull; "" for other shapes."""
     scale: tuple[float, ...] = (1.0, 1.0, 1.0)
     """Factors of the vertices of the file; an odd number of negative ones mirrors the mesh."""
+    vertices: Float64 | None = None
+    """Vertices (n, 3) [m] of a mesh without a file, in the frame of the shape."""
 
     @property
     def is_mirrored(self) -> bool:
@@ -122,3 +128,19 @@ class Tables:
     def joints(self) -> tuple[Joint, ...]:
         """Joints of all bodies but the base, in their order."""
         return tuple(body.joint for body in self.bodies if body.joint is not None)
+
+
+def breadth_first(bodies: Iterable[Body], shapes: Iterable[Shape]) -> Tables:
+    """Return the tables of the bodies below the one without a joint, siblings in their order."""
+    below: dict[str, list[Body]] = defaultdict(list)
+    ordered = []
+    for body in bodies:
+        if body.joint is None:
+            ordered.append(body)
+        else:
+            below[body.joint.parent_link].append(body)
+    for body in ordered:
+        ordered += below[body.name]
+    row = {body.name: index for index, body in enumerate(ordered)}
+    links = {name: Placement(name, ORIGIN, NO_TURN) for name in row}
+    return Tables(tuple(ordered), tuple(sorted(shapes, key=lambda shape: row[shape.body])), links)

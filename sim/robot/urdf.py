@@ -1,34 +1,30 @@
-"""URDF reader: parses safely, repairs the text, resolves meshes, and reads the tables of the robot.
-
-An MJCF file is read as the URDF that is equivalent to it (:mod:`batchpid.sim.robot.mjcf`).
-"""
+"""URDF reader: repairs the elements, resolves meshes, and reads the tables of the robot."""
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from lxml import etree
 
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.arrays.read_only import read_only
-from batchpid.errors import MissingDependencyError, RobotError
+from batchpid.errors import RobotError
+from batchpid.motors import Actuators
 from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.joint_repair import ends_of, free_base, free_joint_of
 from batchpid.sim.robot.link_repair import MOMENTS, from_entries
 from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
-from batchpid.sim.robot.parts import Joint, Mimic, Placement
+from batchpid.sim.robot.parts import FileDefaults, Joint, Mimic, MjcfFile
 from batchpid.sim.robot.repair import repair
-from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Shape, Tables
-from batchpid.sim.robot.xml import number, numbers, parse_xml
+from batchpid.sim.robot.self_collision import DisabledPair
+from batchpid.sim.robot.tables import Body, Shape, Tables, breadth_first
+from batchpid.sim.robot.xml import number, numbers
 from batchpid.task_space.rotations import from_rpy
-
-if TYPE_CHECKING:
-    from batchpid.sim.robot.mjcf.mjcf_reader import Mjcf
 
 MOST_READ = 4096  # links and joints of a file
 TURN = 2 * np.pi + 0.01
@@ -46,70 +42,38 @@ class Source(NamedTuple):
     name: str
     tables: Tables
     repairs: tuple[Finding, ...]
-    oddities: tuple[Finding, ...]
     fixed_base: bool
     base_start: tuple[float, ...] | None
-    mjcf: Mjcf | None
+    oddities: tuple[Finding, ...] = ()
+    mjcf: MjcfFile | None = None
+    pairs: tuple[DisabledPair, ...] = ()
+    """Pairs of links that do not collide."""
+    defaults: FileDefaults | None = None
+    actuators: Actuators | None = None
 
 
-def is_mjcf(root: etree._Element) -> bool:
-    """Return whether a root element is an MJCF file's; MuJoCo ignores a default namespace."""
-    return root.prefix is None and etree.QName(root).localname == "mujoco"
-
-
-def read_robot(
-    path: Path, fixed_base: bool | None, package_dirs: tuple[Path, ...], missing_meshes: str
+def read_urdf(
+    root: etree._Element,
+    path: Path,
+    findings: list[Finding],
+    fixed_base: bool | None,
+    package_dirs: tuple[Path, ...],
+    missing_meshes: str,
 ) -> Source:
-    """Return the robot in the URDF or MJCF file at ``path``.
+    """Return the robot of the root element of a URDF, with ``findings`` of reading the file.
 
-    For the arguments see :meth:`batchpid.sim.Robot.load`.
-
-    Raises
-    ------
-    RobotError
-        A file that cannot be read, a structure or number that SAPIEN cannot build, a bad mesh, or
-        an MJCF file that MuJoCo does not compile.
-    MissingDependencyError
-        The file is MJCF, and the package ``mujoco`` is missing.
+    The element is repaired in place. Raises RobotError for a structure or number that SAPIEN cannot
+    build, or a bad mesh.
     """
-    findings: list[Finding] = []
-    root = parse_xml(path, findings)
-    mjcf, base = None, None
-    if is_mjcf(root):
-        mjcf = _read_mjcf(path, root, fixed_base is not False, missing_meshes)
-        root, base = mjcf.root, mjcf.base
-        findings += mjcf.findings
-    free_joint = free_joint_of(root)
+    free_joint, base = free_joint_of(root), None
     fixed_base = free_joint is None if fixed_base is None else fixed_base
     if free_joint is not None and not fixed_base:
         base = free_base(root, free_joint, findings)
     _repair(root, path, findings, package_dirs, missing_meshes)
-    links = [link.get("name", "") for link in root.findall("link")]
-    joints = [_read_joint(element, path) for element in root.findall("joint")]
     added = [str(finding.link) for finding in findings if finding.code == "missing-link"]
-    ordered = _breadth_first(links, joints, path, added)
-    tables = _read_tables(root, ordered, str(path))
+    tables = _read_tables(root, path, added)
     name, oddities = root.get("name", path.stem), tuple(_degrees(root))
-    return Source(name, tables, tuple(findings), oddities, fixed_base, base, mjcf)
-
-
-def _read_mjcf(path: Path, root: etree._Element, fixed_base: bool, missing_meshes: str) -> Mjcf:
-    if not path.is_file():
-        raise RobotError(
-            f"{path}: an MJCF file is read several times, also by workers; save it as a file first"
-        )
-    try:
-        import mujoco  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError("mujoco>=3.17", "reading an MJCF file") from error
-    from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
-
-    try:
-        return read_mjcf(path, root.get("model") or path.stem, fixed_base, missing_meshes)
-    except UnicodeDecodeError as error:
-        raise RobotError(
-            f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
-        ) from error
+    return Source(name, tables, tuple(findings), fixed_base, base, oddities)
 
 
 def _repair(
@@ -201,24 +165,24 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
     return Joint(name, kind, parent, child, **fields)
 
 
-def _read_tables(root: etree._Element, joints: Sequence[Joint], where: str) -> Tables:
-    """Return the tables of a repaired URDF with these joints, breadth first."""
-    elements = {
-        (tag, element.get("name")): element
-        for tag in ("link", "joint")
-        for element in root.findall(tag)
+def _read_tables(root: etree._Element, path: Path, added: list[str]) -> Tables:
+    """Return the tables of a repaired URDF. ``added`` are links that the file does not hold."""
+    links = root.findall("link")
+    joints = [_read_joint(element, path) for element in root.findall("joint")]
+    _check_tree([link.get("name", "") for link in links], joints, path, added)
+    above = {
+        joint.child_link: (joint, *read_origin(element, f"{path}: joint {joint.name!r}"))
+        for joint, element in zip(joints, root.findall("joint"), strict=True)
     }
-    children = {joint.child_link for joint in joints}
-    base = next(name for tag, name in elements if tag == "link" and name not in children)
+    # Siblings are in the order of their joints.
+    order = {joint.child_link: number for number, joint in enumerate(joints)}
+    links.sort(key=lambda link: order.get(link.get("name", ""), -1))
     bodies: list[Body] = []
     shapes: list[Shape] = []
-    for joint in (None, *joints):
-        name = base if joint is None else joint.child_link
-        link = elements["link", name]
-        body = Body(name, joint)
-        if joint is not None:
-            position, wxyz = read_origin(elements["joint", joint.name], where)
-            body = body._replace(position=position, wxyz=wxyz)
+    for link in links:
+        name = link.get("name", "")
+        where = f"{path}: link {name!r}"
+        body = Body(name, *above.get(name, (None,)))
         if (inertial := link.find("inertial")) is not None:
             center, turn = read_origin(inertial, where)
             tensor = inertial.find("inertia")
@@ -236,8 +200,14 @@ def _read_tables(root: etree._Element, joints: Sequence[Joint], where: str) -> T
                 read_shape(geometry, name, place, where)
                 for geometry in collision.iterfind("geometry/*")
             ]
-    own = {body.name: Placement(body.name, ORIGIN, NO_TURN) for body in bodies}
-    return Tables(tuple(bodies), tuple(shapes), own)
+    tables = breadth_first(bodies, shapes)
+    if len(tables.bodies) != len(bodies):
+        root_link = tables.bodies[0].name
+        raise RobotError(
+            f"{path}: some joints form a loop apart from the root {root_link!r}; a robot must be"
+            " one tree"
+        )
+    return tables
 
 
 def _degrees(root: etree._Element) -> Iterator[Finding]:
@@ -276,38 +246,18 @@ def read_origin(element: etree._Element, where: str) -> tuple[Float64, Float64]:
     return read_only(position), read_only(wxyz)
 
 
-def _breadth_first(
-    links: list[str], joints: list[Joint], path: Path, added: list[str]
-) -> list[Joint]:
-    """Return the joints level by level from the root, siblings in file order, if they form one
-    tree.
-
-    ``added`` are links that joints name and the file does not hold.
-    """
+def _check_tree(links: list[str], joints: list[Joint], path: Path, added: list[str]) -> None:
+    """Raise RobotError for a link with two parents, and unless there is exactly one root."""
     children = [joint.child_link for joint in joints]
-    below = defaultdict(list)
-    for joint in joints:
-        below[joint.parent_link].append(joint)
     if twice := sorted(name for name, count in Counter(children).items() if count > 1):
         raise RobotError(
             f"{path}: link with two parents: {', '.join(twice)}; a robot must be a tree"
         )
     roots = [name for name in links if name not in children]
     if len(roots) != 1:
-        remedy = (
-            f"joints name {added}, not in the file: correct the names"
-            if added
-            else "a robot must be one tree"
-        )
+        remedy = "a robot must be one tree"
+        if added:
+            remedy = f"joints name {added}, not in the file: correct the names"
         raise RobotError(
             f"{path}: needs exactly one root link, found {roots or 'a loop'}; {remedy}"
         )
-    ordered = below[roots[0]].copy()
-    for joint in ordered:
-        ordered += below[joint.child_link]
-    if len(ordered) != len(joints):
-        raise RobotError(
-            f"{path}: some joints form a loop apart from the root {roots[0]!r}; a robot must be one"
-            " tree"
-        )
-    return ordered

@@ -14,14 +14,15 @@ from lxml import etree
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.export.differences import Exported
+from batchpid.sim.robot.collision_shapes import mesh_file
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.link_repair import MOMENTS
 from batchpid.sim.robot.merging import link_inertias
 from batchpid.sim.robot.meshes import find_mesh
+from batchpid.sim.robot.reader import is_mjcf, read_robot
 from batchpid.sim.robot.repair import UNUSED
 from batchpid.sim.robot.tables import NO_TURN, Body, Shape
-from batchpid.sim.robot.urdf import is_mjcf, read_robot
 from batchpid.sim.robot.xml import parse_xml
 from batchpid.task_space.rotations import to_rpy
 
@@ -123,7 +124,7 @@ def _write_joint(root: etree._Element, body: Body) -> None:
 
 def _shape_attributes(shape: Shape) -> dict[str, str]:
     if shape.kind == "mesh":
-        return {"filename": shape.file, "scale": _text(shape.scale)}
+        return {"filename": mesh_file(shape), "scale": _text(shape.scale)}
     if shape.kind == "box":
         return {"size": _text([2 * side for side in shape.size])}
     radius, *half_length = shape.size

@@ -140,11 +140,7 @@ class MotorCase(GuardCase):
                 "saturation_effort": rng.uniform(5, 20, SHAPE),
                 "no_load_speed": rng.uniform(2, 9, SHAPE),
             }
-        self.table = (
-            (np.array([-1.0, 0.0, 2.0]), np.array([4.0, 11.0, 6.0])) if rng.random() < 0.5 else ()
-        )
-        limit = {"position_limit": self.table} if self.table else {}
-        self.model = bp.make_actuators(JOINTS, **self.options, **limit, dtype=dtype)
+        self.model = bp.make_actuators(JOINTS, **self.options, dtype=dtype)
         velocity = 4 * rng.normal(size=(STEPS, *SHAPE))
         position = np.cumsum(0.1 * rng.normal(size=(STEPS + 1, *SHAPE)), axis=0)
         self.start = position[0].astype(dtype)
@@ -165,10 +161,7 @@ class MotorCase(GuardCase):
         return state, (*seen, delivered)
 
     def oracle(self, env, joint):
-        limit = {"position_limit": self.table} if self.table else {}
-        scalar = ScalarMotor(
-            self.start[env, joint].item(), **entry(self.options, env, joint), **limit
-        )
+        scalar = ScalarMotor(self.start[env, joint].item(), **entry(self.options, env, joint))
         for effort, qpos, qvel in self.rows(env, joint):
             seen = scalar.measure(qpos, qvel, DT)
             yield (*seen, scalar.deliver(effort, qpos, qvel, DT))
@@ -244,11 +237,13 @@ def test_signals_are_those_of_plain_numbers(case, name, seed, request):
         request.getfixturevalue("x64")
     made = CASES[case](np.random.default_rng(seed), dtype)
     run, _ = EXECUTORS[name]
-    found = [
-        [np.broadcast_to(np.asarray(each, float), SHAPE) for each in row]
-        for row in run(made, dtype)
-    ]
-    found = np.moveaxis(np.array(found), 0, 1)  # signals, steps, envs, joints
+
+    def signals(rows):
+        """Return the signals (signals, steps, envs, joints)."""
+        found = [[np.broadcast_to(np.asarray(each, float), SHAPE) for each in row] for row in rows]
+        return np.moveaxis(np.array(found), 0, 1)
+
+    found = signals(run(made, dtype))
     wanted = np.array(
         [[list(made.oracle(env, joint)) for joint in range(JOINTS)] for env in range(ENVS)], float
     )
@@ -258,8 +253,4 @@ def test_signals_are_those_of_plain_numbers(case, name, seed, request):
     )  # a resolution, or the last step to a setpoint, may round away
     np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=tolerance)
     if name == "programs":
-        plain = [
-            [np.broadcast_to(np.asarray(each, float), SHAPE) for each in row]
-            for row in by_numpy(made, dtype)
-        ]
-        np.testing.assert_array_equal(found, np.moveaxis(np.array(plain), 0, 1))
+        np.testing.assert_array_equal(found, signals(by_numpy(made, dtype)))

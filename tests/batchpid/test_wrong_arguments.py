@@ -51,10 +51,8 @@ OPTIONS = [
 ]
 
 NEEDS = {"tracking_time": {"anti_windup": "back_calculation", "effort_limit": 1.0}}
-NEEDS |= {
-    name: {"saturation_effort": 1.0, "no_load_speed": 1.0}
-    for name in ("saturation_effort", "no_load_speed")
-}
+SPEEDS = {"saturation_effort": 1.0, "no_load_speed": 1.0}
+NEEDS |= {name: SPEEDS for name in SPEEDS}
 """Options without which an option is refused."""
 
 
@@ -70,17 +68,9 @@ def outside(field):
 )
 def test_options_of_joints(make, base, name, field):
     def error(value):
-        both = (
-            {"saturation_effort": 1.0, "no_load_speed": 1.0}
-            if name in ("saturation_effort", "no_load_speed")
-            else {}
+        return refused(
+            name, make, 2, **(base | NEEDS.get(name, {}) | {name: value}), joint_names=NAMES
         )
-        back = (
-            {"anti_windup": "back_calculation", "effort_limit": 1.0}
-            if name == "tracking_time"
-            else {}
-        )
-        return refused(name, make, 2, **(base | both | back | {name: value}), joint_names=NAMES)
 
     if name != "anti_windup":
         error([[1.0, 2.0], [1.0]])
@@ -117,33 +107,25 @@ COMBINATIONS = [
     (bp.make_params, "effort_min", {"effort_min": [0, 2], "effort_max": 1}),
     (bp.make_params, "effort_limit", {"effort_limit": 1, "effort_max": 2}),
     (bp.make_params, "effort_limit", {"effort_limit": [1, math.nan]}),
-    (bp.make_params, "integral_limit", {"integral_limit": -1}),
     (bp.make_params, "anti_windup", {"anti_windup": ["none", "wind"]}),
-    (bp.make_params, "anti_windup", {"anti_windup": "clamp"}),
     (bp.make_params, "tracking_time", {"tracking_time": 1.0}),
-    (bp.make_params, "gain_units", {"gain_units": "inertia"}),
     (
         bp.make_params,
         "derivative_filter_time",
         {"derivative_filter_time": 1e-3, "gain_units": "mass_matrix", "discretization": "implicit"},
     ),
-    (bp.make_actuators, "position_limit", {"position_limit": [1.0, 2.0, 3.0]}),
-    (bp.make_actuators, "position_limit", {"position_limit": ([0.0, 1.0], [1.0, 2.0, 3.0])}),
-    (bp.make_actuators, "position_limit", {"position_limit": ([1.0, 0.0], [1.0, 2.0])}),
     (bp.make_actuators, "sensor_delay", {"sensor_delay": 0.01, "max_delay": 0.005}),
     (bp.make_actuators, "static", {"static": 0.1, "coulomb": [0.1, 0.2]}),
     (bp.make_actuators, "no_load_speed", {"saturation_effort": 10.0}),
     (bp.make_actuators, "saturation_effort", {"no_load_speed": 10.0}),
     (bp.make_actuators, "stribeck", {"stribeck": 0.1, "coulomb": 0.2}),
     (bp.make_guard, "lower", {"lower": 1.0, "upper": 0.0}),
-    (bp.make_guard, "upper", {"upper": math.nan}),
     (ts.make_osc_params, "stiffness", {"stiffness": [1.0, 2.0]}),
     (ts.make_osc_params, "damping_ratio", {"damping_ratio": math.nan}),
     (ts.make_osc_params, "axes", {"axes": [1, 0, 1, 1, 1, 1]}),
     (ts.make_osc_params, "force_axes", {"axes": [True] * 6, "force_axes": AXIS}),
     (ts.make_osc_params, "posture_stiffness", {"posture_stiffness": [1.0] * 3}),
     (ts.make_osc_params, "effort_min", {"effort_min": 1.0, "effort_max": 0.0}),
-    (ts.make_osc_params, "effort_limit", {"effort_limit": 1.0, "effort_max": 2.0}),
     (ts.make_osc_params, "position_error_limit", {"position_error_limit": -1.0}),
     (
         ts.make_osc_params,
@@ -188,7 +170,6 @@ COMBINATIONS = [
     (trajectories.trapezoidal, "max_acceleration", {"max_acceleration": math.inf}),
     (metrics.step_metrics, "measurement", {"measurement": np.zeros((1, 1, 2))}),
     (metrics.step_metrics, "setpoint", {"setpoint": np.zeros(3)}),
-    (metrics.step_metrics, "effort", {"effort": np.zeros((3, 1, 2))}),
     (metrics.step_metrics, "saturated", {"saturated": np.zeros((9, 1, 2))}),
     (metrics.step_metrics, "band", {"band": 0.0}),
     *((bp.design_gains, name, {name: 0.0}) for name in ("bandwidth_hz", "dt")),
@@ -199,7 +180,6 @@ COMBINATIONS = [
     (bp.design_gains, "load", {"load": 1.0, "gain_units": "mass_matrix"}),
     (bp.design_gains, "discretization", {"discretization": "implicit", "gain_units": "effort"}),
     (bp.stability_bound, "mass_matrix", {"mass_matrix": -np.eye(2)}),
-    (bp.stability_bound, "mass_matrix", {"mass_matrix": np.full((2, 2), math.nan)}),
     (bp.stability_bound, "kp", {"kp": [1.0, 2.0, 3.0]}),
     (ts.inverse_kinematics, "starts", {"starts": 0}),
     (ts.inverse_kinematics, "rotation_tolerance", {"rotation_tolerance": 0.0}),
@@ -214,36 +194,8 @@ COMBINATIONS = [
 
 
 PLACES = [
-    (
-        bp.make_actuators,
-        "position_limit",
-        {"position_limit": ([0.0, 1.0], [1.0, math.inf])},
-        {"joint": 0},
-        math.inf,
-    ),
-    (
-        bp.make_actuators,
-        "position_limit",
-        {"position_limit": ([0.0, 1.0], [1.0, -2.0])},
-        {"joint": 0},
-        -2.0,
-    ),
-    (
-        bp.make_actuators,
-        "position_limit",
-        {"position_limit": ([0.0, 2.0, 1.0], [1.0] * 3)},
-        {"joint": 0},
-        1.0,
-    ),
     (ts.make_osc_params, "stiffness", {"stiffness": [1, 1, -1, 1, 1, 1]}, {"entry": "z"}, -1.0),
     (ts.make_osc_params, "smallest_eigenvalue", {"smallest_eigenvalue": 0.0}, {"entry": "s0"}, 0.0),
-    (
-        ts.make_osc_params,
-        "rotation_error_limit",
-        {"rotation_error_limit": -1.0},
-        {"entry": "norm"},
-        -1.0,
-    ),
     (
         ts.make_osc_params,
         "posture_stiffness",
@@ -364,6 +316,10 @@ def needed(function, more=(), module=None):
     module = module or next(owner for owner, _, each in PUBLIC if each is function)
     values = VALUES | OWN.get(module, {}) | {"duration": 1.0, "dt": 0.01, "timestep": 0.01}
     values |= {"setpoint": np.ones((9, 1, 2))} if function is metrics.step_metrics else {}
+    values |= (
+        {"start": POSE[0], "target": POSE[0]} if function is trajectories.straight_line else {}
+    )
+    values |= {"center": Y, "amplitude": Y, "frequency": 1.0}
     parameters = inspect.signature(function).parameters.items()
     required = {
         name
@@ -438,10 +394,7 @@ TEXTS = [
     (PID % '"kd": 1.0', "joints", "elbow"),
     (PID % '"kp": 1.0, "kq": 2.0', "kq", "elbow"),
     (PID % '"kp": 1.0, "kp": 2.0', "text", None),
-    *(
-        (PID % f'"kp": {value}', "kp", "elbow")
-        for value in ("-1.0", '"nan"', '"1e3"', "true", "null", "[[1.0]]", "[]")
-    ),
+    *((PID % f'"kp": {value}', "kp", "elbow") for value in ("-1.0", '"nan"', "true", "[]")),
     (PID % f'"kp": 1{"0" * 400}', "kp", "elbow"),
     (PID % '"kp": 1.0, "anti_windup": "magic"', "anti_windup", "elbow"),
     (
@@ -458,12 +411,6 @@ TEXTS = [
     ("format: batchpid-params-1\njoints: {elbow: {kp: 1}}", "text", None),
     (MOTOR % "kp: 1", "kp", "elbow"),
     (MOTOR % "strength: strong", "strength", "elbow"),
-    (MOTOR % "strength: -1", "strength", "elbow"),
-    *(
-        (MOTOR % f"position_limit: {value}", "position_limit", "elbow")
-        for value in ("[1, 2]", "[[0], [1, 2]]")
-    ),
-    (MOTOR % "position_limit: [[1, 0], [1, 2]]", "position_limit", "elbow"),
     ("format: batchpid-actuators-1\njoints: {shoulder: {}}", "text", None),
     ("format: batchpid-actuators-1\njoints: {elbow: [1]}", "joints", "elbow"),
     ("format: batchpid-actuators-1\nseed: soon\njoints: {elbow: {}}", "seed", None),

@@ -145,19 +145,8 @@ def test_the_functions_of_law_guard_and_actuators_keep_nothing(law, seed):
     motor, delivered = bp.motors.deliver(real, motor, rows[0], rows[1], rows[2], 0.01)
     motor, qpos, qvel = bp.motors.measure(real, motor, rows[0], rows[1], 0.01)
     state = bp.reset(params, state, rows[2], np.array([True, False, True]))
-    kept = (state, effort, guard, motor, delivered, qpos, qvel)
-    copies = [
-        np.array(leaf)
-        for part in kept
-        for leaf in (part if isinstance(part, tuple) else (part,))
-        if leaf is not None
-    ]
+    kept = (*state, effort, *guard, *motor, delivered, qpos, qvel)
+    copies = [np.array(leaf) for leaf in kept]
     scribble(rows)
-    after = [
-        leaf
-        for part in kept
-        for leaf in (part if isinstance(part, tuple) else (part,))
-        if leaf is not None
-    ]
-    for one, other in zip(copies, after, strict=True):
+    for one, other in zip(copies, kept, strict=True):
         np.testing.assert_array_equal(one, other)

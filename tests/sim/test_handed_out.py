@@ -7,7 +7,7 @@ import pytest
 
 import batchpid as bp
 from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Uniform
-from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write
+from tests.sim.tiny_urdf import gripper, write
 
 
 def arrays(value, path="", seen=None):
@@ -46,18 +46,8 @@ def check(value):
 
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory):
-    follower = joint(
-        "right",
-        "base",
-        "r",
-        inner=LIMIT + '<mimic joint="left" multiplier="-0.5"/>',
-        origin="0 -1 1",
-    )
-    parts = link("base"), link("l"), link("r"), follower, joint("left", "base", "l", origin="0 1 1")
-    return Robot.load(
-        write(tmp_path_factory.mktemp("hand"), robot(*parts)),
-        actuators=bp.make_actuators(2, lag=0.01),
-    )
+    path = write(tmp_path_factory.mktemp("hand"), gripper())
+    return Robot.load(path, actuators=bp.make_actuators(2, lag=0.01))
 
 
 def test_of_a_robot(panda, hand):

@@ -39,6 +39,16 @@ def one_joint(inner: str = LIMIT, kind: str = "revolute", arm: str = INERTIAL) -
     return robot(link("base"), link("arm", arm), joint("hinge", "base", "arm", kind, inner))
 
 
+def gripper(*parts: str) -> str:
+    """Return a robot whose joint ``right`` follows its joint ``left``, with further parts."""
+    follower = LIMIT + '<mimic joint="left" multiplier="-0.5"/>'
+    fingers = (
+        joint("right", "base", "r", inner=follower, origin="0 -1 1"),
+        joint("left", "base", "l", origin="0 1 1"),
+    )
+    return robot(*map(link, ("base", "l", "r")), *fingers, *parts)
+
+
 def random_tree(rng: np.random.Generator, links: int) -> list[str]:
     """Return the parts of a robot with ``links`` links, named l0, l1, ..., random joints, half of
     them fixed.

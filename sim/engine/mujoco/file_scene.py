@@ -21,7 +21,7 @@ from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.mjcf.mjcf_compiler import Names, attempt
 from batchpid.sim.robot.mjcf.mjcf_reader import content_of, home
-from batchpid.sim.robot.mjcf.mjcf_tree import Tree
+from batchpid.sim.robot.mjcf.mjcf_tables import find_base
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.task_space.rotations import inverse, rotate
 
@@ -84,9 +84,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
             f"{file.path}: has changed since the robot was loaded: {problem}; load the robot again"
         )
     names = Names(model)
-    Tree(
-        model, names, Path(file.path), spec.fixed_base, []
-    )  # removes bodies that are not of the robot
+    find_base(model, names, Path(file.path), [])  # removes other objects
     robot = {body: name for body, name in names.bodies.items() if names.is_of_robot(body)}
     for joint in scene.joints:
         joint.name = names.joints.get(joint.id, joint.name)

@@ -1,26 +1,33 @@
-"""Reader of MJCF files: MuJoCo compiles them, and the model becomes a URDF with motors and a start
+"""Reader of MJCF files: MuJoCo compiles them, and the model becomes tables, motors and a start
 pose.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from lxml import etree
 
-from batchpid.arrays.array_types import MjModel
+from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.arrays.digest import digest
+from batchpid.arrays.read_only import read_only
+from batchpid.motors import make_actuators
 from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.mjcf.mjcf_actuators import read_couplings, read_motors
 from batchpid.sim.robot.mjcf.mjcf_compiler import ALONE, Attempt, Names, compile_file, label
-from batchpid.sim.robot.mjcf.mjcf_motors import Motors, read_couplings, read_motors
-from batchpid.sim.robot.mjcf.mjcf_shapes import PLANE, can_collide, excluded_pairs
-from batchpid.sim.robot.mjcf.mjcf_tree import Tree
-from batchpid.sim.robot.parts import MjcfFile
-from batchpid.sim.robot.self_collision import DisabledPair
+from batchpid.sim.robot.mjcf.mjcf_tables import (
+    PLANE,
+    TableReader,
+    can_collide,
+    excluded_pairs,
+    find_base,
+)
+from batchpid.sim.robot.parts import FileDefaults, MjcfFile
+from batchpid.sim.robot.urdf import Source
 from batchpid.sim.robot.xml import parse_xml
 from batchpid.task_space.rigid_tree import GRAVITY
 
@@ -35,23 +42,7 @@ _OTHERS = ("CONTACT", "LIMIT", "EQUALITY", "FRICTIONLOSS", "DAMPER", "CONSTRAINT
 """Parts that it can disable in MuJoCo."""
 
 
-class Mjcf(NamedTuple):
-    """Content of an MJCF file."""
-
-    root: etree._Element
-    """The ``<robot>`` of the equivalent URDF."""
-    pairs: tuple[DisabledPair, ...]
-    """Pairs of links that do not collide."""
-    motors: Motors
-    start: dict[str, float]
-    """Start pose by joint [rad or m]: the keyframe "home", else the reference pose."""
-    base: tuple[float, ...] | None
-    """Start pose (7,) of a floating base, from the same."""
-    findings: tuple[Finding, ...]
-    file: MjcfFile
-
-
-def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> Mjcf:
+def read_mjcf(path: Path, name: str, fixed_base: bool | None, missing_meshes: str) -> Source:
     """Return the content of the MJCF file at ``path`` as the robot ``name``.
 
     For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses
@@ -59,23 +50,45 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     meshes are refused.
     """
     findings: list[Finding] = []
-    compiled = compile_file(path, fixed_base, missing_meshes, findings)
+    compiled = compile_file(path, fixed_base is not False, missing_meshes, findings)
     model = compiled.model
     names = Names(model)
-    tree = Tree(model, names, path, fixed_base, findings)
-    mimics = read_couplings(model, names, findings)
-    motors = read_motors(model, names, mimics, findings)
-    tree.write(motors, mimics)
-    tree.root.set("name", name)
+    base = find_base(model, names, path, findings)
+    # A base is free where the file has a free joint, unless the caller fixes it.
+    if fixed_base is None:
+        fixed_base = not (base and model.body_jntnum[base])
+    couplings = read_couplings(model, names, findings)
+    motors = read_motors(model, names, couplings, findings)
+    reader = TableReader(model, names, base, findings, motors)
+    tables = reader.read(couplings, is_held=fixed_base)
     key = home(model)
     findings += [*_in_radians(model, names), *_unused(model, names, key)]
+    # The start pose is that of the keyframe, else the reference pose.
     pose = model.qpos0 if key is None else model.key_qpos[key]
-    start = {name: float(pose[model.jnt_qposadr[joint]]) for joint, name in names.joints.items()}
-    at = model.jnt_qposadr[model.body_jntadr[tree.base]] if tree.base and not fixed_base else None
-    base = None if at is None else tuple(pose[at : at + 7].tolist())
-    file = _file(path, compiled, names, fixed_base)
-    return Mjcf(
-        tree.root, excluded_pairs(model, tree.solid), motors, start, base, tuple(findings), file
+    base_start = None
+    if base and not fixed_base:
+        at = model.jnt_qposadr[model.body_jntadr[base]]
+        base_start = tuple(pose[at : at + 7].tolist())
+    start = {name: pose[model.jnt_qposadr[joint]] for joint, name in names.joints.items()}
+    joints = [joint.name for joint in tables.joints if joint.moves]
+
+    def column(values: Mapping[str, float]) -> Float64:
+        return read_only(np.array([values.get(joint, 0.0) for joint in joints], np.float64))
+
+    defaults = FileDefaults(column(start))
+    if any((*motors.kp.values(), *motors.kv.values())):
+        defaults = replace(defaults, kp=column(motors.kp), kv=column(motors.kv))
+    armature = column(motors.armature)
+    return Source(
+        name,
+        tables,
+        tuple(findings),
+        fixed_base,
+        base_start,
+        mjcf=_file(path, compiled, names, fixed_base),
+        pairs=excluded_pairs(model, reader.solid),
+        defaults=defaults,
+        actuators=make_actuators(len(joints), armature=armature) if armature.any() else None,
     )
 
 

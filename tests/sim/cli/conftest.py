@@ -2,8 +2,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
+from tiny_urdf import one_joint, write
 
+from batchpid.sim import Robot, Runner, write_recording
 from batchpid.sim.cli import main
 
 
@@ -32,3 +35,14 @@ def batchpid(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str
         return status, captured.out, captured.err
 
     return run
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A folder with a robot and a recording of it."""
+    folder = tmp_path_factory.mktemp("files")
+    robot = Robot.load(write(folder, one_joint(), "arm.urdf"))
+    with Runner(robot, 1, workers=0, substeps=10) as runner:
+        rollout = runner.rollout(np.tile(robot.start, (60, 1, 1)))
+    write_recording(rollout, folder / "run.h5")
+    return folder

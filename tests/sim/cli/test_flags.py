@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import tyro
-from test_outputs import OUT, SUFFIXES, WORDS, files, output_flags  # noqa: F401
+from commands_that_write import WORDS, output, output_flags
 
 from batchpid.sim.cli import COMMANDS
 from batchpid.sim.cli.outputs import bar
@@ -83,17 +83,13 @@ def test_a_wrong_flag_is_answered_with_the_help_of_its_command(command, batchpid
 def test_an_output_without_a_folder_is_refused_before_the_run(
     command,
     flag,
-    files,  # noqa: F811
+    files,
     batchpid,
     tmp_path,
     monkeypatch,
 ):
     monkeypatch.chdir(files)
-    path = (
-        tmp_path
-        / "missing"
-        / f"a{OUT.get(command, SUFFIXES[flag]) if flag == 'out' else SUFFIXES[flag]}"
-    )
+    path = tmp_path / "missing" / output(command, flag)
     status, said, complaint = batchpid(*WORDS[command], f"--{flag}", path)
     assert (status, said) == (2, "")
     assert complaint.splitlines()[-1].endswith(f"mkdir -p {path.parent}")
@@ -141,7 +137,7 @@ def test_a_bad_value_is_answered_by_the_name_of_its_flag(
     command,
     flag,
     bad,
-    files,  # noqa: F811
+    files,
     batchpid,
     monkeypatch,
 ):
@@ -190,7 +186,7 @@ def written(folder: Path) -> set[Path]:
 def test_flags_that_contradict_each_other_are_answered_in_one_line(
     words,
     message,
-    files,  # noqa: F811
+    files,
     batchpid,
     monkeypatch,
 ):

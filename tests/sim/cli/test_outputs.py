@@ -6,50 +6,13 @@ import dataclasses
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
-from tiny_urdf import one_joint, write
+from commands_that_write import SHORT, WORDS, output, output_flags
+from tiny_urdf import one_joint
 
-from batchpid.sim import Robot, Runner, write_recording
 from batchpid.sim.cli import COMMANDS, parse
 
-SHORT = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02)
-WORDS = {
-    "demo": ("demo", *SHORT),
-    "rollout": ("rollout", *SHORT),
-    "tune": ("tune", "arm.urdf"),
-    "compare": ("compare", "arm.urdf"),
-    "excite": ("excite", "arm.urdf"),
-    "export": ("export", "arm.urdf"),
-    "identify": ("identify", "arm.urdf", "run.h5"),
-    "inspect": ("inspect", "arm.urdf"),
-    "plot": ("plot", "run.h5"),
-}
-"""Words of each command that writes, without its outputs."""
-SUFFIXES = {"picture": ".png", "json": ".json", "out": ".yaml"}
 MJCF = "<mujoco><worldbody><body><joint name='a'/><geom size='.1'/></body></worldbody></mujoco>"
-OUT = {"rollout": ".h5", "excite": ".csv", "export": ".h"}
-
-
-def output_flags() -> list[tuple[str, str]]:
-    """Return every flag of every command that names an output file."""
-    return [
-        (name, flag)
-        for name, command in COMMANDS.items()
-        for flag in SUFFIXES
-        if flag in command.outputs
-    ]
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    """A folder with a robot and a recording of it."""
-    folder = tmp_path_factory.mktemp("files")
-    robot = Robot.load(write(folder, one_joint(), "arm.urdf"))
-    with Runner(robot, 1, workers=0, substeps=10) as runner:
-        rollout = runner.rollout(np.tile(robot.start, (60, 1, 1)))
-    write_recording(rollout, folder / "run.h5")
-    return folder
 
 
 @pytest.fixture
@@ -68,15 +31,12 @@ def test_an_existing_output_is_refused_before_the_run(
     name, flag, files, batchpid, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(files)
-    suffix = OUT.get(name, SUFFIXES[flag]) if flag == "out" else SUFFIXES[flag]
-    (path := tmp_path / f"kept{suffix}").write_text("kept")
+    (path := tmp_path / output(name, flag, "kept")).write_text("kept")
     others = [
-        (f"--{each}", tmp_path / f"new{SUFFIXES[each]}")
+        word
         for command, each in output_flags()
-        if command == name
-    ]
-    others = [
-        word for option in others if option[0] not in (f"--{flag}", "--out") for word in option
+        if command == name and each not in (flag, "out")
+        for word in (f"--{each}", tmp_path / output(name, each))
     ]
     status, said, complaint = batchpid(*WORDS[name], *others, f"--{flag}", path)
     assert (status, said) == (2, "")
@@ -151,9 +111,7 @@ def test_a_file_that_a_command_reads_is_never_replaced(
     for file in read:
         (tmp_path / file).write_text("kept")
     for file in read:
-        path = (
-            tmp_path / f"output{OUT.get(name, SUFFIXES[flag]) if flag == 'out' else SUFFIXES[flag]}"
-        )
+        path = tmp_path / output(name, flag)
         make(tmp_path / file, path)
         status, said, complaint = batchpid(*words, f"--{flag}", path, "--force")
         assert (status, said, f"batchpid: {flag}: is a file to read" in complaint) == (

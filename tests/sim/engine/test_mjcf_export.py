@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 from export_cases import JOINTS, random_params, values
@@ -338,50 +336,33 @@ ENDS = zip(JOINTS, ("wx", "xy", "yz"), strict=True)
 CHAIN = robot(*LINKS, *(joint(name, *ends) for name, ends in ENDS))
 
 
-def actuators_of(exported):
-    """Return the actuators of a file, with nine digits of each number."""
-    text = exported.text[exported.text.index("<actuator>") : exported.text.index("</actuator>")]
-    return re.sub(r"-?\d+\.\d+(e[-+]\d+)?", lambda number: f"{float(number[0]):.9g}", text)
-
-
 @given(random_params(), st.integers(0, 2**32 - 1))
 @settings(max_examples=20, deadline=None)
-def test_a_robot_read_from_its_file_is_written_with_the_same_actuators(
-    tmp_path_factory, params, seed
-):
+def test_a_robot_read_from_its_file_has_the_same_gains(tmp_path_factory, params, seed):
     params = params.replace(kp=params.kp + 1.0)  # a file without any stiffness has no servos
     folder, inertia = tmp_path_factory.mktemp("chain"), np.array([2.0, 1.0, 0.5])
     chain, rng = Robot.load(write(folder, CHAIN)), np.random.default_rng(seed)
     assert list(chain.joint_names) == JOINTS
-    has_line, has_lag, has_rate = rng.random((3, 3)) < 0.4
     motors = bp.make_actuators(
         3,
         armature=rng.uniform(0.01, 1, 3),
         coulomb=rng.uniform(0, 1, 3),
         viscous=rng.uniform(0, 1, 3),
-        saturation_effort=np.where(has_line, rng.uniform(1, 99, 3), np.inf),
-        no_load_speed=np.where(has_line, rng.uniform(0.1, 9, 3), np.inf),
-        lag=np.where(has_lag, rng.uniform(1e-4, 0.1, 3), 0.0),
     )
-    guard = chain.guard(rate=np.where(has_rate, rng.uniform(0.1, 9, 3), np.inf))
-    exported = to_mjcf(chain, params, DT, actuators=motors, guard=guard, inertia=inertia)
+    exported = to_mjcf(chain, params, DT, actuators=motors, inertia=inertia)
     (path := folder / "chain.xml").write_text(exported.text)
     other = Robot.load(path)
-    again = to_mjcf(other, other.mjcf_gains(), DT, actuators=other.actuators, guard=other.guard())
-    assert actuators_of(exported) == actuators_of(again)
     scale = 1.0 if params.gain_units is None else inertia
     tolerance = 1e-12 if params.dtype == np.float64 else 1e-6
     for name in ("kp", "kd"):
-        wanted = np.array(values(params, name)) * scale
-        np.testing.assert_allclose(values(other.mjcf_gains(), name), wanted, rtol=tolerance)
+        gains = np.array(values(params, name)) * scale
+        np.testing.assert_allclose(values(other.mjcf_gains(), name), gains, rtol=tolerance)
     for name, found in (
         ("armature", other.actuators.armature[0]),
         ("coulomb", other.friction),
         ("viscous", other.damping),
     ):
         np.testing.assert_allclose(found, getattr(motors, name)[0], rtol=1e-12)
-    rates = [each.velocity_limit for each in other.joints]
-    np.testing.assert_allclose(rates, np.inf if guard.rate is None else guard.rate[0], rtol=1e-12)
 
 
 def test_a_floating_base_starts_as_in_the_runner():

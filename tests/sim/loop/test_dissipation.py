@@ -158,11 +158,6 @@ def test_friction_that_is_drawn_is_in_the_urdfs_units(added, speed, tmp_path):
     np.testing.assert_allclose(rollout.qvel[-1, 0, 0], speed, rtol=1e-3)
 
 
-def test_without_friction_and_damping_the_effort_is_that_of_the_motor(tmp_path):
-    rollout = push(wheel(tmp_path, 0.1), 0.5, 0.1, qvel=1.0)
-    np.testing.assert_allclose(rollout.qvel[-1, 0, 0], 1.0 + 0.5 * 0.1 / 0.1, rtol=1e-4)
-
-
 def test_sapiens_own_dissipation_is_the_engines(tmp_path):
     robots = [wheel(tmp_path, 0.1, 0.5, friction, dissipation="sapien") for friction in (0.0, 1.0)]
     one, other = (push(robot, 2.0, 0.2).qvel for robot in robots)

@@ -16,7 +16,7 @@ from identical import assert_identical
 from robots import load_bundled
 
 from batchpid.errors import ClosedError, InvalidArgumentError
-from batchpid.sim import FaultWarning, Recorder, RecordingError, Runner, read_recording
+from batchpid.sim import FaultWarning, Recorder, Runner, read_recording
 from batchpid.sim.cli import main
 from batchpid.sim.recording import recorder as recorder_module
 
@@ -158,35 +158,34 @@ def test_faults_are_recorded(tmp_path):
     assert recording.ok.tolist() == [[True] * 3] * 2 + [[True, False, True]] * 2
 
 
-def fill_the_disk(path):
-    """Record until no more can be written, and go on without the recorder."""
-    recorder_module.WRITE_PERIOD = 0.0
-    with make() as runner:
-        recorder = Recorder(path, runner)
-        runner.step(ROBOT.start)
-        os.dup2(os.open("/dev/full", os.O_RDWR), recorder._file.id.get_vfd_handle())
-        runner.step(ROBOT.start)
-        with pytest.raises(
-            RecordingError, match=r"run\.h5: cannot be written: .*No space left on device"
-        ):
-            runner.step(ROBOT.start)
-        with pytest.raises(RecordingError):
-            recorder.close()
-        assert runner.step(ROBOT.start).ok.all()
+def with_path():
+    """Return the environment of a program that imports what this one does."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))}
+
+
+FULL = """
+import os, pytest, resource, sys
+from batchpid.sim import Recorder, RecordingError, Robot, Runner
+from batchpid.sim.recording import recorder
+recorder.WRITE_PERIOD = 0.0
+robot = Robot.load("panda")
+with Runner(robot, 3, params=robot.params(), workers=0, substeps=2) as runner:
+    recorder = Recorder(sys.argv[1], runner)
+    runner.step(robot.start)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1, 1))  # as on a full disk
+    runner.step(robot.start)
+    with pytest.raises(RecordingError, match=r"run[.]h5: cannot be written: .*File too large"):
+        runner.step(robot.start)
+    with pytest.raises(RecordingError):
+        recorder.close()
+    assert runner.step(robot.start).ok.all()
+os._exit(0)  # HDF5 would crash
+"""
 
 
 def test_a_file_that_cannot_be_written_is_an_error_before_the_next_tick(tmp_path):
-    """In a process of its own, which HDF5 would crash at its end."""
-    program = "import sys; from test_recorder import fill_the_disk; fill_the_disk(sys.argv[1])"
-    folders = [str(Path(__file__).parent), str(Path.cwd()), *sys.path]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, folders))}
-    path = str(tmp_path / "run.h5")
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", program, path], env=environment, timeout=120
-        ).returncode
-        == 0
-    )
+    command = [sys.executable, "-c", FULL, tmp_path / "run.h5"]
+    subprocess.run(command, env=with_path(), timeout=120, check=True)
 
 
 def test_bad_paths_are_refused():
@@ -215,11 +214,8 @@ def kill_after(seconds, path):
     """Kill a recorded program some seconds after its first tick; return when each of its ticks
     ended [s].
     """
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))
-    }
     command = [sys.executable, "-c", PROGRAM, path]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=with_path()) as process:
         lines = [process.stdout.readline()]
         end = time.monotonic() + seconds
         while time.monotonic() < end:
