@@ -119,6 +119,8 @@ def identify(
     LogWarning
         A log was changed when it was read, or a joint did not move.
     """
+    for name in extras:
+        choice("extras", name, [*EXTRAS])
     data = _read(robot, logs, params, compensate, timestep, reading)
     data, guesses = _regress(data, "slew" in extras)
     windows = windows_of(data.parts)
@@ -298,7 +300,6 @@ def _unknowns(data: Data, guess: Guess, extras: Sequence[str], payload: bool) ->
     """Return the unknowns with starts from the regression, and typical sizes from the motion."""
     log, _, plant, drive = data.parts[0]
     for name in extras:
-        choice("extras", name, [*EXTRAS])
         if name in LAW and drive.params is None:
             problem = "is of a law, and the logs hold efforts"
             remedy = "leave it out, or give the params of the law"
