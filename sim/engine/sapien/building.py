@@ -25,9 +25,8 @@ from batchpid.sim.robot.collision_shapes import mesh_file
 from batchpid.sim.robot.meshes import note_meshes
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
 from batchpid.sim.robot.tables import Shape
-from batchpid.task_space.frames import matrix_of
+from batchpid.task_space.frames import from_rpy, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.rotations import from_rpy
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
 FASTEST = 1000.0
