@@ -36,6 +36,7 @@ from batchpid.sim import Robot
 from batchpid.sim.cli.report import table
 from batchpid.sim.engine import native
 from batchpid.sim.engine.protocol import EnginePack, load_engine
+from batchpid.sim.loop import env_group, numpy_executor
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options.options import RunnerOptions
@@ -157,14 +158,16 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     robot = workload.simulated_robot()
     shared = SharedArrays(Arrays.layout(1, share, robot.dof))
     options = RunnerOptions(robot, share, physics=workload.physics)
-    loop = Loop(options, robot.params(), slice(0, share), Arrays.from_fields(shared.arrays))
+    with ExitStack() as stack:
+        for module in (env_group, numpy_executor):  # in NumPy, with a call for each phase
+            stack.enter_context(patch.object(module, "steps_natively", return_value=False))
+        loop = Loop(options, robot.params(), slice(0, share), Arrays.from_fields(shared.arrays))
     loop.reset(
         np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, robot.dof))
     )
     loop.arrays.command.setpoint[...] = workload.target
     spent = dict.fromkeys(("read", "control", "passive", "write", "step", "waiting"), 0.0)
     for group in loop.groups:
-        group.execute_in_numpy()
         _time_calls(group.pack, spent)
     given = Command(workload.target).given
     total = sum(loop.run(1, workload.substeps, given) for _ in range(workload.ticks))

@@ -8,7 +8,6 @@ best one. The copies have the delay of the robot's motors; with --no-motors they
 """
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,67 +16,32 @@ from scipy.interpolate import CubicSpline
 
 import batchpid as bp
 from batchpid import task_space as ts
-from batchpid.sim import Robot, Rollout, Runner
+from batchpid.sim import Robot, Rollout, Runner, to_urdf
 from batchpid.sim.view.film import write_film
 
 START = np.array([-0.7, 0.3, 0.0, -2.0, 0.0, 2.3, 0.8, 0.02, 0.02])
 GOAL = np.array([0.7, *START[1:]])
 BALL, RADIUS = np.array([0.56, -0.02, 0.38]), 0.12  # in the way of the hand [m]
-LINKS = {
-    "panda_link6": 0.08,
-    "panda_link7": 0.07,
-    "panda_hand": 0.07,
-    "panda_leftfinger": 0.03,
-}  # radius [m]
+LINKS = ["panda_link6", "panda_link7", "panda_hand", "panda_leftfinger"]
+RADII = np.array([0.08, 0.07, 0.07, 0.03])  # of spheres around the links [m]
 TICKS, EXECUTED = 30, 5  # ticks of 10 ms in a rollout, and until the next plan
 KNOTS = np.array([0, 10, 20, 30])  # ticks
 SPREAD = np.array([0.3, 0.3, 0.1, 0.3, 0.1, 0.1, 0.0, 0.0, 0.0])  # of the knots [rad, m]
 MARGIN = 0.02  # desired distance from the ball [m]
 
 
-@dataclass(frozen=True)
-class Options:
-    """Reach around a ball, by plans of the simulated robot."""
-
-    motors: bool = True
-    """Whether rollouts have the motors of the robot."""
-    delay: float = 0.005
-    """Delay of the robot's motors [s]."""
-    samples: int = 64
-    seconds: float = 2.5
-    workers: int | None = None
-    film: Path | None = None
-    """File for a film, .mp4 or .gif."""
-
-
 def clearance(tree, qpos):
-    """Return the least distance of spheres around the links to the ball [m]; negative where they
-    touch.
-    """
-    places = ts.link_poses(tree, qpos, list(LINKS))[..., :3]
-    return (np.linalg.norm(places - BALL, axis=-1) - list(LINKS.values())).min(-1) - RADIUS
+    """Return the least distance of the links to the ball [m]; negative where they touch."""
+    places = ts.link_poses(tree, qpos, LINKS)[..., :3]
+    return (np.linalg.norm(places - BALL, axis=-1) - RADII).min(-1) - RADIUS
 
 
 class Planner:
-    """Finds setpoints (ticks, dof) by rollouts; its first candidate is the rest of the last
-    plan.
-    """
+    """Finds setpoints by rollouts; its first candidate is the rest of the last plan."""
 
-    def __init__(self, robot, options, params, actuators):
-        self.tree, self.samples, self.motors = (
-            robot.kinematic_tree(),
-            options.samples,
-            options.motors,
-        )
-        self.runner = Runner(
-            robot,
-            options.samples,
-            params=params,
-            actuators=actuators if options.motors else None,
-            engine="mujoco",
-            workers=options.workers,
-        )
-        self.knots = np.tile(START, (len(KNOTS), 1))
+    def __init__(self, robot, runner, motors):
+        self.tree, self.runner, self.motors = robot.kinematic_tree(), runner, motors
+        self.knots, self.samples = np.tile(START, (len(KNOTS), 1)), runner.num_envs
         self.lower, self.upper = robot.lower, robot.upper
         self.random = np.random.default_rng(0)
 
@@ -89,9 +53,8 @@ class Planner:
         knots = np.clip(self.knots + noise, self.lower, self.upper)
         setpoints = CubicSpline(KNOTS, knots, axis=1, bc_type="natural")(np.arange(1, TICKS + 1))
         setpoints = setpoints.clip(self.lower, self.upper).swapaxes(0, 1)  # (ticks, samples, dof)
-        snapshot = plant.snapshot()
         if self.motors:
-            self.runner.restore(snapshot.for_envs([0] * self.samples))
+            self.runner.restore(plant.snapshot().for_envs([0] * self.samples))
         else:
             now = plant.observe()
             self.runner.reset(now.qpos.clip(self.lower, self.upper), now.qvel)
@@ -103,32 +66,55 @@ class Planner:
         return setpoints[:, best]
 
 
-def main(options):
-    """Let the robot reach, and print how near it came to the ball."""
+def robot_with_ball(robot, path):
+    """Write a robot to ``path`` that has the ball as a visual shape of its base; return it."""
+    place, base = " ".join(map(str, BALL)), robot.links[0].name
+    shape = f'<origin xyz="{place}"/><geometry><sphere radius="{RADIUS}"/></geometry>'
+    shape += '<material name="red"><color rgba="0.8 0.2 0.1 1"/></material>'
+    joint = f'<joint name="b" type="fixed"><parent link="{base}"/><child link="ball"/></joint>'
+    ball = f'<link name="ball"><visual>{shape}</visual></link>{joint}</robot>'
+    path.write_text(to_urdf(robot).text.replace("</robot>", ball))
+    return Robot.load(path)
+
+
+def main(
+    motors: bool = True,
+    delay: float = 0.005,
+    samples: int = 64,
+    seconds: float = 2.5,
+    workers: int | None = None,
+    film: Path | None = None,
+) -> None:
+    """Let the robot reach for some seconds around the ball, and print how near it came to it.
+
+    ``motors``: whether rollouts have the motors of the robot, with their ``delay`` [s].
+    """
     robot = Robot.load("panda")
     gains = {"gain_units": "mass_matrix", "integral_time": np.inf, "measurement_rate": "measured"}
     params = bp.design_gains(robot, bandwidth_hz=5.0, **gains)
-    actuators = bp.make_actuators(robot.dof, command_delay=options.delay)
-    planner, seconds, parts = Planner(robot, options, params, actuators), [], []
+    actuators = bp.make_actuators(robot.dof, command_delay=delay)
+    shared = {"params": params, "engine": "mujoco"}
+    own = actuators if motors else None
+    times, parts = [], []
     with (
-        planner.runner,
-        Runner(robot, 1, params=params, actuators=actuators, engine="mujoco", workers=0) as plant,
+        Runner(robot, samples, actuators=own, workers=workers, **shared) as runner,
+        Runner(robot, 1, actuators=actuators, workers=0, **shared) as plant,
     ):
+        planner = Planner(robot, runner, motors)
         plant.reset(START)
-        for _ in range(round(options.seconds / 0.01 / EXECUTED)):
+        for _ in range(round(seconds / 0.01 / EXECUTED)):
             began = time.perf_counter()
             setpoints = planner.plan(plant)
-            seconds.append(time.perf_counter() - began)
+            times.append(time.perf_counter() - began)
             parts.append(plant.rollout(setpoints[:EXECUTED, None]))
     reach = Rollout.join(parts)
-    least = clearance(planner.tree, reach.qpos).min()
-    left = np.abs(reach.qpos[-1] - GOAL).max()
+    least, left = clearance(planner.tree, reach.qpos).min(), np.abs(reach.qpos[-1] - GOAL).max()
     result = "touches the ball" if least < 0 else "goes around"
     print(f"{result}: least distance {1e3 * least:.0f} mm, {left:.2f} rad left at the end")
-    print(f"{1 / np.median(seconds):.1f} plans/s")
-    if options.film is not None:
-        write_film(reach, options.film)
+    print(f"{1 / np.median(times):.1f} plans/s")
+    if film is not None:
+        write_film(reach, film, robot=robot_with_ball(robot, film.with_suffix(".urdf")))
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    tyro.cli(main)

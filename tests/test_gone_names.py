@@ -38,6 +38,7 @@ GONE = (
     r"\bjerk_limited\b|import ruckig",
     r"\bmesa-vulkan-drivers\b",
     r"\bpid_controller\b",
+    r"\bposition_limit\b|\blimit_positions\b|\blimit_efforts\b",
     r"\bPushEnv\b",
     r"\bPush-v0\b",
     r"\brecover=",

@@ -110,6 +110,7 @@ LONGER = {
     "task-space.md": 160,
     "reliability.md": 230,
     "robots.md": 206,
+    "sim-to-real.md": 155,
     "architecture.md": 170,
     "performance.md": 225,
     "runner.md": 190,

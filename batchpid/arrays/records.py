@@ -44,8 +44,6 @@ class Record(tuple[Any, ...]):
     """Name of a record in errors, as in "params"."""
     FIELDS: ClassVar[Mapping[str, Field]] = {}
     """Declared fields of numbers, by name."""
-    TABLES: ClassVar[Mapping[str, Field]] = {}
-    """Fields with a table of numbers for each joint, (1 | envs, joints, points)."""
     WHOLE: ClassVar[tuple[str, ...]] = ()
     """Leaves with one value for all joints."""
 
@@ -108,15 +106,14 @@ class Record(tuple[Any, ...]):
         for name, leaf in self.leaves().items():
             if name in self.WHOLE:
                 continue
-            is_table = name in self.TABLES
-            if (leaf.shape[:2] if is_table else leaf.shape) not in shapes:
+            if leaf.shape not in shapes:
                 problem = f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}"
                 remedy = f"give one row, or one row per env{of}"
                 raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy=remedy)
             if not is_traced(leaf):
-                field = self.TABLES.get(name) or self.FIELDS.get(name, Field(low=-math.inf))
-                least = leaf.min(2) if is_table else np.asarray(leaf)
-                field.checked(f"{self.NAME}.{name}", least, joint_names, infinite=True)
+                field = self.FIELDS.get(name, Field(low=-math.inf))
+                values = np.asarray(leaf)
+                field.checked(f"{self.NAME}.{name}", values, joint_names, infinite=True)
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")

@@ -65,8 +65,6 @@ class Drive(Differences):
             if effect not in has:
                 text = _PROBLEMS.get(effect, "none in the target")
                 self.add(effect, text, values != off, values, field.unit.removeprefix("1"))
-        has_table = self.actuators.limit_positions is not None
-        self.add("position_limit", "no limit by position", has_table)
 
     def compare_integral(self, clamps: ArrayLike) -> None:
         """Add the differences of a target that limits its integral alone, symmetrically.

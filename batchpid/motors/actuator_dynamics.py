@@ -10,7 +10,7 @@ velocity v, and the effort u that the controller asks for::
     y      = r rint((y + o + sigma z) / r)                 offset, noise, resolution; of v_y likewise
 
     m      = s u(t - d_c) + b                              command delay, strength, bias
-    e      = min(max(m, low(q, v)), high(q, v))            envelope: batchpid.motors.envelope
+    e      = min(max(m, low(v)), high(v))                  envelope: batchpid.motors.envelope
     e      = e' + (1 - exp(-dt / T)) (e - e')              lag, again within the envelope; exact for a constant e
 
 A command u is delivered unclipped, where nothing is late, if (low - b) / s <= u <= (high - b) / s:
@@ -139,9 +139,7 @@ def init(
     if actuators.lag is None:
         return state
     k = discretise(actuators, state, dt)
-    return state._replace(
-        effort=clip(_motor(k, asked), *limits(k.envelope, position, velocity), xp) + zeros
-    )
+    return state._replace(effort=clip(_motor(k, asked), *limits(k.envelope, velocity), xp) + zeros)
 
 
 def discretise(
@@ -232,7 +230,7 @@ def _delivered(k: MotorCoefficients, behind: Any, effort: Array, qpos: Array, qv
     before, None without.
     """
     xp = namespace(effort, qpos, qvel)
-    low, high = limits(k.envelope, qpos, qvel)
+    low, high = limits(k.envelope, qvel)
     motor = clip(_motor(k, effort), low, high, xp)
     if k.intake is not None:
         motor = clip(behind + k.intake * (motor - behind), low, high, xp)
@@ -247,7 +245,7 @@ def command_limits(k: MotorCoefficients, qpos: Array, qvel: Array) -> tuple[Arra
     dynamics, and as a difference from the effort asked for they would leak into the integral. None:
     no limit.
     """
-    return limits(k.commands, qpos, qvel)
+    return limits(k.commands, qvel)
 
 
 def _play(k: MotorCoefficients, encoder: Array, qpos: Array, qvel: Array) -> tuple[Array, Array]:

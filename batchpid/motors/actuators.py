@@ -11,19 +11,16 @@ from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Array, Document, DType
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.field_tables import Field, declared, in_group
 from batchpid.arrays.records import LeafBuilder, Record, with_fields
-from batchpid.checks.validate import entries, integer, is_traced, number, read_array
+from batchpid.checks.validate import entries, integer, is_traced, number
 from batchpid.errors import InvalidArgumentError
 
 MAX_DELAY = 1.0
 """Longest delay [s]."""
-TABLE = {"limit_efforts": Field("N m or N", math.inf)}
-"""Declared field of the efforts at the points of a position-dependent limit."""
 
 
 class _ActuatorsFields(NamedTuple):
@@ -39,10 +36,6 @@ class _ActuatorsFields(NamedTuple):
         None
     )
     effort_limit: Annotated[Array, Field("N m or N", math.inf, group="motor")] = None
-    limit_positions: Array = None
-    """x_k of the limit that depends on the position (1, joints, points)."""
-    limit_efforts: Array = None
-    """L_k (1, joints, points)."""
     coulomb: Annotated[Array, Field("N m or N", group="joint")] = None
     static: Annotated[Array, Field("N m or N", group="joint")] = None
     stribeck: Annotated[Array, Field("rad/s or m/s", group="joint")] = None
@@ -92,7 +85,6 @@ class Actuators(Record, _ActuatorsFields):
     __slots__ = ()
     NAME = "actuators"
     FIELDS = FIELDS
-    TABLES = TABLE | {"limit_positions": Field(low=-math.inf)}
     WHOLE = ("max_delay", "seed")
 
     @property
@@ -103,12 +95,12 @@ class Actuators(Record, _ActuatorsFields):
     @property
     def delivers(self) -> bool:
         """True if the efforts delivered differ from those asked for."""
-        return not (MOTOR_SIDE | TABLE).keys().isdisjoint(self.leaves())
+        return not MOTOR_SIDE.keys().isdisjoint(self.leaves())
 
     @property
     def is_ideal(self) -> bool:
         """True if every effect is off."""
-        return (FIELDS | TABLE).keys().isdisjoint(self.leaves())
+        return FIELDS.keys().isdisjoint(self.leaves())
 
     def joint_side(self) -> Actuators:
         """Return the friction and reflected inertia alone, which also joints of ideal motors and
@@ -123,8 +115,6 @@ class Actuators(Record, _ActuatorsFields):
         options = self.leaves()
         if self.continuous is not None:
             options["continuous"] = self.continuous > 0
-        if self.limit_positions is not None:
-            options["position_limit"] = options.pop("limit_positions"), options.pop("limit_efforts")
         if self.seed is not None:
             options["seed"] = int(self.seed[0, 0]) + (int(self.seed[0, 1]) << 32)
         if self.max_delay is not None and not is_traced(self.max_delay):
@@ -156,7 +146,6 @@ class Actuators(Record, _ActuatorsFields):
 def make_actuators(
     joints: int,
     *,
-    position_limit: tuple[ArrayLike, ArrayLike] | None = None,
     seed: int = 0,
     max_delay: float | None = None,
     continuous: Array = None,
@@ -188,10 +177,6 @@ def make_actuators(
         between them: the torque-speed envelope (:mod:`batchpid.motors.envelope`). Given together.
     effort_limit
         Largest effort that the motor delivers, >= 0 [N m or N].
-    position_limit
-        Limit that depends on the position: positions [rad or m], ascending, and efforts >= 0 there
-        [N m or N], both (points,), (joints, points) or (envs, joints, points). Linear between the
-        points, constant outside.
     coulomb, viscous
         Friction >= 0 of the joint [N m or N; N m s/rad or N s/m], in addition to the description's,
         by the model of :mod:`batchpid.motors.friction`.
@@ -237,14 +222,11 @@ def make_actuators(
     if leaves["static"] is None and effects.get("static") is not None:
         leaves["stribeck"] = None
     _check_together(leaves, build.names)
-    points, efforts = _table(build, position_limit)
     longest = _longest_delay(leaves, max_delay)
     words = integer("seed", seed, 0, 2**64 - 1)
     has_noise = any(leaves[name] is not None for name in NOISES)
     return Actuators(
         **leaves,
-        limit_positions=points,
-        limit_efforts=efforts,
         continuous=build.mask("continuous", continuous),
         max_delay=None if longest is None else build.freeze(np.array([[longest]])),
         seed=np.array([[words & 0xFFFFFFFF, words >> 32]], np.uint32) if has_noise else None,
@@ -285,40 +267,3 @@ def _longest_delay(leaves: Document, max_delay: float | None) -> float | None:
     if max_delay is None and len(most) == len(delays):
         longest = max(most.values(), default=0.0)
     return longest if delays else None
-
-
-def _table(build: LeafBuilder, table: object) -> tuple[Array, Array]:
-    """Return the positions and efforts of a limit that depends on the position (1 | envs, joints,
-    points).
-    """
-    if table is None:
-        return None, None
-    remedy = (
-        "give positions and efforts (points,), (joints, points) or (envs, joints, points), with two"
-        " points or more"
-    )
-    if not isinstance(table, tuple | list | np.ndarray) or len(table) != 2:
-        raise InvalidArgumentError("position_limit", "must be a pair", value=table, remedy=remedy)
-    rows = [read_array("position_limit", part).astype(build.dtype) for part in table]
-    points = rows[0].shape[-1:]
-    shape = (1, build.joints, *points)
-    for part in rows:
-        fits = part.shape in (points, shape[1:]) or (part.ndim == 3 and part.shape[1:] == shape[1:])
-        if points < (2,) or not fits:
-            raise InvalidArgumentError("position_limit", f"has shape {part.shape}", remedy=remedy)
-    positions, efforts = (
-        np.broadcast_to(part, np.broadcast_shapes(part.shape, shape)) for part in rows
-    )
-    rising = np.isfinite(positions)
-    rising[..., 1:] &= positions[..., 1:] >= positions[..., :-1]
-    good = (efforts >= 0) & (np.isfinite(efforts) | np.isinf(efforts).all(2, keepdims=True))
-    checks = {
-        "has positions that do not ascend": (positions, rising),
-        "has an effort < 0 or not finite": (efforts, good),
-    }
-    for problem, (values, right) in checks.items():
-        first = np.take_along_axis(values, right.argmin(2, keepdims=True), 2)[..., 0]
-        entries("position_limit", first, right.all(2), problem, build.names)
-    if np.isinf(efforts).all():
-        return None, None
-    return build.freeze(positions), build.freeze(efforts)

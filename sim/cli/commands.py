@@ -53,7 +53,7 @@ class Output(NamedTuple):
         return f"{self.content} to write: {suffixes}.{f' Default: {default}.' if default else ''}"
 
 
-class Command(NamedTuple):
+class CommandFunction(NamedTuple):
     """Function that is a command."""
 
     function: Callable[..., Any]
@@ -71,19 +71,19 @@ class Command(NamedTuple):
 FIGURES = Output("Figures", (".json",))
 PICTURE = Output("Picture", PICTURES)
 COMMANDS = {
-    "demo": Command(
+    "demo": CommandFunction(
         demo,
         {"picture": PICTURE._replace(default="out/{robot}-demo.png")},
         ("engine", "workers"),
         (),
     ),
-    "rollout": Command(
+    "rollout": CommandFunction(
         rollout,
         {"out": Output("Recording", (".h5",)), "picture": PICTURE, "json": FIGURES},
         ("engine", "workers", "backend", "compensate", "ground"),
         ("base", "actuators"),
     ),
-    "tune": Command(
+    "tune": CommandFunction(
         tune,
         {
             "out": Output("Params file", DOCUMENTS, "out/{robot}.tuned.yaml"),
@@ -91,13 +91,13 @@ COMMANDS = {
         },
         loading=("base", "actuators"),
     ),
-    "compare": Command(
+    "compare": CommandFunction(
         compare, {"picture": PICTURE, "json": FIGURES}, loading=("base", "actuators")
     ),
-    "excite": Command(
+    "excite": CommandFunction(
         excite_joints, {"out": Output("Setpoints", (".csv",), "out/{robot}.excite.csv")}, (), ()
     ),
-    "identify": Command(
+    "identify": CommandFunction(
         identify_logs,
         {
             "out": Output("Actuators file", DOCUMENTS, "out/{robot}.actuators.yaml"),
@@ -107,13 +107,13 @@ COMMANDS = {
         },
         loading=(),
     ),
-    "export": Command(
+    "export": CommandFunction(
         export,
         {"out": Output("File", (".h", ".yaml", ".xml", ".urdf"), "out/{robot}{ending}")},
         loading=("actuators",),
     ),
-    "inspect": Command(inspect_robot, {"json": FIGURES}),
-    "plot": Command(
+    "inspect": CommandFunction(inspect_robot, {"json": FIGURES}),
+    "plot": CommandFunction(
         plot,
         {
             "picture": Output(
@@ -124,11 +124,11 @@ COMMANDS = {
         },
         loading=(),
     ),
-    "view": Command(view, {}, ("engine", "workers"), ("base", "actuators")),
+    "view": CommandFunction(view, {}, ("engine", "workers"), ("base", "actuators")),
 }
 
 
-def execute(command: Command, values: Document) -> int:
+def execute(command: CommandFunction, values: Document) -> int:
     """Run a command with the values of its flags, and return its exit status."""
     # A run may take hours: its output files are checked first.
     files = OutputFiles(values, command.outputs)
@@ -161,7 +161,7 @@ def _record(
     )
 
 
-def _arguments(command: Command, values: Document) -> Document:
+def _arguments(command: CommandFunction, values: Document) -> Document:
     """Return the arguments of a command's function, with a bar in place of ``progress``, after a
     line about them.
     """

@@ -50,7 +50,7 @@ ticks; settled: within 2 % of the move for good; overshoot: of joints that settl
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class RunReport:
     """Rollout of a robot, and its report."""
 
     robot: Robot

@@ -19,7 +19,7 @@ from batchpid.checks.validate import array
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Robot
 from batchpid.sim.cli.flags import BOUNDS
-from batchpid.sim.cli.report import Run
+from batchpid.sim.cli.report import RunReport
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.tool_space.osc_controller import default_tool
@@ -36,7 +36,7 @@ def demo(
     seconds: Annotated[float, SECONDS] = 2.0,
     progress: Callable[[Any], Any] | None = None,
     **options: Any,
-) -> Run:
+) -> RunReport:
     """Move 64 arms to a setpoint; print a table of the joints and draw a picture.
 
     PID and passive force are computed at each of the 2000 sim steps of a second. Env 0 starts where
@@ -73,7 +73,7 @@ def rollout(
     randomization: Randomization | None = None,
     progress: Callable[[Any], Any] | None = None,
     **options: Any,
-) -> Run:
+) -> RunReport:
     """Move N of any robot to a setpoint or along a trajectory; print a table.
 
     Robots start from seeded poses. The recording holds time (ticks,), setpoint, qpos, qvel, effort
@@ -175,7 +175,7 @@ def rollout(
         result = runner.rollout(setpoints, progress=progress, **given)
         wall = time.perf_counter() - began
         backend = runner.backend
-    return Run(robot, result, timestep, wall, backend, notes, is_held=trajectory is None)
+    return RunReport(robot, result, timestep, wall, backend, notes, is_held=trajectory is None)
 
 
 def start_poses(robot: Robot, num_envs: int, spread: float, seed: int, center: Rows) -> Float64:

@@ -98,17 +98,15 @@ class EnvGroup:
         inputs = acting.acting_params, acting.motors, motors, self._controller
         return make_setup(self._options, self.pack, *inputs)
 
-    def _prepare(self, setup: Setup, state: StepState, in_numpy: bool = False) -> None:
+    def _prepare(self, setup: Setup, state: StepState) -> None:
         """Make the executor, which goes on from a state, and set the engine's drives."""
         state = with_matrix(setup, state)
         # Native wherever the engine has native steps, under backend "numpy" too: the bits are the
         # same.
         self._executor: NumPyExecutor | NativeExecutor | XLAExecutor
-        if in_numpy or not steps_natively(self.pack):
-            self._executor = NumPyExecutor(setup, state)
-        elif self._options.backend == "jax":
+        if self._options.backend == "jax":
             self._executor = XLAExecutor(setup, state)
-        elif runs_natively(setup):
+        elif steps_natively(self.pack) and runs_natively(setup):
             self._executor = NativeExecutor(setup, state, self._last)
         else:
             self._executor = NumPyExecutor(setup, state)
@@ -118,12 +116,6 @@ class EnvGroup:
             if limit is None:
                 limit = np.full_like(stiffness, np.inf)
             self.pack.write_drive(stiffness, damping, limit)
-
-    def execute_in_numpy(self) -> None:
-        """Run sim steps call by call in NumPy until the next change, so that the phases of a step
-        can be timed.
-        """
-        self._prepare(self._executor.setup, self._executor.read_state(), in_numpy=True)
 
     # -- changes between ticks
 
@@ -384,18 +376,18 @@ class EnvGroup:
         self._sensors.write(states.sensors)
         self._pushes.write(states.pushes)
         law: Any = states.controller
-        state = StepState(law if self._controller else bp.PIDState(**law))
-        if states.friction:
-            leaves = (states.friction[name] for name in FrictionState._fields)
-            state = state._replace(friction=FrictionState(*leaves), age=states.friction[AGE])
-        if acting.motors is not None:
-            motors = dict(states.actuators)
+        friction, motors, guard = dict(states.friction), dict(states.actuators), dict(states.guard)
+        state = StepState(
+            law=law if self._controller else bp.PIDState(**law),
+            age=friction.pop(AGE, None),
+            friction=FrictionState(**friction),
+        )
+        if motors:
             self._episode = motors.pop(EPISODE).copy()
             state = state._replace(motors=ActuatorState(**motors))
-        if states.guard:
-            last.guarded[...] = states.guard[CHANGED]
-            guard = GuardState(*(states.guard[name] for name in GuardState._fields))
-            state = state._replace(guard=guard)
+        if guard:
+            last.guarded[...] = guard.pop(CHANGED)
+            state = state._replace(guard=GuardState(**guard))
         self._prepare(self._setup(state.motors), state)
         if self._contacts is not None:
             self._contacts.place(np.ones(pack.size, bool))

@@ -12,15 +12,14 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.trees import leaves, mapped
-from batchpid.native.operations import MOST_SUMMED
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
 from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.backend import native_obstacle
 from batchpid.sim.loop.native_program import Buffers, Table, TickProgram
 from batchpid.sim.loop.numpy_executor import EngineSteps
 from batchpid.sim.loop.step_setup import Setup
 from batchpid.sim.loop.step_values import Measured, Outputs, StepState
-from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 _NO_NOISE = 1 << interface.STATUS.index("no_noise")
 
@@ -167,24 +166,17 @@ def run_ticks(
     command or velocities that are not finite. With ``whole``, commands and observations are those
     of the tables; else the ticks stop at the end of the first one.
     """
-    call = native.extension("_gateway").ticks
     while executors:
-        call(tuple([executor.prepare() for executor in executors]), until, steps, whole)
+        ticks = tuple([executor.prepare() for executor in executors])
+        native.extension("_gateway").ticks(ticks, until, steps, whole)
         executors = [executor for executor in executors if executor.is_waiting()]
 
 
 def runs_natively(setup: Setup) -> bool:
-    """Return whether the control step can be native: a law of batchpid in float64, with at most
-    MOST_SUMMED joints.
-    """
-    control = setup.options.control
-    if isinstance(control, OperationalSpace):
-        if control.bound(*np.zeros((3, 1, control.tree.dof))) is None:
-            return False
-    elif not isinstance(control, str):
-        return False
+    """Return whether the control step can be native: a law of batchpid, in float64."""
     constants = leaves(setup.constants)
-    return setup.pack.dof <= MOST_SUMMED and all(leaf.dtype != np.float32 for leaf in constants)
+    is_double = all(leaf.dtype != np.float32 for leaf in constants)
+    return is_double and not native_obstacle(setup.options)
 
 
 def _copied(state: StepState) -> StepState:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Array, Pytree, Rows
+from batchpid.arrays.array_types import Array, DType, Pytree, Rows
 from batchpid.arrays.trees import filled, leaves, mapped, structure
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.symbols import Symbol
@@ -128,13 +128,15 @@ class TickProgram:
     def _place(self, **arrays: Rows | None) -> None:
         """Let fields of the structure of native code point to these arrays."""
         for name, array in arrays.items():
-            if array is None:
-                continue
-            dtype = np.dtype(_TYPES.get(name, np.float64))
-            if array.dtype != dtype or not array.flags.c_contiguous:
-                raise ValueError(f"{name} is not a contiguous array of {dtype}")
-            setattr(self.tick, name, array.ctypes.data)
-            self._references.append(array)
+            if array is not None:
+                setattr(self.tick, name, self._address(array, _TYPES.get(name, np.float64)))
+
+    def _address(self, array: Rows, dtype: DType) -> int:
+        """Return the address of an array for native code, which has this dtype."""
+        if array.dtype != dtype or not array.flags.c_contiguous:
+            raise ValueError(f"not a contiguous array of {np.dtype(dtype)}")
+        self._references.append(array)
+        return array.ctypes.data
 
     # -- commands and observations
 
@@ -173,14 +175,11 @@ class TickProgram:
         return (interface.Transfer * len(transfers))(*transfers)
 
     def _transfer(self, kind: str, table: Rows, row: Rows) -> interface.Transfer:
+        """Return a copy between a row (M, ...) and the first of the ticks of ``table``."""
         dtype = {"read": np.float64, "write_floats": np.float32}.get(kind, row.dtype)
-        is_fit = table.dtype == dtype and row.flags.c_contiguous and table[0].flags.c_contiguous
-        if not is_fit or table.shape[1:] != row.shape:
-            raise ValueError(f"a {table.dtype} table {table.shape} does not fit rows {row.shape}")
-        self._references += table, row
         return interface.Transfer(
-            table=table.ctypes.data,
-            row=row.ctypes.data,
+            table=self._address(table[0], dtype),
+            row=self._address(row, row.dtype),
             stride=0 if len(table) == 1 else table.strides[0],
             size=row.nbytes if kind == "write_bytes" else row.size,
             kind=interface.TRANSFERS.index(kind),
@@ -192,6 +191,11 @@ class TickProgram:
         """Add the stages that apply; return the values after them."""
         _, _, layout, constants, _ = self._setup
         stages = [stage for stage in STAGES if stage.applies(layout, constants)]
+        every = {"constraint": COUPLING_STEPS}
+        # Writing the targets of drives costs a call for each joint.
+        every["targets"] = int(moves_drives(layout, constants))
+        if layout.law is not None:
+            every["mass matrix"] = layout.law.matrix_steps
         waiting = list[SimStage]()
         for stage in stages:
             if stage.name not in _NATIVE:
@@ -201,6 +205,7 @@ class TickProgram:
                 values = self._add_program(tuple(waiting), values)
                 waiting = []
             values = _NATIVE[stage.name](self, values)
+            self._add_stage(stage.name, every.get(stage.name, 1))
         return values
 
     def _add_program(self, stages: tuple[SimStage, ...], values: Values) -> Values:
@@ -237,7 +242,6 @@ class TickProgram:
 
     def _add_force(self, values: Values) -> Values:
         self._place(pose=values.seen.qpos, rate=values.seen.qvel)
-        self._add_stage("force")
         return values
 
     def _add_inertia(self, values: Values) -> Values:
@@ -245,17 +249,14 @@ class TickProgram:
         self.tick.refresh = refresh.address
         self._references.append(refresh)
         self._place(age=state.age, gain=state.friction.gain, memory=state.friction.memory)
-        self._add_stage("inertia")
         return values
 
     def _add_mass_matrix(self, values: Values) -> Values:
-        _, pack, layout, constants, _ = self._setup
-        assert layout.law is not None
+        _, pack, _, constants, _ = self._setup
         tree, bodies = scene_tree(pack.spec).tables
         self._place(pose=values.seen.qpos, rate=values.seen.qvel, tree=tree, bodies=bodies)
         self._place(matrix=self._buffers.state.matrix, armature=constants.armature)
         self._place(damping=constants.damping, **constants.coupling.native())
-        self._add_stage("mass_matrix", layout.law.matrix_steps)
         return values
 
     def _add_controller(self, values: Values) -> Values:
@@ -263,23 +264,14 @@ class TickProgram:
         self.control = controller.bound(*values.seen)
         self.control.set_state(self._buffers.state.law)
         self.tick.control = self.control.address
-        self._add_stage("controller")
         outputs = values.outputs._replace(returned=self.control.effort)
         return values._replace(limited=self.control.limited, outputs=outputs)
 
     def _add_targets(self, values: Values) -> Values:
         self._place(target=values.outputs.target, target_rate=values.outputs.target_rate)
-        # Writing the targets costs a call for each joint.
-        _, _, layout, constants, _ = self._setup
-        self._add_stage("targets", int(moves_drives(layout, constants)))
         return values
 
-    def _add_constraint(self, values: Values) -> Values:
-        self._add_stage("constraint", COUPLING_STEPS)
-        return values
-
-    def _add_engine(self, values: Values) -> Values:
-        self._add_stage("engine")
+    def _add_nothing(self, values: Values) -> Values:
         return values
 
 
@@ -289,10 +281,10 @@ _NATIVE: dict[str, Callable[[TickProgram, Values], Values]] = {
     "mass matrix": TickProgram._add_mass_matrix,
     "controller": TickProgram._add_controller,
     "targets": TickProgram._add_targets,
-    "constraint": TickProgram._add_constraint,
-    "engine": TickProgram._add_engine,
+    "constraint": TickProgram._add_nothing,
+    "engine": TickProgram._add_nothing,
 }
-"""Stages that are no programs, or have a native function."""
+"""Stages that are no programs, or have a native function, with what each adds."""
 
 _TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
 """Dtypes of arrays that are not float64."""

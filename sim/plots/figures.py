@@ -1,14 +1,15 @@
-"""Figures of runs: step responses, efforts against their limits, two runs compared, errors of an
-identification.
+"""Figures of runs: step responses, efforts against their limits, errors of following, two runs
+compared, and errors of an identification.
 
 Everything is drawn by Matplotlib's object interface on the Agg and SVG canvases: no display, no
-global state.
+global state. Every artist with a meaning has a label, from which the legend is made.
 """
 
 from __future__ import annotations
 
 import io
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,39 +17,39 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
-from PIL import Image
 
-from batchpid.arrays.array_types import Array, Float64
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.sim.plots import drawing
-from batchpid.sim.signals.command import CommandSpec
+from batchpid.sim.signals.observation import OBSERVED
 from batchpid.sim.signals.rollout import Rollout
 
 FORMATS = (".png", ".svg")
 """Suffixes of the files that :func:`save` writes."""
+ENV = "#4c78a8"
+MEDIAN = "#16324f"
+MARKED = "#f28e2b"
+SECOND = "#e45756"
+SETPOINT = "#2f8f4e"
+LIMIT = "#b23a48"
+SMALL = 7.0
+"""Font size of ticks and units."""
+Joints: TypeAlias = Sequence[int | str] | None
+"""Joints to draw, by index or name; None or empty for all."""
 
 
 class Picture(Figure):
     """Figure that a notebook shows as PNG, without pyplot."""
 
     def _repr_png_(self) -> bytes:
-        return _png(self, dpi=90)
-
-
-Joints: TypeAlias = Sequence[int | str] | None
-"""Joints to draw, by index or name; None or empty for all."""
-_MEDIAN = Line2D([], [], color=drawing.MEDIAN, lw=1.6, label="median")
-_SETPOINT = Line2D([], [], color=drawing.SETPOINT, lw=1.2, ls="--", label="setpoint")
-_BEYOND = Patch(fc="none", ec=drawing.LIMIT, hatch="////", lw=0, label="beyond the limits")
-_SATURATION = Patch(color=drawing.LIMIT, alpha=0.6, lw=0, label="share of envs in saturation")
+        file = io.BytesIO()
+        self.savefig(file, format="png", dpi=90)
+        return file.getvalue()
 
 
 def step_responses(
@@ -82,44 +83,42 @@ def step_responses(
     """
     run = _blank_failed(rollout)
     command = None if run.info.sets_positions else run.info.own_command
-    figure, blocks = _figure(run, joints, rows=2, title=title, command=command)
-    own_blocks = blocks[len(blocks) - command.size :] if command is not None else []
-    pose = (
-        None
-        if run.tool_pose is None
-        else _like_setpoints(run.tool_pose, rollout.setpoint[..., 3:7])
-    )
-    for entry, (axes,) in own_blocks:
-        values = rollout.setpoint[..., entry]
-        drawing.draw_entry(axes, run.time, np.where(np.isfinite(values), values, np.nan))
+    labels = [] if command is None else [f"setpoint {label}" for label in command.labels]
+    chosen, names = _chosen(run, joints)
+    figure, blocks = _grid(names + labels, 2, title, run.time[-1])
+    for joint, (above, below) in zip(chosen, blocks, strict=False):
+        _draw_limits(above, run.info.lower[joint], run.info.upper[joint])
+        _draw_setpoint(above, run, joint, band)
+        _draw_fan(above, run.time, run.qpos[..., joint], mark)
+        _show_positions(above, [run], joint)
+        _draw_efforts(below, run, joint, mark)
+    pose = run.tool_pose
+    if pose is not None:
+        # Of the two quaternions of an orientation, the one that is nearer to the setpoint's.
+        sign = np.where((pose[..., 3:] * rollout.setpoint[..., 3:7]).sum(-1) < 0, -1.0, 1.0)
+        pose = np.concatenate([pose[..., :3], sign[..., None] * pose[..., 3:]], axis=-1)
+    for entry, (above, below) in enumerate(blocks[len(chosen) :]):
+        _draw_line(above, run.time, rollout.setpoint[..., entry])
         if pose is not None and entry < pose.shape[-1]:
-            drawing.draw_fan(axes, run.time, pose[..., entry], mark)
-    for joint, (above, below) in blocks[: len(blocks) - len(own_blocks)]:
-        drawing.draw_limits(above, run.info.lower[joint], run.info.upper[joint])
-        drawing.draw_setpoint(above, run, joint, band)
-        drawing.draw_fan(above, run.time, run.qpos[..., joint], mark)
-        drawing.set_position_range(above, [run], joint)
-        drawing.draw_efforts(below, run, joint, mark)
-    settling = Patch(
-        color=drawing.SETPOINT, alpha=0.2, lw=0, label=f"settling band, {band:.0%} of the move"
-    )
-    _legend(figure, [*_fan_entries(run, mark), _SETPOINT, settling, _BEYOND, _SATURATION])
+            _draw_fan(above, run.time, pose[..., entry], mark)
+        below.remove()
+    _add_legend(figure)
     return figure
 
 
 def efforts(
     rollout: Rollout, *, joints: Joints = None, mark: int | None = None, title: str = ""
 ) -> Figure:
-    """Draw, for each joint, efforts against their limit, and the share of envs in saturation.
+    """Draw, for each joint, efforts against their limit.
 
     Parameters as in :func:`step_responses`.
     """
     run = _blank_failed(rollout)
-    figure, blocks = _figure(run, joints, rows=1, title=title)
-    for joint, (axes,) in blocks:
-        drawing.draw_efforts(axes, run, joint, mark)
-    limit = Line2D([], [], color=drawing.LIMIT, lw=1.0, label="limit")
-    _legend(figure, [*_fan_entries(run, mark), limit, _SATURATION])
+    chosen, names = _chosen(run, joints)
+    figure, blocks = _grid(names, 1, title, run.time[-1])
+    for joint, (axes,) in zip(chosen, blocks, strict=True):
+        _draw_efforts(axes, run, joint, mark)
+    _add_legend(figure)
     return figure
 
 
@@ -130,13 +129,13 @@ def following_errors(rollout: Rollout, *, joints: Joints = None, title: str = ""
     Parameters as in :func:`step_responses`.
     """
     run = _blank_failed(rollout)
-    figure, blocks = _figure(run, joints, rows=1, title=title)
-    for joint, (axes,) in blocks:
+    chosen, names = _chosen(run, joints)
+    figure, blocks = _grid(names, 1, title, run.time[-1])
+    for joint, (axes,) in zip(chosen, blocks, strict=True):
         error = run.qpos[..., joint] - run.setpoint[..., joint]
-        drawing.draw_fan(axes, run.time, error, None)
-        axes.autoscale(axis="y")
-        axes.set_ylabel(run.info.units[joint], fontsize=drawing.SMALL)
-    _legend(figure, _fan_entries(run, None))
+        _draw_fan(axes, run.time, error, None)
+        _show(axes, error[np.isfinite(error)], run.info.units[joint])
+    _add_legend(figure)
     return figure
 
 
@@ -156,175 +155,25 @@ def comparison(
     InvalidArgumentError
         The runs have different joints, or the robot has no such joint.
     """
-    ours, theirs = first.info.joint_names, second.info.joint_names
-    if ours != theirs:
-        raise InvalidArgumentError(
-            "second",
-            f"has the joints {', '.join(theirs)}, the first run {', '.join(ours)}",
-            remedy="compare runs of the same robot",
-        )
-    runs, info = [_blank_failed(first), _blank_failed(second)], first.info
-    colours = (drawing.ENV, drawing.SECOND)
-    figure, blocks = _figure(runs[0], joints, rows=2, title=title)
-    for joint, (above, below) in blocks:
-        drawing.draw_limits(above, info.lower[joint], info.upper[joint])
-        drawing.draw_setpoint(above, runs[0], joint, None)
-        drawing.draw_limits(below, -info.effort_limit[joint], info.effort_limit[joint])
-        for run, colour in zip(runs, colours, strict=True):
-            drawing.draw_band(above, run.time, run.qpos[..., joint], colour)
-            drawing.draw_band(below, run.time, run.effort[..., joint], colour)
-        drawing.set_position_range(above, runs, joint)
-        drawing.set_effort_range(below, runs, joint)
-        for axes in (above, below):
-            axes.set_xlim(0, max(first.time[-1], second.time[-1]))
-    bands = [
-        Line2D([], [], color=colour, lw=1.6, label=f"{label}: median, 10 to 90 %")
-        for label, colour in zip(labels, colours, strict=True)
-    ]
-    _legend(figure, [*bands, _SETPOINT, _BEYOND])
+    info = first.info
+    if info.joint_names != second.info.joint_names:
+        theirs = ", ".join(second.info.joint_names)
+        problem = f"has the joints {theirs}, the first run {', '.join(info.joint_names)}"
+        raise InvalidArgumentError("second", problem, remedy="compare runs of the same robot")
+    runs = [_blank_failed(first), _blank_failed(second)]
+    chosen, names = _chosen(first, joints)
+    figure, blocks = _grid(names, 2, title, max(first.time[-1], second.time[-1]))
+    for joint, (above, below) in zip(chosen, blocks, strict=True):
+        for run, colour, label in zip(runs, (ENV, SECOND), labels, strict=True):
+            _draw_band(above, run.time, run.qpos[..., joint], colour, label)
+            _draw_band(below, run.time, run.effort[..., joint], colour, label)
+        _draw_limits(above, info.lower[joint], info.upper[joint])
+        _draw_setpoint(above, runs[0], joint, None)
+        _draw_limits(below, -info.effort_limit[joint], info.effort_limit[joint])
+        _show_positions(above, runs, joint)
+        _show_efforts(below, runs, joint)
+    _add_legend(figure)
     return figure
-
-
-def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
-    """Write ``figure`` to ``path`` (.png or .svg) as a whole or not at all, making its folder, and
-    return the path.
-
-    Raises
-    ------
-    InvalidArgumentError
-        Another suffix.
-    OSError
-        The file cannot be written.
-    """
-    path = file_path("path", path, FORMATS)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix.lower() == ".svg":
-        write_atomically(path, lambda file: figure.savefig(file, dpi=dpi, format="svg"))
-        return path
-    write_atomically(path, _png(figure, dpi))
-    return path
-
-
-def _png(figure: Figure, dpi: int) -> bytes:
-    """Return the figure as a PNG file."""
-    figure.set_dpi(dpi)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    # A palette of 256 colours looks the same, and takes a third of the bytes.
-    image = image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    file = io.BytesIO()
-    image.save(file, "PNG", optimize=True, dpi=(dpi, dpi))
-    return file.getvalue()
-
-
-def _blank_failed(rollout: Rollout) -> Rollout:
-    """Return the rollout with NaN where an env has failed, and for setpoints that are not
-    positions.
-    """
-    alive, seen = rollout.ok[..., None], rollout.observation
-    blank = seen._replace(
-        qpos=np.where(alive, seen.qpos, np.nan),
-        effort=np.where(alive, seen.effort, np.nan),
-        tool_pose=None if seen.tool_pose is None else np.where(alive, seen.tool_pose, np.nan),
-    )
-    setpoint = np.full(seen.qpos.shape, np.nan)
-    if rollout.info.sets_positions:
-        setpoint = np.where(np.isfinite(rollout.setpoint), rollout.setpoint, np.nan)
-    return replace(rollout, setpoint=setpoint, observation=blank)
-
-
-def _like_setpoints(pose: Array, wxyz: Array) -> Any:
-    """Return poses (..., 7) with the sign of the quaternion that is nearer to ``wxyz`` (..., 4)."""
-    sign = np.where((pose[..., 3:] * wxyz).sum(-1, keepdims=True) < 0, -1.0, 1.0)
-    return np.concatenate([pose[..., :3], sign * pose[..., 3:]], axis=-1)
-
-
-def _joint_indices(run: Rollout, joints: Joints) -> list[int]:
-    names = run.info.joint_names
-    indices: dict[int | str, int] = {
-        key: index for index, name in enumerate(names) for key in (name, index)
-    }
-    for joint in joints or ():
-        if joint not in indices:
-            raise InvalidArgumentError(
-                "joints", "no such joint", value=joint, remedy=f"use {', '.join(names)}"
-            )
-    return [indices[joint] for joint in joints or names]
-
-
-def _figure(
-    run: Rollout, joints: Joints, *, rows: int, title: str, command: CommandSpec | None = None
-) -> tuple[Figure, list[tuple[int, list[Axes]]]]:
-    """Return a figure with ``rows`` axes for each joint, then one for each entry of ``command``, in
-    a grid.
-
-    The pairs are (joint, axes) and, after these, (entry, axes).
-    """
-    chosen = [(joint, run.info.joint_names[joint], rows) for joint in _joint_indices(run, joints)]
-    if command is not None:
-        chosen += [(entry, f"setpoint {label}", 1) for entry, label in enumerate(command.labels)]
-    # Up to three columns; with more than 9 joints four or five, which leaves the fewest empty
-    # cells.
-    columns = (
-        min(len(chosen), 3) if len(chosen) <= 9 else min((4, 5), key=lambda n: -len(chosen) % n)
-    )
-    lines = math.ceil(len(chosen) / columns)
-    heights = (1.7, 0.85)[:rows]
-    between = 0.06  # a thin empty row separates the joints
-    size = ((4.0 if columns < 5 else 3.6) * columns, (sum(heights) + between) * lines + 0.75)
-    figure = Picture(figsize=size, layout="constrained")
-    figure.get_layout_engine().set(h_pad=0.02, w_pad=0.05, hspace=0.0)  # type: ignore[call-arg, union-attr]
-    if title:
-        figure.suptitle(title, fontsize=11)
-    # One flat grid, so that the axes of a column are aligned.
-    grid = figure.add_gridspec(
-        lines * (rows + 1), columns, height_ratios=(*heights, between) * lines
-    )
-    blocks = []
-    for place, (index, name, parts) in enumerate(chosen):
-        line, column = divmod(place, columns)
-        first = line * (rows + 1)
-        cells = [slice(first, first + rows)] if parts < rows else range(first, first + rows)
-        block = [figure.add_subplot(grid[cell, column]) for cell in cells]
-        last = place + columns >= len(chosen)
-        for axes in block:
-            axes.tick_params(
-                labelsize=drawing.SMALL, length=2, labelbottom=axes is block[-1] and last
-            )
-            axes.spines[["top", "right"]].set_visible(False)
-            axes.set_xlim(0, run.time[-1])
-            axes.yaxis.set_major_locator(MaxNLocator(4))
-        if last:
-            block[-1].set_xlabel("time [s]", fontsize=drawing.SMALL)
-        block[0].set_title(name, fontsize=8, loc="left", pad=3, fontweight="bold")
-        blocks.append((index, block))
-    return figure, blocks
-
-
-def _fan_entries(run: Rollout, mark: int | None) -> list[Line2D]:
-    line = Line2D(
-        [], [], color=drawing.ENV, alpha=0.6, lw=0.8, label=f"each of {run.num_envs} envs"
-    )
-    marked = (
-        [] if mark is None else [Line2D([], [], color=drawing.MARKED, lw=1.2, label=f"env {mark}")]
-    )
-    return [line, *marked, _MEDIAN]
-
-
-def _legend(figure: Figure, handles: list[Any]) -> None:
-    # As many columns as the figure is wide enough for: an entry of n letters takes about n + 8 of
-    # them.
-    letters = figure.get_figwidth() * 17
-    columns = max(
-        1,
-        min(len(handles), int(letters / (8 + max(len(handle.get_label()) for handle in handles)))),
-    )
-    if sum(len(handle.get_label()) + 8 for handle in handles) < letters:
-        columns = len(handles)
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=columns, fontsize=7.5, frameon=False
-    )
 
 
 class FitErrors(NamedTuple):
@@ -348,33 +197,229 @@ def fit_errors(
 
     The part that was kept to judge is shaded.
     """
-    columns = min(3, len(names))
-    rows = math.ceil(len(names) / columns)
-    figure = Picture(figsize=(4.2 * columns, 0.8 + 2.0 * rows), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, sharex=True)
-    held_out = [fit.time[~fit.fitted] for fit in fits]
-    for number, axes in enumerate(grid.flat):
-        if number >= len(names):
-            axes.set_axis_off()
-            continue
-        for label, colour in (("before", drawing.SECOND), ("after", drawing.ENV)):
-            for index, fit in enumerate(fits):
-                error = np.maximum(np.abs(getattr(fit, label)[:, number]), 1e-9)
-                error[~np.isfinite(error)] = np.nan
-                every = max(1, len(error) // 2000)
-                axes.semilogy(
-                    fit.time[::every],
-                    error[::every],
-                    color=colour,
-                    lw=0.8,
-                    label=label if index == 0 else None,
-                )
-        for times in held_out:
-            if len(times):
-                axes.axvspan(times[0], times[-1], color=drawing.SETPOINT, alpha=0.15, lw=0)
-        axes.set_title(names[number], fontsize=drawing.SMALL)
-        axes.set_ylabel(units[number], fontsize=drawing.SMALL)
-    figure.supxlabel("time [s]", fontsize=drawing.SMALL)
-    figure.suptitle(title, fontsize=drawing.SMALL + 2)
-    grid.flat[0].legend(fontsize=drawing.SMALL)
+    figure, blocks = _grid(names, 1, title, fits[-1].time[-1])
+    for joint, (axes,) in enumerate(blocks):
+        for fit in fits:
+            for errors, colour, label in (
+                (fit.before, SECOND, "before"),
+                (fit.after, ENV, "after"),
+            ):
+                size = np.abs(errors[:, joint])
+                axes.semilogy(fit.time, np.maximum(size, 1e-9), color=colour, lw=0.8, label=label)
+            held_out = fit.time[~fit.fitted]
+            if len(held_out):
+                axes.axvspan(held_out[0], held_out[-1], color=SETPOINT, alpha=0.15, lw=0)
+        axes.set_ylabel(units[joint], fontsize=SMALL)
+    _add_legend(figure)
     return figure
+
+
+def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
+    """Write ``figure`` to ``path`` (.png or .svg) as a whole or not at all, making its folder, and
+    return the path.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Another suffix.
+    OSError
+        The file cannot be written.
+    """
+    path = file_path("path", path, FORMATS)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    suffix = path.suffix.lower()[1:]
+    write_atomically(path, lambda file: figure.savefig(file, dpi=dpi, format=suffix))
+    return path
+
+
+# -- parts of a figure
+
+
+def _grid(
+    names: Sequence[str], rows: int, title: str, end: float
+) -> tuple[Figure, list[list[Axes]]]:
+    """Return a figure, and for each of ``names`` a column of ``rows`` axes, positions above
+    efforts, up to the time ``end`` [s].
+    """
+    columns = min(len(names), 3 if len(names) <= 9 else 4)
+    lines = math.ceil(len(names) / columns)
+    heights = (1.7, 0.85)[:rows]
+    figure = Picture(figsize=(4.0 * columns, sum(heights) * lines + 0.8), layout="constrained")
+    if title:
+        figure.suptitle(title, fontsize=11)
+    grid = figure.add_gridspec(lines * rows, columns, height_ratios=heights * lines)
+    blocks = []
+    for place, name in enumerate(names):
+        line, column = divmod(place, columns)
+        block = [figure.add_subplot(grid[line * rows + row, column]) for row in range(rows)]
+        for axes in block:
+            axes.tick_params(labelsize=SMALL, length=2, labelbottom=axes is block[-1])
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.set_xlim(0, end)
+            axes.yaxis.set_major_locator(MaxNLocator(4))
+        block[0].set_title(name, fontsize=8, loc="left", pad=3, fontweight="bold")
+        if place + columns >= len(names):
+            block[-1].set_xlabel("time [s]", fontsize=SMALL)
+        blocks.append(block)
+    return figure, blocks
+
+
+def _add_legend(figure: Figure) -> None:
+    """Add a legend with each label of the figure's artists once."""
+    entries: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    columns = max(1, int(figure.get_figwidth() / 2))
+    figure.legend(
+        entries.values(),
+        entries.keys(),
+        loc="outside lower center",
+        ncols=columns,
+        fontsize=7.5,
+        frameon=False,
+    )
+
+
+def _draw_fan(axes: Axes, time: Rows, values: Rows, mark: int | None) -> None:
+    """Draw each env of ``values`` (ticks, envs) as a thin line, their median as a bold one, env
+    ``mark`` in colour.
+    """
+    lines = np.empty((values.shape[1], len(time), 2))
+    lines[..., 0], lines[..., 1] = time, values.T
+    alpha = min(0.9, max(0.08, 12.0 / len(lines)))
+    # As one bitmap: an SVG of 64 envs by 9 joints would hold half a million points.
+    fan = LineCollection(
+        list(lines), colors=ENV, linewidths=0.6, alpha=alpha, rasterized=True, label="each env"
+    )
+    axes.add_collection(fan, autolim=False)
+    (median,) = _quantiles(values, 0.5)
+    axes.plot(time, median, color=MEDIAN, lw=1.5, label="median")
+    if mark is not None:
+        axes.plot(time, values[:, mark], color=MARKED, lw=1.1, label=f"env {mark}")
+
+
+def _draw_band(axes: Axes, time: Rows, values: Rows, colour: str, label: str) -> None:
+    """Draw the median of the envs as a line, and 10 to 90 % of them as a band."""
+    low, median, high = _quantiles(values, 0.1, 0.5, 0.9)
+    axes.fill_between(time, low, high, color=colour, alpha=0.2, lw=0)
+    axes.plot(time, median, color=colour, lw=1.4, label=f"{label}: median, 10 to 90 %")
+
+
+def _draw_setpoint(axes: Axes, run: Rollout, joint: int, band: float | None) -> None:
+    """Draw the setpoint of a joint, and the settling band around its last value."""
+    setpoint = run.setpoint[..., joint]
+    _draw_line(axes, run.time, setpoint)
+    move = np.abs(setpoint[-1] - run.qpos[0, :, joint])
+    move = move[np.isfinite(move)]
+    if band is not None and move.size and np.ptp(setpoint[-1]) == 0:
+        half = band * float(np.median(move))
+        low, high = setpoint[-1, 0] - half, setpoint[-1, 0] + half
+        label = f"settling band, {band:.0%} of the move"
+        axes.axhspan(low, high, color=SETPOINT, alpha=0.2, lw=0, label=label)
+
+
+def _draw_line(axes: Axes, time: Rows, values: Rows) -> None:
+    """Draw one number of the setpoints (ticks, envs), as one line where all envs share it."""
+    shared = (values == values[:, :1]).all()
+    shown = np.where(np.isfinite(values), values, np.nan)[:, : 1 if shared else None]
+    lines = axes.plot(time, shown, color=SETPOINT, lw=1.1, ls="--", zorder=3)
+    lines[0].set_label("setpoint")
+
+
+def _draw_limits(axes: Axes, low: float, high: float) -> None:
+    """Draw a line at each finite limit, and hatching beyond it."""
+    for limit, sign in ((low, -1), (high, 1)):
+        if math.isfinite(limit):
+            far = limit + sign * 1e3 * max(1.0, abs(limit))
+            axes.axhspan(limit, far, fc="none", ec=LIMIT, alpha=0.25, hatch="////", lw=0, zorder=0)
+            axes.axhline(limit, color=LIMIT, lw=0.9, zorder=2, label="limit")
+
+
+def _draw_efforts(axes: Axes, run: Rollout, joint: int, mark: int | None) -> None:
+    """Draw the efforts against their limit, with their peak and the share of saturated samples."""
+    values, limit = run.effort[..., joint], float(run.info.effort_limit[joint])
+    _draw_limits(axes, -limit, limit)
+    _draw_fan(axes, run.time, values, mark)
+    _show_efforts(axes, [run], joint)
+    peak = np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
+    share = run.saturated[..., joint].mean()
+    text = f"peak {peak:.3g} of ±{limit:g} {axes.get_ylabel()}, saturated {share:.0%}"
+    axes.text(1, 1, text, transform=axes.transAxes, ha="right", va="bottom", fontsize=6.5)
+
+
+def _show_positions(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
+    """Show all positions and the first run's setpoints, but no more than 15 % beyond the limits."""
+    info = runs[0].info
+    low, high = info.lower[joint], info.upper[joint]
+    margin = 0.15 * (high - low)
+    setpoints = _finite(runs[:1], "setpoint", joint)
+    # Setpoints outside the limits are worth seeing, a run that diverges is not.
+    far = np.append(setpoints, [low - margin, high + margin])
+    positions = np.clip(_finite(runs, "qpos", joint), far.min(), far.max())
+    _show(axes, np.append(positions, setpoints), info.units[joint])
+
+
+def _show_efforts(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
+    """Show all efforts, and the limit of the first run unless it is more than five times as far."""
+    values = _finite(runs, "effort", joint)
+    limit = float(runs[0].info.effort_limit[joint])
+    is_near = math.isfinite(limit) and np.abs(values).max(initial=0.0) > 0.2 * limit
+    further = [0.0, limit, -limit] if is_near else [0.0]
+    unit = OBSERVED["effort"].unit_for(runs[0].info.units[joint])
+    _show(axes, np.append(values, further), unit)
+
+
+def _show(axes: Axes, values: Rows, unit: str) -> None:
+    """Set the range of the axes so that it holds ``values``, and their unit."""
+    axes.set_ylabel(unit, fontsize=SMALL)
+    if values.size:
+        low, high = float(values.min()), float(values.max())
+        margin = 0.08 * (high - low) or 0.05 * max(abs(high), 1e-3)
+        axes.set_ylim(low - margin, high + margin)
+
+
+def _finite(runs: Sequence[Rollout], name: str, joint: int) -> Rows:
+    """Return the finite values of a joint in some runs."""
+    values = np.concatenate([getattr(run, name)[..., joint].ravel() for run in runs])
+    return values[np.isfinite(values)]
+
+
+def _quantiles(values: Rows, *at: float) -> Rows:
+    """Return quantiles over the finite envs of ``values`` (ticks, envs), (len(at), ticks); NaN
+    without finite envs.
+    """
+    finite = np.where(np.isfinite(values), values, np.nan)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "All-NaN slice")
+        return np.nanquantile(finite, at, axis=1)
+
+
+def _blank_failed(rollout: Rollout) -> Rollout:
+    """Return the rollout with NaN where an env has failed, and for setpoints that are not
+    positions.
+    """
+    alive, seen = rollout.ok[..., None], rollout.observation
+    blank = seen._replace(
+        qpos=np.where(alive, seen.qpos, np.nan),
+        effort=np.where(alive, seen.effort, np.nan),
+        tool_pose=None if seen.tool_pose is None else np.where(alive, seen.tool_pose, np.nan),
+    )
+    setpoint = np.full(seen.qpos.shape, np.nan)
+    if rollout.info.sets_positions:
+        setpoint = np.where(np.isfinite(rollout.setpoint), rollout.setpoint, np.nan)
+    return replace(rollout, setpoint=setpoint, observation=blank)
+
+
+def _chosen(run: Rollout, joints: Joints) -> tuple[list[int], list[str]]:
+    """Return indices and names of joints that are given by index or name."""
+    names = run.info.joint_names
+    indices = {name: index for index, name in enumerate(names)}
+    chosen = []
+    for joint in joints or names:
+        index = indices.get(joint, joint) if isinstance(joint, str) else joint
+        if index not in range(len(names)):
+            remedy = f"use {', '.join(names)}"
+            raise InvalidArgumentError("joints", "no such joint", value=joint, remedy=remedy)
+        chosen.append(int(index))
+    return chosen, [names[index] for index in chosen]

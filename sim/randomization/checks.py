@@ -11,7 +11,7 @@ from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN
-from batchpid.motors.actuators import DELAYS, NOISES, TABLE
+from batchpid.motors.actuators import DELAYS, NOISES
 from batchpid.motors.actuators import FIELDS as OF_ACTUATORS
 from batchpid.sim.randomization.fields import GROUPS, Field, elements, nominal_values, parts
 from batchpid.sim.randomization.randomization import EVENTS, FIELDS, Randomization
@@ -132,16 +132,15 @@ def _with_extremes(
     name: str, field: Field, actuators: bp.Actuators, robot: Robot
 ) -> tuple[Rows, float]:
     """Return the nominal values of a field of the actuators, and the largest that can be drawn."""
-    declared = (OF_ACTUATORS | TABLE)[choice("actuators", name, [*OF_ACTUATORS, *TABLE])]
+    declared = OF_ACTUATORS[choice("actuators", name, OF_ACTUATORS)]
     leaf = getattr(actuators, name)
     if leaf is None and np.isinf(declared.neutral):
-        remedy = f"give the runner actuators with {'position_limit' if name in TABLE else name}"
+        remedy = f"give the runner actuators with {name}"
         problem = "is off, and has no value to change"
         raise InvalidArgumentError(f"actuators.{name}", problem, remedy=remedy)
     nominal = np.full((1, robot.dof), declared.neutral) if leaf is None else np.asarray(leaf)
     most = -np.inf
     for rows in _extremes(f"actuators.{name}", field, robot.joint_names, nominal):
-        least = rows.reshape(len(rows), robot.dof, -1).min(2)
-        declared.checked(name, least, robot.joint_names, infinite=name in TABLE)
+        declared.checked(name, rows, robot.joint_names)
         most = max(most, float(rows.max()))
     return nominal, most

@@ -224,12 +224,8 @@ class Randomization:
     def apply(self, name: str, nominal: ArrayLike, draws: Draws, robot: Robot) -> Float64:
         """Return the values of a field (envs, joints or links) that result from ``nominal``, which
         broadcasts to it.
-
-        All entries of a joint's table (1, joints, points) change by one draw.
         """
         drawn = draws.values[name]
-        if np.ndim(nominal) == 3:
-            drawn = drawn[..., None]
         shape = np.broadcast_shapes(np.shape(nominal), drawn.shape)
         values = np.array(np.broadcast_to(nominal, shape))
         for _, chosen, distribution in parts(name, self.given[name], elements(name, robot)):

@@ -99,7 +99,7 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
     """Read a recording: complete, cut short by a kill, or one that is still being written.
 
     ``info.complete`` of the result says whether the run came to its end. Nothing in the file is
-    executed; SECURITY.md lists the risks of files from strangers.
+    executed; SECURITY.md lists the risks of files of unknown origin.
 
     Parameters
     ----------

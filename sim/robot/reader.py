@@ -43,7 +43,7 @@ def read_robot(
 
     name = root.get("model") or path.stem
     try:
-        source = read_mjcf(path, name, fixed_base is not False, missing_meshes)
+        source = read_mjcf(path, name, fixed_base, missing_meshes)
     except UnicodeDecodeError as error:
         raise RobotError(
             f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"

@@ -69,9 +69,10 @@ class Robot(RobotDescription):
             defaults, PhysX's joint friction 0.05 and link damping 0.05, for comparison with its
             tutorial.
         fixed_base
-            True to fix the root link to the world. Default True, unless the root of a URDF is a
-            link without mass and shapes and its only joint is floating or planar: then the base
-            floats, and the root is that joint's child.
+            True to fix the root link to the world. Default True, unless the file has a floating
+            base: the root of an MJCF file has a free joint, or the root of a URDF is a link without
+            mass and shapes and its only joint is floating or planar: then the root is that joint's
+            child.
         self_collision
             ``"auto"``: links that are neighbours, or touch or overlap at the start pose or in
             nearly every sampled pose do not collide (:attr:`self_contact`). ``"urdf"``: all links

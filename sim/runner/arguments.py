@@ -31,36 +31,43 @@ def read_command(
     state: RunnerState,
     limits: SetpointCheck | None,
     given: Mapping[str, ArrayLike | None],
+    seconds: float,
     ticks: int | None = None,
 ) -> Command:
-    """Return the command (ticks, envs, ...) of one tick, or of ``ticks``, as a copy.
+    """Return the command (ticks, envs, ...) of one tick, or of ``ticks``, of ``seconds`` each, as a
+    copy.
 
     ``given`` has its arrays by the names of their arguments, in the order of :class:`Command`.
     Positions of followers are computed from their leaders; the loop passes efforts on to the
     leaders. ``limits`` warns of setpoints.
     """
-    _, _, acceleration, _ = given.values()
+    _, rate, acceleration, _ = given.values()
     if acceleration is not None:
         _check_acceleration(state.params, given)
     table = (options.num_envs,) if ticks is None else (ticks, options.num_envs)
-    finite, rows = options.on_invalid_input == "raise", list[Any]()
+    finite = options.on_invalid_input == "raise"
+    rows = list[Any]()
     for (name, value), (kind, names) in zip(given.items(), options.command_columns, strict=True):
         if value is None and rows:  # the setpoint, which is first, must be given
             rows.append(None)
             continue
-        each: Any = value
+        entries: Any = value
         if ticks is not None:
-            each = read_array(name, each)
-            each = each[:, None] if each.ndim == 2 else each
-        own = array(name, each, (*table, len(names)), names, finite=finite, kind=kind).copy()
-        rows.append(own[None] if ticks is None else own)
+            entries = read_array(name, entries)
+            entries = entries[:, None] if entries.ndim == 2 else entries
+        entries = array(name, entries, (*table, len(names)), names, finite=finite, kind=kind).copy()
+        rows.append(entries[None] if ticks is None else entries)
     coupling = options.command_coupling
     if coupling is not None:
         rows[0] = coupling.positions(rows[0])
-        rows[1:3] = [None if each is None else coupling.rates(each) for each in rows[1:3]]
+        rows[1:3] = [None if table is None else coupling.rates(table) for table in rows[1:3]]
     if limits is not None:
         limits.check("setpoint", rows[0])
-    return Command(*rows)
+    # No constructor of a named tuple, which is a call of Python in the path of a tick.
+    command = tuple.__new__(Command, rows)
+    if rate is None or state.motion is None or state.params.gain_units is None:
+        return command
+    return accelerated(command, state.motion, seconds)
 
 
 def accelerated(command: Command, motion: Motion, seconds: float) -> Command:

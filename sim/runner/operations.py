@@ -26,7 +26,7 @@ from batchpid.sim.loop.loop import Loop
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
-from batchpid.sim.runner.arguments import accelerated, base_rows, joint_rows
+from batchpid.sim.runner.arguments import base_rows, joint_rows
 from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.signals.observation import untouched
 from batchpid.sim.workers.pool import Outcome
@@ -110,19 +110,6 @@ class Run(Operation):
     command: Command = field()
     counts_ticks = True
 
-    @classmethod
-    def after(cls, state: RunnerState, command: Command, substeps: int, timestep: float) -> Self:
-        """Return the operation for ticks of sim steps of ``timestep`` [s] that follow on
-        ``state``.
-        """
-        if (
-            command.setpoint_rate is not None
-            and state.motion is not None
-            and state.params.gain_units is not None
-        ):
-            command = accelerated(command, state.motion, substeps * timestep)
-        return cls(len(command.setpoint), substeps, command)
-
     def for_envs(self, envs: slice) -> Self:
         return replace(self, command=self.command.map(itemgetter((slice(None), envs))))
 
@@ -157,17 +144,11 @@ class Run(Operation):
         if motion is not None and count:
             motion = setpoint[count - 1], None if rate is None else rate[count - 1]
         steps = count * self.substeps
-        return RunnerState(  # not _replace(): it is one more Python call per tick
-            state.params,
-            state.actuators,
-            state.draws,
-            faults,
-            contacts,
-            motion,
-            state.steps + steps,
-            state.steps_since_checkpoint + steps,
-            state.work if outcome.failure else (tuple(outcome.results), count),
-        )
+        work = state.work if outcome.failure else (tuple(outcome.results), count)
+        since = state.steps_since_checkpoint + steps
+        values = faults, contacts, motion, state.steps + steps, since, work
+        # Not _replace(), which is a call of Python in the path of a tick.
+        return tuple.__new__(RunnerState, (state.params, state.actuators, state.draws, *values))
 
 
 @dataclass(frozen=True)

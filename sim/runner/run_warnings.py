@@ -6,7 +6,6 @@ import batchpid as bp
 from batchpid.checks.warn import warn
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
-from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
@@ -26,8 +25,8 @@ class RunWarnings:
         self.setpoint_limits = (
             self.limits if options.sets_positions and options.guard is None else None
         )
-        self.is_watching = False
-        """False where :meth:`see` can find nothing in any tick."""
+        self.moving: MovingSetpointCheck | None = None
+        """Check of the setpoints of every tick; None where it can find nothing."""
         self._control = control
         self._stability = StabilityCheck(robot, timestep) if control == "pid" else None
         self._moving = MovingSetpointCheck(robot) if control == "pid" else None
@@ -47,16 +46,7 @@ class RunWarnings:
         """Watch the next ticks for what these gains may lead to."""
         if self._moving is not None:
             self._moving.set_params(params)
-            self.is_watching = self._moving.is_watching
-
-    def see(self, command: Command, num_ticks: int, seconds: float) -> None:
-        """Look at the first ticks of a command (ticks, envs, ...), of ``seconds`` each, and warn of
-        what is found.
-        """
-        if self._moving is not None:
-            rated = command.setpoint_rate is not None
-            self._moving.see(command.setpoint[:num_ticks], rated, seconds)
-            self.is_watching = self._moving.is_watching
+            self.moving = self._moving if self._moving.is_watching else None
 
     def issue(self, faults: FaultLog, contacts: MissedContactLog | None, lost: list[str]) -> None:
         """Warn of lost workers (the messages ``lost``, which are removed), faults and missed

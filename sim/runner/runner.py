@@ -314,9 +314,11 @@ class Runner(SingleOwner):
             "feedforwards": feedforwards,
         }
         options, ticks = self.options, count_ticks(self.options, setpoints)
-        command = read_command(options, self._state, self._warnings.setpoint_limits, given, ticks)
-        robot = options.robot
         tick = options.substeps * options.timestep
+        command = read_command(
+            options, self._state, self._warnings.setpoint_limits, given, tick, ticks
+        )
+        robot = options.robot
         done = 0
         seen = empty_observation(ticks, self.num_envs, robot.dof, observed=options.observed)
         times = (
@@ -330,7 +332,7 @@ class Runner(SingleOwner):
                 done = min(ticks, number + self._max_ticks())
                 part = slice(number, done)
                 rows = command.map(itemgetter(part))
-                self._execute(Run.after(self._state, rows, options.substeps, options.timestep))
+                self._execute(Run(done - number, options.substeps, rows))
                 for name in options.observed:
                     getattr(seen, name)[part] = getattr(self._pool.arrays.observation, name)[
                         : done - number
@@ -629,15 +631,14 @@ class Runner(SingleOwner):
     def _tick(self, arrays: tuple[ArrayLike | None, ...], substeps: int | None) -> Run:
         """Return the operation for the arguments of :meth:`step`, checked."""
         inputs = dict(zip(Command._fields, arrays, strict=True))
-        command = read_command(self.options, self._state, self._warnings.setpoint_limits, inputs)
         count = self.substeps if substeps is None else checked_option("substeps", substeps)
         if self.recorder is not None and count != self.substeps:
-            problem, remedy = (
-                f"is not the runner's {self.substeps}",
-                "all ticks of a recording have the same length",
-            )
+            problem = f"is not the runner's {self.substeps}"
+            remedy = "all ticks of a recording have the same length"
             raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
-        return Run.after(self._state, command, count, self.timestep)
+        limits, seconds = self._warnings.setpoint_limits, count * self.timestep
+        command = read_command(self.options, self._state, limits, inputs, seconds)
+        return Run(1, count, command)
 
     def _begin(self, run: Run) -> None:
         """Send a request of ticks, for :meth:`_execute` to complete."""
@@ -703,8 +704,10 @@ class Runner(SingleOwner):
             call.end()
         if outcome.failure is not None:
             raise outcome.failure.error
-        if run is not None and self._warnings.is_watching:
-            self._warnings.see(run.command, outcome.num_ticks, run.substeps * self.timestep)
+        moving = self._warnings.moving
+        if run is not None and moving is not None:
+            rows, rates = run.command.setpoint[: outcome.num_ticks], run.command.setpoint_rate
+            moving.see(rows, rates is not None, run.substeps * self.timestep)
         faults, contacts = self._state.faults, self._state.contacts
         if pool.warnings or faults.faults or contacts is not None:
             self._warnings.issue(faults, contacts, pool.warnings)

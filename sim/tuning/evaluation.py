@@ -23,7 +23,6 @@ from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.diagnosis.findings import absolute_band
-from batchpid.sim.diagnosis.loop_stability import StabilityReport, stability_report
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.options.groups import EngineName
 from batchpid.sim.robot.robot import Robot
@@ -44,10 +43,6 @@ the samples.
 SETTLE_SECONDS, SETTLE_SLACK = 1.0, 1.2
 """A move should settle within a second, or within this multiple of the shortest that its effort
 limits allow.
-"""
-POSES = 3
-"""Number of poses, starts and targets of moves, at which the stability of each draw is
-evaluated.
 """
 
 
@@ -230,47 +225,3 @@ def evaluate_gains(
         settling_limit=settling_limits(robot, moves),
         following_error=followed,
     )
-
-
-class Within(NamedTuple):
-    """Stability and settling of gains on sets of motors."""
-
-    stability: StabilityReport
-    """Report for the least stable set and pose; ``env`` is the number of the set."""
-    settling: Float64
-    """Settling time of the slowest joint of the arm in the slowest move of each set (sets,) [s];
-    inf: never.
-    """
-
-    @property
-    def holds(self) -> bool:
-        """True if the loop is stable, and settles in every move, with every set."""
-        return self.stability.robot_ratio < 1 and bool(np.isfinite(self.settling).all())
-
-
-def within(
-    robot: Robot,
-    params: bp.PIDParams,
-    motors: bp.Actuators,
-    moves: Moves,
-    seconds: float = 2.0,
-    **options: Any,
-) -> Within:
-    """Run all ``moves`` as setpoint steps from rest with each row of ``motors``, and evaluate them.
-
-    ``params`` have one row. ``options`` go to :class:`batchpid.sim.Runner`.
-    """
-    sets, count = motors.num_envs, len(moves.start)
-    repeated = motors.for_envs(np.repeat(np.arange(sets), count))
-    with Runner(
-        robot, sets * count, params=params, actuators=repeated, **{"substeps": SUBSTEPS, **options}
-    ) as runner:
-        metrics, timestep = (
-            run_moves(runner, moves.take(np.tile(np.arange(count), sets)), seconds)[1],
-            runner.timestep,
-        )
-    settled = np.nan_to_num(metrics.settling_time[:, arm_joints(robot)], nan=0.0, posinf=np.inf)
-    poses = np.concatenate([moves.start, moves.target])[:POSES]
-    reports = [stability_report(robot, params, pose, timestep, actuators=motors) for pose in poses]
-    worst = max(reports, key=lambda report: report.robot_ratio)
-    return Within(worst, settled.reshape(sets, -1).max(1))

@@ -19,7 +19,7 @@ and the one at a share of the velocity limits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -146,14 +146,16 @@ def random_moves(
     center, movable = easy_pose(robot, dynamics, poses[:200])
     clearance = 0.0 if dynamics.in_contact(center[None], _CLEARANCE)[0] else _CLEARANCE
     share, in_vain = 1.0, 0
-
-    def draw(index: int) -> list[tuple[Float64, Float64, str]]:
-        nonlocal share, in_vain
+    moves = list[tuple[Float64, Float64, str]]()
+    for _ in range(200 * count + 200):
+        if len(moves) == count:
+            break
+        # Where few poses are free of contact, moves get smaller.
         if in_vain == _PATIENCE:
             share, in_vain = share / 2, 0
-        kind = KINDS[index % len(KINDS)]
-        drawn = robot.sample(1, seed=int(rng.integers(2**31)))[0]
-        start = np.clip(drawn if share == 1 else center + share * (drawn - center), low, high)
+        kind = KINDS[len(moves) % len(KINDS)]
+        pose = robot.sample(1, seed=int(rng.integers(2**31)))[0]
+        start = np.clip(pose if share == 1 else center + share * (pose - center), low, high)
         joint, fraction = rng.integers(robot.dof), rng.uniform(-1, 1, robot.dof)
         if kind == "all alike":
             fraction[:] = fraction[0]
@@ -161,23 +163,34 @@ def random_moves(
             joint = robot.coupling.leader[joint]
             fraction[np.arange(robot.dof) != joint] = 0.0
             kind = f"{robot.joint_names[joint]} alone"
-        step = (
-            movable * share * fraction * np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
+        span = np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
+        start, target = (
+            robot.coupled(ends)
+            for ends in (start, np.clip(start + movable * share * fraction * span, low, high))
         )
-        target = np.clip(start + step, low, high)
-        start, target = robot.coupled(start), robot.coupled(target)
+        # The ends are tested first: most moves in contact are so at an end.
         path = start + line * (target - start)
-        free = not any(dynamics.in_contact(qpos, clearance).any() for qpos in (path[[0, -1]], path))
-        if (
-            not free
-            or shortest_durations(robot, Moves(start[None], target[None], (kind,)))[0] > LONGEST
-        ):
+        touches = any(dynamics.in_contact(q, clearance).any() for q in (path[[0, -1]], path))
+        move = Moves(start[None], target[None], (kind,))
+        if touches or shortest_durations(robot, move)[0] > LONGEST:
             in_vain += 1
-            return []
+            continue
         in_vain = 0
-        return [(start, target, kind)]
-
-    return draw_moves(robot, count, draw)
+        moves.append((start, target, kind))
+    if len(moves) < count:
+        problem = (
+            f"{robot.name!r} touches itself or the ground where it should not, or is too weak, in"
+            f" nearly every draw of a move: {len(moves)} of {count} were found"
+        )
+        remedy = (
+            "give the moves or gains yourself, or correct what batchpid inspect lists as touching"
+            " or weak"
+        )
+        raise InvalidArgumentError("robot", problem, remedy=remedy)
+    starts, targets = (
+        np.array([move[end] for move in moves]).reshape(-1, robot.dof) for end in (0, 1)
+    )
+    return Moves(starts, targets, tuple(name for _, _, name in moves))
 
 
 def easy_pose(
@@ -218,39 +231,6 @@ def easy_pose(
                 center, least = tried[index], move_cost
                 break
     return center, movable
-
-
-def draw_moves(
-    robot: Robot,
-    count: int,
-    draw: Callable[[int], list[tuple[Float64, Float64, str]]],
-    draws: int | None = None,
-) -> Moves:
-    """Return ``count`` moves: starts, targets and names that ``draw(moves so far)`` returns, which
-    may be none.
-
-    Raises InvalidArgumentError if ``draws`` (200 for each move, and 200 more) return too few.
-    """
-    moves: list[tuple[Float64, Float64, str]] = []
-    for _ in range(200 * count + 200 if draws is None else draws):
-        if len(moves) >= count:
-            break
-        moves += draw(len(moves))
-    if len(moves) < count:
-        raise InvalidArgumentError(
-            "robot",
-            f"{robot.name!r} touches itself or the ground where it should not, is too weak, or"
-            f" leaves its limits, in nearly every draw of a move: {len(moves)} of {count} were"
-            " found",
-            remedy=(
-                "give the moves or gains yourself, or correct what batchpid inspect lists as"
-                " touching or weak"
-            ),
-        )
-    starts, targets = (
-        np.array([move[end] for move in moves[:count]]).reshape(-1, robot.dof) for end in (0, 1)
-    )
-    return Moves(starts, targets, tuple(name for _, _, name in moves[:count]))
 
 
 def shortest_durations(robot: Robot, moves: Moves) -> Float64:

@@ -232,7 +232,8 @@ class NodeWorker(Worker):
         self._actor, self._cpus = actor_type.remote(), 0
 
     def send(self, request: Request) -> None:
-        self._limit = self.limit(request)
+        limit = self._step_limit * (request.ticks or 1) * request.substeps
+        self._limit = limit + self._timeout + request.patience
         if isinstance(request, Build):
             machine = self._machine
             self._call = self._actor.start.remote(self._message, machine.workers, machine.address)

@@ -204,7 +204,8 @@ class WorkerPool(SingleOwner):
         if count:
             views = self.ticks.made
             self.present = views[count - 1] if count <= len(views) else self.ticks[count - 1]
-        return Outcome(results, failure, count, self.ticks)
+        # No constructor of a named tuple, which is a call of Python in the path of a tick.
+        return tuple.__new__(Outcome, (results, failure, count, self.ticks))
 
     def start_replay_from(self, request: Request | None) -> None:
         """Drop the kept requests, because ``request``, whose arrays no one changes, brings a new

@@ -53,6 +53,10 @@ class WorkerLost(WorkerError):
     """A worker died or is stuck; the message names it, its envs and the cause."""
 
 
+STEP_LIMIT = 1e-3
+"""Upper bound of the time of a sim step of an env [s], which takes about 20 us."""
+
+
 class Worker(SingleOwner, ABC):
     """Loop of some envs: :meth:`send` a request, then :meth:`receive` its result. The first request
     is a Build.
@@ -65,6 +69,8 @@ class Worker(SingleOwner, ABC):
         self.envs = start.envs
         """Rows in the arrays."""
         self._start, self._shared = start, shared
+        self._timeout = start.options.timeout
+        self._step_limit = STEP_LIMIT * (self.envs.stop - self.envs.start)
 
     def open(self) -> None:
         """Start the process; again after :meth:`close`, for a replacement of a lost one."""
@@ -97,13 +103,6 @@ class Worker(SingleOwner, ABC):
             f"{self._start.index} ({process}envs {first + self.envs.start} to"
             f" {first + self.envs.stop - 1})"
         )
-
-    def limit(self, request: Request) -> float:
-        """Return the time after which the worker counts as stuck [s]; a sim step of an env takes
-        about 20 us.
-        """
-        steps = (request.ticks or 1) * request.substeps * (self.envs.stop - self.envs.start)
-        return self._start.options.timeout + request.patience + 1e-3 * steps
 
 
 class LocalWorker(Worker):
@@ -181,7 +180,9 @@ class ProcessWorker(Worker):
                 os.sched_setaffinity(self.pid, {self._core})
 
     def send(self, request: Request) -> None:
-        limit = self.limit(request)
+        # Time after which the worker counts as stuck. No method, which is a call of Python in a tick.
+        limit = self._step_limit * (request.ticks or 1) * request.substeps
+        limit += self._timeout + request.patience
         self._deadline = time.monotonic() + limit
         self._socket.settimeout(limit)
         try:

@@ -11,7 +11,6 @@ ALL = {
     "saturation_effort": 8.0,
     "no_load_speed": 4.0,
     "effort_limit": 6.0,
-    "position_limit": ([-1.0, 0.0, 1.0], [4.0, 7.0, 5.0]),
     "position_offset": 0.03,
     "backlash": 0.01,
     "position_noise": 1e-3,

@@ -118,7 +118,6 @@ class ScalarMotor:
     saturation_effort: float = math.inf
     no_load_speed: float = math.inf
     effort_limit: float = math.inf
-    position_limit: tuple = ()
     position_offset: float = 0.0
     backlash: float = 0.0
     position_resolution: float = 0.0
@@ -131,8 +130,6 @@ class ScalarMotor:
     def ends(self, position: float, velocity: float) -> tuple[float, float]:
         """Return the least and the largest effort that the motor delivers."""
         limit = self.effort_limit
-        if self.position_limit:
-            limit = min(limit, float(np.interp(position, *self.position_limit)))
         if math.isinf(self.saturation_effort):
             return -limit, limit
         lost = self.saturation_effort * velocity / self.no_load_speed

@@ -101,12 +101,7 @@ def test_the_command_limits_are_where_the_motor_clips(seed):
         "saturation_effort": rng.uniform(1, 40, joints),
         "no_load_speed": rng.uniform(1, 5, joints),
     }
-    table = np.sort(rng.uniform(-3, 3, (joints, 4))), rng.uniform(5, 30, (joints, 4))
-    shape = (
-        {"position_limit": table}
-        if rng.random() < 0.5
-        else {"effort_limit": rng.uniform(1, 30, joints)}
-    )
+    shape = {"effort_limit": rng.uniform(1, 30, joints)}
     static = bp.make_actuators(joints, **options, **(line if rng.random() < 0.5 else {}), **shape)
     late = static.replace(command_delay=0.01, lag=0.1)
     asked, q, v = (

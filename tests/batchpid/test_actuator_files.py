@@ -44,26 +44,10 @@ def test_a_file_written_by_hand(tmp_path):
     path.write_text("""
 format: batchpid-actuators-1
 joints:
-  elbow: {strength: 0.9, position_limit: [[0, 1, 2], [5, 6, 7]]}
-  shoulder: {coulomb: [0.1, 0.2], position_limit: [[0, 1], [3, 4]]}
+  elbow: {strength: 0.9}
+  shoulder: {coulomb: [0.1, 0.2]}
 """)
     actuators, names = bp.load_actuators(path, ["shoulder", "wrist", "elbow"])
     assert names == ["shoulder", "wrist", "elbow"]
     assert actuators.strength.tolist() == [[1.0, 1.0, 0.9]]
     assert actuators.coulomb.tolist() == [[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]]
-    assert actuators.limit_positions[0, ::2].tolist() == [[0, 1, 1], [0, 1, 2]]
-    assert actuators.limit_efforts[0].tolist() == [[3, 4, 4], [np.inf] * 3, [5, 6, 7]]
-
-
-def test_limits_by_position_that_differ_from_env_to_env_are_in_no_file(tmp_path):
-    efforts = np.arange(1.0, 13.0).reshape(2, 2, 3)
-    both = bp.make_actuators(2, position_limit=([0.0, 1.0, 2.0], efforts))
-    assert both.num_envs == 2
-    assert np.array_equal(both.replace(strength=0.5).limit_efforts, efforts)
-    with pytest.raises(bp.InvalidArgumentError, match="for each env, and a file has one"):
-        bp.save_actuators(tmp_path / "a.yaml", both, ["a", "b"])
-    for env in range(2):
-        own = both.for_envs(slice(env, env + 1))
-        bp.save_actuators(tmp_path / "a.yaml", own, ["a", "b"])
-        again, _ = bp.load_actuators(tmp_path / "a.yaml")
-        assert np.array_equal(again.limit_efforts[0], efforts[env])

@@ -140,11 +140,7 @@ class MotorCase(GuardCase):
                 "saturation_effort": rng.uniform(5, 20, SHAPE),
                 "no_load_speed": rng.uniform(2, 9, SHAPE),
             }
-        self.table = (
-            (np.array([-1.0, 0.0, 2.0]), np.array([4.0, 11.0, 6.0])) if rng.random() < 0.5 else ()
-        )
-        limit = {"position_limit": self.table} if self.table else {}
-        self.model = bp.make_actuators(JOINTS, **self.options, **limit, dtype=dtype)
+        self.model = bp.make_actuators(JOINTS, **self.options, dtype=dtype)
         velocity = 4 * rng.normal(size=(STEPS, *SHAPE))
         position = np.cumsum(0.1 * rng.normal(size=(STEPS + 1, *SHAPE)), axis=0)
         self.start = position[0].astype(dtype)
@@ -165,10 +161,7 @@ class MotorCase(GuardCase):
         return state, (*seen, delivered)
 
     def oracle(self, env, joint):
-        limit = {"position_limit": self.table} if self.table else {}
-        scalar = ScalarMotor(
-            self.start[env, joint].item(), **entry(self.options, env, joint), **limit
-        )
+        scalar = ScalarMotor(self.start[env, joint].item(), **entry(self.options, env, joint))
         for effort, qpos, qvel in self.rows(env, joint):
             seen = scalar.measure(qpos, qvel, DT)
             yield (*seen, scalar.deliver(effort, qpos, qvel, DT))

@@ -200,11 +200,10 @@ def test_every_field_of_params_is_exported_or_a_difference(target):
         assert not same or {LABELS.get(name, name), PART_OF.get(name)} & listed, label
 
 
-OWN = {"limit_positions", "limit_efforts", "continuous", "max_delay", "seed"}
+OWN = {"continuous", "max_delay", "seed"}
 MOTORS = {name: 0.25 for name in bp.Actuators._fields if name not in OWN}
-MOTORS |= {"no_load_speed": 9.0, "position_limit": ([0.0, 1.0], [5.0, 6.0])}
-PART_OF_MOTORS = {"no_load_speed": "saturation_effort", "limit_positions": "position_limit"}
-PART_OF_MOTORS["limit_efforts"] = "position_limit"
+MOTORS |= {"no_load_speed": 9.0}
+PART_OF_MOTORS = {"no_load_speed": "saturation_effort"}
 
 
 @pytest.mark.parametrize(
@@ -255,7 +254,7 @@ def test_every_field_of_motors_and_sensors_changes_a_signal():
         "continuous": [True, False, True],
         "seed": 5,
     }
-    base = bp.make_actuators(3, **MOTORS | own | {"position_limit": ([0.0, 1.0], [0.05, 0.4])})
+    base = bp.make_actuators(3, **MOTORS | own)
     plain, without = outcome(delivered, base), {*bp.motors.JOINT_SIDE, "max_delay"}
     for label, name, actuators in changes(base, {}):
         assert name in without or outcome(delivered, actuators) != plain, label

@@ -114,8 +114,6 @@ COMBINATIONS = [
         "derivative_filter_time",
         {"derivative_filter_time": 1e-3, "gain_units": "mass_matrix", "discretization": "implicit"},
     ),
-    (bp.make_actuators, "position_limit", {"position_limit": [1.0, 2.0, 3.0]}),
-    (bp.make_actuators, "position_limit", {"position_limit": ([1.0, 0.0], [1.0, 2.0])}),
     (bp.make_actuators, "sensor_delay", {"sensor_delay": 0.01, "max_delay": 0.005}),
     (bp.make_actuators, "static", {"static": 0.1, "coulomb": [0.1, 0.2]}),
     (bp.make_actuators, "no_load_speed", {"saturation_effort": 10.0}),
@@ -196,20 +194,6 @@ COMBINATIONS = [
 
 
 PLACES = [
-    (
-        bp.make_actuators,
-        "position_limit",
-        {"position_limit": ([0.0, 1.0], [1.0, math.inf])},
-        {"joint": 0},
-        math.inf,
-    ),
-    (
-        bp.make_actuators,
-        "position_limit",
-        {"position_limit": ([0.0, 2.0, 1.0], [1.0] * 3)},
-        {"joint": 0},
-        1.0,
-    ),
     (ts.make_osc_params, "stiffness", {"stiffness": [1, 1, -1, 1, 1, 1]}, {"entry": "z"}, -1.0),
     (ts.make_osc_params, "smallest_eigenvalue", {"smallest_eigenvalue": 0.0}, {"entry": "s0"}, 0.0),
     (
@@ -332,6 +316,10 @@ def needed(function, more=(), module=None):
     module = module or next(owner for owner, _, each in PUBLIC if each is function)
     values = VALUES | OWN.get(module, {}) | {"duration": 1.0, "dt": 0.01, "timestep": 0.01}
     values |= {"setpoint": np.ones((9, 1, 2))} if function is metrics.step_metrics else {}
+    values |= (
+        {"start": POSE[0], "target": POSE[0]} if function is trajectories.straight_line else {}
+    )
+    values |= {"center": Y, "amplitude": Y, "frequency": 1.0}
     parameters = inspect.signature(function).parameters.items()
     required = {
         name
@@ -423,7 +411,6 @@ TEXTS = [
     ("format: batchpid-params-1\njoints: {elbow: {kp: 1}}", "text", None),
     (MOTOR % "kp: 1", "kp", "elbow"),
     (MOTOR % "strength: strong", "strength", "elbow"),
-    (MOTOR % "position_limit: [[1, 0], [1, 2]]", "position_limit", "elbow"),
     ("format: batchpid-actuators-1\njoints: {shoulder: {}}", "text", None),
     ("format: batchpid-actuators-1\njoints: {elbow: [1]}", "joints", "elbow"),
     ("format: batchpid-actuators-1\nseed: soon\njoints: {elbow: {}}", "seed", None),

@@ -115,7 +115,6 @@ NOISE = {"position_noise": 1e-5, "velocity_noise": 1e-3, "velocity_resolution": 
 LINE = {
     "saturation_effort": 8.0,
     "no_load_speed": 3.0,
-    "position_limit": ([-1.0, 0.0, 1.0], [6.0, 9.0, 5.0]),
 }
 FRICTION = {
     "coulomb": 0.2,

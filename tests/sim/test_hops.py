@@ -11,7 +11,7 @@ from robots import load_bundled
 from batchpid.sim import Runner
 
 PANDA = load_bundled("panda")
-CALLS, LEVELS = 27, 6
+CALLS, LEVELS = 20, 6
 
 
 def python_calls(act):

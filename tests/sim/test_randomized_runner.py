@@ -9,7 +9,6 @@ import pytest
 from identical import assert_identical
 from robots import load_bundled
 
-import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import (
     Choice,
@@ -65,26 +64,6 @@ def episodes(runner, num_envs=N):
     first = runner.rollout(command)
     runner.reset(mask=np.arange(num_envs) % 2 == 0)
     return first, runner.rollout(command)
-
-
-def test_limits_by_position_are_drawn_for_each_joint_of_each_env():
-    points = np.linspace(PANDA.lower, PANDA.upper, 3).T
-    actuators = bp.make_actuators(
-        PANDA.dof, position_limit=(points, np.tile([5.0, 8.0, 4.0], (PANDA.dof, 1)))
-    )
-    scale = Randomization(seed=1, actuators={"limit_efforts": Uniform(0.1, 1, operation="scale")})
-    runs = []
-    for options in ({}, {"workers": 2}):
-        with make(actuators=actuators, randomization=scale, **options) as runner:
-            draws = runner.draws["actuators.limit_efforts"]
-            runs.append(episodes(runner))
-    for run in runs[1:]:
-        for ours, expected in zip(run, runs[0], strict=True):
-            assert_identical(ours, expected)
-    assert draws.shape == (N, PANDA.dof)
-    drawn = actuators._replace(limit_efforts=actuators.limit_efforts * draws[..., None])
-    with make(actuators=drawn, randomization=None) as runner:
-        assert_identical(runner.rollout(setpoints()), runs[0][0])
 
 
 def test_a_reset_draws_for_the_envs_of_its_mask():

@@ -9,7 +9,6 @@ A pack that is not at work keeps the rows of its states; back at work it compute
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 from typing import Any, Protocol
 
 import mujoco
@@ -29,8 +28,12 @@ POSITIONS = 1
 class User(Protocol):
     """Pack that uses a :class:`DataPool`: a model and a row of the state for each robot."""
 
-    models: Sequence[Any]
+    models: list[Any]
     rows: NDArray[np.float64]
+
+    @property
+    def data(self) -> list[Any]:
+        """``mujoco.MjData`` of each robot, in its state."""
 
 
 def rest(model: MjModel, data: Any) -> None:

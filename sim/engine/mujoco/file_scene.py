@@ -84,7 +84,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
             f"{file.path}: has changed since the robot was loaded: {problem}; load the robot again"
         )
     names = Names(model)
-    find_base(model, names, Path(file.path), spec.fixed_base, [])  # removes other objects
+    find_base(model, names, Path(file.path), [])  # removes other objects
     robot = {body: name for body, name in names.bodies.items() if names.is_of_robot(body)}
     for joint in scene.joints:
         joint.name = names.joints.get(joint.id, joint.name)

@@ -33,9 +33,9 @@ sim_step.h.
 """
 STAGES = (
     "program",
-    "force",
+    "passive force",
     "inertia",
-    "mass_matrix",
+    "mass matrix",
     "controller",
     "targets",
     "constraint",

@@ -11,11 +11,10 @@
 namespace batchpid {
 
 // Robots of one kind: the joint above each, or -1, and whether it slides (dof, 2); and rows of BodyRow (dof, 25).
-template <class T>
 struct Bodies {
   std::int64_t dof;
   std::int32_t const *tree;
-  T const *rows;
+  double const *rows;
 };
 
 // Base of robots: fixed at the origin of the world; free to move; or held where it is, at the rate at which it turns.
@@ -45,18 +44,17 @@ struct Posed {
     bodies.resize(static_cast<std::size_t>(dof));
   }
   // Place the bodies at the positions in qpos.
-  template <class T>
-  inline __attribute__((always_inline)) void place(Bodies<T> const &of) {
-    static_assert(sizeof(BodyRow<T>) == 25 * sizeof(T));
+  inline __attribute__((always_inline)) void place(Bodies const &of) {
+    static_assert(sizeof(BodyRow<double>) == 25 * sizeof(double));
     for (std::int64_t j = 0; j < of.dof; ++j) sine_and_cosine(qpos[j], sine[j], cosine[j]);
-    auto const *rows = reinterpret_cast<BodyRow<T> const *>(of.rows);
+    auto const *rows = reinterpret_cast<BodyRow<double> const *>(of.rows);
     place_bodies(of.dof, of.tree, rows, cosine.data(), sine.data(), qpos.data(), bodies.data());
   }
   // Place and weigh the bodies of robots `first` to `first + WIDTH` of a model; return the inertia of their base.
   inline __attribute__((always_inline)) Inertia<Lanes> pose(Model const &of, std::int64_t first, std::int64_t rows,
                                                             double const *at) {
     for (std::int64_t j = 0; j < of.dof; ++j) qpos[j] = gather(at, of.dof, j, first, rows);
-    place(Bodies<double>{of.dof, of.tree, of.rows});
+    place(Bodies{of.dof, of.tree, of.rows});
     BodyState<Lanes> base{};
     base.axes[0].x = base.axes[1].y = base.axes[2].z = Lanes(1.0);
     std::int64_t const numbers = sizeof(BodyInertia<double>) / sizeof(double), columns = (of.dof + 1) * numbers;
@@ -189,9 +187,8 @@ FOR_EACH_PROCESSOR static void write_forces(Model const &of, Parts parts, std::i
 }
 
 // Write the mass matrices (rows, dof, dof) at qpos + ahead * qvel, both (rows, dof); qvel may be null for zero.
-template <class T>
-inline __attribute__((always_inline)) void write_lanes(Bodies<T> const &of, std::int64_t rows, T const *qpos,
-                                                       T const *qvel, double ahead, T *out) {
+FOR_EACH_PROCESSOR static void write_mass_matrices(Bodies const &of, std::int64_t rows, double const *qpos,
+                                                   double const *qvel, double ahead, double *out) {
   Posed posed(of.dof);
   std::vector<Lanes> matrix(static_cast<std::size_t>(of.dof * of.dof));
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
@@ -200,20 +197,10 @@ inline __attribute__((always_inline)) void write_lanes(Bodies<T> const &of, std:
       if (qvel != nullptr) posed.qpos[j] += ahead * gather(qvel, of.dof, j, first, rows);
     }
     posed.place(of);
-    weigh_bodies(of.dof, reinterpret_cast<BodyRow<T> const *>(of.rows), posed.bodies.data());
+    weigh_bodies(of.dof, reinterpret_cast<BodyRow<double> const *>(of.rows), posed.bodies.data());
     composite_mass_matrix(of.dof, of.tree, posed.bodies.data(), matrix.data());
     for (std::int64_t k = 0; k < of.dof * of.dof; ++k) scatter(matrix[k], out, of.dof * of.dof, k, first, rows);
   }
-}
-
-FOR_EACH_PROCESSOR static void write_mass_matrices(Bodies<double> const &of, std::int64_t rows, double const *qpos,
-                                                   double const *qvel, double ahead, double *out) {
-  write_lanes(of, rows, qpos, qvel, ahead, out);
-}
-
-FOR_EACH_PROCESSOR static void write_float_mass_matrices(Bodies<float> const &of, std::int64_t rows, float const *qpos,
-                                                         float *out) {
-  write_lanes(of, rows, qpos, static_cast<float const *>(nullptr), 0.0, out);
 }
 
 }  // namespace batchpid

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array
-from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine import native
 
 _lock = threading.Lock()
@@ -70,26 +69,13 @@ def sim_step(address: Any, step: Any, effort: Array) -> tuple[Any, Any, Any, Any
 
 
 def mass_matrix(tree: Any, bodies: Any, qpos: Array) -> Array:
-    """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof) in a program
-    of JAX.
+    """Return the mass matrices (rows, dof, dof) [kg m^2 or kg] at ``qpos`` (rows, dof) in a program
+    of JAX, of float64.
 
     ``tree`` (dof, 2) and ``bodies`` (dof, 25) are arrays of
     :attr:`batchpid.task_space.RigidTree.tables`.
-
-    Raises
-    ------
-    InvalidArgumentError
-        Programs of JAX cannot call the extension.
     """
     import jax
 
-    if reason := obstacle():
-        problem = f"is an array of JAX, for which the mass matrix needs native code ({reason})"
-        remedy = (
-            "use batchpid.task_space.mass_matrix(robot.kinematic_tree(), qpos), or an array of"
-            " NumPy"
-        )
-        raise InvalidArgumentError("qpos", problem, remedy=remedy)
     result = jax.ShapeDtypeStruct((*qpos.shape, qpos.shape[-1]), qpos.dtype)
-    call = jax.ffi.ffi_call("batchpid_mass_matrix", result, vmap_method="sequential")
-    return call(tree, jax.numpy.asarray(bodies, qpos.dtype), qpos)
+    return jax.ffi.ffi_call("batchpid_mass_matrix", result)(tree, bodies, qpos)

@@ -42,7 +42,7 @@ _OTHERS = ("CONTACT", "LIMIT", "EQUALITY", "FRICTIONLOSS", "DAMPER", "CONSTRAINT
 """Parts that it can disable in MuJoCo."""
 
 
-def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> Source:
+def read_mjcf(path: Path, name: str, fixed_base: bool | None, missing_meshes: str) -> Source:
     """Return the content of the MJCF file at ``path`` as the robot ``name``.
 
     For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses
@@ -50,10 +50,13 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> S
     meshes are refused.
     """
     findings: list[Finding] = []
-    compiled = compile_file(path, fixed_base, missing_meshes, findings)
+    compiled = compile_file(path, fixed_base is not False, missing_meshes, findings)
     model = compiled.model
     names = Names(model)
-    base = find_base(model, names, path, fixed_base, findings)
+    base = find_base(model, names, path, findings)
+    # A base is free where the file has a free joint, unless the caller fixes it.
+    if fixed_base is None:
+        fixed_base = not (base and model.body_jntnum[base])
     couplings = read_couplings(model, names, findings)
     motors = read_motors(model, names, couplings, findings)
     reader = TableReader(model, names, base, findings, motors)

@@ -46,9 +46,7 @@ _PARALLELS, _MERIDIANS = 12, 16
 """Rings, poles included, and vertices of a ring, of an ellipsoid's hull."""
 
 
-def find_base(
-    model: MjModel, names: Names, path: Path, fixed_base: bool, findings: list[Finding]
-) -> int:
+def find_base(model: MjModel, names: Names, path: Path, findings: list[Finding]) -> int:
     """Return the body of the root, 0 for the world, and remove other objects from ``names``.
 
     Raises RobotError if there is a ball joint, or more than one robot.
@@ -87,10 +85,6 @@ def find_base(
         findings.append(Finding("note", "loose-link", text, remedy, link=names.bodies[body]))
     names.leave_out(left_out)
     if floating:
-        if fixed_base:
-            text = "the root has a free joint, but is fixed to the world"
-            remedy = "load with fixed_base=False for a robot that is free to move"
-            findings.append(Finding("note", "joint-type", text, remedy))
         return floating.pop()
     only, *others = sorted(tops - left_out) or [0]
     pose = [*model.body_pos[only], *model.body_quat[only]]

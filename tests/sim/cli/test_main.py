@@ -19,7 +19,7 @@ from batchpid import __version__ as version
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import cli
-from batchpid.sim.cli.commands import Command
+from batchpid.sim.cli.commands import CommandFunction
 from batchpid.sim.cli.flags import sections
 
 
@@ -50,7 +50,7 @@ def stub(monkeypatch):
             action()
         return Result(number)
 
-    monkeypatch.setitem(cli.COMMANDS, "stub", Command(stub, {}, loading=()))
+    monkeypatch.setitem(cli.COMMANDS, "stub", CommandFunction(stub, {}, loading=()))
     return actions
 
 

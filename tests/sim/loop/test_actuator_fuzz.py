@@ -44,8 +44,6 @@ def random_actuators(seed, dof):
     if "coulomb" in on and rng.random() < 0.5:
         options["static"] = options["coulomb"] * rng.uniform(1, 3, (ENVS, dof))
         options["stribeck"] = rng.choice([0.0, 0.01, 0.3], (ENVS, dof))
-    if rng.random() < 0.5:
-        options["position_limit"] = np.sort(rng.normal(size=5)), rng.uniform(0, 90, 5)
     return bp.make_actuators(dof, **options, seed=seed)
 
 

@@ -39,7 +39,6 @@ def actuators(robot, seed=0, **more):
         "velocity_noise": rng.uniform(0, 1e-3, shape),
         "backlash": rng.uniform(0, 1e-4, shape),
         "static": 0.3,
-        "position_limit": ([-2.0, 0.0, 2.0], [30.0, 60.0, 50.0]),
         "seed": 1,
     }
     return bp.make_actuators(robot.dof, **{**options, **more})
