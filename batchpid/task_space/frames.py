@@ -8,8 +8,6 @@ products: their rounding does not depend on the number of rows, as a library's d
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -24,7 +22,7 @@ def cross(a: Array, b: Array) -> Array:
     return a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]
 
 
-def rotate(turn: Any, vector: Array) -> Array:
+def rotate(turn: Array, vector: Array) -> Array:
     """Return the vectors (..., 3) turned by matrices (..., 3, 3): R v."""
     return (
         turn[..., 0] * vector[..., :1]
@@ -33,7 +31,7 @@ def rotate(turn: Any, vector: Array) -> Array:
     )
 
 
-def unrotate(turn: Any, vector: Array) -> Array:
+def unrotate(turn: Array, vector: Array) -> Array:
     """Return the vectors (..., 3) in the axes of matrices (..., 3, 3): R^T v."""
     return (
         turn[..., 0, :] * vector[..., :1]
@@ -42,7 +40,7 @@ def unrotate(turn: Any, vector: Array) -> Array:
     )
 
 
-def in_axes(turn: Any, twists: Array) -> Array:
+def in_axes(turn: Array, twists: Array) -> Array:
     """Return the columns of ``twists`` (..., 6, n) in the axes of matrices (..., 3, 3)."""
     xp, columns = namespace(turn, twists), namespace(twists).moveaxis(twists, -1, -2)
     halves = [
@@ -56,7 +54,7 @@ def multiply(a: Array, b: Array) -> Array:
     return a[..., :1] * b[..., :1, :] + a[..., 1:2] * b[..., 1:2, :] + a[..., 2:3] * b[..., 2:3, :]
 
 
-def turned(frame: Any, inner: Any) -> Array:
+def turned(frame: Array, inner: Array) -> Array:
     """Return the frames ``inner`` (..., 3, 4), given in ``frame`` (..., 3, 4), where the latter is
     given.
     """
@@ -79,7 +77,7 @@ def matrix_of(wxyz: Array) -> Array:
     return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def wxyz_of(turn: Any) -> Array:
+def wxyz_of(turn: Array) -> Array:
     """Return the unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3).
 
     4 q q^T is linear in the entries of the matrix; its row with the largest diagonal entry is a
@@ -113,7 +111,7 @@ def wxyz_of(turn: Any) -> Array:
     return xp.where(q[..., :1] < 0, -q, q)
 
 
-def pose_of(frame: Any) -> Array:
+def pose_of(frame: Array) -> Array:
     """Return the poses (..., 7) of frames (..., 3, 4)."""
     return namespace(frame).concatenate([frame[..., 3], wxyz_of(frame[..., :3])], axis=-1)
 
