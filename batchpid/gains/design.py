@@ -93,8 +93,8 @@ def pid_from_inertia(
     """
     w, load = 2 * np.pi * np.asarray(bandwidth_hz, np.float64), np.asarray(damping, np.float64)
     # A joint whose own damping exceeds zeta needs the stiffness of a heavier one to be as fast.
-    own = np.maximum(inertia, load / (2 * damping_ratio * w))
-    kp, full = own * w**2, 2 * damping_ratio * w * own
+    effective = np.maximum(inertia, load / (2 * damping_ratio * w))
+    kp, full = effective * w**2, 2 * damping_ratio * w * effective
     return {
         "kp": kp,
         "ki": kp / (INTEGRAL_TIME / w if integral_time is None else integral_time),
@@ -174,8 +174,8 @@ def design_gains(
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
     coupling = getattr(robot, "coupling", Coupling.of(mass.shape[-1]))
     mass, viscous = coupling.reduced(mass), coupling.reduced_damping(robot.damping)
-    own = np.diagonal(mass, axis1=1, axis2=2)
-    carried = np.maximum(own.max(0), coupling.reduced_damping(least))
+    diagonal = np.diagonal(mass, axis1=1, axis2=2)
+    carried = np.maximum(diagonal.max(0), coupling.reduced_damping(least))
     # The loop with the mass matrix has unit inertias, and compensates the joints' damping.
     inertia, damping = (
         (carried, viscous) if gain_units == "effort" else (np.ones_like(carried), 0.0)

@@ -29,8 +29,6 @@ b) / ki.
 
 from __future__ import annotations
 
-from typing import Any
-
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.choices import Everywhere, HoldEffort
 from batchpid.arrays.elementwise import (
@@ -90,7 +88,7 @@ def step(
     measurement_rate: Array = None,
     setpoint_rate: Array = None,
     feedforward: Array = None,
-) -> tuple[PIDState, Any]:
+) -> tuple[PIDState, Array]:
     """Advance the law by ``dt`` seconds; return the state and the effort.
 
     Arrays are (envs, joints), or (1, joints) for all envs, and taken in the params' dtype, which
@@ -133,7 +131,7 @@ def step_terms(
     setpoint: Array,
     measurement: Array,
     dt: Array,
-    **inputs: Any,
+    **inputs: Array,
 ) -> tuple[PIDState, Terms]:
     """Advance the law as :func:`step`, with the same arguments; return the state and all terms,
     effort included.
@@ -148,7 +146,7 @@ def _step(
     setpoint: Array,
     measurement: Array,
     dt: Array,
-    **inputs: Any,
+    **inputs: Array,
 ) -> tuple[PIDState, Terms]:
     """Check the arguments of a step and advance the law."""
     r, y, inputs = _checked(params, state, setpoint, measurement, inputs)
@@ -338,8 +336,8 @@ def drive_target(
     setpoint: Array,
     measurement: Array,
     dt: Array,
-    **inputs: Any,
-) -> tuple[PIDState, Any]:
+    **inputs: Array,
+) -> tuple[PIDState, Array]:
     """Return ``(state, target)``: the position target that makes a PD drive of stiffness kp act as
     a PID::
 
@@ -364,8 +362,8 @@ def drive_target(
 
 
 def advance_drive(
-    k: Coefficients, state: PIDState, setpoint: Array, measurement: Array, **inputs: Any
-) -> tuple[PIDState, Any]:
+    k: Coefficients, state: PIDState, setpoint: Array, measurement: Array, **inputs: Array
+) -> tuple[PIDState, Array]:
     """Return ``(state, target)`` with given coefficients, for loops with constant params; else as
     :func:`drive_target`.
 

@@ -307,7 +307,7 @@ def _goals_and_starts(
 ) -> tuple[Float64, Float64]:
     """Return checked poses (envs, 7) and starts (envs, dof)."""
     columns = ("x", "y", "z", "qw", "qx", "qy", "qz")
-    counts = [np.shape(given)[0] for given in (pose, start) if np.ndim(given) == 2]
+    counts = [np.shape(arguments)[0] for arguments in (pose, start) if np.ndim(arguments) == 2]
     envs = max([1, *counts])
     goal = array("pose", pose, (envs, 7), columns, kind="entry").copy()
     rows = array("start", start, (envs, tree.dof), tree.joint_names)

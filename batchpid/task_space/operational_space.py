@@ -124,8 +124,8 @@ def osc(
         The link of the tool is unknown, or an array has a wrong shape.
     """
     try:
-        if (found := native_law.law(k, state, dynamics, inputs, wanted)) is not None:
-            return found
+        if (results := native_law.law(k, state, dynamics, inputs, wanted)) is not None:
+            return results
         _check_shapes(k, inputs)
     except ValueError:
         _check_shapes(k, inputs)
@@ -312,8 +312,8 @@ def track(
     inputs = OSCInputs(setpoint, qpos, qvel, twist, acceleration)
     xp = namespace(*k, *dynamics, *inputs, effort)
     with quiet():
-        known = bias if feedforward is None else bias + feedforward
-        qacc = solve(mass, (effort - known)[..., None])[..., 0]
+        available = bias if feedforward is None else bias + feedforward
+        qacc = solve(mass, (effort - available)[..., None])[..., 0]
         stiff = k.posture_kp > 0
         rest = qacc - posture_acceleration(k, dynamics, qpos, qpos, qvel)[0]
         posture = qpos + xp.where(stiff, rest / xp.where(stiff, k.posture_kp, 1.0), 0.0)

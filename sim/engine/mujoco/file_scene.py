@@ -23,7 +23,7 @@ from batchpid.sim.robot.mjcf.mjcf_compiler import Names, attempt
 from batchpid.sim.robot.mjcf.mjcf_reader import content_of, home
 from batchpid.sim.robot.mjcf.mjcf_tables import find_base
 from batchpid.sim.robot.parts import MjcfFile
-from batchpid.task_space.rotations import inverse, rotate
+from batchpid.task_space.frames import inverse, matrix_of, rotate
 
 REMOVED = ("tuples", "sensors", "actuators", "keys", "cameras", "lights")
 """Elements of a file that a scene does not have."""
@@ -193,7 +193,10 @@ def _frames(
         hinges = joints[-1:][model.jnt_type[joints[-1:]] == mujoco.mjtJoint.mjJNT_HINGE]
         anchor = model.jnt_pos[hinges[0]].copy() if len(hinges) else np.zeros(3)
         back = inverse(wxyz)
-        names[link], frames[link] = name, BodyFrame(anchor - rotate(back, position), back, ())
+        names[link], frames[link] = (
+            name,
+            BodyFrame(anchor - rotate(matrix_of(back), position), back, ()),
+        )
     return names, frames
 
 

@@ -35,9 +35,8 @@ from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_ba
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import CONTACT_FRICTION
-from batchpid.task_space.frames import matrix_of
+from batchpid.task_space.frames import inverse, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.rotations import inverse
 
 _KEPT = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
 """Parts of the state in snapshots: all but the targets of drives, which every tick writes."""

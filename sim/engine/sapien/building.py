@@ -26,9 +26,8 @@ from batchpid.sim.robot.meshes import note_meshes
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
 from batchpid.sim.robot.simulated_links import rigid_tree
 from batchpid.sim.robot.tables import Body, Shape, Tables
-from batchpid.task_space.frames import matrix_of
+from batchpid.task_space.frames import from_rpy, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.rotations import from_rpy
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
 FASTEST = 1000.0
