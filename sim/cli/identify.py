@@ -97,7 +97,7 @@ def identify_logs(
     Parameters
     ----------
     logs
-        Logs: .csv, .h5, ROS bags (.bag, .mcap, folders) or recordings.
+        Logs: .csv, ROS bags (.bag, .mcap, folders) or recordings (.h5).
     gains
         Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file
         as for --gains of other commands. Without it a recording's own, or the logs' efforts. Gains

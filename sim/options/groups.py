@@ -76,6 +76,7 @@ def option(*kept: Place, flag: str = "", **kept_as: str) -> Option:
 
 def check_plain(record: object) -> None:
     """Convert the fields of a frozen dataclass to their declared types, and check their bounds."""
+    # The class is frozen; its __dict__ is not.
     kinds = get_type_hints(type(record), include_extras=True)
     for name, value in vars(record).items():
         vars(record)[name] = plain(name, kinds[name], value)
@@ -217,6 +218,7 @@ class Scene(Group):
                 remedy = "define build(scene, env)"
                 raise InvalidArgumentError("build", "must be a function", remedy=remedy)
         self._check_randomization(robot)
+        # By default an MJCF file has its own floor; other robots stand on one, or hang over it.
         ground = self.ground
         if not self.collisions:
             self._check_without_collisions(robot)
@@ -270,6 +272,7 @@ class Scene(Group):
             problem = "need a robot without SAPIEN's link damping, which acts like a contact"
             remedy = "load the robot with dissipation='urdf'"
             raise InvalidArgumentError(argument, problem, remedy=remedy)
+        # A link that no joint moves has no sensor: it is part of the root's body.
         bodies = place_links(robot.tables, links if argument == "wrenches" else ())
         root = next(place.link for place in bodies.values())
         for link in links:
@@ -406,6 +409,7 @@ class Control(Group):
                 raise InvalidArgumentError("control", problem, remedy=remedy)
             if tool is None:
                 tool = default_tool(robot)
+            # From here on it is a controller like the caller's own.
             control = OperationalSpace(robot, choice("tool", tool, robot.kinematic_tree().links))
         elif callable(control) and callable(getattr(control, "init", None)):
             own_command(control)  # raises for an invalid command

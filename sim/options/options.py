@@ -50,7 +50,7 @@ from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.signals.command import CommandSpec, joint_command, own_command
-from batchpid.sim.signals.observation import Quantity, observed
+from batchpid.sim.signals.observation import Observation, Quantity, observed
 from batchpid.sim.signals.rollout import RunInfo
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
@@ -181,7 +181,8 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def observed(self) -> dict[str, Quantity]:
         """Quantities that the loop observes."""
-        return observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
+        quantities = observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
+        return {name: quantity for name, quantity in quantities.items() if quantity.derive is None}
 
     @property
     def misses_contacts(self) -> bool:
@@ -213,12 +214,17 @@ class RunnerOptions(RunnerKeywords):
         is_coupled = self.sets_positions and not self.robot.independent.all()
         return self.robot.coupling if is_coupled else None
 
-    @property
-    def tool_pose(self) -> Callable[[Rows], NDArray[np.float32]] | None:
-        """Function from positions (..., dof) to poses of the tool (..., 7); None where setpoints
-        are not poses.
-        """
-        return self.control.tool_pose if isinstance(self.control, OperationalSpace) else None
+    @cached_property
+    def derived(self) -> dict[str, Callable[[Observation], Rows]]:
+        """Functions from what the loop observed to further quantities, by name."""
+        derived = {}
+        for name, quantity in observed(self.robot.fixed_base).items():
+            if quantity.derive is not None:
+                derived[name] = quantity.derive
+        if isinstance(self.control, OperationalSpace):
+            tool_pose = self.control.tool_pose
+            derived["tool_pose"] = lambda seen: tool_pose(seen.qpos)
+        return derived
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
@@ -268,6 +274,7 @@ class RunnerOptions(RunnerKeywords):
         InvalidArgumentError
             They do not fit.
         """
+        # The engine's drive replaces the motors' electronics, and not what is behind the gear.
         if actuators is None:
             actuators = self.robot.actuators or IDEAL
             if self.control == "drive":
@@ -297,6 +304,7 @@ class RunnerOptions(RunnerKeywords):
         for name, entry in OPTIONS.items():
             if place in entry.kept:
                 values[name] = getattr(self, entry.kept[place] or name)
+        # A recording is read without the classes of the engine and of the randomization.
         if place == "recording":
             values["physics"] = str(self.physics)
             if self.randomization is not None:

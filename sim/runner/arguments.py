@@ -114,17 +114,15 @@ def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
 
 def _check_acceleration(params: bp.PIDParams, given: Mapping[str, ArrayLike | None]) -> None:
     """Raise InvalidArgumentError for an acceleration that the law does not take."""
-    _, (rate, given_rate), (name, _), _ = given.items()
+    _, rate, acceleration, _ = given
     if params.gain_units is None:
-        remedy = (
-            "give M(q) times it as feedforward, or use gains in accelerations, such as"
-            " robot.designed()"
-        )
+        problem = "is for gains in accelerations, and these are efforts"
+        remedy = "give M(q) times it as feedforward, or use robot.designed()"
+        raise InvalidArgumentError(acceleration, problem, remedy=remedy)
+    if given[rate] is None:
         raise InvalidArgumentError(
-            name, "is for gains in accelerations, and these are efforts", remedy=remedy
+            acceleration, f"is given without {rate}", remedy=f"give {rate}, too"
         )
-    if given_rate is None:
-        raise InvalidArgumentError(name, f"is given without {rate}", remedy=f"give {rate}, too")
 
 
 def joint_rows(options: RunnerOptions, name: str, value: ArrayLike) -> Float64:

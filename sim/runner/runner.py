@@ -110,7 +110,7 @@ class Runner(SingleOwner):
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call, self._warnings = OneCall(), RunWarnings(checked)
-        self._tool_pose = checked.tool_pose
+        self._derived = checked.derived
         self._state = RunnerState.first(checked)
         self._sent: Run | None = None  # and not completed yet
         self._unreceived: Observation | None = None
@@ -147,16 +147,12 @@ class Runner(SingleOwner):
 
     def __repr__(self) -> str:
         options = self.options
-        workers = len(self.pids)
-        nodes = len(self.nodes)
-        where = "closed" if self.closed else f"{workers} workers" if workers else "in this process"
-        further = "" if options.collisions else ", no collisions"
-        where = f"{nodes} nodes" if nodes else where
+        where = f"{len(self.nodes) or len(self.pids)} {'nodes' if self.nodes else 'workers'}"
+        state = "closed" if self.closed else f"at {self.time:g} s"
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control"
-            f" {options.control_name!r}, compensate {options.compensate!r},\n       physics"
-            f" {options.physics!r}{further}, timestep {self.timestep:g} s, {self.substeps}"
-            f" substeps, at {self.time:g} s)"
+            f" {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
+            f" {self.substeps} substeps, {state})"
         )
 
     # -- commands
@@ -202,7 +198,7 @@ class Runner(SingleOwner):
         self._ready("reset")
         limits, base = self._warnings.limits, (base_pose, base_twist)
         self._execute(Reset.read(self.options, self._state, limits, (qpos, qvel), mask, seed, base))
-        return self._pool.present.observation.copied(self._tool_pose)
+        return self._pool.present.observation.copied(self._derived)
 
     def step(
         self,
@@ -245,7 +241,7 @@ class Runner(SingleOwner):
             self._ready("step")
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         self._execute(self._tick(command, substeps))
-        return self._pool.present.observation.copied(self._tool_pose)
+        return self._pool.present.observation.copied(self._derived)
 
     def send(
         self,
@@ -307,7 +303,7 @@ class Runner(SingleOwner):
             Wraps the range of ticks, e.g. ``tqdm.tqdm``.
         """
         self._ready("rollout")
-        given = {
+        arrays = {
             "setpoints": setpoints,
             "setpoint_rates": setpoint_rates,
             "setpoint_accelerations": setpoint_accelerations,
@@ -316,7 +312,7 @@ class Runner(SingleOwner):
         options, ticks = self.options, count_ticks(self.options, setpoints)
         tick = options.substeps * options.timestep
         command = read_command(
-            options, self._state, self._warnings.setpoint_limits, given, tick, ticks
+            options, self._state, self._warnings.setpoint_limits, arrays, tick, ticks
         )
         robot = options.robot
         done = 0
@@ -338,8 +334,8 @@ class Runner(SingleOwner):
                         : done - number
                     ]
         next(shown, None)  # the end
-        if options.tool_pose is not None:
-            seen = seen._replace(tool_pose=options.tool_pose(seen.qpos))
+        further = {name: derive(seen) for name, derive in options.derived.items()}
+        seen = seen._replace(**further)
         if (faults := self._state.faults.faults) is not info.faults:
             info = replace(info, faults=faults)
         return Rollout(times, command.setpoint, seen, tick, info, command.feedforward)
@@ -347,7 +343,7 @@ class Runner(SingleOwner):
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
         self._ready()
-        return self._pool.present.observation.copied(self._tool_pose)
+        return self._pool.present.observation.copied(self._derived)
 
     def poses(self) -> NDArray[np.float32]:
         """Return the poses of the entities that ``build`` returned (envs, entities, 7): x, y, z
@@ -360,11 +356,8 @@ class Runner(SingleOwner):
         """
         self._ready()
         rows = self._read(ReadPoses())
-        counts = [len(row) for row in rows]
-        if not rows or len(set(counts)) > 1:
-            problem = (
-                f"returned {sorted(set(counts))} entities, by env" if rows else "was not given"
-            )
+        if len({len(poses) for poses in rows}) != 1:
+            problem = "was not given, or returned more entities for one env than for another"
             remedy = "let build(scene, env) return as many entities for every env"
             raise InvalidArgumentError("build", problem, remedy=remedy)
         return np.stack(rows)
@@ -453,7 +446,7 @@ class Runner(SingleOwner):
         self._execute(restore)
         self._pool.start_replay_from(restore)
         self._warnings.set_params(self._state.params)
-        return self._pool.present.observation.copied(self._tool_pose)
+        return self._pool.present.observation.copied(self._derived)
 
     def settle(self) -> None:
         """Complete a tick that :meth:`send` began, as every other method does first."""
@@ -467,12 +460,14 @@ class Runner(SingleOwner):
     def info(self) -> RunInfo:
         """Robot, options and origin of a run that starts now."""
         start = self.observe().qpos
-        state = self._state
-        options = self.options
-        draws = None if options.randomization is None else state.draws
+        state, options = self._state, self.options
+        drawn = {}
+        if options.randomization is not None:
+            drawn = {"draws": self.draws, "episodes": self.episodes}
         return RunInfo.of(
             options.robot,
             **options.values_for("recording"),
+            **drawn,
             own_command=options.own_command,
             params=state.params,
             actuators=state.actuators,
@@ -480,12 +475,6 @@ class Runner(SingleOwner):
             versions=dict(self._versions),
             begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
             faults=state.faults.faults,
-            draws=(
-                None
-                if draws is None
-                else {name: rows.copy() for name, rows in draws.values.items()}
-            ),
-            episodes=None if draws is None else draws.episodes.copy(),
         )
 
     @cached_property
@@ -673,6 +662,7 @@ class Runner(SingleOwner):
         is_due = self.recorder is not None or self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
         if is_due and run is not None and not is_sent:
             self._prepare_ticks()
+        # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
             call.waits, before = True, self._state
@@ -680,6 +670,7 @@ class Runner(SingleOwner):
                 pool.begin(operation)
             outcome = pool.finish()
             call.waits = False
+            # Ticks before a failure count: the workers have run them.
             if outcome.failure is None or run is not None:
                 self._state = operation.committed(before, outcome)
             if run is not None and self.recorder is not None:
@@ -690,7 +681,7 @@ class Runner(SingleOwner):
                     (
                         None
                         if outcome.failure
-                        else self._pool.present.observation.copied(self._tool_pose)
+                        else self._pool.present.observation.copied(self._derived)
                     ),
                 )
             if outcome.failure is not None and operation.changes_loop:
@@ -704,6 +695,7 @@ class Runner(SingleOwner):
             call.end()
         if outcome.failure is not None:
             raise outcome.failure.error
+        # Warnings come last: as errors they must leave a runner that can go on.
         moving = self._warnings.moving
         if run is not None and moving is not None:
             rows, rates = run.command.setpoint[: outcome.num_ticks], run.command.setpoint_rate
@@ -731,7 +723,7 @@ class Runner(SingleOwner):
             recorder.append(
                 time,
                 run.command.map(itemgetter(number)),
-                arrays.observation.copied(self._tool_pose),
+                arrays.observation.copied(self._derived),
             )
 
     def _fail(self, error: BaseException) -> None:
@@ -758,5 +750,5 @@ class Runner(SingleOwner):
 
 _PARAMETERS = signature(RunnerOptions).parameters.items()
 Runner.__signature__ = Signature(
-    [each.replace(annotation=get_args(KINDS[name])[0]) for name, each in _PARAMETERS]
+    [one.replace(annotation=get_args(KINDS[name])[0]) for name, one in _PARAMETERS]
 )

@@ -41,12 +41,12 @@ class RunnerState(NamedTuple):
     def first(cls, options: RunnerOptions) -> RunnerState:
         """Return the state before the first reset, which places all envs."""
         robot = options.robot
-        own = options.own_command
+        command = options.own_command
         count = options.num_envs
         draws = NOTHING
         if options.randomization is not None:
             draws = options.randomization.first(robot, count, options.first_env)
-        names = None if own is None else own.names
+        names = None if command is None else command.names
         faults, contacts = (
             FaultLog(count, robot.joint_names, options.timestep, options.on_fault, names),
             None,

@@ -110,18 +110,15 @@ def own_command(control: object) -> CommandSpec | None:
     InvalidArgumentError
         The attribute is neither a CommandSpec nor a sequence of names.
     """
-    given = None if isinstance(control, str) else getattr(control, "command", None)
-    if given is None or isinstance(given, CommandSpec):
-        return given
+    command = None if isinstance(control, str) else getattr(control, "command", None)
+    if command is None or isinstance(command, CommandSpec):
+        return command
     try:
-        return CommandSpec(given)
+        return CommandSpec(command)
     except InvalidArgumentError as error:
-        raise InvalidArgumentError(
-            "control",
-            f"has an attribute 'command' whose {error.argument} {error.problem}",
-            value=given,
-            remedy="use a batchpid.sim.CommandSpec, or names such as ('x', 'y')",
-        ) from None
+        problem = f"has an attribute 'command' whose {error.argument} {error.problem}"
+        remedy = "use a batchpid.sim.CommandSpec, or names such as ('x', 'y')"
+        raise InvalidArgumentError("control", problem, remedy=remedy) from None
 
 
 def _texts(argument: str, value: object) -> tuple[str, ...]:

@@ -2,8 +2,8 @@
 option that it belongs to.
 
 Shared memory, snapshots, recordings and rollouts take names and shapes from that line. Its value
-comes from ``EnvGroup.observe``, from the engine's sensors of links, or, if it follows from other
-quantities, from the runner.
+comes from ``EnvGroup.observe``, from the engine's sensors of links, or from the function ``derive``
+of the line, if it follows from other quantities.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from operator import itemgetter
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Bool, DType, Float32, Rows
 from batchpid.sim.signals.command import FORCE_UNITS, POSE_UNITS, TWIST_UNITS, WRENCH_UNITS
@@ -34,6 +33,10 @@ class Quantity(NamedTuple):
     """
     links: tuple[str, ...] | None = None
     """These links."""
+    derive: Callable[[Any], Rows] | None = None
+    """Function from an observation, for a quantity that follows from the others; None for a
+    quantity that the loop reads.
+    """
 
     def shape(self, joints: tuple[int, ...]) -> tuple[int, ...]:
         """Return the shape of this quantity where that of a quantity per joint is ``joints`` (...,
@@ -107,16 +110,14 @@ class Observation(NamedTuple):
         """Return an observation with ``function`` applied to each array that there is."""
         return Observation._make([None if array is None else function(array) for array in self])
 
-    def copied(self, tool_pose: Callable[[Rows], NDArray[np.float32]] | None = None) -> Observation:
-        """Return a copy with arrays of its own; ``tool_pose`` gives the pose of the tool at
-        positions (..., dof).
-        """
+    def copied(self, derived: Mapping[str, Callable[[Observation], Rows]]) -> Observation:
+        """Return a copy with arrays of its own, and with ``derived`` quantities, by name."""
         rows = list[Any]()
         # No comprehension and no constructor, which are calls of Python in the path of a tick.
         for array in self:
             rows.append(None if array is None else array.copy())
-        if tool_pose is not None:
-            rows[_TOOL_POSE] = tool_pose(rows[0])
+        for name, derive in derived.items():
+            rows[_INDICES[name]] = derive(self)
         return tuple.__new__(Observation, rows)
 
     @staticmethod
@@ -132,7 +133,7 @@ class Observation(NamedTuple):
         return f"Observation({envs} envs, {dof} joints, {failed_envs(self.ok)})"
 
 
-_TOOL_POSE = Observation._fields.index("tool_pose")
+_INDICES = {name: index for index, name in enumerate(Observation._fields)}
 _HINTS = get_type_hints(Observation, include_extras=True)
 QUANTITIES: dict[str, Quantity] = {name: hint.__metadata__[0] for name, hint in _HINTS.items()}
 """Quantity of each field of :class:`Observation`."""

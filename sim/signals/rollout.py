@@ -297,6 +297,7 @@ class Rollout:
         if len(numbers):
             first = numbers[0]
             start, begin = info.start, -np.inf
+            # A later part starts where the ticks before it ended.
             if first:
                 start, begin = self.qpos[first - 1], float(self.time[first - 1])
             info = info.for_ticks(start, begin, float(time[-1]))

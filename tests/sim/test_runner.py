@@ -73,14 +73,14 @@ def test_a_floating_robot_needs_no_params():
         assert runner.step(runner.robot.start).ok.all()
 
 
-def test_its_repr_fits_two_lines(panda):
+def test_its_repr_has_robot_size_control_and_time(panda):
     with Runner(panda, 2, params=panda.params(), workers=0) as runner:
         runner.step(panda.start)
-        assert (
-            repr(runner) == "Runner(panda, 2 envs, in this process, control 'pid', compensate"
-            " 'gravity+coriolis+friction',\n       physics 'accurate', timestep 0.0005 s, 20"
-            " substeps, at 0.01 s)"
+        expected = (
+            f"Runner(panda, 2 envs, 0 workers, control 'pid', {runner.options.engine}, timestep"
+            " 0.0005 s, 20 substeps, at 0.01 s)"
         )
+        assert repr(runner) == expected
     assert "closed" in repr(runner)
 
 

@@ -9,7 +9,6 @@ A pack that is not at work keeps the rows of its states; back at work it compute
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 from typing import Any, Protocol
 
 import mujoco
@@ -29,8 +28,12 @@ POSITIONS = 1
 class User(Protocol):
     """Pack that uses a :class:`DataPool`: a model and a row of the state for each robot."""
 
-    models: Sequence[Any]
+    models: list[Any]
     rows: NDArray[np.float64]
+
+    @property
+    def data(self) -> list[Any]:
+        """``mujoco.MjData`` of each robot, in its state."""
 
 
 def rest(model: MjModel, data: Any) -> None:
@@ -69,21 +72,21 @@ class DataPool:
         """
         if self._user is not user:
             if self._user is not None:
-                for model, each, row in zip(
+                for model, data, row in zip(
                     self._user.models, self._taken, self._user.rows, strict=True
                 ):
-                    mujoco.mj_getState(model, each, row, STATE)
+                    mujoco.mj_getState(model, data, row, STATE)
             self._user, self._taken = user, self._new(len(user.rows))
             sound = np.all(
                 np.abs(user.rows[:, POSITIONS : POSITIONS + self.robot.model.nq]) <= FARTHEST,
                 axis=1,
             )
-            for model, each, row, finite in zip(
+            for model, data, row, finite in zip(
                 user.models, self._taken, user.rows, sound.tolist(), strict=True
             ):
-                mujoco.mj_setState(model, each, row, STATE)
+                mujoco.mj_setState(model, data, row, STATE)
                 if finite:
-                    mujoco.mj_step1(model, each)
+                    mujoco.mj_step1(model, data)
         return self._taken
 
     def leave(self, user: User) -> None:

@@ -35,9 +35,8 @@ from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_ba
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import CONTACT_FRICTION
-from batchpid.task_space.frames import matrix_of
+from batchpid.task_space.frames import inverse, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.rotations import inverse
 
 _KEPT = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
 """Parts of the state in snapshots: all but the targets of drives, which every tick writes."""
@@ -100,7 +99,7 @@ class MujocoPack(ModelPack):
         self._update(range(self.size))
 
     @property
-    def _data(self) -> list[Any]:
+    def data(self) -> list[Any]:
         """``mujoco.MjData`` of each robot, in its state."""
         return self._pool.take(self)
 
@@ -112,7 +111,7 @@ class MujocoPack(ModelPack):
 
     def _evaluate(self, rows: Iterable[int]) -> None:
         """Compute all that follows from the states of robots ``rows``."""
-        data = self._data
+        data = self.data
         for row in rows:
             mujoco.mj_step1(self.models[row], data[row])
 
@@ -127,14 +126,14 @@ class MujocoPack(ModelPack):
     # ----------------------------------------------------------------------------------------------
 
     def read_qpos(self, dtype: DType = np.float64) -> Rows:
-        return np.array([data.qpos[self._at] for data in self._data], dtype)
+        return np.array([data.qpos[self._at] for data in self.data], dtype)
 
     def read_qvel(self, dtype: DType = np.float64) -> Rows:
-        return np.array([data.qvel[self._moves] for data in self._data], dtype)
+        return np.array([data.qvel[self._moves] for data in self.data], dtype)
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
         if self.steps_read_force(gravity, coriolis):
-            return np.array([data.qfrc_bias[self._moves] for data in self._data], dtype)
+            return np.array([data.qfrc_bias[self._moves] for data in self.data], dtype)
         state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
         return self._passive_force(*state).astype(dtype)
 
@@ -168,7 +167,7 @@ class MujocoPack(ModelPack):
             lambda message: None
         )  # the loop finds states that are not finite
         try:
-            everyone = self._data
+            everyone = self.data
             for row in np.flatnonzero(~self._suspended):
                 model, data = self.models[row], everyone[row]
                 data.qfrc_applied[self._moves] = effort[row]
@@ -199,23 +198,12 @@ class MujocoPack(ModelPack):
     def _make_step(
         self, reads_force: bool, speed_limit: NDArray[np.float64] | None, drives: bool = False
     ) -> MujocoStep:
-        constraint, arrays = (
-            None if self._constraint is None else self._constraint.address,
-            (self.qf, self._suspended),
-        )
-        moving = (self._stiffness, self._rate_gain) if drives else None
+        arrays = {"qf": self.qf, "sensed": self._sensed}
+        if drives:
+            arrays |= {"stiffness": self._stiffness, "rate_gain": self._rate_gain}
+        constraint = None if self._constraint is None else self._constraint.address
         return MujocoStep(
-            *(
-                self._robot,
-                self.models,
-                lambda: self._data,
-                *arrays,
-                reads_force,
-                speed_limit,
-                constraint,
-                moving,
-            ),
-            sensed=self._sensed,
+            self, self._robot, reads_force, speed_limit, arrays, self._suspended, constraint
         )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
@@ -249,7 +237,7 @@ class MujocoPack(ModelPack):
         qpos, qvel = self._robot.base or (0, 0)
         parts = slice(qpos, qpos + FLOATING + 1), slice(qvel, qvel + FLOATING)
         return np.array(
-            [np.concatenate([data.qpos[parts[0]], data.qvel[parts[1]]]) for data in self._data]
+            [np.concatenate([data.qpos[parts[0]], data.qvel[parts[1]]]) for data in self.data]
         )
 
     def strays(self) -> NDArray[np.bool_]:
@@ -258,7 +246,7 @@ class MujocoPack(ModelPack):
         """
         if self._robot.model.nq == self.dof:
             return np.zeros(self.size, bool)
-        return ~np.array([np.abs(data.qpos).max() <= FARTHEST for data in self._data])
+        return ~np.array([np.abs(data.qpos).max() <= FARTHEST for data in self.data])
 
     def take_sensed(self) -> dict[str, Float64]:
         sums = self._sensors.quantities(self._sensed) if self._sensors.size else {}
@@ -272,7 +260,7 @@ class MujocoPack(ModelPack):
         return np.hstack([turned_back(rows[:, 3:7], np.array(self.spec.gravity)), rows[:, 10:]])
 
     def push(self, rows: Sequence[int], twists: Float64) -> None:
-        data, turns = self._data, matrix_of(self._bases()[rows, 3:7])
+        data, turns = self.data, matrix_of(self._bases()[rows, 3:7])
         _, at = self._robot.base or (0, 0)
         for row, twist, turn in zip(rows, twists, turns, strict=True):
             data[row].qvel[at : at + 3] += twist[:3]
@@ -285,7 +273,7 @@ class MujocoPack(ModelPack):
         """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root
         at ``base``.
         """
-        everyone, floats = self._data, self._robot.base is not None
+        everyone, floats = self.data, self._robot.base is not None
         bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else base.copy()
         at, moves = self._robot.base or (0, 0)
         bases[:, 10:] = np.einsum("eji,ej->ei", matrix_of(bases[:, 3:7]), bases[:, 10:])
@@ -310,7 +298,7 @@ class MujocoPack(ModelPack):
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
         self._actuators = actuators
-        armature, damping = self._robot.own
+        armature, damping = self._robot.terms
         values = {"dof_armature": np.maximum(armature + self._add_joints(actuators), 0.0)}
         if self.spec.mjcf is not None and self._variation.damping is not None:
             values["dof_damping"] = np.maximum(damping + self._variation.damping, 0.0)
@@ -429,7 +417,7 @@ class MujocoPack(ModelPack):
         if velocity is not None:
             self._target_rate = velocity
         values = self._stiffness * position + self._rate_gain * self._target_rate
-        for data, row in zip(self._data, values, strict=True):
+        for data, row in zip(self.data, values, strict=True):
             data.ctrl[:] = row
 
     # -- snapshots
@@ -442,19 +430,19 @@ class MujocoPack(ModelPack):
     def read_state(self) -> Float64:
         """Return the state of each robot (M, values), in MuJoCo's order."""
         states = np.empty((self.size, self.state_sizes()[0]))
-        for model, data, state in zip(self.models, self._data, states, strict=True):
+        for model, data, state in zip(self.models, self.data, states, strict=True):
             mujoco.mj_getState(model, data, state, _KEPT)
         return states
 
     def write_state_rows(self, states: Float64) -> None:
-        for model, data, state in zip(self.models, self._data, states, strict=True):
+        for model, data, state in zip(self.models, self.data, states, strict=True):
             mujoco.mj_setState(model, data, state, _KEPT)
         self._update(range(self.size))
 
     def read_poses(self, names: Sequence[str] | None = None) -> list[Rows]:
         """Return the poses of bodies of the file, by name, in each env (names, 7)."""
         numbers = [self._robot.model.body(name).id for name in names or ()]
-        return [np.hstack([data.xpos[numbers], data.xquat[numbers]]) for data in self._data]
+        return [np.hstack([data.xpos[numbers], data.xquat[numbers]]) for data in self.data]
 
     def close(self) -> None:
         self._release()

@@ -9,10 +9,8 @@ native code proves, from tables of the shapes, that they do not touch (``clearan
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
+from batchpid.sim.engine.mujoco.data_pool import User
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import Mujoco
 from batchpid.sim.engine.native_model import NativeStep
@@ -36,15 +35,15 @@ FUNCTIONS = {
 """
 CLOCK = "mjcb_time"
 """Variable of the library that holds its clock."""
-FIELDS = {
-    "qpos": "qpos",
-    "qvel": "qvel",
-    "applied": "qfrc_applied",
-    "bias": "qfrc_bias",
-    "ctrl": "ctrl",
-}
-FIELDS |= {"sensors": "sensordata"}
-"""Arrays of ``mujoco.MjData``, by field."""
+FIELDS = (
+    ("qpos", "qpos"),
+    ("qvel", "qvel"),
+    ("applied", "qfrc_applied"),
+    ("bias", "qfrc_bias"),
+    ("ctrl", "ctrl"),
+    ("sensors", "sensordata"),
+)
+"""Fields of the structure, and arrays of ``mujoco.MjData``."""
 
 
 def mujoco_library() -> Path:
@@ -84,78 +83,53 @@ class MujocoStep(NativeStep):
 
     Parameters
     ----------
-    robot
-        Places of the joints in MuJoCo's arrays.
-    models
-        Of each robot.
-    take_data
-        Function that returns the ``mujoco.MjData`` of each robot, the same at every call, in its
-        state.
-    qf, skip
-        Efforts last applied (robots, dof), and the robots that are not stepped (robots,).
+    pack
+        Pack of the robots.
     reads_force
         Whether to read the forces of gravity and Coriolis; otherwise they are zero.
     speed_limit
         Joint speed beyond which the status says so (dof,), or None.
+    arrays
+        Arrays of the pack (robots, ...) for native code: efforts last applied, sums of the sensors,
+        and stiffness and rate gain of the drives, if their targets move within a tick.
+    skip
+        Robots that are not stepped (robots,).
     constraint
         Address of the constraint of coupled joints, or None.
-    sensed
-        Sums of the sensors over sim steps (robots, values).
-    drives
-        Stiffness and rate gain of the drives (robots, dof), if the targets move within a tick.
     """
 
     def __init__(
         self,
+        pack: User,
         robot: RobotMj,
-        models: Sequence[Any],
-        take_data: Callable[[], Sequence[Any]],
-        qf: NDArray[np.float64],
-        skip: NDArray[np.bool_],
         reads_force: bool,
         speed_limit: NDArray[np.float64] | None,
-        constraint: int | None = None,
-        drives: tuple[Rows, ...] | None = None,
-        *,
-        sensed: NDArray[np.float64],
+        arrays: dict[str, Rows],
+        skip: NDArray[np.bool_],
+        constraint: int | None,
     ) -> None:
-        found, data = functions(), take_data()
-        assert found is not None
-        addresses = dict(found)
-        kinematics, shapes = (
-            addresses.pop("kinematics"),
-            None if robot.is_file else shape_tables(robot),
-        )
-        clearance = (
-            None
-            if shapes is None
-            else GroupClearance(shapes, kinematics, models, data, qf.shape[1])
-        )
-        tables = {
-            "models": [model._address for model in models],
-            "data": [scene._address for scene in data],
-            **{
-                field: [getattr(scene, name).ctypes.data for scene in data]
-                for field, name in FIELDS.items()
-            },
-        }
-        arrays: dict[str, Rows] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
-        arrays |= {
-            "qpos_at": robot.qpos.astype(np.int64),
-            "qvel_at": robot.qvel.astype(np.int64),
-            "qf": qf,
-        }
-        arrays["sensed"] = sensed
-        if drives is not None:
-            arrays |= zip(("stiffness", "rate_gain"), drives, strict=True)
+        data = pack.data
+        dof = len(robot.qpos)
+        addresses = dict(functions() or {})
+        kinematics = addresses.pop("kinematics")
+        tables = {name: [getattr(row, field).ctypes.data for row in data] for name, field in FIELDS}
+        tables["models"] = [model._address for model in pack.models]
+        tables["data"] = [row._address for row in data]
+        arrays = arrays | {name: np.array(rows, np.uint64) for name, rows in tables.items()}
+        arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64)}
         robots = Mujoco(**addresses, **{name: array.ctypes.data for name, array in arrays.items()})
-        robots.sensor_size = sensed.shape[1]
+        robots.sensor_size = arrays["sensed"].shape[1]
         robots.base_qpos, robots.base_qvel = robot.base or (0, 0)
-        robots.clearance = None if clearance is None else clearance.address
-        self._take_data, self._kept = take_data, (models, data, arrays, robots, clearance)
+        clearance = None
+        shapes = None if robot.is_file else shape_tables(robot)
+        if shapes is not None:
+            clearance = GroupClearance(shapes, kinematics, pack.models, data, dof)
+            robots.clearance = clearance.address
+        self._pack = pack
+        self._kept = [*pack.models], data, arrays, robots, clearance
         super().__init__(
             len(data),
-            qf.shape[1],
+            dof,
             {"skip": skip},
             speed_limit,
             mujoco=ctypes.addressof(robots),
@@ -169,5 +143,5 @@ class MujocoStep(NativeStep):
         """Return the address of the group, for a call of the extension or of XLA; the robots are in
         their states.
         """
-        self._take_data()
+        _ = self._pack.data  # taken into the working memory
         return super().prepare()

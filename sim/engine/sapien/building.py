@@ -24,10 +24,10 @@ from batchpid.sim.robot.collision_groups import Words, link_groups
 from batchpid.sim.robot.collision_shapes import mesh_file
 from batchpid.sim.robot.meshes import note_meshes
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
-from batchpid.sim.robot.tables import Shape
-from batchpid.task_space.frames import matrix_of
+from batchpid.sim.robot.simulated_links import rigid_tree
+from batchpid.sim.robot.tables import Body, Shape, Tables
+from batchpid.task_space.frames import from_rpy, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.rotations import from_rpy
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
 FASTEST = 1000.0
@@ -154,29 +154,26 @@ def engine_settings(spec: SceneSpec) -> Iterator[None]:
     Only one thread at a time enters the context.
     """
     with _building:
-        yield from _engine_settings(spec)
-
-
-def _engine_settings(spec: SceneSpec) -> Iterator[None]:
-    scene, body = physx.get_scene_config(), physx.get_body_config()
-    shape, material = physx.get_shape_config(), physx.get_default_material()
-    # Settings that are not given get SAPIEN's defaults.
-    gravity = np.array(spec.gravity, np.float32)
-    physx.set_scene_config(gravity=gravity, enable_tgs=spec.physics.solver == "TGS")
-    physx.set_body_config(
-        spec.physics.position_iterations, spec.physics.velocity_iterations, sleep_threshold=0.0
-    )
-    physx.set_shape_config()
-    physx.set_default_material(CONTACT_FRICTION, CONTACT_FRICTION, RESTITUTION)
-    try:
-        yield
-    finally:
-        physx.set_scene_config(scene)
-        physx.set_body_config(body)
-        physx.set_shape_config(shape)
-        physx.set_default_material(
-            material.static_friction, material.dynamic_friction, material.restitution
+        scene, body = physx.get_scene_config(), physx.get_body_config()
+        shape, material = physx.get_shape_config(), physx.get_default_material()
+        solver = spec.physics
+        # Settings that are not given get SAPIEN's defaults.
+        gravity = np.array(spec.gravity, np.float32)
+        physx.set_scene_config(gravity=gravity, enable_tgs=solver.solver == "TGS")
+        physx.set_body_config(
+            solver.position_iterations, solver.velocity_iterations, sleep_threshold=0.0
         )
+        physx.set_shape_config()
+        physx.set_default_material(CONTACT_FRICTION, CONTACT_FRICTION, RESTITUTION)
+        try:
+            yield
+        finally:
+            physx.set_scene_config(scene)
+            physx.set_body_config(body)
+            physx.set_shape_config(shape)
+            physx.set_default_material(
+                material.static_friction, material.dynamic_friction, material.restitution
+            )
 
 
 def new_system(spec: SceneSpec, gravity: NDArray[np.float64] | None = None) -> Any:
@@ -269,45 +266,29 @@ def scene_tree(spec: SceneSpec) -> RigidTree:
     joint above.
     """
     _scene, robot = build_scene(spec, new_system(spec))
-    names: list[str] = []
-    parents: list[int] = []
-    kinds: list[str] = []
-    poses: list[Pose] = []
-    inertias: list[SpatialInertia] = []
-
-    def add(name: str, parent: int, kind: str, pose: Pose, inertia: SpatialInertia) -> None:
-        names.append(name)
-        parents.append(parent)
-        kinds.append(kind)
-        poses.append(pose)
-        inertias.append(inertia)
-
-    massless = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))
-    for link in robot.links:
-        axes = matrix_of(_wxyz(link.cmass_local_pose))
+    links = {link.name: link for link in robot.links}
+    rows = []
+    for body in spec.simulated.bodies:
+        link = links[body.name]
+        place = link.cmass_local_pose
+        axes = matrix_of(_wxyz(place))
         moments = np.diag([float(str(moment)) for moment in link.inertia])
-        inertia = SpatialInertia(link.mass, link.cmass_local_pose.p, axes @ moments @ axes.T)
-        if link.parent is None:
-            add(link.name, -1, "fixed", Pose(), inertia)
-            continue
-        kind = link.joint.type if link.joint.type in ("fixed", "prismatic") else "revolute"
-        above = names.index(link.parent.name)
-        add(f"{link.name} (joint)", above, kind, link.joint.pose_in_parent, massless)
-        add(link.name, len(names) - 1, "fixed", link.joint.pose_in_child.inv(), inertia)
-    return RigidTree(
-        tuple(names),
-        np.array(parents),
-        tuple(kinds),
-        tuple(joint.name for joint in spec.joints),
-        position=np.array([pose.p for pose in poses], float),
-        wxyz=np.array([_wxyz(pose) for pose in poses]),
-        axis=np.tile([1.0, 0.0, 0.0], (len(names), 1)),
-        mass=np.array([inertia.mass for inertia in inertias]),
-        center=np.array([inertia.center for inertia in inertias], float),
-        inertia=np.array([inertia.tensor for inertia in inertias]),
-        gravity=spec.gravity,
-        fixed_base=spec.fixed_base,
-    )
+        row = Body(body.name, None, mass=link.mass, center=np.asarray(place.p, float))
+        row = row._replace(inertia=axes @ moments @ axes.T)
+        if body.joint is not None:
+            above = f"{body.name} (joint)"
+            moving = replace(body.joint, axis=(1.0, 0.0, 0.0))
+            rows.append(_placed(Body(above, moving), link.joint.pose_in_parent))
+            fixed = replace(body.joint, type="fixed", parent_link=above)
+            row = _placed(row._replace(joint=fixed), link.joint.pose_in_child.inv())
+        rows.append(row)
+    tables = Tables(tuple(rows), (), {})
+    return rigid_tree(tables, gravity=spec.gravity, fixed_base=spec.fixed_base)
+
+
+def _placed(row: Body, pose: Pose) -> Body:
+    """Return a body at one of SAPIEN's poses in its parent."""
+    return row._replace(position=np.asarray(pose.p, float), wxyz=_wxyz(pose))
 
 
 def _wxyz(pose: Pose) -> Float64:
