@@ -62,17 +62,17 @@ class NumPyBackend:
         self.native = not obstacle()
         self.prepare(self.params, self.shape)
 
-    def array(self, value: Any) -> Array:
+    def array(self, value: Array) -> Array:
         """Return ``value`` as an array of this backend."""
         return np.asarray(value, dtype=self.params.dtype)
 
-    def call(self, function: Any, *inputs: Any, **named: Any) -> PIDState:
+    def call(self, function: Any, *inputs: Array, **named: Any) -> PIDState:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
         return function(self.params, *inputs, **named)
 
     def step(
-        self, state: PIDState, out: Any, *inputs: Any
-    ) -> tuple[PIDState, Any, Terms | None, Callable[..., Any]]:
+        self, state: PIDState, out: Array, *inputs: Array
+    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Any]]:
         """Return the new state, the effort, the terms if they are kept, and a fast call of the next
         steps.
 
@@ -113,13 +113,13 @@ class JAXBackend:
         )
 
         def step(
-            params: PIDParams, state: PIDState, *inputs: Any
-        ) -> tuple[PIDState, Any, Terms | None]:
-            new, found = pid.advance(discretise(params, dt), state, *inputs)
-            return new, found.effort, found.filled() if terms else None
+            params: PIDParams, state: PIDState, *inputs: Array
+        ) -> tuple[PIDState, Array, Terms | None]:
+            new, results = pid.advance(discretise(params, dt), state, *inputs)
+            return new, results.effort, results.filled() if terms else None
 
         def step_in_blocks(
-            params: PIDParams, spare: PIDState, state: PIDState, *inputs: Any
+            params: PIDParams, spare: PIDState, state: PIDState, *inputs: Array
         ) -> Array:
             out = (spare, jax.numpy.zeros_like(inputs[1]))
             return blocks.advance_in_blocks(discretise(params, dt), state, *inputs, out=out)
@@ -132,7 +132,7 @@ class JAXBackend:
         own.
         """
 
-        def packed(layout: Any, shared: Any, own: Any, *inputs: Any, **named: Any) -> Any:
+        def packed(layout: Any, shared: Any, own: Any, *inputs: Array, **named: Any) -> Any:
             tree, is_shared = layout
             shared, own = iter(shared), iter(own)
             leaves = [next(shared if one else own) for one in is_shared]
@@ -154,9 +154,10 @@ class JAXBackend:
             ]
             stacked = np.stack(shared) if shared else np.empty((0, 1, shape[1]), params.dtype)
             self.packed = ((tree, is_shared), jnp.asarray(stacked), own)
+        # Buffers of other params have another shape or dtype, and are of no use.
         self.dtype, self._spare = self.packed[1].dtype, None
 
-    def array(self, value: Any) -> Array:
+    def array(self, value: Array) -> Array:
         """Return ``value`` as an array of this backend."""
         if isinstance(value, np.ndarray) or not isinstance(value, self.jax.Array):
             return np.asarray(value, dtype=self.dtype)
@@ -165,7 +166,7 @@ class JAXBackend:
         with own_settings():
             return np.asarray(value, dtype=self.dtype)
 
-    def call(self, function: Any, *inputs: Any, **named: Any) -> PIDState:
+    def call(self, function: Any, *inputs: Array, **named: Any) -> PIDState:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
         if function not in self._compiled:
             self._compiled[function] = self._compile(function)
@@ -174,7 +175,7 @@ class JAXBackend:
 
     def step(
         self, state: PIDState, out: None, r: Array, y: Array, *rates: Array
-    ) -> tuple[PIDState, Any, Terms | None, Callable[..., Any]]:
+    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Any]]:
         """Return the new state, the effort, the terms if they are kept, and no fast call; ``out``
         is None.
         """

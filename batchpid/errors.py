@@ -109,10 +109,10 @@ class MissingDependencyError(BatchPIDError, ImportError):
         self.purpose = purpose
         self.extra = extra
         # Extras come from a checkout, as long as batchpid is on no index.
-        wanted = package if extra is None else f".[{extra}]"
+        requirement = package if extra is None else f".[{extra}]"
         place = "" if extra is None else " in the checkout of batchpid"
         super().__init__(
-            f"{purpose} needs the package {package!r}; install it with: pip install '{wanted}'{place}"
+            f"{purpose} needs the package {package!r}; install it with: pip install '{requirement}'{place}"
         )
 
     def __reduce__(self) -> tuple[Any, ...]:

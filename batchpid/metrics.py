@@ -170,7 +170,7 @@ def step_metrics(
     rise = high - np.where(np.isfinite(high), low, 0.0)
     tail_rows = max(1, round(tail * len(t)))
 
-    def judged(figure: Any) -> Float64:
+    def judged(figure: ArrayLike) -> Float64:
         return np.where(finite, figure, np.inf)
 
     nothing = np.full(size.shape, np.nan)

@@ -54,7 +54,7 @@ def _digest(value: Any, where: str) -> bytes:
         return _of_fields(kind, dict(zip(names, value, strict=True)), where)
     if is_dataclass(value) and not isinstance(value, type):
         return _of_fields(
-            kind, {each.name: getattr(value, each.name) for each in fields(value)}, where
+            kind, {entry.name: getattr(value, entry.name) for entry in fields(value)}, where
         )
     if kind in (list, tuple):
         return _of_parts(
@@ -87,6 +87,7 @@ def _of_array(array: Array, where: str) -> bytes:
         raise InvalidArgumentError(
             f"values{where}", f"is an array of {array.dtype}, which has no digest", remedy=remedy
         )
+    # Byte order and strides are no content.
     content = array.astype(dtype, order="C", copy=False).tobytes()
     head = _of_bytes("dtype", dtype.str.encode()), _of_bytes("shape", str(array.shape).encode())
     return _of_parts("array", [*head, _of_bytes("content", content)])
@@ -94,11 +95,11 @@ def _of_array(array: Array, where: str) -> bytes:
 
 def _of_fields(kind: type, parts: Mapping[str, Any], where: str) -> bytes:
     name = _of_bytes("class", f"{kind.__module__}.{kind.__qualname__}".encode())
-    found = [
+    results = [
         (_of_bytes("field", key.encode()), _digest(part, f"{where}.{key}"))
         for key, part in parts.items()
     ]
-    return _of_parts("fields", [name, *(part for pair in found for part in pair)])
+    return _of_parts("fields", [name, *(part for pair in results for part in pair)])
 
 
 def _of_bytes(kind: str, content: bytes) -> bytes:

@@ -22,12 +22,16 @@ def span(values: Array) -> str:
         array = np.asarray(values)
         if array.dtype == bool:
             return f"{array.sum()} of {array.size}"
-        known = array[~np.isnan(array)]
+        present = array[~np.isnan(array)]
     except (TypeError, ValueError, RuntimeError):
         return type(values).__name__
-    ends = dict.fromkeys(f"{end:.4g}" for end in (known.min(), known.max())) if known.size else ()
+    ends = (
+        dict.fromkeys(f"{end:.4g}" for end in (present.min(), present.max()))
+        if present.size
+        else ()
+    )
     parts = [" to ".join(ends)] if ends else []
-    return " or ".join([*parts, "nan"] if known.size < array.size else parts) or "empty"
+    return " or ".join([*parts, "nan"] if present.size < array.size else parts) or "empty"
 
 
 def summary(name: str, parts: Iterable[str]) -> str:

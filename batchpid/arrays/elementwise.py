@@ -28,7 +28,7 @@ def namespace(*leaves: Array) -> Array:
     return np
 
 
-def in_dtype_of(params: Any, *arrays: Array) -> list[Any]:
+def in_dtype_of(params: Any, *arrays: Array) -> list[Array]:
     """Return ``arrays`` in the dtype of the floats in ``params``, a named tuple; None stays
     None.
     """

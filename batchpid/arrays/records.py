@@ -131,14 +131,17 @@ def with_fields(
     defaults = {name: field.default for name, field in fields.items()} | choices
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
-        own = inspect.signature(function)
-        shown = [one for one in own.parameters.values() if one.kind is not one.VAR_KEYWORD]
+        declared_signature = inspect.signature(function)
+        shown = [
+            one for one in declared_signature.parameters.values() if one.kind is not one.VAR_KEYWORD
+        ]
         shown += [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default)
             for name, default in defaults.items()
-            if name not in own.parameters
+            if name not in declared_signature.parameters
         ]
-        signature = own.replace(parameters=shown)
+        # help(), editors and the tests of wrong calls read the whole signature.
+        signature = declared_signature.replace(parameters=shown)
 
         @wraps(function)
         def build(*args: P.args, **options: P.kwargs) -> T:

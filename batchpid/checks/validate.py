@@ -26,7 +26,7 @@ LONGEST_STEP = 1.0
 AxisKind = Literal["joint", "entry"]
 
 
-def integer(argument: str, value: Any, low: int, high: int) -> int:
+def integer(argument: str, value: object, low: int, high: int) -> int:
     """Return ``value`` as an int within [low, high]."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise InvalidArgumentError(
@@ -39,7 +39,7 @@ def integer(argument: str, value: Any, low: int, high: int) -> int:
     return int(value)
 
 
-def number(argument: str, value: Any, low: float, high: float, unit: str) -> float:
+def number(argument: str, value: object, low: float, high: float, unit: str) -> float:
     """Return ``value`` as a finite float within [low, high]; an infinite bound does not limit."""
     value = _scalar(argument, value, unit)
     if not low <= value <= high or math.isinf(value):  # NaN is in no range
@@ -50,7 +50,7 @@ def number(argument: str, value: Any, low: float, high: float, unit: str) -> flo
     return value
 
 
-def positive(argument: str, value: Any, unit: str) -> float:
+def positive(argument: str, value: object, unit: str) -> float:
     """Return ``value`` as a finite float above 0."""
     value = _scalar(argument, value, unit)
     if not 0 < value < math.inf:
@@ -63,7 +63,7 @@ def positive(argument: str, value: Any, unit: str) -> float:
     return value
 
 
-def time_step(argument: str, value: Any) -> float:
+def time_step(argument: str, value: object) -> float:
     """Return ``value`` as a time step [s]; above :data:`LONGEST_STEP` it is taken for a rate."""
     value = positive(argument, value, "s")
     if value > LONGEST_STEP:
@@ -74,7 +74,7 @@ def time_step(argument: str, value: Any) -> float:
     return value
 
 
-def check_time_step(argument: str, value: Any) -> None:
+def check_time_step(argument: str, value: object) -> None:
     """Check a time step that is not an array; the values of arrays are not read."""
     if (
         isinstance(value, float) and 0.0 < value <= LONGEST_STEP
@@ -84,9 +84,9 @@ def check_time_step(argument: str, value: Any) -> None:
         time_step(argument, value)
 
 
-def choice(argument: str, value: Any, known: Collection[S]) -> S:
+def choice(argument: str, value: object, known: Collection[S]) -> S:
     """Return ``value`` if it is one of ``known``."""
-    chosen: S = value
+    chosen: Any = value
     if not isinstance(value, str) or value not in known:
         raise InvalidArgumentError(
             argument,
@@ -97,7 +97,7 @@ def choice(argument: str, value: Any, known: Collection[S]) -> S:
     return chosen
 
 
-def flag(argument: str, value: Any) -> bool:
+def flag(argument: str, value: object) -> bool:
     """Return ``value`` as a bool."""
     if not isinstance(value, bool | np.bool_):
         raise InvalidArgumentError(
@@ -106,7 +106,7 @@ def flag(argument: str, value: Any) -> bool:
     return bool(value)
 
 
-def instance(argument: str, value: Any, kind: type[T], remedy: str) -> T:
+def instance(argument: str, value: object, kind: type[T], remedy: str) -> T:
     """Return ``value`` if it is a ``kind``."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIO" else "a"
@@ -137,7 +137,7 @@ def names(argument: str, value: Any, count: int | None = None) -> list[str]:
     return list(value)
 
 
-def file_path(argument: str, value: Any, suffixes: Collection[str] = ()) -> Path:
+def file_path(argument: str, value: object, suffixes: Collection[str] = ()) -> Path:
     """Return ``value`` as a path that ends in one of ``suffixes``, if any are given."""
     if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
         raise InvalidArgumentError(
@@ -154,7 +154,7 @@ def file_path(argument: str, value: Any, suffixes: Collection[str] = ()) -> Path
     return path
 
 
-def is_traced(value: Any) -> bool:
+def is_traced(value: object) -> bool:
     """Return whether ``value`` is an array inside jax.jit, jax.grad or jax.vmap, whose entries
     cannot be checked.
     """
@@ -366,7 +366,7 @@ def check_keywords(owner: str, given: Collection[str], known: Collection[str]) -
             raise InvalidArgumentError(name, f"is not an argument of {owner}", remedy=remedy)
 
 
-def _scalar(argument: str, value: Any, unit: str) -> float:
+def _scalar(argument: str, value: object, unit: str) -> float:
     if isinstance(value, bool | np.bool_) or not isinstance(
         value, int | float | np.integer | np.floating
     ):

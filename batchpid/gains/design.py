@@ -93,8 +93,8 @@ def pid_from_inertia(
     """
     w, load = 2 * np.pi * np.asarray(bandwidth_hz, np.float64), np.asarray(damping, np.float64)
     # A joint whose own damping exceeds zeta needs the stiffness of a heavier one to be as fast.
-    own = np.maximum(inertia, load / (2 * damping_ratio * w))
-    kp, full = own * w**2, 2 * damping_ratio * w * own
+    effective = np.maximum(inertia, load / (2 * damping_ratio * w))
+    kp, full = effective * w**2, 2 * damping_ratio * w * effective
     return {
         "kp": kp,
         "ki": kp / (INTEGRAL_TIME / w if integral_time is None else integral_time),
@@ -160,6 +160,7 @@ def design_gains(
     positive("damping_ratio", damping_ratio, "zeta")
     time_step("dt", dt)
     number("margin", margin, 1e-3, 1 - 1e-3, "share of the stability range")
+    # Without an integral a setpoint weight would leave an error.
     integrates = integral_time is None or integral_time != math.inf
     if integral_time is not None and integrates:
         positive("integral_time", integral_time, "s")
@@ -174,8 +175,8 @@ def design_gains(
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
     coupling = getattr(robot, "coupling", Coupling.of(mass.shape[-1]))
     mass, viscous = coupling.reduced(mass), coupling.reduced_damping(robot.damping)
-    own = np.diagonal(mass, axis1=1, axis2=2)
-    carried = np.maximum(own.max(0), coupling.reduced_damping(least))
+    diagonal = np.diagonal(mass, axis1=1, axis2=2)
+    carried = np.maximum(diagonal.max(0), coupling.reduced_damping(least))
     # The loop with the mass matrix has unit inertias, and compensates the joints' damping.
     inertia, damping = (
         (carried, viscous) if gain_units == "effort" else (np.ones_like(carried), 0.0)

@@ -146,13 +146,14 @@ def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) ->
     """
     ratio, participation = np.zeros(m.shape[:-2]), np.zeros(m.shape[:-1])
     for at in np.ndindex(*m.shape[:-2]):
-        own = [column[at] for column in columns]
-        slowest = _SLOWEST / (1 + float(np.max(own[-2] + own[-1])) / dt)
+        local = [column[at] for column in columns]
+        # Frequencies are spaced by ratio where loci bend, and evenly up to the highest.
+        slowest = _SLOWEST / (1 + float(np.max(local[-2] + local[-1])) / dt)
         slow = np.geomspace(slowest, np.pi / 4, _FREQUENCIES)
         z = np.exp(1j * np.append(slow, np.linspace(np.pi / 4, np.pi, _FREQUENCIES)[1:]))
-        loop = _loop(z, m[at], unit[at], own, dt)
+        loop = _loop(z, m[at], unit[at], local, dt)
         ratio[at], where = _crossing(z, np.linalg.eigvals(loop))
-        inertia = m[at] + dt * z[where] / (z[where] - 1) * np.diag(own[3])
+        inertia = m[at] + dt * z[where] / (z[where] - 1) * np.diag(local[3])
         participation[at] = _participation(loop[where], inertia, min(float(ratio[at]), 1e300))
     return StabilityBound(ratio, participation)
 
@@ -180,12 +181,12 @@ def _loop(z: Rows, m: Float64, unit: Float64, columns: list[Float64], dt: float)
     ``columns`` are kp, kd, filter time, damping, delay and lag (joints,).
     """
     p, c, tau, b, delay, lag = columns
-    each = z[:, None]
-    law = p + c * (each - 1) / ((tau + dt) * each - tau)
+    entry = z[:, None]
+    law = p + c * (entry - 1) / ((tau + dt) * entry - tau)
     whole = np.floor(delay / dt)
     part = delay / dt - whole
     intake = -np.expm1(-dt / np.maximum(lag, 1e-3 * dt))
-    late = each**-whole * (1 - part + part / each) * intake / (1 - (1 - intake) / each)
+    late = entry**-whole * (1 - part + part / entry) * intake / (1 - (1 - intake) / entry)
     plant = (z - 1)[:, None, None] * m + dt * z[:, None, None] * (b * np.eye(len(b)))
     moved: Rows = np.linalg.solve(plant, late[..., None] * unit * law[:, None, :])
     return moved * (dt**2 * z / (z - 1))[:, None, None]
@@ -202,8 +203,8 @@ def _crossing(z: Rows, values: Rows) -> tuple[float, int]:
     values[-1] = values[-1].real  # at z = -1 it is real, but for rounding
     # Each eigenvalue goes on from the nearest one at the frequency before, apart from the fall of
     # all with frequency.
-    own = values * np.abs(z - 1)[:, None] ** 2
-    nearest = np.abs(own[1:, :, None] - own[:-1, None, :]).argmin(2)
+    local = values * np.abs(z - 1)[:, None] ** 2
+    nearest = np.abs(local[1:, :, None] - local[:-1, None, :]).argmin(2)
     now, then = np.take_along_axis(values[:-1], nearest, 1), values[1:]
     first = values[0]
     if ((first.real < 0) & (first.imag > 0)).any():
@@ -211,9 +212,9 @@ def _crossing(z: Rows, values: Rows) -> tuple[float, int]:
     falls = (now.real < 0) & (then.real < 0) & (now.imag < 0) & (then.imag >= 0)
     if not falls.any():
         return 0.0, len(values) - 1
-    above, below = (-each.imag / np.where(falls, -each.real, 1.0) for each in (now, then))
+    above, below = (-entry.imag / np.where(falls, -entry.real, 1.0) for entry in (now, then))
     share = np.where(falls, above / np.where(falls, above - below, 1.0), 0.0)
-    sizes = [np.log(np.maximum(np.abs(each), 1e-300)) for each in (now, then)]
+    sizes = [np.log(np.maximum(np.abs(entry), 1e-300)) for entry in (now, then)]
     crossed = np.where(falls, np.exp(sizes[0] + share * (sizes[1] - sizes[0])), 0.0)
     row = int(crossed.max(1).argmax())
     return float(crossed.max()), row
@@ -265,17 +266,17 @@ def oscillation(
     lasts = turns & (-s.real * positive("lasting", lasting, "s") < -np.log(0.02))
     ratio = np.where(lasts, -s.real / np.abs(s), 1.0)
     worst = ratio.argmin(-1)[..., None]
-    found = np.take_along_axis(lasts, worst, -1)
+    results = np.take_along_axis(lasts, worst, -1)
     shape = np.take_along_axis(vectors, worst[..., None], -1)[..., :joints, 0]
     # Kinetic energy, apart from the coupling of joints.
     energy = np.abs(shape) ** 2 * np.diagonal(
         read_array("mass_matrix", mass_matrix), axis1=-2, axis2=-1
     )
-    energy = np.where(found, energy, 1.0)
+    energy = np.where(results, energy, 1.0)
     frequency = np.abs(np.take_along_axis(s, worst, -1).imag) / (2 * np.pi)
     return Oscillation(
         damping_ratio=np.take_along_axis(ratio, worst, -1)[..., 0],
-        frequency=np.where(found, frequency, 0.0)[..., 0],
+        frequency=np.where(results, frequency, 0.0)[..., 0],
         participation=energy / energy.sum(-1, keepdims=True),
     )
 
@@ -290,6 +291,7 @@ def _one_step(mass_matrix: ArrayLike, dt: float, *gains: ArrayLike) -> Float64:
     def diagonal(values: Float64) -> Float64:
         return values[..., None] * one
 
+    # One step of the law, output first, and of the plant, semi-implicit, as block rows.
     keep, take = tau / (tau + dt), dt / (tau + dt)
     # d = keep d' - take w / dt on the negated measurement, so u = -p q + I + c d; w = q - q'.
     rate = [zero, diagonal(-take / dt), zero, diagonal(keep)]

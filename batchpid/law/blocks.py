@@ -25,10 +25,10 @@ ROWS = 1024
 def advance_in_blocks(
     k: Coefficients,
     state: PIDState,
-    *inputs: Any,
-    out: tuple[PIDState, Any] | None = None,
+    *inputs: Array,
+    out: tuple[PIDState, Array] | None = None,
     rows: int = ROWS,
-) -> tuple[PIDState, Any]:
+) -> tuple[PIDState, Array]:
     """Advance the law ``rows`` envs at a time, for jax.jit with ``out`` donated.
 
     ``inputs`` are the inputs of :func:`batchpid.advance`, in order: setpoint, measurement and,
@@ -51,19 +51,19 @@ def advance_in_blocks(
             return x
         return (jnp.tile(x, (rows, 1)) if x.shape[0] == 1 else x).reshape(-1)
 
-    def step(n: Array, out: Any) -> Any:
+    def step(n: Array, out: Array) -> Any:
         # The last block may repeat some rows of the one before.
         start = jnp.minimum(n * block, total - block)
 
         def cut(x: Array) -> Array:
             return jax.lax.dynamic_slice_in_dim(x, start, block) if jnp.shape(x) == (total,) else x
 
-        new, terms = advance(*jax.tree.map(cut, given))
+        new, terms = advance(*jax.tree.map(cut, arguments))
         done = new, terms.effort
         return jax.tree.map(
             lambda x, part: jax.lax.dynamic_update_slice_in_dim(x, part, start, 0), out, done
         )
 
-    given = jax.tree.map(flat, (k, state, *inputs))
+    arguments = jax.tree.map(flat, (k, state, *inputs))
     out = jax.lax.fori_loop(0, -(-envs // rows), step, jax.tree.map(flat, out))
     return jax.tree.map(lambda x: x.reshape(envs, joints), out)

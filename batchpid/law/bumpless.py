@@ -63,9 +63,10 @@ def track(
         raise InvalidArgumentError("dt", problem, remedy="give dt in seconds")
     xp = namespace(*params, *state, setpoint, measurement, effort)
     k = discretise(params, 1.0 if dt is None else dt)
+    # The terms of the next step, on the same inputs, with the derivative settled.
     zero = xp.zeros_like(measurement)
     error = wrapped_error(k, setpoint, measurement, xp)
-    (origin, _), (kept, _) = (
+    (origin, _), (lasting, _) = (
         origins(k, state, measurement, rate, xp) for rate in (setpoint_rate, None)
     )
     rate = zero if measurement_rate is None else -measurement_rate
@@ -83,5 +84,5 @@ def track(
         setpoint=None if state.setpoint is None else zero + setpoint,
         setpoint_seen=None if state.setpoint_seen is None else xp.ones_like(measurement),
         effort=None if state.effort is None else zero + effort,
-        origin=kept,
+        origin=lasting,
     )

@@ -72,11 +72,11 @@ def advance_with_mass_matrix(
     rates = measurement_rate, setpoint_rate, given_acceleration(k, setpoint_acceleration)
     new, terms = advance(_unlimited(k), state, setpoint, measurement, *rates)
     new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
-    p, i, d, given = (
+    p, i, d, arguments = (
         x if isinstance(x, float) else matrix_vector(mass_matrix, x) for x in terms[:4]
     )
-    given = given if feedforward is None else given + feedforward
-    return new, Terms(p, i, d, given, unsaturated, effort)
+    arguments = arguments if feedforward is None else arguments + feedforward
+    return new, Terms(p, i, d, arguments, unsaturated, effort)
 
 
 def given_acceleration(k: Coefficients, setpoint_acceleration: Array) -> Array:
@@ -137,7 +137,7 @@ def _unlimited(k: Coefficients) -> Coefficients:
 
 def _to_effort(
     k: Coefficients, old: PIDState, new: PIDState, a: Array, mass_matrix: Array, feedforward: Array
-) -> tuple[PIDState, Any, Any]:
+) -> tuple[PIDState, Array, Array]:
     """Return the state, the effort of the acceleration ``a`` within the limits of ``k``, and
     without them.
     """
@@ -150,10 +150,12 @@ def _to_effort(
     stops = k.ki_dt is not None and k.conditional is not None
     change, deeper = new.integral - old.integral if stops else None, None
     if low is not None or high is not None:
+        # The acceleration is scaled as a whole, so that its direction stays.
         share = _share(wanted, passive, low, high, xp)
         effort = clip(share * wanted + passive, low, high, xp)
         deeper = None if change is None else (share < 1) & (a * change > 0)
     if k.effort_step is not None:
+        # The change of the effort is scaled as a whole, for the same reason.
         reached = effort
         effort = clip(_towards(reached, old.effort, k.effort_step, xp), low, high, xp)
         new = new._replace(effort=effort.copy())

@@ -45,7 +45,7 @@ E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (Springer, 1
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import namespace
@@ -84,7 +84,7 @@ def implicit_gains(params: PIDParams, dt: Array) -> ImplicitGains:
     per_step = 1 / (1 + dt * damping)
     on_rate = kd if c is None else c * kd
 
-    def share(part: Any, whole: Array, otherwise: Array) -> Array:
+    def share(part: Array, whole: Array, otherwise: Array) -> Array:
         has = whole > 0
         return xp.where(has, part / xp.where(has, whole, 1), otherwise)
 

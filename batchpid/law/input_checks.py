@@ -32,8 +32,8 @@ for off.
 
 
 def checked_inputs(
-    params: PIDParams, state: PIDState, measurement: Array, **inputs: Any
-) -> list[Any]:
+    params: PIDParams, state: PIDState, measurement: Array, **inputs: Array
+) -> list[Array]:
     """Return ``measurement`` and ``inputs`` as arrays in the params' dtype that broadcast with
     params and state.
 
@@ -62,8 +62,8 @@ def check_alone(law: Any, measurement_rate: Array) -> None:
     if law.gain_units is not None:
         unit = next(
             name
-            for name, each in CHOICES["gain_units"].items()
-            if type(each) is type(law.gain_units)
+            for name, entry in CHOICES["gain_units"].items()
+            if type(entry) is type(law.gain_units)
         )
         raise InvalidArgumentError(
             "params.gain_units",

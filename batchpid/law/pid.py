@@ -29,8 +29,6 @@ b) / ki.
 
 from __future__ import annotations
 
-from typing import Any
-
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.choices import Everywhere, HoldEffort
 from batchpid.arrays.elementwise import (
@@ -90,7 +88,7 @@ def step(
     measurement_rate: Array = None,
     setpoint_rate: Array = None,
     feedforward: Array = None,
-) -> tuple[PIDState, Any]:
+) -> tuple[PIDState, Array]:
     """Advance the law by ``dt`` seconds; return the state and the effort.
 
     Arrays are (envs, joints), or (1, joints) for all envs, and taken in the params' dtype, which
@@ -133,7 +131,7 @@ def step_terms(
     setpoint: Array,
     measurement: Array,
     dt: Array,
-    **inputs: Any,
+    **inputs: Array,
 ) -> tuple[PIDState, Terms]:
     """Advance the law as :func:`step`, with the same arguments; return the state and all terms,
     effort included.
@@ -148,7 +146,7 @@ def _step(
     setpoint: Array,
     measurement: Array,
     dt: Array,
-    **inputs: Any,
+    **inputs: Array,
 ) -> tuple[PIDState, Terms]:
     """Check the arguments of a step and advance the law."""
     r, y, inputs = _checked(params, state, setpoint, measurement, inputs)
@@ -202,11 +200,13 @@ def advance(
             None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff)
         )
 
+    # The terms, in the order of the equations above.
     error = wrapped_error(k, r, y, xp)
     origin, moved_origin = origins(k, state, y, r_rate, xp)
     p = proportional(k, error, y, origin)
     u = p
 
+    # The effort takes I before it includes the present error: a change of ki is bumpless.
     i, integral = 0.0, state.integral
     if k.ki_dt is not None:
         integral = integral + k.ki_dt * error
@@ -215,6 +215,7 @@ def advance(
         i = state.integral
         u = u + i
 
+    # The filter acts on the weighted rate, so that one state serves measurement and setpoint.
     d, derivative = 0.0, None
     if k.kd is not None:
         rate = (
@@ -234,11 +235,13 @@ def advance(
     if ff is not None:
         u = u + ff
 
+    # The rate limit comes first: the limits of the effort hold in any case.
     effort = u
     if k.effort_step is not None:
         effort = clip(u, state.effort - k.effort_step, state.effort + k.effort_step, xp)
     effort = clip(effort, k.effort_min, k.effort_max, xp)
 
+    # Anti-windup sees the saturated effort; without limits it costs nothing.
     if k.ki_dt is not None:
         if effort is not u and k.conditional is not None:
             deeper = (u - effort) * error > 0
@@ -260,6 +263,7 @@ def advance(
         effort=None if state.effort is None else effort.copy(),
         origin=moved_origin,
     )
+    # A joint with a bad input keeps its state, as if the step had not been.
     if finite is not None:
         new = PIDState(
             *(
@@ -338,8 +342,8 @@ def drive_target(
     setpoint: Array,
     measurement: Array,
     dt: Array,
-    **inputs: Any,
-) -> tuple[PIDState, Any]:
+    **inputs: Array,
+) -> tuple[PIDState, Array]:
     """Return ``(state, target)``: the position target that makes a PD drive of stiffness kp act as
     a PID::
 
@@ -364,8 +368,8 @@ def drive_target(
 
 
 def advance_drive(
-    k: Coefficients, state: PIDState, setpoint: Array, measurement: Array, **inputs: Any
-) -> tuple[PIDState, Any]:
+    k: Coefficients, state: PIDState, setpoint: Array, measurement: Array, **inputs: Array
+) -> tuple[PIDState, Array]:
     """Return ``(state, target)`` with given coefficients, for loops with constant params; else as
     :func:`drive_target`.
 

@@ -20,17 +20,18 @@ A prime is the value of the step before. The play is the backlash hysteresis (G.
 Kokotovic, Adaptive Control of Systems with Actuator and Sensor Nonlinearities, Wiley, 1996, chapter
 2). Friction and armature are the simulator's: see :mod:`batchpid.motors.friction`.
 
-A new effect is, in :mod:`batchpid.motors.actuators`, an argument of ``make_actuators`` with its
-``Field`` and an entry in the docstring, and a field of :class:`Actuators` of the same name. Here it
-is a field of :class:`MotorCoefficients`, a value in :func:`discretise`, and a term in
-``_delivered`` (motor), ``_play`` or ``_encode`` (sensor). An effect that changes the limits of
-commands has a term in :func:`command_limits`, too. Terms may use the operations of
-:mod:`batchpid.native.operations` only, so that they also run in JAX and in native code.
+A new effect is, in :mod:`batchpid.motors.actuators`, a field of :class:`Actuators` with its
+``Field``, and an entry in the docstring of ``make_actuators``. Files, randomizations, exports and
+the table of docs/actuators.md (``python docs/tables.py``) take it from there. Here it is a field of
+:class:`MotorCoefficients`, a value in :func:`discretise`, and a term in ``_delivered`` (motor),
+``_play`` or ``_encode`` (sensor). An effect that changes the limits of commands has a term in
+:func:`command_limits`, too. Terms may use the operations of :mod:`batchpid.native.operations` only,
+so that they also run in JAX and in native code.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -88,8 +89,8 @@ def init(
     *,
     qvel: Array = None,
     effort: Array = None,
-    envs: Any = None,
-    episode: Any = 0,
+    envs: Array = None,
+    episode: Array = 0,
     samples: int | None = None,
 ) -> ActuatorState:
     """Return the state of actuators that have been at rest: with ``qpos`` measured and ``effort``
@@ -120,12 +121,13 @@ def init(
     xp = namespace(*actuators, qpos)
     zeros = xp.zeros_like(qpos)
     position, velocity = zeros + qpos, zeros if qvel is None else zeros + qvel
-    asked = zeros if effort is None else zeros + effort
+    requested = zeros if effort is None else zeros + effort
     command = sensor = encoder = key = step = None
+    # Histories are as long as the longest delay may become, so that delays can grow in flight.
     if actuators.max_delay is not None:
         samples = delay.samples_of(actuators.max_delay, dt) if samples is None else samples
         if actuators.command_delay is not None:
-            command = delay.start(asked, samples)
+            command = delay.start(requested, samples)
         if actuators.sensor_delay is not None:
             sensor = delay.start(xp.concatenate((position, velocity), axis=1), samples)
     if actuators.backlash is not None:
@@ -139,7 +141,9 @@ def init(
     if actuators.lag is None:
         return state
     k = discretise(actuators, state, dt)
-    return state._replace(effort=clip(_motor(k, asked), *limits(k.envelope, velocity), xp) + zeros)
+    return state._replace(
+        effort=clip(_motor(k, requested), *limits(k.envelope, velocity), xp) + zeros
+    )
 
 
 def discretise(
@@ -189,13 +193,13 @@ def discretise(
         return xp.broadcast_to(leaf, (*leaf.shape[:-2], num_envs, leaf.shape[-1])).copy()
 
     flat = {name: spread(leaf) for name, leaf in k._asdict().items() if not isinstance(leaf, tuple)}
-    ends, commands = (Envelope(*map(spread, each)) for each in (k.envelope, k.commands))
+    ends, commands = (Envelope(*map(spread, item)) for item in (k.envelope, k.commands))
     return k._replace(**flat, envelope=ends, commands=commands)
 
 
 def deliver(
     actuators: Actuators, state: ActuatorState, effort: Array, qpos: Array, qvel: Array, dt: Array
-) -> tuple[ActuatorState, Any]:
+) -> tuple[ActuatorState, Array]:
     """Advance the motors by ``dt`` seconds; return ``(state, effort)``, the effort delivered [N m
     or N].
 
@@ -208,7 +212,7 @@ def deliver(
 
 def measure(
     actuators: Actuators, state: ActuatorState, qpos: Array, qvel: Array, dt: Array
-) -> tuple[ActuatorState, Any, Any]:
+) -> tuple[ActuatorState, Array, Array]:
     """Advance the sensors by ``dt`` seconds; return ``(state, qpos, qvel)`` as measured (envs,
     joints).
 
@@ -225,7 +229,9 @@ def _motor(k: MotorCoefficients, effort: Array) -> Array:
     return effort if k.bias is None else effort + k.bias
 
 
-def _delivered(k: MotorCoefficients, behind: Any, effort: Array, qpos: Array, qvel: Array) -> Array:
+def _delivered(
+    k: MotorCoefficients, behind: Array, effort: Array, qpos: Array, qvel: Array
+) -> Array:
     """Return s u + b within the envelope, after the lag; ``behind`` is the effort of the step
     before, None without.
     """
@@ -282,11 +288,12 @@ def advance_effort(
     effort: Array,
     qpos: Array,
     qvel: Array,
-) -> tuple[ActuatorState, Any]:
+) -> tuple[ActuatorState, Array]:
     """Advance the motors with given coefficients, for loops with constant actuators; otherwise as
     :func:`deliver`.
     """
     xp = namespace(effort, qpos, qvel)
+    # Delay, motor, envelope and lag, in the order in which a command passes them.
     command, behind = state.command, state.effort
     if k.command is not None:
         command = push_history(command, effort)
@@ -301,7 +308,7 @@ def advance_measurement(
     qpos: Array,
     qvel: Array,
     drawn: tuple[Array, Array] | None = None,
-) -> tuple[ActuatorState, Any, Any]:
+) -> tuple[ActuatorState, Array, Array]:
     """Advance the sensors with given coefficients, for loops with constant actuators; otherwise as
     :func:`measure`.
 
@@ -309,6 +316,7 @@ def advance_measurement(
     """
     xp = namespace(qpos, qvel)
     command, effort, sensor, encoder, key, step = state
+    # Play, delay, encoder: in the order in which a signal passes them.
     if k.play is not None:
         encoder, qvel = _play(k, encoder, qpos, qvel)
         qpos = encoder
@@ -326,7 +334,7 @@ def advance_measurement(
 
 
 def measurement_noise(
-    k: MotorCoefficients, key: Any, step: Any, like: Any, xp: ArrayModule
+    k: MotorCoefficients, key: Array, step: Array, like: Array, xp: ArrayModule
 ) -> tuple[Array, Array]:
     """Return the noise of positions and of velocities (..., envs, joints) at ``step`` (..., envs);
     None for none.

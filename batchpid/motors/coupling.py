@@ -47,7 +47,7 @@ def _of_followers(method: Callable[[Coupling, Any], Any]) -> Callable[[Coupling,
     """Return a method that returns its argument if no joint follows."""
 
     @wraps(method)
-    def call(self: Coupling, given: Any) -> Array:
+    def call(self: Coupling, given: Array) -> Array:
         return method(self, given) if self.shares else given
 
     return call
@@ -99,12 +99,12 @@ class Coupling(NamedTuple):
             leaders[joint], multipliers[joint], offsets[joint] = leader, multiplier, offset
         independent = np.array([joint not in direct for joint in range(joints)], bool)
         of_leader = [
-            [each for each in sorted(direct) if leaders[each] == joint] for joint in range(joints)
+            [item for item in sorted(direct) if leaders[item] == joint] for joint in range(joints)
         ]
         shares = list[Share]()
         for number in range(max(map(len, of_leader), default=0)):
-            exists = np.array([len(each) > number for each in of_leader])
-            chosen = np.array([each[number] if len(each) > number else 0 for each in of_leader])
+            exists = np.array([len(item) > number for item in of_leader])
+            chosen = np.array([item[number] if len(item) > number else 0 for item in of_leader])
             shares.append(
                 Share(*map(read_only, (exists, chosen, np.where(exists, multipliers[chosen], 0.0))))
             )
@@ -159,17 +159,17 @@ class Coupling(NamedTuple):
         return acting
 
     @_of_followers
-    def of_independent(self, figures: Any) -> Array:
+    def of_independent(self, figures: Array) -> Array:
         """Return ``figures`` with 0 for followers."""
         return namespace(figures).where(self.independent, figures, 0.0)
 
     @_of_followers
-    def of_leaders(self, figures: Any) -> Array:
+    def of_leaders(self, figures: Array) -> Array:
         """Return ``figures`` in which followers take the figures of their leaders."""
         return take_columns(figures, self.leader)
 
     @_of_followers
-    def of_all(self, figures: Any) -> Array:
+    def of_all(self, figures: Array) -> Array:
         """Return ``figures`` (..., independent) for all joints (..., joints); followers have their
         leaders' values.
         """

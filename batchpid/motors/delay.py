@@ -13,7 +13,7 @@ Lagrange filter of order 1).
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace, read_history, wrap
@@ -73,7 +73,7 @@ def discretise(delay: Array, dt: Array, history: Array, begin: int = 0) -> Delay
     return Delay(xp.stack((later, later + numbers)), fraction)
 
 
-def start(value: Any, samples: int) -> Array:
+def start(value: Array, samples: int) -> Array:
     """Return a history (envs, samples, joints) that has been ``value`` (envs, joints) so far."""
     xp = namespace(value)
     return xp.broadcast_to(value[:, None], (value.shape[0], samples, value.shape[1])).copy()

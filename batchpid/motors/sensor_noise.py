@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from functools import cache
 from statistics import NormalDist
-from typing import Any
 
 import numpy as np
 
@@ -49,7 +48,7 @@ def pcg4d(x: Array, y: Array, z: Array, w: Array) -> tuple[Array, Array, Array, 
     return x, y, z, w
 
 
-def keys(seed: Any, envs: Any, episode: Any, xp: ArrayModule) -> Array:
+def keys(seed: Array, envs: Array, episode: Array, xp: ArrayModule) -> Array:
     """Return the key of each env's noise (envs, 2) uint32, from a ``seed`` (1, 2) uint32 and
     numbers (envs,).
     """
@@ -57,7 +56,9 @@ def keys(seed: Any, envs: Any, episode: Any, xp: ArrayModule) -> Array:
     return xp.stack(pcg4d(seed[:, 0], seed[:, 1], *words)[:2], axis=1)
 
 
-def normals(key: Any, step: Any, joints: int, dtype: DType, xp: ArrayModule) -> tuple[Array, Array]:
+def normals(
+    key: Array, step: Array, joints: int, dtype: DType, xp: ArrayModule
+) -> tuple[Array, Array]:
     """Return two independent standard normal numbers for each step, env and joint.
 
     ``key`` is (envs, 2), ``step`` (..., envs) uint32; the results are (..., envs, joints).

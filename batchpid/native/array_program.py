@@ -35,12 +35,12 @@ def interpreter() -> Any:
     native.use(np.ndarray, np.empty)
     rows, fixed = np.empty((2, 3)), np.empty((4, 1), np.float32)
     fixed.flags.writeable = False
-    for each in (rows, fixed):
-        if native.look(each) != (
-            each.ctypes.data,
-            *each.shape,
-            each.dtype.num,
-            each.flags.writeable,
+    for entry in (rows, fixed):
+        if native.look(entry) != (
+            entry.ctypes.data,
+            *entry.shape,
+            entry.dtype.num,
+            entry.flags.writeable,
         ):
             raise StaleExtensionError(f"cannot read the arrays of NumPy {np.__version__}")
     return native
@@ -83,11 +83,11 @@ class ArrayProgram:
         self.shape = shape
         self.dtype = np.dtype(dtype)
         self.masks = trace.masks
-        given = [np.ascontiguousarray(each, dtype) for each in (*constants, *trace.literals)]
+        given = [np.ascontiguousarray(entry, dtype) for entry in (*constants, *trace.literals)]
         if trace.prelude is not None:
-            rows = max((each.shape[0] for each in given if each.ndim == 2), default=1)
-            found = ArrayProgram(trace.prelude, (), len(given), (rows, shape[1]), dtype)(*given)
-            given += [each.astype(dtype) for each in found]
+            rows = max((entry.shape[0] for entry in given if entry.ndim == 2), default=1)
+            result = ArrayProgram(trace.prelude, (), len(given), (rows, shape[1]), dtype)(*given)
+            given += [entry.astype(dtype) for entry in result]
         tables = trace.operations, trace.results, trace.registers
         self.arguments = (*tables, inputs, tuple(given), *shape, self.dtype == np.float32)
         """Arguments of ``make_program`` in make_program.h."""
@@ -109,7 +109,7 @@ class ArrayProgram:
             self._run(self._program, self.shape[0], arrays, tuple(out), self._threads)
         except ValueError:  # the extension takes plain ndarrays only, contiguous and aligned
             plain = tuple(
-                [np.asarray(np.require(each, requirements=["C", "A"])) for each in arrays]
+                [np.asarray(np.require(entry, requirements=["C", "A"])) for entry in arrays]
             )
             self._run(
                 self._program, self.shape[0], plain, tuple(map(np.asarray, out)), self._threads

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import DType, Rows
+from batchpid.arrays.array_types import Array, DType, Rows
 from batchpid.arrays.trees import leaves, structure
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.pid import advance
@@ -27,14 +27,14 @@ def _trace(structures: tuple[Any, ...], terms: bool, dtype: DType) -> tuple[Trac
 
     ``structures`` describe coefficients, state and inputs.
     """
-    kept: list[int] = []
+    lasting: list[int] = []
 
-    def function(k: Coefficients, state: PIDState, inputs: tuple[Any, ...]) -> list[Any]:
-        new, found = advance(k, state, *inputs)
-        kept[:] = [at for at, leaf in enumerate(new) if leaf is not None]
-        return [*(new[at] for at in kept), *(found.filled() if terms else ()), found.effort]
+    def function(k: Coefficients, state: PIDState, inputs: tuple[Any, ...]) -> list[Array]:
+        new, result = advance(k, state, *inputs)
+        lasting[:] = [at for at, leaf in enumerate(new) if leaf is not None]
+        return [*(new[at] for at in lasting), *(result.filled() if terms else ()), result.effort]
 
-    return trace_trees(function, *structures, dtype=dtype), tuple(kept)
+    return trace_trees(function, *structures, dtype=dtype), tuple(lasting)
 
 
 class CompiledLaw:
@@ -58,40 +58,41 @@ class CompiledLaw:
         key = tuple([leaf is None for leaf in (*state, *inputs)])
         if key not in self._programs:
             dtype = self._k.kp.dtype
-            traced, kept = _trace(structure((self._k, state, inputs)), self._terms, dtype)
+            traced, lasting = _trace(structure((self._k, state, inputs)), self._terms, dtype)
             program = ArrayProgram(
                 traced, leaves(self._k), key.count(False), self._shape, dtype, self._threads
             )
-            self._programs[key] = program, kept
+            self._programs[key] = program, lasting
         return self._programs[key]
 
     def step(
         self, state: PIDState, inputs: tuple[Rows | None, ...], out: Rows | None
-    ) -> tuple[PIDState, Any, Terms | None, Callable[..., Any] | None]:
+    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Any] | None]:
         """Advance the law; return the new state, the effort, the terms, and a fast function for the
         next steps.
 
         The new state is written into the arrays of ``state``. The fast function advances this state
         in place, for ``out`` and the same kinds of inputs: see :meth:`ArrayProgram.bind`.
         """
-        given = [each for each in inputs if each is not None]
+        arguments = [entry for entry in inputs if entry is not None]
         state = PIDState(*(None if leaf is None else self._whole(leaf) for leaf in state))
-        program, kept = self._program(state, inputs)
+        program, lasting = self._program(state, inputs)
         fixed = [leaf for leaf in state if leaf is not None]
-        written = [state[at] for at in kept]
-        masks = program.masks[len(kept) :]
+        written = [state[at] for at in lasting]
+        masks = program.masks[len(lasting) :]
         effort = np.empty(self._shape, program.dtype) if out is None else out
         shown = [
             np.empty(self._shape, bool if is_mask else program.dtype) for is_mask in masks[:-1]
         ]
+        # An input that shares memory with the result is read before it is overwritten.
         read = [
-            each if out is None or not np.may_share_memory(each, out) else each.copy()
-            for each in given
+            entry if out is None or not np.may_share_memory(entry, out) else entry.copy()
+            for entry in arguments
         ]
         program(*fixed, *read, out=(*written, *shown, effort))
         if self._terms:
             return state, effort, Terms(*shown)._replace(effort=effort), None
-        bits = sum((each is not None) << at for at, each in enumerate(inputs))
+        bits = sum((entry is not None) << at for at, entry in enumerate(inputs))
         return state, effort, None, program.bind(fixed, written, bits, 1 << _MEASUREMENT)
 
     def _whole(self, leaf: Rows) -> Rows:

@@ -47,27 +47,29 @@ def trace(
         The function uses an operation that programs do not have.
     """
     namespace = Namespace(dtype)
-    given = [Symbol(namespace) for _ in range(constants + inputs)]
-    results = [namespace.symbol(result) for result in function(*given)]
+    entries = [Symbol(namespace) for _ in range(constants + inputs)]
+    results = [namespace.symbol(result) for result in function(*entries)]
     operations = _needed(namespace.noted, results)
     needed = {*results, *(operand for _, operands, _ in operations for operand in operands)}
     literals = {
         symbol: number for number, symbol in namespace.literals.values() if symbol in needed
     }
-    first = [*given[:constants], *literals]
+    first = [*entries[:constants], *literals]
+    # Operations on constants alone run once, when the program is made.
     fixed = set(first)
     early = list[_Operation]()
     late = list[_Operation]()
-    for each in operations:
-        is_early = fixed.issuperset(each[1])
-        (early if is_early else late).append(each)
-        fixed.update([each[2]] * is_early)
+    for entry in operations:
+        is_early = fixed.issuperset(entry[1])
+        (early if is_early else late).append(entry)
+        fixed.update([entry[2]] * is_early)
+    # Pairs are fused after that: a constant part needs no speed.
     late = _fused(late, results)
     used = {*results, *(operand for _, operands, _ in late for operand in operands)}
     shared = [result for _, _, result in early if result in used]
     prelude = _assembled(early, first, shared, ()) if shared else None
     return _assembled(
-        late, [*first, *shared, *given[constants:]], results, tuple(literals.values()), prelude
+        late, [*first, *shared, *entries[constants:]], results, tuple(literals.values()), prelude
     )
 
 
@@ -79,10 +81,10 @@ def trace_trees(function: Callable[..., Any], *structures: Any, dtype: DType = n
     """
 
     def flat(*symbols: Symbol) -> list[Any]:
-        given = iter(symbols)
-        return list(function(*(filled(each, given) for each in structures)))
+        entries = iter(symbols)
+        return list(function(*(filled(entry, entries) for entry in structures)))
 
-    first, *rest = [len(leaves(each)) for each in structures]
+    first, *rest = [len(leaves(entry)) for entry in structures]
     return trace(flat, first, sum(rest), dtype)
 
 
@@ -112,19 +114,19 @@ def _fused(operations: list[_Operation], results: list[Symbol]) -> list[_Operati
     uses = Counter(operand for _, operands, _ in operations for operand in operands) + Counter(
         results
     )
-    found: dict[Symbol, _Operation] = {}
+    fused: dict[Symbol, _Operation] = {}
     for name, operands, result in operations:
-        found[result] = (name, operands, result)
+        fused[result] = (name, operands, result)
         for at in range(2 if name in ("add", "multiply") else 1):
-            before = found.get(operands[at])
+            before = fused.get(operands[at])
             pair = (
                 None if before is None or uses[operands[at]] > 1 else _PAIRS.get((before[0], name))
             )
             if before is not None and pair is not None:
-                del found[operands[at]]
-                found[result] = (pair, (*before[1], operands[1 - at]), result)
+                del fused[operands[at]]
+                fused[result] = (pair, (*before[1], operands[1 - at]), result)
                 break
-    return list(found.values())
+    return list(fused.values())
 
 
 def _assembled(
@@ -146,19 +148,19 @@ def _assembled(
     registers = len(order)
     free = list[int]()
     rows = list[list[int]]()
-    kept = {*order, *results}
+    lasting = {*order, *results}
     for at, (name, operands, result) in enumerate(operations):
         if name == "push":
             places[result] = places[operands[0]]
-            kept.add(result)
+            lasting.add(result)
         else:
-            if not free or result in kept:
+            if not free or result in lasting:
                 free.append(registers)
                 registers += 1
             places[result] = free.pop()
         numbers = [places[operand] for operand in operands]
         rows.append([OPERATIONS.index(name), places[result], *numbers, *(2 * numbers[:1])][:5])
-        free += {places[one] for one in operands if last_use[one] == at and one not in kept}
+        free += {places[one] for one in operands if last_use[one] == at and one not in lasting}
     table, ends = (
         np.array(rows, np.int32),
         np.array([places[result] for result in results], np.int32),

@@ -50,13 +50,16 @@ def law(
     Raises ValueError if an array has a wrong shape.
     """
     tool: Tool | None = None
-    given: tuple[Any, ...] = dynamics
+    dynamics_arrays: tuple[Any, ...] = dynamics
     if isinstance(dynamics, Tool):
         tool = dynamics
         (qpos, qvel), *_ = prepared(tool.tree, qpos=inputs.qpos, qvel=inputs.qvel)
-        inputs, given = inputs._replace(qpos=qpos, qvel=qvel), (read_point(qpos, tool.point),)
+        inputs, dynamics_arrays = (
+            inputs._replace(qpos=qpos, qvel=qvel),
+            (read_point(qpos, tool.point),),
+        )
     arrays = (*inputs, None, None, *state, *k[:-1])
-    if (native := native_rows.for_rows(inputs.qpos, *given, *arrays)) is None:
+    if (native := native_rows.for_rows(inputs.qpos, *dynamics_arrays, *arrays)) is None:
         return None
     rows, dof = inputs.qpos.shape
     wanted = wanted if state.integral is None else (*wanted, "integral")
@@ -65,11 +68,11 @@ def law(
     ]
     fixed: tuple[Any, ...] = (k.frame is not None, *_WITHOUT_TREE)
     if tool is not None:
-        fixed, chain = _of_tree(native, tool.tree, tool.link, given[0], k)
-        given = (*[None] * 5, chain)
-    native_rows.call(native.law, rows, dof, *fixed, *given, *arrays, *results)
+        fixed, chain = _of_tree(native, tool.tree, tool.link, dynamics_arrays[0], k)
+        dynamics_arrays = (*[None] * 5, chain)
+    native_rows.call(native.law, rows, dof, *fixed, *dynamics_arrays, *arrays, *results)
     effort, integral, _, *parts, s1, s2, near = results
-    shares = [None if each is None else each[:, 0] for each in (s1, s2)]
+    shares = [None if entry is None else entry[:, 0] for entry in (s1, s2)]
     terms = OSCTerms._make((*parts, effort, *shares, None if near is None else near[:, 0] > 0))
     return (state if integral is None else state._replace(integral=integral)), terms
 
@@ -82,12 +85,12 @@ def friction(arrays: Mapping[str, Any], coulomb: Array, band: Array) -> Float64 
     qpos = arrays["qpos"]
     if (native := native_rows.for_rows(qpos, *arrays.values(), coulomb, band)) is None:
         return None
-    found = np.empty(qpos.shape)
-    given = map({**arrays, "effort": found}.get, LAW)
+    rubbing_effort = np.empty(qpos.shape)
+    dynamics_arrays = map({**arrays, "effort": rubbing_effort}.get, LAW)
     native_rows.call(
-        native.friction, *qpos.shape, False, *_WITHOUT_TREE, *given, None, coulomb, band
+        native.friction, *qpos.shape, False, *_WITHOUT_TREE, *dynamics_arrays, None, coulomb, band
     )
-    return found
+    return rubbing_effort
 
 
 def _of_tree(
@@ -96,9 +99,9 @@ def _of_tree(
     """Return the arguments of ``law`` and ``bind`` between sizes and arrays, and the chain to the
     tool (dof,).
     """
-    own, index = native_rows.native_tree(native, tree), tree.index(link)
+    constants, index = native_rows.native_tree(native, tree), tree.index(link)
     body = tree.link_bodies[index]
-    fixed = k.frame is not None, own.tree, body, native_rows.tool(own, index, point)
+    fixed = k.frame is not None, constants.tree, body, native_rows.tool(constants, index, point)
     return fixed, np.array(tree.chains[body], np.float64)
 
 
@@ -142,26 +145,26 @@ class BoundOSC:
         self.effort, self.limited = np.zeros((2, *qpos.shape))
         fixed, chain = _of_tree(native, tool.tree, tool.link, tool.point, k)
         integral = self.state.get("integral")
-        known: Document = dict(zip(k._fields[:-1], k[:-1], strict=True)) | self._given
-        known |= {
+        arrays: Document = dict(zip(k._fields[:-1], k[:-1], strict=True)) | self._given
+        arrays |= {
             "qpos": qpos,
             "qvel": qvel,
             "bias": bias,
             "chain": chain,
             "posture": self._posture,
         }
-        known |= {
+        arrays |= {
             "integral": integral,
             "next_integral": integral,
             "effort": self.effort,
             "limited": self.limited,
         }
         if damping is not None:
-            known |= {"damping": damping, "added_inertia": timestep * damping}
+            arrays |= {"damping": damping, "added_inertia": timestep * damping}
         rubbing: list[Float64 | None] = [None, None, None]
         if friction is not None:  # damping is part of this friction, and not an input of the law
-            rubbing = [known.pop("damping", None), *friction]
-        self._kept, self.address = native.bind(rows, dof, *fixed, *map(known.get, LAW), *rubbing)
+            rubbing = [arrays.pop("damping", None), *friction]
+        self._kept, self.address = native.bind(rows, dof, *fixed, *map(arrays.get, LAW), *rubbing)
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Copy a state."""

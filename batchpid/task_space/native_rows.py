@@ -166,7 +166,7 @@ def native_tree(native: Any, tree: RigidTree) -> _NativeTree:
     return own
 
 
-def for_rows(like: Any, *arrays: Array) -> Array:
+def for_rows(like: Array, *arrays: Array) -> Array:
     """Return the extension if all arrays are NumPy's and ``like`` is (envs, columns), else None."""
     plain = _PLAIN.issuperset(map(type, arrays)) or all(
         x is None or isinstance(x, np.ndarray) for x in arrays

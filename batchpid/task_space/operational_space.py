@@ -124,8 +124,8 @@ def osc(
         The link of the tool is unknown, or an array has a wrong shape.
     """
     try:
-        if (found := native_law.law(k, state, dynamics, inputs, wanted)) is not None:
-            return found
+        if (results := native_law.law(k, state, dynamics, inputs, wanted)) is not None:
+            return results
         _check_shapes(k, inputs)
     except ValueError:
         _check_shapes(k, inputs)
@@ -134,6 +134,7 @@ def osc(
         dynamics = task_dynamics(dynamics.tree, *inputs[1:3], dynamics.link, point=dynamics.point)
     with quiet():
         task = in_frame(k, dynamics, inputs)
+        # Accelerations of task and posture first, then their efforts, then the limits.
         a = task_acceleration(k, task)
         a = a if state.integral is None else a + state.integral
         a_n, a_s = posture_acceleration(k, dynamics, state.posture, inputs.qpos, inputs.qvel)
@@ -262,6 +263,7 @@ def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
             axis=-1, keepdims=True
         )
 
+    # The task takes the room first, and the posture what is left of it.
     s1 = share(task, base)
     s2 = share(null, base + s1 * task)
     others = s1 * p.task_of_others + s2 * p.posture_of_others
@@ -312,8 +314,8 @@ def track(
     inputs = OSCInputs(setpoint, qpos, qvel, twist, acceleration)
     xp = namespace(*k, *dynamics, *inputs, effort)
     with quiet():
-        known = bias if feedforward is None else bias + feedforward
-        qacc = solve(mass, (effort - known)[..., None])[..., 0]
+        available = bias if feedforward is None else bias + feedforward
+        qacc = solve(mass, (effort - available)[..., None])[..., 0]
         stiff = k.posture_kp > 0
         rest = qacc - posture_acceleration(k, dynamics, qpos, qpos, qvel)[0]
         posture = qpos + xp.where(stiff, rest / xp.where(stiff, k.posture_kp, 1.0), 0.0)

@@ -95,7 +95,7 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
     same = {
         name: leaf for name, leaf in params._asdict().items() if name in OSCCoefficients._fields
     }
-    own = {
+    part = {
         "limit_margin": None if margin is None else xp.where(margin > 0, margin, 1.0),
         "limit_low": (
             None if margin is None else xp.where(margin > 0, params.lower + margin, -xp.inf)
@@ -105,7 +105,7 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
         ),
     }
     return OSCCoefficients(
-        **same | own,
+        **same | part,
         kp=kp,
         kd=kd,
         c=c,

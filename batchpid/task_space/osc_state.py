@@ -124,10 +124,10 @@ def task_dynamics(
     names: tuple[str, ...] = ("pose", "jacobian", "jacobian_rate", "mass_matrix")
     if bias is None:
         names = (*names, "bias")
-    found = evaluated(tree, names, qpos, qvel, link, point)
-    xp = namespace(found["pose"])
-    chain = xp.asarray(tree.chain(link), dtype=found["pose"].dtype)
-    return TaskDynamics(**{"bias": bias, "chain": chain, **found})
+    results = evaluated(tree, names, qpos, qvel, link, point)
+    xp = namespace(results["pose"])
+    chain = xp.asarray(tree.chain(link), dtype=results["pose"].dtype)
+    return TaskDynamics(**{"bias": bias, "chain": chain, **results})
 
 
 def in_tool_axes(dynamics: TaskDynamics) -> TaskDynamics:

@@ -7,8 +7,6 @@ one is not finite. So such a matrix is replaced by the identity, and its result 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from batchpid.arrays.array_types import Array
@@ -62,7 +60,7 @@ def _sound(matrix: Array) -> tuple[Array, Array]:
     return (matrix if sound.all() else np.where(sound, matrix, _identity(matrix))), sound
 
 
-def gram(factor: Array, other: Any) -> Array:
+def gram(factor: Array, other: Array) -> Array:
     """Return the products Y^T Z (..., m, k) of (..., n, m) and (..., n, k)."""
     total = factor[..., 0, :, None] * other[..., 0, None, :]
     for row in range(1, factor.shape[-2]):

@@ -100,13 +100,13 @@ def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: ArrayModule)
     of its base.
     """
     roots = [joint for joint, above in enumerate(tree.body_parents) if above < 0]
-    own = bodies.base_mass * bodies.base_center
+    part = bodies.base_mass * bodies.base_center
     mass = all_.mass[..., roots, :].sum(-2) + bodies.base_mass
-    moment = all_.moment[..., roots, :].sum(-2) + own
+    moment = all_.moment[..., roots, :].sum(-2) + part
     tensor = (
         all_.tensor[..., roots, :, :].sum(-3)
         + bodies.base_tensor
-        + _about_origin(own, bodies.base_center, xp)
+        + _about_origin(part, bodies.base_center, xp)
     )
     eye = xp.eye(3, dtype=moment.dtype)
     crossed = xp.stack(
@@ -117,12 +117,13 @@ def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: ArrayModule)
     return xp.concatenate([upper, xp.concatenate([crossed, tensor + zero], axis=-1)], axis=-2)
 
 
-def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayModule) -> Any:
+def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayModule) -> Array:
     """Return the mass matrices (..., dof, dof) at given motions of the joints."""
     all_ = _composite(tree, bodies, motions, xp)
     s = xp.concatenate([motions.linear, motions.angular], axis=-1)
     table = (s[..., :, None, :] * all_.momenta[..., None, :, :]).sum(-1)
     above = xp.swapaxes(bodies.moves, 0, 1) > 0
+    # Only entries of joints on one branch differ from 0: one of them moves the other.
     rest = xp.where(bodies.moves > 0, xp.swapaxes(table, -1, -2), xp.zeros_like(table))
     matrix = xp.where(above, table, rest)
     if not tree.fixed_base:
@@ -140,7 +141,7 @@ def effort_of(
     motions: Motions,
     rates: Velocities,
     xp: ArrayModule,
-    turning: Any = None,
+    turning: Array = None,
 ) -> Array:
     """Return the efforts (..., dof) of given velocities and accelerations of the bodies, without
     armature.
@@ -164,13 +165,13 @@ def effort_of(
             wrench[..., joint, :] for joint, above in enumerate(tree.body_parents) if above < 0
         )
         if turning is not None:
-            own = bodies.base_mass * cross(
+            part = bodies.base_mass * cross(
                 turning, cross(turning, bodies.base_center + xp.zeros_like(turning))
             )
             torque = cross(turning, rotate(bodies.base_tensor, turning)) + cross(
-                bodies.base_center + xp.zeros_like(own), own
+                bodies.base_center + xp.zeros_like(part), part
             )
-            on_base = on_base + xp.concatenate([own, torque], axis=-1)
+            on_base = on_base + xp.concatenate([part, torque], axis=-1)
         falls = solve(_of_base(tree, bodies, all_, xp), on_base[..., None])[..., 0]
         effort = effort - (all_.momenta * falls[..., None, :]).sum(-1)
     return tree.efforts(effort)

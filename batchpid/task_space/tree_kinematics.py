@@ -38,7 +38,7 @@ class Motions(NamedTuple):
     positions.
     """
 
-    frames: Any
+    frames: Array
     """(..., dof, 3, 4)."""
     linear: Array
     """Velocity per rate of the joint, of the body's point that is at the origin of the world (...,
@@ -106,8 +106,8 @@ def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModu
         )
         frames: list[Any] = []
         for joint, above in enumerate(tree.body_parents):
-            own = local[..., joint, :, :]
-            frames.append(own if above < 0 else turned(frames[above], own))
+            part = local[..., joint, :, :]
+            frames.append(part if above < 0 else turned(frames[above], part))
         return xp.stack(frames, axis=-3)
 
 
@@ -120,7 +120,7 @@ def motions_of(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModule) ->
 
 
 def velocities_of(
-    tree: RigidTree, motions: Motions, qvel: Array, xp: ArrayModule, turning: Any = None
+    tree: RigidTree, motions: Motions, qvel: Array, xp: ArrayModule, turning: Array = None
 ) -> Velocities:
     """Return the velocities of the bodies, and their accelerations at q'' = 0, on a base that turns
     at ``turning``.
@@ -137,7 +137,7 @@ def velocities_of(
     )
 
 
-def from_base(tree: RigidTree, steps: Any, xp: ArrayModule) -> Array:
+def from_base(tree: RigidTree, steps: Array, xp: ArrayModule) -> Array:
     """Return the sums of ``steps`` (..., dof, k) over the joints between the base and each body."""
     sums: list[Any] = []
     for joint, above in enumerate(tree.body_parents):
@@ -145,7 +145,7 @@ def from_base(tree: RigidTree, steps: Any, xp: ArrayModule) -> Array:
     return xp.stack(sums, axis=-2)
 
 
-def from_tips(tree: RigidTree, parts: Any, xp: ArrayModule) -> Array:
+def from_tips(tree: RigidTree, parts: Array, xp: ArrayModule) -> Array:
     """Return the sums of ``parts`` (..., dof, k) over the bodies that each joint moves."""
     sums = [parts[..., joint, :] for joint in range(tree.dof)]
     for joint, above in reversed(list(enumerate(tree.body_parents))):
@@ -154,15 +154,15 @@ def from_tips(tree: RigidTree, parts: Any, xp: ArrayModule) -> Array:
     return xp.stack(sums, axis=-2)
 
 
-def frame_of_link(tree: RigidTree, bodies: Bodies, frames: Any, index: int) -> Array:
+def frame_of_link(tree: RigidTree, bodies: Bodies, frames: Array, index: int) -> Array:
     """Return the frame (..., 3, 4) of a link, from the frames of the bodies."""
-    body, own = tree.link_bodies[index], bodies.link_frames[index]
+    body, part = tree.link_bodies[index], bodies.link_frames[index]
     if body >= 0:
-        return turned(frames[..., body, :, :], own)
-    return own + namespace(frames).zeros_like(frames[..., 0, :, :])
+        return turned(frames[..., body, :, :], part)
+    return part + namespace(frames).zeros_like(frames[..., 0, :, :])
 
 
-def tool_frame(tree: RigidTree, bodies: Bodies, frames: Any, index: int, point: Array) -> Array:
+def tool_frame(tree: RigidTree, bodies: Bodies, frames: Array, index: int, point: Array) -> Array:
     """Return the frame (..., 3, 4) of a link with its origin at ``point`` (..., 3) of the link."""
     frame = frame_of_link(tree, bodies, frames, index)
     if point is None:
@@ -172,7 +172,7 @@ def tool_frame(tree: RigidTree, bodies: Bodies, frames: Any, index: int, point: 
     return xp.concatenate([frame[..., :3], place[..., None]], axis=-1)
 
 
-def read_point(like: Any, point: Array) -> Array:
+def read_point(like: Array, point: Array) -> Array:
     """Return ``point`` as a checked array (3,) or (..., 3), where ``like`` is (..., n); None where
     it is None.
     """
@@ -191,7 +191,9 @@ def read_point(like: Any, point: Array) -> Array:
     return at
 
 
-def jacobian_at(tree: RigidTree, bodies: Bodies, motions: Motions, index: int, place: Any) -> Array:
+def jacobian_at(
+    tree: RigidTree, bodies: Bodies, motions: Motions, index: int, place: Array
+) -> Array:
     """Return the Jacobian (..., 6, dof) of a link's point at ``place`` (..., 3) in the world, J G
     of coupled joints.
     """
@@ -202,7 +204,7 @@ def jacobian_at(tree: RigidTree, bodies: Bodies, motions: Motions, index: int, p
     return tree.efforts(xp.moveaxis(xp.where(moved, columns, xp.zeros_like(columns)), -1, -2))
 
 
-def rate_at(tree: RigidTree, velocities: Velocities, index: int, place: Any) -> Array:
+def rate_at(tree: RigidTree, velocities: Velocities, index: int, place: Array) -> Array:
     """Return J' q' (..., 6) of a link's point at ``place`` (..., 3) in the world."""
     xp, body = namespace(place), tree.link_bodies[index]
     if body < 0:

@@ -47,8 +47,8 @@ def evaluated(
     """Return quantities by name: "pose", "jacobian" and "jacobian_rate" of a ``point`` of ``link``,
     "mass_matrix" and "bias"; "jacobian_rate" and "bias" need ``qvel``.
     """
-    given = {"qpos": qpos} if qvel is None else {"qpos": qpos, "qvel": qvel}
-    (q, *rates), own, xp = prepared(tree, **given)
+    inputs = {"qpos": qpos} if qvel is None else {"qpos": qpos, "qvel": qvel}
+    (q, *rates), nominal, xp = prepared(tree, **inputs)
     v = rates[0] if rates else None
     index = 0 if link is None else tree.index(link)
     point = read_point(q, point)
@@ -56,17 +56,18 @@ def evaluated(
         native = native_rows.kinematics(tree, names, q, v, index, point)
         if native is not None:
             return native
-    varied = bodies or own
+    # The definition, for JAX, for varied bodies, and where no extension was built.
+    varied = bodies or nominal
     quantities: dict[str, Array] = {}
     with quiet():
-        motions = motions_of(tree, own, q, xp)
+        motions = motions_of(tree, nominal, q, xp)
         velocities = None if v is None else velocities_of(tree, motions, v, xp, turning)
         if link is not None:
-            tool = tool_frame(tree, own, motions.frames, index, point)
+            tool = tool_frame(tree, nominal, motions.frames, index, point)
             place = tool[..., 3]
             quantities["pose"] = pose_of(tool)
             if "jacobian" in names:
-                quantities["jacobian"] = jacobian_at(tree, own, motions, index, place)
+                quantities["jacobian"] = jacobian_at(tree, nominal, motions, index, place)
             if "jacobian_rate" in names and velocities is not None:
                 quantities["jacobian_rate"] = rate_at(tree, velocities, index, place)
         if "mass_matrix" in names:
@@ -106,8 +107,8 @@ def jacobian(
         Axes of the twist: "world" or "tool", the axes of the link.
     """
     choice("frame", frame, FRAMES)
-    found = evaluated(tree, ("pose", "jacobian"), qpos, None, link, point)
-    return _in_frame(frame, found["pose"], found["jacobian"])
+    results = evaluated(tree, ("pose", "jacobian"), qpos, None, link, point)
+    return _in_frame(frame, results["pose"], results["jacobian"])
 
 
 def jacobian_rate(
@@ -126,8 +127,8 @@ def jacobian_rate(
     of the link. Other arguments as in :func:`jacobian`.
     """
     choice("frame", frame, FRAMES)
-    found = evaluated(tree, ("pose", "jacobian_rate"), qpos, qvel, link, point)
-    return _in_frame(frame, found["pose"], found["jacobian_rate"][..., None])[..., 0]
+    results = evaluated(tree, ("pose", "jacobian_rate"), qpos, qvel, link, point)
+    return _in_frame(frame, results["pose"], results["jacobian_rate"][..., None])[..., 0]
 
 
 def mass_matrix(tree: RigidTree, qpos: Array, bodies: Bodies | None = None) -> Array:
@@ -170,9 +171,9 @@ def inverse_dynamics(tree: RigidTree, qpos: Array, qvel: Array, qacc: Array) -> 
     h.
     """
     *_, a = prepared(tree, qpos=qpos, qvel=qvel, qacc=qacc)[0]
-    found = evaluated(tree, ("mass_matrix", "bias"), qpos, qvel)
+    results = evaluated(tree, ("mass_matrix", "bias"), qpos, qvel)
     with quiet():
-        return product(found["mass_matrix"], tree.coupling.of_independent(a)) + found["bias"]
+        return product(results["mass_matrix"], tree.coupling.of_independent(a)) + results["bias"]
 
 
 def forward_dynamics(tree: RigidTree, qpos: Array, qvel: Array, effort: Array) -> Array:
@@ -186,10 +187,10 @@ def forward_dynamics(tree: RigidTree, qpos: Array, qvel: Array, effort: Array) -
     """
     *_, u = prepared(tree, qpos=qpos, qvel=qvel, effort=effort)[0]
     check_masses(tree)
-    found = evaluated(tree, ("mass_matrix", "bias"), qpos, qvel)
+    results = evaluated(tree, ("mass_matrix", "bias"), qpos, qvel)
     with quiet():
-        net = tree.efforts(u) - found["bias"]
-        return tree.rates(solve(found["mass_matrix"], net[..., None])[..., 0])
+        net = tree.efforts(u) - results["bias"]
+        return tree.rates(solve(results["mass_matrix"], net[..., None])[..., 0])
 
 
 def _in_frame(frame: str, pose: Array, columns: Array) -> Array:

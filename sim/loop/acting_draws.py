@@ -87,6 +87,7 @@ def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variati
         rows = np.tile(nominal, (size, 1))
         if draws is not None:
             rows = randomization.apply(name, nominal, draws, robot)
+        # Masses vary by a factor, the others by their value.
         if name == "link_mass":
             rows = rows / nominal
         values[name] = rows[:, 0] if name in ("payload", "ground_friction") else rows

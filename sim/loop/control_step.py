@@ -150,6 +150,7 @@ def _passive_force(layout: Layout, constants: Constants, values: Values) -> Valu
 def _inertia(layout: Layout, constants: Constants, values: Values) -> Values:
     """The inertia of the friction model, for the envs where it is ``REFRESH_STEPS`` old."""
     state, qpos = values.state, values.measured.qpos
+    # The age counts from the env's own reset, so that an env does not depend on others.
     xp, due = namespace(state.age), state.age == REFRESH_STEPS
 
     def fresh() -> FrictionState:
@@ -243,6 +244,7 @@ def _pid(
     state, law = values.state, layout.law
     coupling = constants.coupling
     assert law is not None
+    # The engine integrates this damping implicitly: see PIDLaw.advance.
     viscous = None
     if constants.damping is not None:
         viscous = coupling.efforts(constants.damping * qvel)
@@ -290,6 +292,7 @@ def _custom(
     layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]
 ) -> Values:
     """qf = sat(effort of the caller's own controller)."""
+    # A follower's effort acts on its leader.
     effort = constants.coupling.efforts(values.outputs.returned)
     values = _saturated(constants, effort, values, limits)
     if values.limited is None:

@@ -77,9 +77,9 @@ class OwnController:
         copies = (
             read_only(np.array(rows)) for rows in inputs
         )  # the controller may keep them, but not write to them
-        new, wanted, *limited = self._called(unflatten(self._structure, state), *copies)
+        new, returned, *limited = self._called(unflatten(self._structure, state), *copies)
         leaves = _like(state, flatten(new, read=np.array))
-        effort = np.array(wanted, np.float64)
+        effort = np.array(returned, np.float64)
         _check_effort(effort, inputs[1])
         return leaves, effort, *limited
 
@@ -99,9 +99,9 @@ class OwnController:
 
         qpos = inputs[1]
         try:
-            state, wanted, *limited = self._called(unflatten(self._structure, leaves), *inputs)
+            state, returned, *limited = self._called(unflatten(self._structure, leaves), *inputs)
             new = _like(leaves, flatten(state, read=jax.numpy.asarray))
-            effort = jax.numpy.asarray(wanted, qpos.dtype)
+            effort = jax.numpy.asarray(returned, qpos.dtype)
         except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
             raise InvalidArgumentError(
                 "control",
@@ -144,12 +144,10 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
 
 def _check_effort(effort: Array, qpos: Array) -> None:
     if effort.shape != qpos.shape:
-        rows = effort.shape[:1] == qpos.shape[:1]  # the number of rows depends on the groups
-        got, wanted = (
-            f"(envs{''.join(f', {n}' for n in a.shape[1:])})" if rows else a.shape
-            for a in (effort, qpos)
-        )
-        problem = f"returned an effort of shape {got}, not {wanted}"
+        # The number of rows depends on the groups.
+        has_rows = effort.shape[:1] == qpos.shape[:1]
+        shape = ("envs", *effort.shape[1:]) if has_rows else effort.shape
+        problem = f"returned an effort of shape {shape}, not (envs, {qpos.shape[1]})"
         raise InvalidArgumentError(
             "control", problem, remedy="return (state, effort), effort of shape (envs, dof)"
         )
@@ -160,24 +158,18 @@ def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
 
     Raises InvalidArgumentError if names or shapes differ, or a dtype cannot be cast.
     """
-    new = {}
     for name in dict.fromkeys([*before, *leaves]):
-        old, leaf = before.get(name), leaves.get(name)
-        if old is None or leaf is None:
-            problem = (
-                f"returned a state {'without' if leaf is None else 'with an unknown'} {name!r}"
-            )
-        elif leaf.shape != old.shape:
-            problem = f"returned a state {name!r} of shape {leaf.shape}, not {old.shape}"
-        elif leaf.dtype == old.dtype:
-            new[name] = leaf
+        old: Any = before.get(name)
+        new: Any = leaves.get(name)
+        is_fit = old is not None and new is not None and new.shape == old.shape
+        if is_fit and np.can_cast(new.dtype, old.dtype, "same_kind"):
             continue
-        elif np.can_cast(leaf.dtype, old.dtype, "same_kind"):
-            new[name] = leaf.astype(old.dtype)
-            continue
-        else:
-            problem = (
-                f"returned a state {name!r} of {leaf.dtype}, which does not fit into {old.dtype}"
-            )
-        raise InvalidArgumentError("control", problem, remedy="return a state as init does")
-    return new
+        kinds = [
+            "no array" if leaf is None else f"{leaf.dtype} {leaf.shape}" for leaf in (new, old)
+        ]
+        raise InvalidArgumentError(
+            "control",
+            "returned a state {!r} of {}, not {}".format(name, *kinds),
+            remedy="return a state as init does",
+        )
+    return {name: leaf.astype(before[name].dtype, copy=False) for name, leaf in leaves.items()}

@@ -79,6 +79,7 @@ class EnvGroup:
         if options.misses_contacts:
             self._contacts = MissedContacts(pack.spec, pack.size, options.robot.has_ground)
         self._episode = np.zeros(pack.size, np.int64)
+        # Results of the last sim step, which outlive executors: native code writes them in each tick.
         shape = (pack.size, pack.dof)
         last = np.zeros(shape, np.float32), np.zeros(shape, bool), np.zeros(shape, bool)
         self._last = Table(ticks.arrays, *last, self._faults.rows)
@@ -100,6 +101,7 @@ class EnvGroup:
 
     def _prepare(self, setup: Setup, state: StepState) -> None:
         """Make the executor, which goes on from a state, and set the engine's drives."""
+        # An executor keeps the shapes of the state that it starts from.
         state = with_matrix(setup, state)
         # Native wherever the engine has native steps, under backend "numpy" too: the bits are the
         # same.
@@ -148,6 +150,7 @@ class EnvGroup:
         old, motors = state.motors, None
         self.pack.write_joints(self.acting.set_actuators(actuators), rows)
         if self.acting.motors is not None:
+            # New motors begin the streams of their noise again.
             if old is None:
                 self._episode[:] = 0
             qpos = self.pack.read_qpos()
@@ -179,6 +182,7 @@ class EnvGroup:
             cause: mask[:, None] & ~np.isfinite(rows)
             for cause, rows in (("qpos", qpos), ("qvel", qvel))
         }
+        # An env with a start that is not finite keeps its last one, and fails there.
         good = mask & ~(bad["qpos"] | bad["qvel"]).any(1)
         faults.start_qpos[good], faults.start_qvel[good] = qpos[good], qvel[good]
         if base is not None:
@@ -195,6 +199,7 @@ class EnvGroup:
         rows = np.flatnonzero(mask).tolist()
         if randomization is None or acting.draws is None or not rows:
             return
+        # The robots first: friction and inertia of the motors add to theirs.
         if randomization.changes_robot:
             self.pack.vary(rows, variation(self._options, len(rows), acting.draws.for_envs(rows)))
         state = self._with_actuators(self._executor.read_state(), acting.actuators, rows)
@@ -215,6 +220,7 @@ class EnvGroup:
     def _start(self) -> list[NativeExecutor]:
         """Start the next tick; return the executor if native code runs it, and more, as a whole."""
         self._step = 0
+        # A suspended env needs neutral commands, which only Python gives.
         is_quiet = self._faults.begin_tick()
         executor = self._executor
         self._runs_whole = False
@@ -268,6 +274,7 @@ class EnvGroup:
             if done == substeps:
                 break
             done = executor.run(command, self._moves, done, substeps)
+        # The executors look at positions alone, since each look at a sim step costs time.
         strays = not self.pack.spec.is_alone and self.pack.strays().any()
         if strays or not (is_near(executor.qpos()) and are_finite(self.pack.read_qvel())):
             self._contain(before + done, executor.qpos(), None)
@@ -363,11 +370,13 @@ class EnvGroup:
         """
         acting, last = self.acting, self._last
         self.pack = pack
+        # Params and actuators come before the state: they say which arrays it has.
         acting.draws = draws
         acting.set_params(params)
         state = self._executor.read_state()
         if actuators is not None or acting.actuators is not None:
             self._with_actuators(state, actuators)
+        # Placing robots clears efforts and suspension, so these follow.
         pack.write_state_rows(states.engine)
         self._faults.write(states.containment)
         pack.suspend(self._faults.suspended)
@@ -437,6 +446,7 @@ class EnvGroup:
         setup, state = executor.setup, executor.read_state()
         constants, model = setup.constants, setup.layout.model
         rows = np.flatnonzero(mask)
+        # 1: the robots
         base = None if pack.spec.fixed_base else self._faults.start_base[rows]
         pack.write_state(rows.tolist(), qpos[rows], qvel[rows], base)
         pack.suspend(self._faults.suspended)
@@ -447,6 +457,7 @@ class EnvGroup:
         if self._contacts is not None:
             self._contacts.place(mask)
         executor.measure()
+        # 2: guard and motors, from the robots' state as the engine has it
         qpos, qvel = pack.read_qpos(), pack.read_qvel()
         state = reset_guard(setup, state, qpos, mask)
         if acting.motors is not None and state.motors is not None:
@@ -459,7 +470,7 @@ class EnvGroup:
             fresh = init_motors(acting.motors, pack, qpos, self._episode, **start)
             motors = bp.motors.reset(state.motors, fresh, mask)
             state = state._replace(motors=motors)
-            # The law starts at the joints' state as the sensors show it.
+            # 3: the law, from the joints' state as the sensors show it
             noise = model.noise(constants.motors, motors, qpos)
             _, qpos, _ = advance_measurement(constants.motors, motors, qpos, qvel, noise)
         if self._controller is None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.arrays import Arrays, FaultArrays
+from batchpid.sim.loop.arrays import Arrays, FaultArrays, StateRows
 from batchpid.sim.options.groups import FaultAction
 
 CAUSES = (
@@ -128,7 +128,7 @@ class FaultLog:
         return log
 
 
-class FaultContainment:
+class FaultContainment(StateRows):
     """Last fault of each of M envs, and the state in which a failed env goes on.
 
     Attributes
@@ -145,11 +145,6 @@ class FaultContainment:
     step, joint, cause, missed_contact
         :class:`batchpid.sim.loop.arrays.FaultArrays` of the envs (M,).
     """
-
-    _STATE = (
-        *("suspended", "failed", "start_qpos", "start_qvel", "start_base", "suspended_qpos"),
-        *FaultArrays._fields,
-    )
 
     def __init__(self, size: int, dof: int, action: FaultAction) -> None:
         self.suspends = action == "hold"
@@ -181,6 +176,7 @@ class FaultContainment:
         failed = bad.any(1)
         if not failed.any():
             return
+        # The first fault of an env in a tick is the one that counts.
         new = failed & ~self.failed
         self.step[new] = step
         self.joint[new] = bad.argmax(1)[new]
@@ -238,14 +234,11 @@ class FaultContainment:
         if observation.base_twist is not None:
             observation.base_twist[envs] = 0
 
-    def read(self) -> dict[str, Rows]:
-        """Return the state by name, one row per env, for :meth:`write`."""
-        return {name: getattr(self, name).copy() for name in self._STATE}
-
-    def write(self, state: dict[str, Rows]) -> None:
-        """Set the state that :meth:`read` returned."""
-        for name in self._STATE:
-            getattr(self, name)[...] = state[name]
+    @property
+    def state(self) -> dict[str, Rows]:
+        """Arrays of the state (M, ...), by name."""
+        names = "suspended", "failed", "start_qpos", "start_qvel", "start_base", "suspended_qpos"
+        return {name: getattr(self, name) for name in names} | self.rows._asdict()
 
 
 def is_near(qpos: NDArray[np.float64]) -> bool:

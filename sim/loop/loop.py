@@ -69,6 +69,7 @@ class Loop:
         controller = None if isinstance(options.control, str) else OwnController(options)
         count, size = envs.stop - envs.start, group_size(options)
         self.groups = list[EnvGroup]()
+        # Each group has its own scenes; nothing else in the loop depends on the grouping.
         for first in range(0, count, size):
             rows = slice(first, min(first + size, count))
             ticks = Ticks(arrays.at((slice(None), rows)))
@@ -129,6 +130,7 @@ class Loop:
         began = time.perf_counter()
         if given != self._given:
             self._given = given
+            # The caller writes only what is given, so zeros stay until that changes.
             for table, is_given in zip(self.arrays.command, given, strict=True):
                 if not is_given:
                     table[...] = 0
@@ -142,7 +144,7 @@ class Loop:
             for group in groups:
                 try:
                     group.finish(ticks, substeps)
-                except Exception as error:
+                except Exception as error:  # of a controller, or of the engine
                     failures.append(self._failure(error, group, substeps))
         if failures:
             raise RunError(min(failures, key=order))

@@ -90,6 +90,7 @@ class NativeExecutor:
 
     def run(self, command: Command, moves: bool, begin: int, end: int) -> int:
         """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
+        # The tables of ticks are not used here, since the command may differ from theirs.
         program = self.start(moves, begin)
         if program.control is not None:
             program.control.load(command.setpoint)
@@ -112,6 +113,7 @@ class NativeExecutor:
                 noise,
                 self._engine.native_force,
             )
+            # A native controller has arrays of its own for its state.
             if program.control is not None:
                 self._change_state(law=program.control.state)
         self._program = program = self._programs[moves]
@@ -133,6 +135,7 @@ class NativeExecutor:
         """Return the program for the extension, with robots and noise prepared."""
         assert self._program is not None
         tick = self._program.tick
+        # The address changes when the engine's robots are built again.
         tick.group = self._engine.compiled().prepare()
         noise = leaves(self._noise())
         tick.drawn = min(map(len, noise), default=-1)

@@ -99,6 +99,7 @@ class TickProgram:
         )
         left = np.zeros(()) if layout.moves else None
         self._place(**buffers.measured._asdict(), before=buffers.before, left=left)
+        # SAPIEN knows neither measured states nor the model of varied robots.
         if layout.gravity and (layout.measures or not reads_force):
             field = "measured_force" if layout.measures else "read_force"
             setattr(self.tick, field, pack.force_model().address)
@@ -219,6 +220,7 @@ class TickProgram:
         layout = self._setup.layout._replace(model=Model())
         histories = tuple(array.ndim == 3 for array in state)
         traced = _trace(stages, layout, histories, structure(constants), structure(values))
+        # Arrays for the results: the state's own, and new ones for the others.
         outputs = [np.zeros(shape, bool if is_mask else float) for is_mask in traced.program.masks]
         for array, place in zip(state, traced.places, strict=False):  # the state comes first
             if place.is_result:
@@ -228,6 +230,7 @@ class TickProgram:
         if outputs:
             program = ArrayProgram(traced.program, leaves(constants), len(inputs), shape)
             pairs = tuple([(array, _row_size(array)) for array in inputs])
+            # Native code sets the addresses of the noise, which is another in each sim step.
             drawn = [id(block) for block in leaves(values.noise)]
             noise = [at for at, array in enumerate(inputs) if id(array) in drawn]
             self._add_stage("program", program=len(self._programs), noise=(*noise, -1, -1)[:2])

@@ -94,7 +94,7 @@ class NumPyExecutor:
         }
         for index in range(begin, end):
             step = Step(index, end, layout.left(index, end, constants.timestep))
-            self.before = self.measured.qpos
+            self.before = self.measured.qpos  # where a robot that fails now is suspended
             values = Values(self._state, command, self.measured, step, self.measured)
             with controller_errors(controller, index + 1):
                 values = sim_step(layout, constants, values, engine)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Bool, Float64
+from batchpid.arrays.array_types import Bool, Float64, Rows
+from batchpid.sim.loop.arrays import StateRows
 from batchpid.sim.options.options import RunnerOptions
 
 Int64 = NDArray[np.int64]
@@ -13,7 +14,7 @@ COUNTS = ("steps", "due", "number")
 """Sim steps since the reset, those at which the next push is due, and pushes so far."""
 
 
-class Pushes:
+class Pushes(StateRows):
     """Pushes of ``size`` envs, if the randomization of ``options`` has some.
 
     A push comes at the beginning of the first tick after its time, at most one in a tick.
@@ -39,13 +40,10 @@ class Pushes:
         self._take(rows, episodes)
         return rows.tolist(), twists
 
-    def read(self) -> dict[str, Int64]:
-        """Return the counts, for :meth:`write`."""
-        return {name: rows.copy() for name, rows in self.counts.items()}
-
-    def write(self, counts: dict[str, Int64]) -> None:
-        """Set the counts that :meth:`read` returned."""
-        self.counts = {name: rows.copy() for name, rows in counts.items()}
+    @property
+    def state(self) -> dict[str, Rows]:
+        """Arrays of the state (M, ...), by name."""
+        return dict(self.counts)
 
     def _take(self, rows: NDArray[np.intp], episodes: Int64) -> None:
         """Set the time of the next push of envs ``rows``."""

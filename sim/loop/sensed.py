@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from batchpid.arrays.array_types import Bool, Rows
 from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.loop.arrays import StateRows
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.signals.observation import untouched
 
 
-class LinkSensors:
+class LinkSensors(StateRows):
     """Quantities of ``size`` envs from the sensors of links, if ``options`` observe some."""
 
     def __init__(self, options: RunnerOptions, size: int) -> None:
@@ -33,11 +34,7 @@ class LinkSensors:
         for values in self.values.values():
             values[mask] = 0
 
-    def read(self) -> dict[str, Rows]:
-        """Return the values, for :meth:`write`."""
-        return {name: values.copy() for name, values in self.values.items()}
-
-    def write(self, values: dict[str, Rows]) -> None:
-        """Set the values that :meth:`read` returned."""
-        for name, rows in values.items():
-            self.values[name][...] = rows
+    @property
+    def state(self) -> dict[str, Rows]:
+        """Arrays of the state (M, ...), by name."""
+        return self.values

@@ -111,6 +111,7 @@ def _constants(options: RunnerOptions, pack: EnginePack, params: bp.PIDParams) -
             motors = known_joints(robot)
             armature = motors.armature
             damping = damping + motors.viscous
+        # Other laws leave the damping to the engine, and to the integral.
         has_damping = PIDLaw.of(params).uses_mass_matrix and damping.any()
         return constants._replace(
             k=spread(bp.discretise(gains, timestep), pack.size),
@@ -118,6 +119,7 @@ def _constants(options: RunnerOptions, pack: EnginePack, params: bp.PIDParams) -
             damping=damping if has_damping else None,
         )
     if options.control == "drive":
+        # With an integral the targets move; the drive itself has P and D only.
         driven = None
         if params.ki is not None and np.any(params.ki > 0):
             driven = bp.discretise(gains._replace(measurement_rate=None), timestep)

@@ -133,6 +133,7 @@ class XLAExecutor:
         layout = setup.layout._replace(model=Model(), moves=moves)
         traced = None if controller is None else controller.traced
         with own_settings("float64"):
+            # An address has two parts: without 64-bit integers JAX would cut it.
             steps = np.array([begin, end, 0, 0], np.int32)
             steps[2:].view(np.uint64)[0] = step.prepare()
             rows = put(mapped(padded, command))
@@ -200,6 +201,7 @@ def tick(
         progress = xp.stack([index + 1, status])
         return Carry(progress, values.state, values.measured, values.outputs, carry.measured.qpos)
 
+    # The loop may end before its first sim step, so its results have values before.
     qpos = measured.qpos
     zero, none = xp.zeros_like(qpos), xp.zeros(qpos.shape, bool)
     outputs = Outputs(zero, zero, none, returned=None if controller is None else zero)

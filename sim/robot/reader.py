@@ -36,9 +36,11 @@ def read_robot(
             f"{path}: an MJCF file is read several times, also by workers; save it as a file first"
         )
     try:
-        from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
+        import mujoco  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError("mujoco>=3.17", "reading an MJCF file") from error
+    from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
+
     name = root.get("model") or path.stem
     try:
         source = read_mjcf(path, name, fixed_base, missing_meshes)
