@@ -22,7 +22,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.display import array_summary
 from batchpid.checks.validate import at_least, broadcast, entries, positive, read_array, time_step
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space.rotations import multiply
+from batchpid.task_space.frames import compose
 
 _PEAK_VELOCITY = 15 / 8  # of the minimum-jerk s, times T
 _PEAK_ACCELERATION = 10 / math.sqrt(3)  # times T^2
@@ -176,7 +176,7 @@ def straight_line(start: ArrayLike, target: ArrayLike, dt: float, *, duration: f
     """
     first, last = (broadcast(name, x, (7,)) for name, x in (("start", start), ("target", target)))
     q0, q1 = (pose[3:] / np.linalg.norm(pose[3:]) for pose in (first, last))
-    turn = multiply(q1, q0 * np.array([1, -1, -1, -1]))
+    turn = compose(q1, q0 * np.array([1, -1, -1, -1]))
     turn = turn if turn[0] >= 0 else -turn
     sine = np.linalg.norm(turn[1:])
     angle = 2 * np.arctan2(sine, turn[0])
@@ -184,7 +184,7 @@ def straight_line(start: ArrayLike, target: ArrayLike, dt: float, *, duration: f
     way = np.concatenate([last[:3] - first[:3], angle * axis])
     s = minimum_jerk([0.0], [1.0], dt, duration=duration)
     half = s.position * angle / 2
-    q = multiply(np.concatenate([np.cos(half), np.sin(half) * axis], 1), q0)
+    q = compose(np.concatenate([np.cos(half), np.sin(half) * axis], 1), q0)
     position = np.concatenate([first[:3] + s.position * way[:3], q], 1)
     return Trajectory(s.time, position, s.velocity * way, s.acceleration * way)
 

@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from batchpid.sim import Robot
 from batchpid.sim.gym import RobotVectorEnv
-from batchpid.task_space.rotations import inverse, rotate
+from batchpid.task_space.frames import inverse, matrix_of, rotate
 
 # Gait of the bundled quadruped [rad]: lift of the first and of the second pair of legs in the
 # middle of their swing, and stride at 1 m/s at the start of a period. Feet rise by 6 cm.
@@ -80,7 +80,7 @@ class WalkVectorEnv(RobotVectorEnv):
         pose, twist = observed.base_pose.astype(float), observed.base_twist.astype(float)
         turn = inverse(pose[:, 3:])  # from the world's axes to the trunk's
         trunk = [
-            rotate(turn, vector)
+            rotate(matrix_of(turn), vector)
             for vector in (twist[:, :3], twist[:, 3:], np.array([0.0, 0.0, 1.0]))
         ]
         angle = 2 * np.pi * self._clock[:, None]

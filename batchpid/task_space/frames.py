@@ -1,13 +1,17 @@
 """Frames and rotations, batched over any leading axes, for NumPy and JAX arrays.
 
 A frame is a matrix (..., 3, 4): the axes of the frame as columns, and its position. A pose (..., 7)
-is a position and a unit quaternion (w, x, y, z). Products are written as sums of elementwise
+is a position and a unit quaternion (w, x, y, z), the order that SAPIEN and viser use. Functions of
+quaternions that follow :func:`pose_error` are for NumPy alone. Products are written as sums of elementwise
 products: their rounding does not depend on the number of rows, as a library's does.
 """
 
 from __future__ import annotations
 
-from batchpid.arrays.array_types import Array
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.arrays.array_types import Array, Rows
 from batchpid.arrays.elementwise import namespace
 
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
@@ -138,3 +142,54 @@ def pose_error(goal: Array, pose: Array) -> Array:
     """
     turn = rotation_error(goal[..., 3:], pose[..., 3:])
     return namespace(goal, pose).concatenate([goal[..., :3] - pose[..., :3], turn], axis=-1)
+
+
+def compose(a: Rows, b: Rows) -> Rows:
+    """Return the rotation b followed by a: Hamilton's product of (..., 4) and (..., 4)."""
+    aw, ax, ay, az = (a[..., k] for k in range(4))
+    bw, bx, by, bz = (b[..., k] for k in range(4))
+    w, x = aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by
+    y, z = aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw
+    return np.stack([w, x, y, z], axis=-1)
+
+
+def inverse(q: Rows) -> Rows:
+    """Return the inverse of unit quaternions (..., 4): the conjugate."""
+    return np.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
+
+
+def placed(base: Rows, poses: Rows) -> Rows:
+    """Return poses (..., 7) that are given in the frame of ``base`` (..., 7), in the frame of that
+    one.
+    """
+    position = base[..., :3] + rotate(matrix_of(base[..., 3:]), poses[..., :3])
+    return np.concatenate([position, compose(base[..., 3:], poses[..., 3:])], axis=-1)
+
+
+def about(axis: Rows, angle: Rows) -> Rows:
+    """Return the rotations (..., 4) by ``angle`` (...) [rad] about a unit ``axis`` (3,)."""
+    half = np.asarray(angle) / 2
+    return np.concatenate([np.cos(half)[..., None], np.sin(half)[..., None] * axis], axis=-1)
+
+
+def from_rpy(rpy: ArrayLike) -> NDArray[np.float64]:
+    """Return the rotation of a URDF's ``rpy`` [rad]: about the fixed x, then y, then z."""
+    roll, pitch, yaw = (
+        about(axis, angle) for axis, angle in zip(np.eye(3), np.asarray(rpy, float), strict=True)
+    )
+    return compose(yaw, compose(pitch, roll))
+
+
+def to_rpy(q: Rows) -> NDArray[np.float64]:
+    """Return the ``rpy`` [rad] of a rotation (4,), the inverse of :func:`from_rpy`, exact at pitch
+    +-pi/2 too.
+
+    With R = Rz(yaw) Ry(pitch) Rx(roll), yaw = atan2(R10, R00). Pitch and roll follow from Rz(-yaw)
+    R = Ry(pitch) Rx(roll), which has a solution for any yaw where cos(pitch) = 0.
+    """
+    (r00, r01, r02), (r10, r11, r12), (r20, _, _) = np.asarray(matrix_of(np.asarray(q, float)))
+    yaw = np.arctan2(r10, r00)
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array(
+        [np.arctan2(s * r02 - c * r12, c * r11 - s * r01), np.arctan2(-r20, c * r00 + s * r10), yaw]
+    )

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.task_space.rotations import rotate
+from batchpid.task_space.frames import matrix_of
 
 
 class SpatialInertia(NamedTuple):
@@ -30,15 +30,10 @@ class SpatialInertia(NamedTuple):
 
         The tensor about the center of mass turns with the axes: I' = R I R^T.
         """
-        matrix = rotation_matrix(wxyz)
+        matrix = matrix_of(wxyz)
         return SpatialInertia(
             self.mass, position + matrix @ self.center, matrix @ self.tensor @ matrix.T
         )
-
-
-def rotation_matrix(wxyz: Float64) -> Float64:
-    """Return the axes of a frame with this rotation, as columns (3, 3)."""
-    return rotate(np.broadcast_to(wxyz, (3, 4)), np.eye(3)).T
 
 
 def spatial_matrix(inertia: SpatialInertia) -> Float64:

@@ -15,7 +15,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
-from batchpid.sim.robot.merging import merge_fixed
+from batchpid.sim.robot.merging import merge_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
 from batchpid.sim.robot.simulated_links import BodyParts, varied_bodies
@@ -65,7 +65,7 @@ class SceneSpec:
     @property
     def simulated(self) -> Tables:
         """Tables of the simulated bodies."""
-        return merge_fixed(self.tables, self.separate)
+        return merge_links(self.tables, self.separate)
 
     @property
     def separate(self) -> tuple[str, ...]:

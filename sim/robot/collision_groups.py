@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from itertools import combinations
 
-from batchpid.sim.robot.merging import Separate, merge_fixed, rigid_bodies
+from batchpid.sim.robot.merging import Separate, merge_links, rigid_bodies
 from batchpid.sim.robot.tables import Tables
 
 Words = tuple[int, int, int, int]
@@ -73,7 +73,7 @@ def link_groups(
     them. PhysX ignores contacts within a simulated link, and with its parent, unless that is the
     root of a fixed base.
     """
-    simulated = merge_fixed(tables, separate)
+    simulated = merge_links(tables, separate)
     placements, root = simulated.links, simulated.bodies[0].name
     bodies = rigid_bodies(tables.joints)
     neighbours = {

@@ -140,9 +140,9 @@ def inertia_of(shapes: Sequence[Shape]) -> SpatialInertia:
     axes = np.zeros(9)
     mujoco.mju_quat2Mat(axes, model.body_iquat[1])
     turn = axes.reshape(3, 3)
-    return SpatialInertia(
-        float(model.body_mass[1]), model.body_ipos[1].copy(), turn * model.body_inertia[1] @ turn.T
-    )
+    tensor = turn * model.body_inertia[1] @ turn.T
+    center = model.body_ipos[1].copy()
+    return SpatialInertia(float(model.body_mass[1]), read_only(center), read_only(tensor))
 
 
 def add_geom(spec: Any, body: Any, shape: Shape, **options: Any) -> None:

@@ -19,7 +19,7 @@ from batchpid.arrays.read_only import read_only
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.merging import merge_fixed, place_links
+from batchpid.sim.robot.merging import merge_links, place_links
 from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import (
@@ -389,5 +389,5 @@ class RobotDescription:
 @lru_cache(maxsize=8)
 def _model(robot: RobotDescription, ground: bool) -> RobotModel:
     ignored = frozenset(map(frozenset, robot.ignored_pairs))
-    simulated = merge_fixed(robot.tables)
+    simulated = merge_links(robot.tables)
     return RobotModel(rigid_tree(simulated), robot.coupling, simulated, ignored, ground)

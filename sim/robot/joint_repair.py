@@ -10,7 +10,7 @@ from lxml import etree
 from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.parts import MOVING_TYPES
 from batchpid.sim.robot.xml import numbers, readable
-from batchpid.task_space.rotations import from_rpy
+from batchpid.task_space.frames import from_rpy
 
 FREE_TYPES = ("floating", "planar")
 """Types of a joint at the root that make a floating base."""

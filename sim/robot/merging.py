@@ -22,7 +22,7 @@ from batchpid.arrays.read_only import read_only
 from batchpid.sim.robot.collision_shapes import inertia_of
 from batchpid.sim.robot.parts import Joint, Placement
 from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Tables
-from batchpid.task_space.rotations import multiply, rotate
+from batchpid.task_space.frames import compose, matrix_of, rotate
 from batchpid.task_space.spatial_inertia import SpatialInertia, total
 
 Separate = tuple[str, ...]
@@ -32,7 +32,7 @@ NO_MASS = 1e-6
 
 
 @lru_cache(maxsize=16)
-def merge_fixed(tables: Tables, separate: Separate = ()) -> Tables:
+def merge_links(tables: Tables, separate: Separate = ()) -> Tables:
     """Return the tables that engines simulate: fixed joints merged, and every body with a mass.
 
     Links ``separate`` begin a body. Raises RobotError if a mass comes from the volume of a mesh
@@ -111,18 +111,13 @@ def _with_inertia(body: Body, parts: Sequence[SpatialInertia]) -> Body:
     """Return ``body`` with the sum of inertias in its frame; without any, with NO_MASS."""
     nothing = SpatialInertia(NO_MASS, np.zeros(3), NO_MASS * np.eye(3))
     mass, center, tensor = total(parts) if parts else nothing
-    return body._replace(
-        mass=float(mass),
-        center=read_only(center),
-        inertia=read_only(tensor),
-        inertia_wxyz=NO_TURN,
-    )
+    return body._replace(mass=float(mass), center=center, inertia=tensor, inertia_wxyz=NO_TURN)
 
 
 def _within(at: Placement, position: Float64, wxyz: Float64) -> tuple[Float64, Float64]:
     """Return a pose in the frame of a link as a pose in the frame of its body."""
-    place = at.position + rotate(at.wxyz, position)
-    return read_only(place), read_only(multiply(at.wxyz, wxyz))
+    place = at.position + rotate(matrix_of(at.wxyz), position)
+    return read_only(place), read_only(compose(at.wxyz, wxyz))
 
 
 def _merged_joints(joints: Sequence[Joint], separate: Separate) -> set[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lxml import etree
 
-from batchpid.errors import RobotError
+from batchpid.errors import MissingDependencyError, RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.urdf import Source, read_urdf
 from batchpid.sim.robot.xml import parse_xml
@@ -24,6 +24,8 @@ def read_robot(
     RobotError
         A file that cannot be read, a structure or number that SAPIEN cannot build, a bad mesh, or
         an MJCF file that MuJoCo does not compile.
+    MissingDependencyError
+        The file is MJCF, and the package ``mujoco`` is missing.
     """
     findings: list[Finding] = []
     root = parse_xml(path, findings)
@@ -33,6 +35,10 @@ def read_robot(
         raise RobotError(
             f"{path}: an MJCF file is read several times, also by workers; save it as a file first"
         )
+    try:
+        import mujoco  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError("mujoco>=3.17", "reading an MJCF file") from error
     from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
 
     name = root.get("model") or path.stem

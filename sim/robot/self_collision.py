@@ -20,7 +20,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.sim.robot.collision_groups import link_groups
 from batchpid.sim.robot.contacts import Contacts
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.merging import merge_fixed, rigid_bodies
+from batchpid.sim.robot.merging import merge_links, rigid_bodies
 from batchpid.sim.robot.parts import Joint
 from batchpid.sim.robot.simulated_links import rigid_tree
 from batchpid.sim.robot.xml import parse_xml
@@ -135,7 +135,7 @@ def self_contact(robot: Any) -> SelfContact:
     """
     solid = list(dict.fromkeys(shape.owner for shape in robot.tables.shapes))
     bodies = rigid_bodies(robot.all_joints)
-    simulated = merge_fixed(robot.tables)
+    simulated = merge_links(robot.tables)
     tree = rigid_tree(simulated, fixed_base=robot.fixed_base)
     contacts = Contacts(tree, simulated.shapes, frozenset(), ground=False)
     computed: tuple[DisabledPair, ...] = ()

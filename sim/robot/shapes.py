@@ -25,7 +25,7 @@ from batchpid.sim.robot.reader import is_mjcf
 from batchpid.sim.robot.tables import Shape
 from batchpid.sim.robot.urdf import read_origin, read_shape
 from batchpid.sim.robot.xml import numbers, parse_xml
-from batchpid.task_space.rotations import rotate
+from batchpid.task_space.frames import matrix_of, rotate
 
 Rgba = tuple[float, ...]
 _REMEDY = (
@@ -226,7 +226,7 @@ def _mesh(shape: Shape | None, robot: RobotDescription, deviation: float) -> Any
             count = ((segments + 1) // 2, segments)
             mesh = creation.capsule(length / max(radius, 1e-9), 1.0, count=count)
             mesh.vertices *= radius
-    mesh.vertices = rotate(shape.wxyz, np.asarray(mesh.vertices)) + shape.position
+    mesh.vertices = rotate(matrix_of(shape.wxyz), np.asarray(mesh.vertices)) + shape.position
     return mesh
 
 

@@ -16,12 +16,12 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.read_only import read_only
 from batchpid.sim.robot.collision_shapes import half_extents
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.merging import Separate, link_inertias, merge_fixed, place_links
+from batchpid.sim.robot.merging import Separate, link_inertias, merge_links, place_links
 from batchpid.sim.robot.parts import LinkMass
 from batchpid.sim.robot.tables import Shape, Tables
+from batchpid.task_space.frames import matrix_of, rotate
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.rotations import rotate
-from batchpid.task_space.spatial_inertia import SpatialInertia, rotation_matrix
+from batchpid.task_space.spatial_inertia import SpatialInertia
 
 
 class Part(NamedTuple):
@@ -56,14 +56,14 @@ def varied_bodies(
         if name in inertias:
             inertia = inertias[name].moved(at.position, at.wxyz)
             column = links.index(name) if name in links else None
-            parts[at.link].append(Part(inertia, rotation_matrix(at.wxyz), column))
+            parts[at.link].append(Part(inertia, matrix_of(at.wxyz), column))
     # The payload is at the center of mass of its carrier, or at the origin of one without mass.
     at = placements[carrier]
     place = at.position
     if carrier in inertias:
         place = inertias[carrier].moved(at.position, at.wxyz).center
     varied = {}
-    for body in merge_fixed(tables, separate).bodies:
+    for body in merge_links(tables, separate).bodies:
         members = parts[body.name] or [Part(body.spatial_inertia, np.eye(3), None)]
         if body.name == at.link or any(part.column is not None for part in members):
             varied[body.name] = BodyParts(members, place if body.name == at.link else None)
@@ -102,7 +102,7 @@ def _size(shapes: Sequence[Shape]) -> float:
     corners = []
     for shape in shapes:
         center, half = half_extents(shape)
-        corners.append(rotate(shape.wxyz, center + half * _CORNERS) + shape.position)
+        corners.append(rotate(matrix_of(shape.wxyz), center + half * _CORNERS) + shape.position)
     return float(np.linalg.norm(np.ptp(np.concatenate(corners), axis=0))) if corners else 0.0
 
 

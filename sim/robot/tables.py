@@ -4,7 +4,7 @@ A :class:`Tables` is made once, by the reader of a URDF (:mod:`batchpid.sim.robo
 MJCF file (:mod:`batchpid.sim.robot.mjcf.mjcf_reader`). Everything else reads it: engines, rigid
 trees, distances and exports.
 
-:func:`batchpid.sim.robot.merging.merge_fixed` makes the tables that engines simulate, with one body
+:func:`batchpid.sim.robot.merging.merge_links` makes the tables that engines simulate, with one body
 for all links that fixed joints hold together. :attr:`batchpid.sim.engine.scene_spec.SceneSpec.tables`
 has a row for each link of the file, ``SceneSpec.simulated`` the merged rows.
 
@@ -64,7 +64,7 @@ class Body(NamedTuple):
     def spatial_inertia(self) -> SpatialInertia:
         """Inertia of the body in its frame."""
         turn = matrix_of(self.inertia_wxyz)
-        return SpatialInertia(self.mass, self.center, turn @ self.inertia @ turn.T)
+        return SpatialInertia(self.mass, self.center, read_only(turn @ self.inertia @ turn.T))
 
 
 class Shape(NamedTuple):
@@ -108,6 +108,12 @@ class Tables:
     """
     links: Mapping[str, Placement]
     """Body and place in it of each link of the file, in the order of the file's rows."""
+
+    def __post_init__(self) -> None:
+        vars(self).update(
+            bodies=tuple(Body._make(map(read_only, body)) for body in self.bodies),
+            shapes=tuple(Shape._make(map(read_only, shape)) for shape in self.shapes),
+        )
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Tables) and self.digest == other.digest

@@ -12,7 +12,6 @@ import numpy as np
 from lxml import etree
 
 from batchpid.arrays.array_types import Document, Float64
-from batchpid.arrays.read_only import read_only
 from batchpid.errors import RobotError
 from batchpid.motors import Actuators
 from batchpid.sim.robot.findings import Finding, finding_of
@@ -24,7 +23,7 @@ from batchpid.sim.robot.repair import repair
 from batchpid.sim.robot.self_collision import DisabledPair
 from batchpid.sim.robot.tables import Body, Shape, Tables, breadth_first
 from batchpid.sim.robot.xml import number, numbers
-from batchpid.task_space.rotations import from_rpy
+from batchpid.task_space.frames import from_rpy
 
 MOST_READ = 4096  # links and joints of a file
 TURN = 2 * np.pi + 0.01
@@ -190,7 +189,7 @@ def _read_tables(root: etree._Element, path: Path, added: list[str]) -> Tables:
             body = body._replace(
                 mass=number(inertial.find("mass"), "value", "0", where),
                 center=center,
-                inertia=read_only(from_entries(entries)),
+                inertia=from_entries(entries),
                 inertia_wxyz=turn,
             )
         bodies.append(body)
@@ -242,8 +241,7 @@ def read_origin(element: etree._Element, where: str) -> tuple[Float64, Float64]:
     """Return position (3,) [m] and orientation (4,) of an element's ``<origin>``."""
     origin = element.find("origin")
     position = np.array(numbers(origin, "xyz", "0 0 0", where))
-    wxyz = from_rpy(numbers(origin, "rpy", "0 0 0", where))
-    return read_only(position), read_only(wxyz)
+    return position, from_rpy(numbers(origin, "rpy", "0 0 0", where))
 
 
 def _check_tree(links: list[str], joints: list[Joint], path: Path, added: list[str]) -> None:

@@ -24,7 +24,7 @@ from batchpid.sim.robot.reader import is_mjcf, read_robot
 from batchpid.sim.robot.repair import UNUSED
 from batchpid.sim.robot.tables import NO_TURN, Body, Shape
 from batchpid.sim.robot.xml import parse_xml
-from batchpid.task_space.rotations import to_rpy
+from batchpid.task_space.frames import to_rpy
 
 COPIED = {*UNUSED, "safety_controller"}
 """Elements that are copied from a URDF."""

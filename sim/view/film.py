@@ -26,7 +26,7 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.playback import Playback, rows_at
 from batchpid.sim.view.scene import FIELD_OF_VIEW, MAX_ROBOTS, TILE, RobotScene
-from batchpid.task_space.rotations import rotate
+from batchpid.task_space.frames import matrix_of, rotate
 
 LIGHT = np.array([0.5, 0.2, 0.85]) / np.linalg.norm([0.5, 0.2, 0.85])
 """Direction to the light."""
@@ -99,7 +99,7 @@ class Painter:
         """
         parts = []
         for surface, pose in zip(self._scene.surfaces, poses.swapaxes(0, 1), strict=True):
-            vertices = rotate(pose[:, None, 3:], surface.vertices) + pose[:, None, :3]
+            vertices = rotate(matrix_of(pose[:, None, 3:]), surface.vertices) + pose[:, None, :3]
             parts.append(vertices[:, surface.faces])
         return np.concatenate(parts, axis=1).reshape(-1, 3, 3)
 

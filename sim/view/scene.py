@@ -11,7 +11,7 @@ from batchpid.arrays.array_types import Float64, Rows
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.shapes import surfaces
-from batchpid.task_space.rotations import placed
+from batchpid.task_space.frames import placed
 
 MAX_ROBOTS = 64
 """Largest number of robots in a scene."""

@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space.rotations import rotate
+from batchpid.task_space.frames import matrix_of, rotate
 from batchpid.trajectories import (
     Trajectory,
     minimum_jerk,
@@ -155,7 +155,9 @@ def test_a_tool_moves_on_a_straight_line_and_turns_about_one_axis(sign):
     path = straight_line(start, target, DT, duration=0.8)
     assert np.hstack(path[1:]).shape == (200, 19)
     np.testing.assert_allclose(path.position[-1, :3], target[:3], atol=1e-12)
-    ends = rotate(np.stack([path.position[-1, 3:], target[3:]]), np.array([1.0, 2.0, 3.0]))
+    ends = rotate(
+        matrix_of(np.stack([path.position[-1, 3:], target[3:]])), np.array([1.0, 2.0, 3.0])
+    )
     np.testing.assert_allclose(*ends, atol=1e-12)
     angle = 2 * np.arccos(path.position[:, 3])  # about y, from 0 to 1.2 rad
     np.testing.assert_allclose(np.diff(angle) / DT, path.velocity[1:, 4], atol=0.05)

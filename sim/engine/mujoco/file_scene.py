@@ -23,7 +23,7 @@ from batchpid.sim.robot.mjcf.mjcf_compiler import Names, attempt
 from batchpid.sim.robot.mjcf.mjcf_reader import content_of, home
 from batchpid.sim.robot.mjcf.mjcf_tables import find_base
 from batchpid.sim.robot.parts import MjcfFile
-from batchpid.task_space.rotations import inverse, rotate
+from batchpid.task_space.frames import inverse, matrix_of, rotate
 
 REMOVED = ("tuples", "sensors", "actuators", "keys", "cameras", "lights")
 """Elements of a file that a scene does not have."""
@@ -59,7 +59,7 @@ class FileScene(NamedTuple):
     """``mujoco.MjSpec`` of a file.
 
     ``names`` has the body of each simulated link, ``frames`` the frame of the link in this body,
-    ``root`` the body of a floating base, or "". ``own`` (2, dof) is armature and damping that the
+    ``root`` the body of a floating base, or "". ``terms`` (2, dof) is armature and damping that the
     file's joints have in addition to the robot's description, in which leaders include their
     followers.
     """
@@ -68,7 +68,7 @@ class FileScene(NamedTuple):
     names: dict[str, str]
     frames: dict[str, BodyFrame]
     root: str
-    own: Float64
+    terms: Float64
 
 
 def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
@@ -193,7 +193,10 @@ def _frames(
         hinges = joints[-1:][model.jnt_type[joints[-1:]] == mujoco.mjtJoint.mjJNT_HINGE]
         anchor = model.jnt_pos[hinges[0]].copy() if len(hinges) else np.zeros(3)
         back = inverse(wxyz)
-        names[link], frames[link] = name, BodyFrame(anchor - rotate(back, position), back, ())
+        names[link], frames[link] = (
+            name,
+            BodyFrame(anchor - rotate(matrix_of(back), position), back, ()),
+        )
     return names, frames
 
 
@@ -201,10 +204,10 @@ def _of_followers(values: Float64, spec: SceneSpec) -> Float64:
     """Return the armature or damping (dof,) that moves from leaders to their followers: d_f and
     -m^2 d_f.
     """
-    coupling, own = coupling_of(spec.joints), np.zeros(len(values))
+    coupling, terms = coupling_of(spec.joints), np.zeros(len(values))
     follower = coupling.followers
-    own[follower] = values[follower]
+    terms[follower] = values[follower]
     np.subtract.at(
-        own, coupling.leader[follower], coupling.multiplier[follower] ** 2 * values[follower]
+        terms, coupling.leader[follower], coupling.multiplier[follower] ** 2 * values[follower]
     )
-    return own
+    return terms

@@ -35,9 +35,8 @@ from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_ba
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import CONTACT_FRICTION
-from batchpid.task_space.frames import matrix_of
+from batchpid.task_space.frames import inverse, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.rotations import inverse
 
 _KEPT = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
 """Parts of the state in snapshots: all but the targets of drives, which every tick writes."""
@@ -299,7 +298,7 @@ class MujocoPack(ModelPack):
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
         self._actuators = actuators
-        armature, damping = self._robot.own
+        armature, damping = self._robot.terms
         values = {"dof_armature": np.maximum(armature + self._add_joints(actuators), 0.0)}
         if self.spec.mjcf is not None and self._variation.damping is not None:
             values["dof_damping"] = np.maximum(damping + self._variation.damping, 0.0)

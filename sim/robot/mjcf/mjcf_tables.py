@@ -22,7 +22,6 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjModel
-from batchpid.arrays.read_only import read_only
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.link_repair import possible_inertia
@@ -31,7 +30,7 @@ from batchpid.sim.robot.mjcf.mjcf_compiler import ALONE, Names, label
 from batchpid.sim.robot.parts import Joint, Mimic
 from batchpid.sim.robot.self_collision import DisabledPair
 from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Shape, ShapeKind, Tables, breadth_first
-from batchpid.task_space.rotations import about, multiply, rotate
+from batchpid.task_space.frames import about, compose, matrix_of, rotate
 
 NO_MASS = 1e-9
 """Mass [kg] of a body with shapes and without mass: a row without mass gets that of its shapes."""
@@ -154,7 +153,7 @@ class TableReader:
         model, name = self._model, self._names.bodies[body]
         joints = [joint for joint in self._names.joints if model.jnt_bodyid[joint] == body]
         place = model.body_pos[body] - self._anchors[int(model.body_parentid[body])]
-        turn, anchor = model.body_quat[body], ORIGIN
+        turn, anchor = model.body_quat[body].copy(), ORIGIN
         if model.body_jntnum[body] > len(joints):  # on a free joint, which has the position
             place = ORIGIN
         row = Body(name, None)
@@ -167,16 +166,16 @@ class TableReader:
             rest = model.qpos0[model.jnt_qposadr[number]]
             if self._names.is_slide(number):
                 anchor = ORIGIN
-                place = place - rest * rotate(turn, axis)
+                place = place - rest * rotate(matrix_of(turn), axis)
             else:
                 anchor = model.jnt_pos[number]
-                place = place + rotate(turn, anchor)
-                turn = multiply(turn, about(axis, np.asarray(-rest)))
+                place = place + rotate(matrix_of(turn), anchor)
+                turn = compose(turn, about(axis, np.asarray(-rest)))
             link = name
             if number != joints[-1]:
                 link = self._names.new_link(f"{name}_{joint_name}")
             joint = self._read_joint(number, str(parent), link, couplings)
-            row = Body(link, joint, read_only(place), read_only(turn))
+            row = Body(link, joint, place, turn)
             if number != joints[-1]:
                 self._bodies.append(row)
             parent = link
@@ -226,8 +225,7 @@ class TableReader:
                 self._findings.append(
                     Finding("warning", "inertia", text, remedy, link=row.name, detail=detail)
                 )
-            row = row._replace(mass=mass, center=read_only(center), inertia_wxyz=axes.copy())
-            row = row._replace(inertia=read_only(inertia))
+            row = row._replace(mass=mass, center=center, inertia=inertia, inertia_wxyz=axes.copy())
         self._bodies.append(row)
 
     def _read_shapes(self, body: int, link: str, anchor: Float64) -> None:
@@ -250,7 +248,7 @@ class TableReader:
             else:
                 self._report_shape(geom, body)
                 continue
-            place = read_only(self._model.geom_pos[geom] - anchor)
+            place = self._model.geom_pos[geom] - anchor
             turn = self._model.geom_quat[geom].copy()
             self._shapes.append(Shape(link, link, kind, size, place, turn, vertices=vertices))
 
@@ -350,7 +348,7 @@ def _hull(model: MjModel, mesh: int) -> Float64:
         corners = int(model.mesh_graph[begin])
         begin += 2 + corners
         vertices = vertices[np.sort(model.mesh_graph[begin : begin + corners])]
-    return read_only(vertices)
+    return vertices
 
 
 def _ellipsoid(radii: Float64) -> Float64:
@@ -364,4 +362,4 @@ def _ellipsoid(radii: Float64) -> Float64:
         -1,
     )
     poles = [[0, 0, 1], [0, 0, -1]]
-    return read_only(np.concatenate([rings.reshape(-1, 3), poles]) * radii)
+    return np.concatenate([rings.reshape(-1, 3), poles]) * radii

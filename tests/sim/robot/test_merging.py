@@ -6,9 +6,9 @@ from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
 import batchpid.task_space as ts
 from batchpid.sim import Robot
-from batchpid.sim.robot.merging import link_inertias, merge_fixed, place_links
+from batchpid.sim.robot.merging import link_inertias, merge_links, place_links
 from batchpid.sim.robot.simulated_links import rigid_tree
-from batchpid.task_space.rotations import multiply, rotate
+from batchpid.task_space.frames import compose, matrix_of, rotate
 from batchpid.task_space.spatial_inertia import total
 
 BOX = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
@@ -33,7 +33,7 @@ def test_a_rigid_body_becomes_its_first_link(tmp_path):
         joint("f2", "arm", "flange", "fixed", ""),
         joint("f3", "flange", "camera", "fixed", '<origin rpy="0 0 1.5707963267948966"/>'),
     ).tables
-    merged = merge_fixed(tables)
+    merged = merge_links(tables)
     assert names_of(merged) == ["base", "arm"]
     assert {name: at.link for name, at in merged.links.items()} == {
         "base": "base",
@@ -62,7 +62,7 @@ def test_links_whose_wrench_is_measured_begin_a_body(tmp_path):
 def test_mass_of_shapes_counts_beside_given_mass_and_alone(given, tmp_path):
     parts = link("base"), link("arm", INERTIAL if given else ""), link("tool", BOX)
     joints = joint("h", "base", "arm"), joint("f", "arm", "tool", "fixed", "")
-    merged = merge_fixed(load(tmp_path, *parts, *joints).tables)
+    merged = merge_links(load(tmp_path, *parts, *joints).tables)
     arm = merged.bodies[1]
     assert len(merged.shapes_of("tool")) == len(merged.shapes) == 1
     assert arm.mass == pytest.approx(7 if given else 6)
@@ -73,7 +73,7 @@ def test_mass_of_shapes_counts_beside_given_mass_and_alone(given, tmp_path):
 def test_poses_inertia_and_order_of_random_trees_stay(seed, tmp_path):
     rng = np.random.default_rng(seed)
     original = load(tmp_path, *random_tree(rng, 12))
-    merged = merge_fixed(original.tables)
+    merged = merge_links(original.tables)
     tree, reduced = original.rigid_tree, rigid_tree(merged)
     assert reduced.joint_names == original.joint_names
     qpos = rng.uniform(-2, 2, original.dof)
@@ -91,8 +91,10 @@ def test_poses_inertia_and_order_of_random_trees_stay(seed, tmp_path):
 
     for name, at in merged.links.items():
         body, pose = bodies[reduced.index(at.link)], poses[tree.index(name)]
-        np.testing.assert_allclose(body[:3] + rotate(body[3:], at.position), pose[:3], atol=1e-12)
-        assert abs(multiply(body[3:], at.wxyz) @ pose[3:]) == pytest.approx(1, abs=1e-12)
+        np.testing.assert_allclose(
+            body[:3] + rotate(matrix_of(body[3:]), at.position), pose[:3], atol=1e-12
+        )
+        assert abs(compose(body[3:], at.wxyz) @ pose[3:]) == pytest.approx(1, abs=1e-12)
     before = world(link_inertias(original.tables), tree, poses)
     after = world(link_inertias(merged), reduced, bodies)
     for ours, theirs in zip(before, after, strict=True):
@@ -111,7 +113,7 @@ def test_a_fixed_joint_is_kept_where_its_merge_would_change_the_order_of_the_joi
     )
     original = load(tmp_path, *map(link, names), *parts)
     assert original.joint_names == ("ja", "jb", "jc", "jd")
-    merged = merge_fixed(original.tables)
+    merged = merge_links(original.tables)
     assert sorted(names_of(merged)) == ["a", "b", "base", "c", "d", "mount"]
     assert [each.name for each in merged.joints if not each.moves] == ["fixed"]
 
@@ -127,4 +129,4 @@ def test_siblings_of_a_merged_link_stay_in_order(tmp_path):
     )
     original = load(tmp_path, *map(link, ("base", "a", "mount", "c")), *parts)
     assert original.joint_names == ("early", "late")
-    assert [each.name for each in merge_fixed(original.tables).joints] == ["early", "late"]
+    assert [each.name for each in merge_links(original.tables).joints] == ["early", "late"]
