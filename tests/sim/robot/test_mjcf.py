@@ -5,6 +5,7 @@ a finding.
 from __future__ import annotations
 
 import random
+import sys
 from contextlib import suppress
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.batch")
 
-from batchpid.errors import InvalidArgumentError, RobotError  # noqa: E402
+from batchpid.errors import InvalidArgumentError, MissingDependencyError, RobotError  # noqa: E402
 from batchpid.sim import Robot, Runner, to_urdf  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
@@ -708,6 +709,14 @@ def test_a_damaged_file_is_a_robot_or_an_error(load, seed, tmp_path, monkeypatch
         )
         with suppress(RobotError):
             load(text[:begin] + part + text[begin + rng.randrange(8) :])
+
+
+def test_needs_mujoco(load, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(
+        MissingDependencyError, match=r"reading an MJCF file.*pip install 'mujoco>=3.17'"
+    ):
+        load(ARM)
 
 
 def test_an_unwritable_cache_is_an_error(load, monkeypatch, tmp_path):
