@@ -154,6 +154,7 @@ class JAXBackend:
             ]
             stacked = np.stack(shared) if shared else np.empty((0, 1, shape[1]), params.dtype)
             self.packed = ((tree, is_shared), jnp.asarray(stacked), own)
+        # Buffers of other params have another shape or dtype, and are of no use.
         self.dtype, self._spare = self.packed[1].dtype, None
 
     def array(self, value: Array) -> Array:

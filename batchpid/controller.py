@@ -207,6 +207,7 @@ class BatchPID:
         if out is not None:
             self._check_out(out)
         state = self._started(y)
+        # The native law writes into the arrays of the state, which a caller may hold.
         if self._lent and self._engine.native:
             state = PIDState(*(None if leaf is None else leaf.copy() for leaf in state))
         self._state, effort, self._terms, self._fast = self._engine.step(

@@ -140,6 +140,7 @@ def with_fields(
             for name, default in defaults.items()
             if name not in declared_signature.parameters
         ]
+        # help(), editors and the tests of wrong calls read the whole signature.
         signature = declared_signature.replace(parameters=shown)
 
         @wraps(function)

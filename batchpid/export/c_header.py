@@ -163,6 +163,7 @@ class Header:
         body = statements(
             self.names, traced, [*read, *state, *arguments], len(read), [*state, "effort[j]"]
         )
+        # Constants that no statement names would be warnings of the compiler.
         tables = [
             self.names.table(label, leaf[0])
             for label, leaf in zip(labels, leaves(constants), strict=True)

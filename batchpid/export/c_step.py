@@ -164,6 +164,7 @@ def _unrolled(
             values[out] = value
         return [values[end] for end in np.frombuffer(part.results, np.int32).tolist()]
 
+    # Operations on constants alone are part of the step in C, for the compiler to fold.
     fixed = list(range(constants))
     if traced.prelude is not None:
         fixed += unroll(traced.prelude, fixed)

@@ -160,6 +160,7 @@ def design_gains(
     positive("damping_ratio", damping_ratio, "zeta")
     time_step("dt", dt)
     number("margin", margin, 1e-3, 1 - 1e-3, "share of the stability range")
+    # Without an integral a setpoint weight would leave an error.
     integrates = integral_time is None or integral_time != math.inf
     if integral_time is not None and integrates:
         positive("integral_time", integral_time, "s")

@@ -147,6 +147,7 @@ def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) ->
     ratio, participation = np.zeros(m.shape[:-2]), np.zeros(m.shape[:-1])
     for at in np.ndindex(*m.shape[:-2]):
         local = [column[at] for column in columns]
+        # Frequencies are spaced by ratio where loci bend, and evenly up to the highest.
         slowest = _SLOWEST / (1 + float(np.max(local[-2] + local[-1])) / dt)
         slow = np.geomspace(slowest, np.pi / 4, _FREQUENCIES)
         z = np.exp(1j * np.append(slow, np.linspace(np.pi / 4, np.pi, _FREQUENCIES)[1:]))
@@ -290,6 +291,7 @@ def _one_step(mass_matrix: ArrayLike, dt: float, *gains: ArrayLike) -> Float64:
     def diagonal(values: Float64) -> Float64:
         return values[..., None] * one
 
+    # One step of the law, output first, and of the plant, semi-implicit, as block rows.
     keep, take = tau / (tau + dt), dt / (tau + dt)
     # d = keep d' - take w / dt on the negated measurement, so u = -p q + I + c d; w = q - q'.
     rate = [zero, diagonal(-take / dt), zero, diagonal(keep)]

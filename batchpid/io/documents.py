@@ -190,6 +190,7 @@ class RecordFile(Generic[R]):
         if not isinstance(document.get("about", {}), dict):
             raise error(source, "about", "must be a mapping", "use 'key: value', or leave it out")
         choice(f"{source}: dtype", document.get("dtype", "float64"), ("float32", "float64"))
+        # Names and types first: their errors name a key, where a constructor could not.
         joints = document.get("joints")
         if not isinstance(joints, dict) or not all(isinstance(name, str) for name in joints or [0]):
             raise error(source, "joints", "must map names to options", "name the joints")

@@ -63,6 +63,7 @@ def track(
         raise InvalidArgumentError("dt", problem, remedy="give dt in seconds")
     xp = namespace(*params, *state, setpoint, measurement, effort)
     k = discretise(params, 1.0 if dt is None else dt)
+    # The terms of the next step, on the same inputs, with the derivative settled.
     zero = xp.zeros_like(measurement)
     error = wrapped_error(k, setpoint, measurement, xp)
     (origin, _), (lasting, _) = (

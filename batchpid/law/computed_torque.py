@@ -150,10 +150,12 @@ def _to_effort(
     stops = k.ki_dt is not None and k.conditional is not None
     change, deeper = new.integral - old.integral if stops else None, None
     if low is not None or high is not None:
+        # The acceleration is scaled as a whole, so that its direction stays.
         share = _share(wanted, passive, low, high, xp)
         effort = clip(share * wanted + passive, low, high, xp)
         deeper = None if change is None else (share < 1) & (a * change > 0)
     if k.effort_step is not None:
+        # The change of the effort is scaled as a whole, for the same reason.
         reached = effort
         effort = clip(_towards(reached, old.effort, k.effort_step, xp), low, high, xp)
         new = new._replace(effort=effort.copy())

@@ -227,6 +227,7 @@ def make_params(
     options |= {"kp": kp, "ki": ki, "kd": kd}
     options |= {"effort_limit": effort_limit, "integral_limit": integral_limit}
     build = LeafBuilder(joints, joint_names, dtype, options.values())
+    # kp may be traced, so a missing one is None and not 0.
     if kp is None:
         remedy = "give the proportional gain, 0 for none"
         raise InvalidArgumentError("kp", "is missing", remedy=remedy)
@@ -234,6 +235,7 @@ def make_params(
     leaves |= build.options({name: FIELDS[name] for name in PLAIN}, options)
     for name, chosen in CHOICES.items():
         leaves[name] = chosen[choice(name, options.get(name, DEFAULTS[name]), chosen)]
+    # The implicit law predicts with kd, so it needs one, 0 as well.
     if leaves["discretization"] is not None:
         _check_implicit(leaves["gain_units"], leaves["derivative_filter_time"])
         if kd is None:

@@ -200,11 +200,13 @@ def advance(
             None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff)
         )
 
+    # The terms, in the order of the equations above.
     error = wrapped_error(k, r, y, xp)
     origin, moved_origin = origins(k, state, y, r_rate, xp)
     p = proportional(k, error, y, origin)
     u = p
 
+    # The effort takes I before it includes the present error: a change of ki is bumpless.
     i, integral = 0.0, state.integral
     if k.ki_dt is not None:
         integral = integral + k.ki_dt * error
@@ -213,6 +215,7 @@ def advance(
         i = state.integral
         u = u + i
 
+    # The filter acts on the weighted rate, so that one state serves measurement and setpoint.
     d, derivative = 0.0, None
     if k.kd is not None:
         rate = (
@@ -232,11 +235,13 @@ def advance(
     if ff is not None:
         u = u + ff
 
+    # The rate limit comes first: the limits of the effort hold in any case.
     effort = u
     if k.effort_step is not None:
         effort = clip(u, state.effort - k.effort_step, state.effort + k.effort_step, xp)
     effort = clip(effort, k.effort_min, k.effort_max, xp)
 
+    # Anti-windup sees the saturated effort; without limits it costs nothing.
     if k.ki_dt is not None:
         if effort is not u and k.conditional is not None:
             deeper = (u - effort) * error > 0
@@ -258,6 +263,7 @@ def advance(
         effort=None if state.effort is None else effort.copy(),
         origin=moved_origin,
     )
+    # A joint with a bad input keeps its state, as if the step had not been.
     if finite is not None:
         new = PIDState(
             *(

@@ -20,12 +20,13 @@ A prime is the value of the step before. The play is the backlash hysteresis (G.
 Kokotovic, Adaptive Control of Systems with Actuator and Sensor Nonlinearities, Wiley, 1996, chapter
 2). Friction and armature are the simulator's: see :mod:`batchpid.motors.friction`.
 
-A new effect is, in :mod:`batchpid.motors.actuators`, an argument of ``make_actuators`` with its
-``Field`` and an entry in the docstring, and a field of :class:`Actuators` of the same name. Here it
-is a field of :class:`MotorCoefficients`, a value in :func:`discretise`, and a term in
-``_delivered`` (motor), ``_play`` or ``_encode`` (sensor). An effect that changes the limits of
-commands has a term in :func:`command_limits`, too. Terms may use the operations of
-:mod:`batchpid.native.operations` only, so that they also run in JAX and in native code.
+A new effect is, in :mod:`batchpid.motors.actuators`, a field of :class:`Actuators` with its
+``Field``, and an entry in the docstring of ``make_actuators``. Files, randomizations, exports and
+the table of docs/actuators.md (``python docs/tables.py``) take it from there. Here it is a field of
+:class:`MotorCoefficients`, a value in :func:`discretise`, and a term in ``_delivered`` (motor),
+``_play`` or ``_encode`` (sensor). An effect that changes the limits of commands has a term in
+:func:`command_limits`, too. Terms may use the operations of :mod:`batchpid.native.operations` only,
+so that they also run in JAX and in native code.
 """
 
 from __future__ import annotations
@@ -122,6 +123,7 @@ def init(
     position, velocity = zeros + qpos, zeros if qvel is None else zeros + qvel
     requested = zeros if effort is None else zeros + effort
     command = sensor = encoder = key = step = None
+    # Histories are as long as the longest delay may become, so that delays can grow in flight.
     if actuators.max_delay is not None:
         samples = delay.samples_of(actuators.max_delay, dt) if samples is None else samples
         if actuators.command_delay is not None:
@@ -291,6 +293,7 @@ def advance_effort(
     :func:`deliver`.
     """
     xp = namespace(effort, qpos, qvel)
+    # Delay, motor, envelope and lag, in the order in which a command passes them.
     command, behind = state.command, state.effort
     if k.command is not None:
         command = push_history(command, effort)
@@ -313,6 +316,7 @@ def advance_measurement(
     """
     xp = namespace(qpos, qvel)
     command, effort, sensor, encoder, key, step = state
+    # Play, delay, encoder: in the order in which a signal passes them.
     if k.play is not None:
         encoder, qvel = _play(k, encoder, qpos, qvel)
         qpos = encoder

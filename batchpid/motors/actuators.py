@@ -259,6 +259,7 @@ def _longest_delay(leaves: Document, max_delay: float | None) -> float | None:
     longest = MAX_DELAY
     if max_delay is not None:
         longest = number("max_delay", max_delay, 0.0, MAX_DELAY, "seconds")
+    # A traced delay is not known; its history is as long as any delay may be.
     most = {name: float(rows.max()) for name, rows in delays.items() if not is_traced(rows)}
     for name, delay in most.items():
         if delay > longest:

@@ -169,6 +169,7 @@ def refresh(
     inverse = xp.linalg.inv(mass_matrix + dt * diagonal)
     mobility = xp.einsum("ejj->ej", inverse)
     scale = xp.sqrt(mobility)
+    # Coupled joints share the gain, by Gershgorin: see above.
     correlation = xp.abs(inverse) / (scale[:, :, None] * scale[:, None, :])
     shared = (correlation * rubs.astype(correlation.dtype)[:, None, :]).sum(-1)
     k = xp.where(rubs, SHARE / (dt * mobility * xp.where(rubs, shared, 1.0)), 0.0)
@@ -188,6 +189,7 @@ def advance(
     total = effort
     if friction.coulomb is not None:
         xp = namespace(effort, velocity, *state)
+        # The effort that would bring the joint to rest, clipped to what friction can give.
         held = state.effort - state.gain * velocity + state.memory * state.velocity
         bound = bound_of(friction, state.sliding, effort, velocity)
         total = xp.minimum(xp.maximum(held, effort - bound), effort + bound)

@@ -128,6 +128,7 @@ def advance(
     (setpoint,) = in_dtype_of(guard, setpoint)
     xp = namespace(*guard, setpoint, *state)
     target = clip(setpoint, guard.lower, guard.upper, xp)
+    # On a continuous joint the short way round.
     error = wrap(target - state.setpoint, guard.turns, xp)
     arriving = rate = error / dt
     if guard.acceleration is not None:
@@ -137,6 +138,7 @@ def advance(
     if guard.acceleration is not None:
         most = dt * guard.acceleration
         rate = clip(rate, state.rate - most, state.rate + most, xp)
+    # A setpoint within one step is reached to the bit, not by a sum.
     guarded = xp.where(rate == arriving, target, state.setpoint + dt * rate)
     return GuardState(guarded, rate), guarded != setpoint
 

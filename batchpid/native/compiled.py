@@ -84,6 +84,7 @@ class CompiledLaw:
         shown = [
             np.empty(self._shape, bool if is_mask else program.dtype) for is_mask in masks[:-1]
         ]
+        # An input that shares memory with the result is read before it is overwritten.
         read = [
             entry if out is None or not np.may_share_memory(entry, out) else entry.copy()
             for entry in arguments

@@ -55,6 +55,7 @@ def trace(
         symbol: number for number, symbol in namespace.literals.values() if symbol in needed
     }
     first = [*entries[:constants], *literals]
+    # Operations on constants alone run once, when the program is made.
     fixed = set(first)
     early = list[_Operation]()
     late = list[_Operation]()
@@ -62,6 +63,7 @@ def trace(
         is_early = fixed.issuperset(entry[1])
         (early if is_early else late).append(entry)
         fixed.update([entry[2]] * is_early)
+    # Pairs are fused after that: a constant part needs no speed.
     late = _fused(late, results)
     used = {*results, *(operand for _, operands, _ in late for operand in operands)}
     shared = [result for _, _, result in early if result in used]

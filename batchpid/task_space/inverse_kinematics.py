@@ -219,6 +219,7 @@ class _Search(NamedTuple):
         full = chain & _wholly_turning(self.tree) & (high - low > _FULL_TURN)
         full &= np.isfinite(high - low)
         free = np.where(full, -np.inf, low), np.where(full, np.inf, high)
+        # Without limits a search passes a full turn, and is turned back afterwards.
         found = self.solve(goal, qpos, free)
         over = np.where(full, np.maximum(found.qpos - high, 0), 0.0)
         under = np.where(full, np.maximum(low - found.qpos, 0), 0.0)
@@ -275,6 +276,7 @@ class _At:
 def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Float64) -> Float64:
     """Return the positions (n, dof) after a step within the limits."""
     damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
+    # Joints that would pass a limit stop there, and the others take over their share.
     free, move = np.ones(qpos.shape, bool), np.zeros_like(qpos)
     for _ in range(_PASSES):
         part = np.where(free[:, None], at.jacobian, 0.0)
@@ -286,6 +288,7 @@ def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Flo
         move, free = np.where(beyond, within - qpos, move), free & ~beyond
         if not beyond.any():
             break
+    # Geodesic acceleration: the curvature of the path of the tool.
     acceleration = -_damped(part, damping, at.rate(move))
     size = np.sqrt((acceleration * acceleration).sum(-1, keepdims=True))
     most = _LARGEST_ACCELERATION * np.sqrt((move * move).sum(-1, keepdims=True))

@@ -134,6 +134,7 @@ def osc(
         dynamics = task_dynamics(dynamics.tree, *inputs[1:3], dynamics.link, point=dynamics.point)
     with quiet():
         task = in_frame(k, dynamics, inputs)
+        # Accelerations of task and posture first, then their efforts, then the limits.
         a = task_acceleration(k, task)
         a = a if state.integral is None else a + state.integral
         a_n, a_s = posture_acceleration(k, dynamics, state.posture, inputs.qpos, inputs.qvel)
@@ -262,6 +263,7 @@ def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
             axis=-1, keepdims=True
         )
 
+    # The task takes the room first, and the posture what is left of it.
     s1 = share(task, base)
     s2 = share(null, base + s1 * task)
     others = s1 * p.task_of_others + s2 * p.posture_of_others

@@ -176,6 +176,7 @@ def make_osc_params(
         entries("force_axes", both > 0, both == 0, "is an axis of motion, too", AXES, kind="entry")
     if rows["damping"] is None:
         rows["damping"] = 2 * rows["damping_ratio"] * np.sqrt(rows["stiffness"])
+    # Critical damping and the like follow from the stiffness that is left.
     posture = rows["posture_stiffness"] * tree.independent
     rows["posture_stiffness"] = posture
     rows["posture_damping"] = 2 * rows["posture_damping_ratio"] * np.sqrt(posture)

@@ -66,6 +66,7 @@ def projections(
     f = f if wrench is None else f + wrench
     task = gram(j, f[..., None])[..., 0]
 
+    # Joints outside the chain, such as fingers, are controlled by computed torque.
     a_c, a_o = a_n * chain, a_n * (1 - chain)
     # The difference is 0 to the bit where neither inertia is bounded.
     held = product(

@@ -123,6 +123,7 @@ def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayM
     s = xp.concatenate([motions.linear, motions.angular], axis=-1)
     table = (s[..., :, None, :] * all_.momenta[..., None, :, :]).sum(-1)
     above = xp.swapaxes(bodies.moves, 0, 1) > 0
+    # Only entries of joints on one branch differ from 0: one of them moves the other.
     rest = xp.where(bodies.moves > 0, xp.swapaxes(table, -1, -2), xp.zeros_like(table))
     matrix = xp.where(above, table, rest)
     if not tree.fixed_base:

@@ -56,6 +56,7 @@ def evaluated(
         native = native_rows.kinematics(tree, names, q, v, index, point)
         if native is not None:
             return native
+    # The definition, for JAX, for varied bodies, and where no extension was built.
     varied = bodies or nominal
     quantities: dict[str, Array] = {}
     with quiet():

@@ -139,8 +139,10 @@ def execute(command: CommandFunction, values: Document) -> int:
             paths[name] = files.path(name, path, output.suffixes)
     arguments = _arguments(command, values)
     result = command.function(**arguments)
+    # The view has run already, and leaves nothing to report.
     if result is None:
         return 0
+    # The report stands before the files, so that a full disk does not hide it.
     print(result.report())
     for name, path in paths.items():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -166,11 +168,13 @@ def _arguments(command: CommandFunction, values: Document) -> Document:
     line about them.
     """
     accepted = inspect.signature(command.function).parameters
+    # Output files and --force are for execute(), but identify also takes --force.
     arguments = {name: value for name, value in values.items() if name in accepted}
     for name in command.options:
         # On and off are switches; one that is left out is left to the Runner.
         if values[name] is not None:
             arguments[name] = {"on": True, "off": False}.get(values[name], values[name])
+    # A recording may stand in place of a robot.
     if values.get("robot") is not None:
         loading: Document = {}
         if values.get("base") is not None:
@@ -178,6 +182,7 @@ def _arguments(command: CommandFunction, values: Document) -> Document:
         if values.get("actuators") is not None:
             loading["actuators"] = values["actuators"]
         arguments["robot"] = robot = Robot.load(values["robot"], **loading)
+        # Distributions are checked against the joints and links of the robot.
         if values.get("randomize") is not None:
             arguments["randomization"] = load_randomization(values["randomize"], robot)
         print(_heading(robot, values), flush=True)
@@ -191,6 +196,7 @@ def _arguments(command: CommandFunction, values: Document) -> Document:
 def _heading(robot: Robot, values: Document) -> str:
     """Return a line with robot, engine, gains, rate and number of robots."""
     parts = []
+    # A search leaves the engine out, a comparison may have both.
     if "engine" in values:
         names = values["engine"] or tuning_engine(None)
         names = (names,) if isinstance(names, str) else names
@@ -216,6 +222,7 @@ def _default(template: str, values: Document) -> Path | None:
     """Return the default name of an output file."""
     if not template:
         return None
+    # A template may use every flag: {kind} of plot, and these.
     stems: Document = {"ending": ENDINGS.get(values.get("to", ""))}
     for name in ("out", "recording"):
         if values.get(name) is not None:

@@ -49,6 +49,7 @@ class ExportedFile:
 
     def report(self) -> str:
         """Return a line for each difference."""
+        # The folder decides only how meshes are named.
         differences = self.make(Path.cwd()).differences
         return (
             "\n".join(f"differs: {text}" for text in differences) or "The file differs in nothing."
@@ -109,12 +110,14 @@ def export(
     motors
         In MJCF, write the motors without the law: their inputs are the efforts asked for.
     """
+    # A flag without effect is refused by name.
     chosen = {"gains": gains, "limits": limits, "dynamics": dynamics, "motors": motors}
     unused = [name for name, value in chosen.items() if value and name not in USED[to]]
     if unused:
         raise InvalidArgumentError(
             unused[0], f"has no effect with --to {to}", remedy="leave it out"
         )
+    # The robot alone, its motors, or the law.
     if to == "urdf":
         from batchpid.sim.robot.urdf_export import to_urdf
 

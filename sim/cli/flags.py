@@ -70,6 +70,7 @@ def record_of(
     hints = get_type_hints(function, include_extras=True)
     rows = []
     for name, parameter in inspect.signature(function).parameters.items():
+        # What has no plain type, or no text, is an argument for Python alone.
         kind = _plain_part(hints[name])
         default = parameter.default
         if Robot in (hints[name], *get_args(hints[name])):
@@ -84,6 +85,7 @@ def record_of(
             rows.append(_flag(name, kind, default, texts[name]))
     for name in options:
         kind, default = _plain_part(get_args(KINDS[name])[0]), OPTIONS_WITH_FLAG[name]
+        # A switch that is left out is left to the Runner: three values.
         if default is None and bool in get_args(kind):
             kind = Literal["on", "off"] | None
         rows.append(_flag(name, Annotated[kind, BOUNDS.get(name)], default, OPTIONS[name].flag))
@@ -136,6 +138,7 @@ def _flag(name: str, kind: Kind, default: Any, text: str) -> tuple[str, Any, Any
 
 def _plain_part(kind: Kind) -> Any:
     """Return the part of a type that has plain values; None if it has none besides None."""
+    # Ranges and marks for tyro stay with the type.
     if get_origin(kind) is Annotated:
         inner, *notes = get_args(kind)
         part = _plain_part(inner)
@@ -150,5 +153,6 @@ def _plain_part(kind: Kind) -> Any:
 
 def _words(text: str) -> str:
     """Return a docstring's text without its marks of references and code, a line a paragraph."""
+    # A terminal shows neither references nor code.
     text = re.sub(r":\w+:`~?([^`]*)`|``", r"\1", text)
     return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n"))

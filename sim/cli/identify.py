@@ -97,7 +97,7 @@ def identify_logs(
     Parameters
     ----------
     logs
-        Logs: .csv, .h5, ROS bags (.bag, .mcap, folders) or recordings.
+        Logs: .csv, ROS bags (.bag, .mcap, folders) or recordings (.h5).
     gains
         Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file
         as for --gains of other commands. Without it a recording's own, or the logs' efforts. Gains
@@ -133,6 +133,7 @@ def identify_logs(
     from batchpid.sim.identification.identification import identify
     from batchpid.sim.identification.logs import Reading
 
+    # A fit ends when it has converged: the bar shows an upper bound.
     evaluations = iter(range(EVALUATIONS) if progress is None else progress(range(EVALUATIONS)))
     result = identify(
         robot,
@@ -159,5 +160,6 @@ def _gains(robot: Robot, name: str) -> bp.PIDParams:
     except InvalidArgumentError:
         if Path(name).suffix.lower() not in (".yaml", ".yml", ".json") or not Path(name).is_file():
             raise
+        # The log may be of some joints: the file names them.
         joints = [joint for joint in robot.joint_names if joint in bp.load_params(name)[1]]
         return bp.load_params(name, joints)[0]

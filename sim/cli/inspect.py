@@ -78,6 +78,7 @@ class Inspection:
                 *(sentences(self.of_gains) or ["Nothing odd."]),
             ]
 
+        # Joints in the order of qpos, then links by mass: the data sheet has both.
         joints = list(robot.joints)
         if self.all:
             joints += [joint for joint in robot.all_joints if not joint.moves]
@@ -99,6 +100,7 @@ class Inspection:
         robot = self.robot
         pairs = robot.self_contact.pairs
         ground = "Ground at height 0." if robot.has_ground else NO_GROUND
+        # A robot that hangs in the air by its trunk settles, and nothing else would say so.
         if robot.fixed_base and limbs(robot) > 1:
             ground = f"{ground} {LEGS}"
         if not pairs:
@@ -162,6 +164,7 @@ def limbs(robot: Robot) -> int:
     """Return how many chains of :data:`LIMB` or more joints leave the root link."""
     above = {joint.child_link: joint for joint in robot.all_joints}
     sizes = Counter[str]()
+    # Of each joint, the first moving joint on the way from the root.
     for joint in robot.joints:
         first, link = joint.name, joint.parent_link
         while link in above:
@@ -177,6 +180,7 @@ def sentences(findings: Iterable[Finding]) -> list[str]:
 
 
 def _fill(text: str) -> str:
+    # A unit stays with its other half on a line.
     wrapper = textwrap.TextWrapper(
         120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
     )

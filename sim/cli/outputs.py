@@ -58,6 +58,7 @@ class OutputFiles:
     def _check(self, argument: str, path: Path) -> None:
         folder = str(path.parent)
         remedy = "choose another file"
+        # Links count as the file that they lead to, so that none is read and replaced at once.
         if os.path.exists(path) and any(os.path.samefile(path, source) for source in self._inputs):
             problem = "is a file to read"
         elif os.path.realpath(path) in self._outputs:
@@ -81,6 +82,7 @@ def write_figures(path: Path, figures: Any) -> None:
 
 
 def _plain(value: Any) -> Any:
+    # Named tuples keep their names; JSON has no NaN.
     if hasattr(value, "_asdict"):
         value = value._asdict()
     elif hasattr(value, "tolist"):
@@ -107,6 +109,7 @@ def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
     options = {"delay": 1.0, **options, **fixed}
 
     def wrap(items: Iterable[Any]) -> Iterable[Any]:
+        # Kept to be closed by an error's message.
         shown = tqdm(items, desc=label, **options)
         _bars.add(shown)
         return shown

@@ -39,6 +39,7 @@ class Recording:
         """Draw the run, or both."""
         from batchpid.sim import plots
 
+        # Two runs are compared as bands: fans of both would hide each other.
         if self.versus is not None:
             labels = (self.path.name, self.versus.name)
             other = _read(self.versus)

@@ -92,11 +92,13 @@ class RunReport:
         robot, rollout = self.robot, self.rollout
         ticks = len(rollout.time)
         ends = slice(-max(1, ticks // 10), None)
+        # Poses of a tool have six errors, whatever the joints do.
         if rollout.tool_pose is not None:
             error = np.abs(pose_error(rollout.setpoint[..., :7], rollout.tool_pose.astype(float)))
             figures = {"first_error": error[0], "final_error": error[ends].max(0)}
             return list(AXES), list(AXES.values()), figures
         has_effort = rollout.info.control != "drive"
+        # A setpoint that moves is followed; one that is held is a step, with a settling time.
         if ticks < 2 or (rollout.setpoint != rollout.setpoint[0]).any():
             figures = {
                 "following_error": following_error(robot, rollout),
@@ -140,6 +142,7 @@ class RunReport:
         """Return lines about envs that failed, joints that did not settle, and the causes."""
         rollout = self.rollout
         lines = []
+        # Failed envs first: their joints are not counted as unsettled.
         failed = np.flatnonzero(~rollout.ok.all(0))
         if failed.size:
             first = rollout.tick * (1 + np.argmin(rollout.ok.all(1)))
@@ -168,6 +171,7 @@ class RunReport:
                     f"Every joint of every env settled within {self.seconds:g} s to 2 % of its"
                     " move."
                 )
+        # A trajectory ends where it ends: its last setpoint need not be reached.
         if "following_error" in self.columns[2]:
             return lines
         return lines + list(cause_lines(rollout.findings(self.robot)))

@@ -87,8 +87,8 @@ def rollout(
         Number of robots, one in each scene.
     gains
         Gains: tuned, designed, sapien-tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file
-        (.yaml or .json) that `batchpid tune` or batchpid.save_params wrote, or an MJCF file (.xml).
-        Default: tuned where the robot has them, else designed.
+        (.yaml or .json) that `batchpid tune` or batchpid.save_params wrote. Default: tuned where
+        the robot has them, else designed.
     control
         Batch PID, the engine's internal drive, or operational-space control of a tool.
     tool
@@ -123,6 +123,7 @@ def rollout(
     from batchpid.sim.runner.runner import Runner
 
     options |= {"timestep": timestep, "randomization": randomization, "control": control}
+    # Gains, or the controller of a tool.
     center: Rows = robot.start
     goal: ArrayLike = robot.target
     columns = robot.joint_names
@@ -140,7 +141,9 @@ def rollout(
         if chosen.control == "drive":
             options["control"] = "drive"
 
-    notes, given = [], Document()
+    # Setpoints: of a file, or one that is held.
+    notes: list[str] = []
+    further = Document()
     if trajectory is not None:
         from batchpid.sim.recording.setpoint_files import read_setpoints
 
@@ -150,7 +153,7 @@ def rollout(
         setpoints, options["substeps"] = motion.position, motion.substeps
         center = center if motion.start is None else motion.start
         if rates:
-            given = {"setpoint_rates": motion.rate, "setpoint_accelerations": motion.acceleration}
+            further = {"setpoint_rates": motion.rate, "setpoint_accelerations": motion.acceleration}
         source = "from the file" if motion.has_rates else "central differences of the rows"
         notes.append(f"Rates of the setpoints: {source if rates else 'not given'}.")
         if motion.steps and rates:
@@ -169,10 +172,11 @@ def rollout(
 
     with Runner(robot, num_envs, **options) as runner, warnings.catch_warnings():
         warnings.simplefilter("ignore", SetpointWarning)  # the report has the finding
+        # The speed is that of the run alone, without the start of processes.
         began = time.perf_counter()
         start = start_poses(robot, num_envs, spread, seed, center)
         runner.reset(start, seed=None if randomization is None else 0)
-        result = runner.rollout(setpoints, progress=progress, **given)
+        result = runner.rollout(setpoints, progress=progress, **further)
         wall = time.perf_counter() - began
         backend = runner.backend
     return RunReport(robot, result, timestep, wall, backend, notes, is_held=trajectory is None)

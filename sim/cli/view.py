@@ -55,6 +55,7 @@ def view(
         for finding in page.findings:
             print(f"batchpid: {finding}", file=sys.stderr)
         print(f"Open in a browser: {page.url}  (Ctrl-C ends it)", flush=True)
+        # Ctrl-C is how a view ends.
         with suppress(KeyboardInterrupt):
             page.run(time_limit)
         print(f"{page.rate:.0f} frames/s, real-time factor {page.factor:.2f}")

@@ -135,10 +135,10 @@ class ConstraintEfforts:
         ``mass_matrix`` is a function of positions; native code does not need it.
         """
         if self._model is not None:
-            wanted = np.zeros(len(qpos), bool)
-            wanted[rows] = True
-            arrays = (np.ascontiguousarray(each, np.float64) for each in (qpos, passive))
-            native.extension("_gateway").update_constraint(self.address, *arrays, wanted, len(qpos))
+            mask = np.zeros(len(qpos), bool)
+            mask[rows] = True
+            arrays = (np.ascontiguousarray(table, np.float64) for table in (qpos, passive))
+            native.extension("_gateway").update_constraint(self.address, *arrays, mask, len(qpos))
             return
         matrices = (mass_matrix(qpos) + self.implicit[:, None] * np.eye(qpos.shape[1]))[rows]
         numbers = np.concatenate([matrices, passive[rows][:, :, None]], axis=2)

@@ -68,7 +68,7 @@ class NativeModel:
             self.__dict__.pop("_structure", None)
             self._inertias = np.tile(self._tree.inertias(), (size, 1, 1))
         picked = np.asarray(rows, np.intp)
-        varied = self._tree.varied({name: each[picked] for name, each in added.items()})
+        varied = self._tree.varied({name: rows[picked] for name, rows in added.items()})
         self._inertias[picked] = self._tree.inertias(varied)
 
     def mass_matrix(self, qpos: Rows) -> Float64:
@@ -95,8 +95,8 @@ class NativeModel:
         turns, in its own axes: :meth:`batchpid.sim.engine.protocol.EnginePack.read_base_motion`.
         """
         state = [
-            None if each is None else np.ascontiguousarray(each, np.float64)
-            for each in (qpos, qvel, base)
+            None if rows is None else np.ascontiguousarray(rows, np.float64)
+            for rows in (qpos, qvel, base)
         ]
         out = np.empty(qpos.shape)
         self._native.forces(self.address, gravity, coriolis, *state, out, len(out))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from importlib.util import find_spec
 from multiprocessing import get_context
@@ -14,24 +14,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Bool
 from batchpid.checks.validate import choice, flag, instance, integer, number
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.sim.identification.fit import MOST_WINDOWS, Problem, windows_of
-from batchpid.sim.identification.intervals import intervals_of
-from batchpid.sim.identification.log import Log, LogWarning, checked
+from batchpid.sim.identification.fit import Problem, windows_of
+from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
 from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.regression import (
-    STRENGTHS,
+    SETPOINT_DELAYS,
     Guess,
-    Motion,
-    Regression,
+    LogData,
     better_reading,
+    regress,
     smooth,
 )
 from batchpid.sim.identification.result import Identification
-from batchpid.sim.identification.simulator import LogControl, Plant
+from batchpid.sim.identification.simulator import Dynamics, LogControl, Plant
 from batchpid.sim.identification.unknowns import BASIC, EXTRAS, LAW, Unknowns
 from batchpid.sim.options.groups import Compensation
 from batchpid.sim.robot.parts import FileDefaults
@@ -39,26 +38,25 @@ from batchpid.sim.robot.robot import Robot
 
 STILL = {"rad": 1e-3, "m": 1e-4}
 """Standard deviation of the positions up to which a joint did not move."""
-SHARE, SHAKEN = 0.01, 1.5
-"""The same as a share of the joint that moved most, and over the noise from row to row."""
-BEYOND = 3.0
-"""Effort over the robot's limit from which it looks like another unit."""
-FOLLOWS = 0.02
+FOLLOWS = 0.01
 """Ratio of the standard deviation of positions to the setpoints', up to which a joint counts as
 stuck.
+"""
+BEYOND = 3.0
+"""Effort over the robot's limit from which it looks like another unit."""
+LEAD = 5e-3
+"""Time by which setpoints act before they were logged that is an error of the log [s]."""
+DETOUR = 0.1
+"""Least decrease of the regression's cost for a compensation that does not pass through the motors.
 """
 
 
 class Data(NamedTuple):
-    """Logs of the joints that moved, and the robots and control that made them."""
+    """Logs of the joints that moved."""
 
     robot: Robot
     """The robot, whose start pose has the positions of the joints that did not move."""
-    logs: list[Log]
-    motions: list[Motion]
-    plants: list[Plant]
-    drives: list[LogControl]
-    """Motion, plant and drive of each log."""
+    parts: list[LogData]
     still: list[str]
     """Names of the joints that did not move."""
 
@@ -73,7 +71,7 @@ def identify(
     payload: bool = True,
     extras: Sequence[str] = (),
     reading: Reading | None = None,
-    evaluations: int = 30,
+    evaluations: int = 60,
     workers: int = 0,
     progress: Callable[[], Any] | None = None,
 ) -> Identification:
@@ -124,25 +122,15 @@ def identify(
     for name in extras:
         choice("extras", name, [*EXTRAS])
     data = _read(robot, logs, params, compensate, timestep, reading)
-    guess = _guess(data)
-    # An effect of the law, which the regression does not have, may look like another reading.
-    if {*LAW}.isdisjoint(extras) and _is_odd(data, guess) and (words := _better_reading(data)):
-        raise InvalidArgumentError(
-            "logs", f"make sense with {words}", remedy="correct the log or its options"
-        )
-    unknowns = _unknowns(data, guess, [*extras], flag("payload", payload))
-    pool: Any = nullcontext()
-    if integer("workers", workers, 0, 1000) > 1:
-        pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-    with pool as executor:
-        run = map if executor is None else executor.map
-        problem = Problem(data.plants, data.drives, _windows(data), unknowns, run)
-        found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
-    if not found.explains and (words := _better_reading(data)):
-        return replace(
-            found, advice=f"the logs make more sense with {words}: correct the log or its options"
-        )
-    return found
+    data, guesses = _regress(data, "slew" in extras)
+    windows = windows_of(data.parts)
+    with ExitStack() as stack:
+        run = _map(stack, integer("workers", workers, 0, 1000))
+        unknowns = [_unknowns(data, guess, extras, flag("payload", payload)) for guess in guesses]
+        problems = [Problem(data.parts, windows, start, run) for start in unknowns]
+        problem = min(problems, key=Problem.start_error)
+        fit = problem.fit(integer("evaluations", evaluations, 2, 1000), progress)
+        return _sensible(Identification.of(fit, data.still))
 
 
 def _read(
@@ -153,120 +141,56 @@ def _read(
     timestep: float | None,
     reading: Reading | None,
 ) -> Data:
-    """Return the inputs for the arguments of :func:`identify`."""
+    """Return the logs of the arguments of :func:`identify`, each with its plant and control."""
     if find_spec("scipy") is None:
         raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
-    sources = [logs] if isinstance(logs, str | os.PathLike | Log) else list(logs)
+    kind: CommandKind | None = None
+    if params is not None:
+        instance("params", params, bp.PIDParams, "load them with load_params()")
+        kind = "setpoint"
     read = list[Log]()
-    for source in sources:
+    for source in [logs] if isinstance(logs, str | os.PathLike | Log) else logs:
         if isinstance(source, Log):
             read += checked(source.settings.robot or robot, source)
         else:
-            read += read_logs(
-                robot, [source], None if params is None else "setpoint", reading=reading
-            )
-    if not read:
-        raise InvalidArgumentError("logs", "are missing", remedy="name one file or more")
-    if params is not None:
-        params = _of_joints(
-            instance("params", params, bp.PIDParams, "load them with load_params()"), robot, read[0]
-        )
-    forces = str(
-        _recorded("compensate", compensate, read, "gravity+coriolis+friction")
-    ).removesuffix("+friction")
+            read += read_logs(robot, [source], kind, reading=reading)
+    if all(log.settings.held_out for log in read):
+        raise InvalidArgumentError("logs", "are missing or held out", remedy="name some to fit")
+    forces = _option("compensate", compensate, read, "gravity+coriolis+friction")
+    forces = str(forces).removesuffix("+friction")
     choice("compensate", forces, ("gravity+coriolis", "gravity", "none"))
-    dt = number("timestep", _recorded("timestep", timestep, read, 1 / 2000), 1e-5, 0.01, "seconds")
-    laws = [_law(robot, log, params) for log in read]
-    for log, law in zip(read, laws, strict=True):
+    dt = number("timestep", _option("timestep", timestep, read, 1 / 2000), 1e-5, 0.01, "seconds")
+    for log in read:
         if log.joints != read[0].joints or log.kind != read[0].kind:
             problem = f"holds other joints or commands than {read[0].source}"
             raise InvalidArgumentError(log.source, problem, remedy="fit them one by one")
-        if (law is None) != (log.kind == "effort"):
-            remedy = "give the params that drove the robot" if law is None else "give no params"
-            raise InvalidArgumentError(log.source, f"holds {log.kind}s", remedy=remedy)
-        if law is not None and law.gain_units is not None:
-            problem = "have gains per inertia or mass matrix, which a fit does not simulate"
-            raise InvalidArgumentError(
-                "params", problem, remedy="log the efforts, and give no params"
-            )
-    if all(log.settings.held_out for log in read):
-        raise InvalidArgumentError(
-            "logs", "are all held out", remedy="set held_out of some of them"
-        )
+    # Joints that did not move are held at their mean position, with the unlogged ones.
     moves = _moves(robot, read)
-    still = [
-        robot.joint_names[joint]
-        for joint, moving in zip(read[0].joints, moves, strict=True)
-        if not moving
-    ]
+    joints = np.array(read[0].joints)
     start = robot.start
-    places = np.concatenate([log.qpos for log in read]).mean(0)
-    start[np.array(read[0].joints)[~moves]] = places[~moves]
-    parts = [log.part(joints=moves) for log in read]
-    resting = _resting(robot, start) if still else robot
-    robots = [
-        resting if log.settings.robot is None else _resting(log.settings.robot, start)
-        for log in parts
-    ]
+    start[joints[~moves]] = np.concatenate([log.qpos for log in read]).mean(0)[~moves]
     plants = dict[Any, Plant]()
-    for log, at_rest in zip(parts, robots, strict=True):
-        plants.setdefault(
-            (id(log.settings.robot), log.settings.payload),
-            Plant(at_rest, log.joints, log.settings.payload),
-        )
-    drives = [
-        LogControl(dt, None if law is None else law.for_joints(moves), forces) for law in laws
-    ]
-    chosen = [plants[id(log.settings.robot), log.settings.payload] for log in parts]
-    return Data(resting, parts, [smooth(log, dt) for log in parts], chosen, drives, still)
+    parts = list[LogData]()
+    for log in read:
+        law = _law(robot, log, params)
+        drive = LogControl(dt, None if law is None else law.for_joints(moves), forces)
+        key = id(log.settings.robot), log.settings.payload
+        if key not in plants:
+            resting = _resting(log.settings.robot or robot, start)
+            plants[key] = Plant(resting, tuple(joints[moves].tolist()), log.settings.payload)
+        moving = log.part(joints=moves)
+        parts.append(LogData(moving, smooth(moving, dt), plants[key], drive))
+    still = [robot.joint_names[joint] for joint in joints[~moves]]
+    return Data(_resting(robot, start), parts, still)
 
 
-def _resting(robot: Robot, start: Float64) -> Robot:
+def _resting(robot: Robot, start: Any) -> Robot:
     """Return ``robot`` with the start pose ``start`` (dof,)."""
     return replace(robot, settings=None, defaults=FileDefaults(start))
 
 
-def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
-    """Return the params that drove a log; raise InvalidArgumentError if a recording contradicts
-    them.
-    """
-    chosen = params if log.settings.params is None else log.settings.params
-    recorded, law = (
-        None if one is None else _of_joints(one, robot, log) for one in (log.params, chosen)
-    )
-    if recorded is None or law is None:
-        return recorded if law is None else law
-    for name in ("kp", "ki", "kd"):
-        before, now = (
-            0.0 if gain is None else gain for gain in (getattr(recorded, name), getattr(law, name))
-        )
-        if not np.allclose(before, now, rtol=1e-6):
-            problem = f"contradict {log.source}, which was recorded with another {name}"
-            raise InvalidArgumentError(
-                "params", problem, remedy="leave them out: a recording has its own"
-            )
-    return law
-
-
-def _of_joints(params: bp.PIDParams, robot: Robot, log: Log) -> bp.PIDParams:
-    """Return the params of the joints of a log, one row."""
-    if params.num_envs != 1:
-        raise InvalidArgumentError(
-            "params", f"hold {params.num_envs} envs", remedy="give those of the logged robot"
-        )
-    if params.num_joints == len(log.joints):
-        return params
-    if params.num_joints != robot.dof:
-        problem = (
-            f"hold {params.num_joints} joints; the robot has {robot.dof}, the logs"
-            f" {len(log.joints)}"
-        )
-        raise InvalidArgumentError("params", problem, remedy="give one gain per joint of the robot")
-    return params.for_joints(list(log.joints))
-
-
-def _recorded(name: str, value: Any, logs: list[Log], default: Any) -> Any:
+def _option(name: str, value: Any, logs: list[Log], default: Any) -> Any:
     """Return an option as the recordings say, or its ``value``, or the default."""
     for log in logs:
         recorded = getattr(log, name)
@@ -280,132 +204,147 @@ def _recorded(name: str, value: Any, logs: list[Log], default: Any) -> Any:
     return default if value is None else value
 
 
-def _moves(robot: Robot, logs: list[Log]) -> Any:
+def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
+    """Return the params that drove a log, of its joints, one row; None for efforts."""
+    recorded = _of_joints(log.params, robot, log)
+    law = _of_joints(log.settings.params or params, robot, log)
+    if law is None:
+        law = recorded
+    if (law is None) != (log.kind == "effort"):
+        remedy = "give the params that drove the robot" if law is None else "give no params"
+        raise InvalidArgumentError(log.source, f"holds {log.kind}s", remedy=remedy)
+    if law is not None and law.gain_units is not None:
+        problem = "have gains per inertia or mass matrix, which a fit does not simulate"
+        raise InvalidArgumentError("params", problem, remedy="log the efforts, and give no params")
+    for name in ("kp", "ki", "kd") if recorded is not None else ():
+        gains = getattr(recorded, name), getattr(law, name)
+        before, now = (0.0 if gain is None else gain for gain in gains)
+        if not np.allclose(before, now, rtol=1e-6):
+            problem = f"contradict {log.source}, which was recorded with another {name}"
+            remedy = "leave them out: a recording has its own"
+            raise InvalidArgumentError("params", problem, remedy=remedy)
+    return law
+
+
+def _of_joints(params: bp.PIDParams | None, robot: Robot, log: Log) -> bp.PIDParams | None:
+    """Return the params of the joints of a log."""
+    if params is None or params.num_joints == len(log.joints):
+        return params
+    if params.num_joints != robot.dof or params.num_envs != 1:
+        problem = f"hold {params.num_joints} joints of {params.num_envs} envs"
+        remedy = f"give one gain for each of the robot's {robot.dof} joints"
+        raise InvalidArgumentError("params", problem, remedy=remedy)
+    return params.for_joints(list(log.joints))
+
+
+def _moves(robot: Robot, logs: list[Log]) -> Bool:
     """Return the mask (joints,) of the joints that moved; warn about the others, which are jammed
     or not driven.
     """
-    joints, qpos = logs[0].joints, np.concatenate([log.qpos for log in logs])
-    noise = np.sqrt(
-        np.mean(np.concatenate([np.diff(log.qpos, axis=0) for log in logs]) ** 2, axis=0) / 2
-    )
-    spread = qpos.std(0)
-    least = np.clip(SHARE * spread.max(), 1e-9, [STILL[robot.units[joint]] for joint in joints])
-    moves = spread > np.maximum(least, SHAKEN * noise)
+    joints = logs[0].joints
+    spread = np.concatenate([log.qpos for log in logs]).std(0)
+    moves = spread > [STILL[robot.units[joint]] for joint in joints]
     if logs[0].kind == "setpoint":
-        commanded = np.concatenate([log.command for log in logs]).std(0)
-        degrees = moves & (commanded > 30 * spread) & (commanded < 90 * spread)
-        if degrees.any():
-            name = robot.joint_names[joints[int(np.argmax(degrees))]]
-            problem = f"have setpoints of joint {name!r} that move 57 times as far as its positions"
-            raise InvalidArgumentError(
-                "logs", problem, remedy="setpoints look like degrees: give both in rad"
-            )
-        moves &= spread > FOLLOWS * commanded
-    names = ", ".join(
-        repr(robot.joint_names[joint])
-        for joint, moving in zip(joints, moves, strict=True)
-        if not moving
-    )
+        moves &= spread > FOLLOWS * np.concatenate([log.command for log in logs]).std(0)
+    still = [robot.joint_names[joint] for joint in np.array(joints)[~moves]]
+    names = ", ".join(map(repr, still))
     if not moves.any():
-        raise InvalidArgumentError(
-            "logs", f"show no motion of any joint ({names})", remedy="record a motion"
-        )
-    if names:
-        warn(
-            f"{names} did not move, or did not follow its setpoint: left out, and held in place",
-            LogWarning,
-        )
+        problem = f"show no motion of any joint ({names})"
+        raise InvalidArgumentError("logs", problem, remedy="record a motion")
+    if still:
+        words = "did not move, or did not follow its setpoint: left out, and held in place"
+        warn(f"{names} {words}", LogWarning)
     return moves
 
 
-def _guess(data: Data) -> Guess:
-    """Return the motors by the regression, and set whether the compensation passes through them."""
-    fitted = [at for at, log in enumerate(data.logs) if not log.settings.held_out]
-    guesses = []
-    for through in (True, False) if data.drives[0].compensate != "none" else (True,):
-        drives = [drive._replace(through=through) for drive in data.drives]
-        parts = zip(
-            *[(data.plants[at], drives[at], data.logs[at], data.motions[at]) for at in fitted],
-            strict=True,
-        )
-        guess = Regression(*parts).best()
-        guesses.append((guess.cost - (0.1 if through else 0.0), drives, guess))
-    _, data.drives[:], best = min(guesses, key=lambda option: option[0])
-    return best
+def _regress(data: Data, has_slew: bool) -> tuple[Data, list[Guess]]:
+    """Return the motors by the regression, and the data with the way of the compensation.
 
-
-def _is_odd(data: Data, guess: Guess) -> bool:
-    """Return whether a strength is at its bound, or efforts are far beyond the limits of the
-    robot.
+    Raises InvalidArgumentError where a log makes far more sense in another reading.
     """
-    if data.logs[0].kind == "effort":
-        most = np.quantile(np.abs(np.concatenate([log.command for log in data.logs])), 0.99, axis=0)
-        limits = data.robot.effort_limit[list(data.logs[0].joints)]
-        if (most > BEYOND * np.where(limits > 0, limits, np.inf)).any():
-            return True
-    return bool(np.isin(guess.values["strength"], STRENGTHS).any())
+    parts, guesses = data.parts, _guesses(data.parts, has_slew)
+    if parts[0].drive.compensate != "none":
+        # A robot that adds the compensation by itself may do so exactly, whatever its motors.
+        exact = [part._replace(drive=part.drive._replace(through=False)) for part in parts]
+        others = _guesses(exact, has_slew)
+        if others[0].cost < guesses[0].cost - DETOUR:
+            parts, guesses = exact, others
+    log = parts[0].log
+    limits = data.robot.effort_limit[list(log.joints)]
+    beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > BEYOND * limits
+    is_odd = guesses[0].odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any())
+    if is_odd:
+        names = [data.robot.joint_names[joint] for joint in log.joints]
+        words = better_reading(parts[0], names)
+        if words:
+            remedy = "correct the log or its options"
+            raise InvalidArgumentError("logs", f"make sense with {words}", remedy=remedy)
+    return data._replace(parts=parts), guesses
 
 
-def _better_reading(data: Data) -> str:
-    names = [data.robot.joint_names[joint] for joint in data.logs[0].joints]
-    return better_reading(data.plants[0], data.drives[0], data.logs[0], names)
+def _guesses(parts: list[LogData], has_slew: bool) -> list[Guess]:
+    return regress([part for part in parts if not part.log.settings.held_out], has_slew)
 
 
-def _unknowns(data: Data, guess: Guess, extras: list[str], payload: bool) -> Unknowns:
-    """Return the unknowns with typical sizes from the motion."""
-    first = data.logs[0]
-    if first.kind == "effort" and (of_law := [name for name in extras if name in LAW]):
-        remedy = "leave it out, or give the params of the law"
-        raise InvalidArgumentError(
-            "extras", "is of a law, and the logs hold efforts", value=of_law[0], remedy=remedy
-        )
-    kinds = [kind for kind in BASIC if not (kind == "delay" and first.measured)]
-    kinds = [kind for kind in kinds if not (kind == "strength" and "gain" in extras)]
-    kinds += ["setpoint_delay"] * (first.kind == "setpoint") + ["payload"] * payload
-    kinds += [kind for name in extras for kind in EXTRAS[name]]
-    qpos, qvel, qacc = (
-        np.concatenate([motion[part] for motion in data.motions]) for part in range(3)
-    )
-    poses = np.ascontiguousarray(qpos[:: max(1, len(qpos) // 200)])
-    dynamics = data.plants[0].dynamics([()] * len(poses), poses, np.zeros_like(poses))
+def _sensible(result: Identification) -> Identification:
+    """Return the result; raise InvalidArgumentError if setpoints acted before they were logged."""
+    for at, entry in enumerate(result.unknowns.entries):
+        delay, _, high = result.row(at)
+        if entry.kind == "setpoint_delay" and SETPOINT_DELAYS[0] <= delay and high < -LEAD:
+            problem = f"make sense with setpoints that were logged {-1e3 * delay:.0f} ms late"
+            raise InvalidArgumentError("logs", problem, remedy="correct their times")
+    return result
+
+
+def _unknowns(data: Data, guess: Guess, extras: Sequence[str], payload: bool) -> Unknowns:
+    """Return the unknowns with starts from the regression, and typical sizes from the motion."""
+    log, _, plant, drive = data.parts[0]
+    for name in extras:
+        if name in LAW and drive.params is None:
+            problem = "is of a law, and the logs hold efforts"
+            remedy = "leave it out, or give the params of the law"
+            raise InvalidArgumentError("extras", problem, value=name, remedy=remedy)
+    starts = dict(guess.values)
+    kinds = list(BASIC)
+    if drive.params is not None:
+        kinds.append("setpoint_delay")
+    if log.measured:
+        # Measured efforts are late by nothing, and say nothing of the motor's strength.
+        kinds.remove("delay")
+        kinds[kinds.index("strength")] = "effort_scale"
+        starts["effort_scale"] = starts["strength"]
+    if "gain" in extras:
+        kinds.remove("strength")
+        starts["gain"] = starts["strength"]
+    if payload:
+        kinds.append("payload")
+    for name in extras:
+        kinds += EXTRAS[name]
+    motions = [part.motion for part in data.parts]
+    qpos, qvel, qacc = (np.concatenate(tables) for tables in list(zip(*motions, strict=True))[:3])
+    poses = np.ascontiguousarray(qpos[:: 1 + len(qpos) // 200])
+    dynamics = Dynamics(plant, [()] * len(poses), poses, np.zeros_like(poses))
     dynamics.update()
     links = np.diagonal(dynamics.matrix, axis1=1, axis2=2).mean(0)
+    inertia = links + starts["armature"]
     speed = np.maximum(np.sqrt((qvel**2).mean(0)), 1e-3)
-    inertia = links + guess.values["armature"]
-    effort = np.maximum(
-        inertia * np.sqrt((qacc**2).mean(0)) + guess.values["friction"], 0.1 * inertia
-    )
-    sizes = {"inertia": links, "damping": effort / speed, "effort": effort, "speed": 0.1 * speed}
-    sizes |= {"friction": 0.3 * np.maximum(guess.values["friction"], 0.05 * effort)}
-    sizes |= {"top_speed": np.quantile(np.abs(qvel), 0.99, axis=0)}
-    if first.kind == "setpoint":
-        errors = np.concatenate([np.abs(motion.command - motion.qpos) for motion in data.motions])
-        sizes["error"] = 0.7 * np.quantile(errors, 0.95, axis=0)
-    starts = dict(guess.values)
-    if "gain" in extras:
-        starts["gain"] = starts.pop("strength")
-    return Unknowns.of(data.robot, first.joints, kinds, starts, sizes, data.plants[0].heavy_links)
+    friction = starts["friction"]
+    effort = inertia * np.maximum(np.sqrt((qacc**2).mean(0)), 0.1) + friction
+    errors = np.concatenate([np.abs(motion.command - motion.qpos) for motion in motions])
+    sizes = {
+        "inertia": links,
+        "damping": effort / speed,
+        "effort": effort,
+        "friction": 0.3 * np.maximum(friction, 0.05 * effort),
+        "speed": 0.1 * speed,
+        "top_speed": np.mean([motion.top_speed for motion in motions], axis=0),
+        "error": 0.7 * np.quantile(errors, 0.95, axis=0),
+    }
+    return Unknowns.of(data.robot, log.joints, kinds, starts, sizes, plant.heavy_links)
 
 
-def _windows(data: Data) -> list[Any]:
-    dt, whole = data.drives[0].timestep, data.logs[0].kind == "setpoint"
-    windows = [
-        window
-        for at, (log, motion) in enumerate(zip(data.logs, data.motions, strict=True))
-        for window in windows_of(at, log, motion, dt, whole)
-    ]
-    return windows[:: 1 + len(windows) // MOST_WINDOWS]
-
-
-def _fitted(
-    data: Data, problem: Problem, evaluations: int, progress: Callable[[], Any] | None
-) -> Identification:
-    """Return the fit: first of all unknowns, then of those that the logs show."""
-    fitted = replace(problem, windows=[window for window in problem.windows if window.fitted.any()])
-    rough = fitted.solve(problem.unknowns.start, max(evaluations // 4, 1), progress=progress)
-    shown = intervals_of(fitted, rough).shown
-    unknowns, hidden = problem.unknowns.only(shown), problem.unknowns.only(~shown)
-    fitted = replace(fitted, unknowns=unknowns)
-    solution = fitted.solve(rough.point[shown], evaluations, rough.size, progress)
-    intervals, problem = intervals_of(fitted, solution), replace(problem, unknowns=unknowns)
-    return Identification.of(data.logs, data.still, problem, solution, intervals, hidden, fitted)
+def _map(stack: ExitStack, workers: int) -> Callable[..., Any]:
+    """Return the map over tasks: of worker processes that end with ``stack``, or of this one."""
+    if workers < 2:
+        return map
+    return stack.enter_context(ProcessPoolExecutor(workers, mp_context=get_context("spawn"))).map

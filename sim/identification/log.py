@@ -25,12 +25,16 @@ BEYOND = {"rad": 0.3, "m": 0.05}
 """Distance beyond a joint limit at which a position counts as given in another unit."""
 MIN_ROWS, MIN_SECONDS = 50, 0.2
 """Least number of rows and length [s] of a stretch."""
+LONGEST = 0.05
+"""Longest period of the rows [s]."""
 GAP, PERIODS = 0.1, 5.0
 """Least length of a gap, in seconds and in median periods of the rows; the longer one applies."""
 CLEAR = np.pi / 2
 """Largest change from row to row, apart from whole turns, at which the number of turns is certain
 [rad].
 """
+BEGIN = 0.03
+"""Time at the start of a log over which its first velocity is measured [s]."""
 
 
 class LogWarning(UserWarning):
@@ -92,6 +96,18 @@ class Log:
         """Length [s]."""
         return float(self.time[-1] - self.time[0])
 
+    @property
+    def start(self) -> tuple[Float64, Float64]:
+        """Position and velocity (joints,) at the start: a line through the first rows; small speeds
+        are rest.
+        """
+        count = max(4, int((self.time <= self.time[0] + BEGIN).sum()))
+        first = self.qpos[:count]
+        slope, place = np.polyfit(self.time[:count] - self.time[0], first, 1)
+        speed = np.diff(self.qpos, axis=0) / np.diff(self.time)[:, None]
+        moves = np.abs(slope) > 0.2 * np.sqrt((speed**2).mean(0))
+        return np.where(moves, place, first.mean(0)), np.where(moves, slope, 0.0)
+
     def part(
         self, rows: Any = slice(None), commands: Any = slice(None), joints: Any = slice(None)
     ) -> Log:
@@ -140,63 +156,45 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
     """
     if log.is_checked:
         return [log]
-    places = (
-        [f"row {index + 1}" for index in range(len(log.time))]
-        if lines is None
-        else [f"line {n}" for n in lines]
-    )
+    places = [f"row {index + 1}" for index in range(len(log.time))]
+    if lines is not None:
+        places = [f"line {line}" for line in lines]
     _check_finite(robot, log, places)
-    if (log.time[1:] < log.time[:-1]).any():
-        index = int(np.argmax(log.time[1:] < log.time[:-1])) + 1
-        raise error(log.source, f"{places[index]}: time decreases", "sort the rows")
-    repeated = np.append(False, log.time[1:] == log.time[:-1])
+    steps = np.diff(log.time, prepend=-np.inf)
+    if (steps < 0).any():
+        place = places[int(np.argmax(steps < 0))]
+        raise error(log.source, f"{place}: time decreases", "sort the rows")
+    repeated = steps == 0
     if repeated.any():
         first = places[int(np.argmax(repeated))]
-        warn(
-            f"{log.source}: {repeated.sum()} rows repeat a time, the first at {first}: left out",
-            LogWarning,
-        )
+        problem = f"{repeated.sum()} rows repeat a time, the first at {first}: left out"
+        warn(f"{log.source}: {problem}", LogWarning)
         places = [place for place, again in zip(places, repeated, strict=True) if not again]
-        log = log.part(
-            ~repeated, ~repeated if len(log.command_time) == len(repeated) else slice(None)
-        )
-    need = f"{MIN_ROWS} rows and {MIN_SECONDS} s"
-    if len(log.time) < MIN_ROWS or log.seconds < MIN_SECONDS:
-        problem = f"has {len(log.time)} rows of {log.seconds:.3g} s"
-        raise error(
-            log.source,
-            problem,
-            f"record {need} at least; time is in seconds, or the column is time_ms",
-        )
-    period = float(np.median(np.diff(log.time)))
-    if period > 0.05:
-        remedy = (
-            "record at 100 Hz or more; time is in seconds, or the column is time_ms, time_us or"
-            " time_ns"
-        )
-        raise error(
-            log.source, f"has one row per {period:.3g} s, too few to see friction and delay", remedy
-        )
+        # Commands of a recording have times of their own.
+        rows_are_commands = len(log.command_time) == len(repeated)
+        log = log.part(~repeated, ~repeated if rows_are_commands else slice(None))
+    period = float(np.median(np.diff(log.time))) if len(log.time) > 1 else 0.0
+    units = "time is in seconds, or the column is time_ms, time_us or time_ns"
+    if period > LONGEST:
+        problem = f"has one row per {period:.3g} s, too few to see friction and delay"
+        raise error(log.source, problem, f"record at 100 Hz or more; {units}")
     gap = max(GAP, PERIODS * period)
-    ends = [0, *(np.flatnonzero(np.diff(log.time) > gap) + 1).tolist(), len(log.time)]
-    parts, short = list[Log](), list[str]()
-    for begin, end in pairwise(ends):
-        if end - begin < MIN_ROWS or log.time[end - 1] - log.time[begin] < MIN_SECONDS:
+    cuts = np.flatnonzero(np.diff(log.time) > gap) + 1
+    parts = list[Log]()
+    short = list[str]()
+    for begin, end in pairwise([0, *cuts.tolist(), len(log.time)]):
+        part = _between(log, slice(begin, end), places) if len(cuts) else log
+        if len(part.time) < MIN_ROWS or part.seconds < MIN_SECONDS:
             short.append(f"{places[begin]} to {places[end - 1]}")
             continue
-        part = log if len(ends) == 2 else _between(log, slice(begin, end), places)
         parts.append(replace(_unwrapped(robot, part, places[begin:end]), is_checked=True))
     if not parts:
-        raise error(
-            log.source,
-            f"has gaps of more than {gap:.3g} s in time",
-            f"a stretch between gaps needs {need}",
-        )
+        problem = f"has {len(log.time)} rows of {log.seconds:.3g} s in {1 + len(cuts)} stretches"
+        remedy = f"record {MIN_ROWS} rows and {MIN_SECONDS} s without a gap; {units}"
+        raise error(log.source, problem, remedy)
     if short:
-        warn(
-            f"{log.source}: stretches between gaps in time are too short, left out: {short[0]} ...",
-            LogWarning,
-        )
+        problem = f"stretches between gaps in time are too short, left out: {short[0]} ..."
+        warn(f"{log.source}: {problem}", LogWarning)
     return parts
 
 
@@ -204,30 +202,23 @@ def _between(log: Log, rows: slice, places: list[str]) -> Log:
     """Return the stretch ``rows`` of ``log``, with the commands that act in it."""
     begin, end = log.time[rows.start], log.time[rows.stop - 1]
     first = max(int(np.searchsorted(log.command_time, begin, "right")) - 1, 0)
-    commands = slice(first, int(np.searchsorted(log.command_time, end, "right")) + 1)
+    last = int(np.searchsorted(log.command_time, end, "right")) + 1
     source = f"{log.source}, {places[rows.start]} to {places[rows.stop - 1]}"
-    return replace(log.part(rows, commands), source=source)
+    return replace(log.part(rows, slice(first, last)), source=source)
 
 
 def _check_finite(robot: Robot, log: Log, places: list[str]) -> None:
-    tables = {
-        "time": log.time[:, None],
-        "qpos": log.qpos,
-        log.kind: log.command,
-        "feedforward": log.feedforward,
-    }
+    tables = {"qpos": log.qpos, log.kind: log.command, "feedforward": log.feedforward}
+    columns = {"time": log.time}
     for quantity, table in tables.items():
-        if table is None or np.isfinite(table).all():
-            continue
-        index, joint = (int(n) for n in np.argwhere(~np.isfinite(table))[0])
-        column = (
-            "time" if quantity == "time" else f"{quantity}:{robot.joint_names[log.joints[joint]]}"
-        )
-        raise error(
-            log.source,
-            f"{places[min(index, len(places) - 1)]}, column {column!r} is empty or not finite",
-            "remove the row",
-        )
+        if table is not None:
+            for joint, column in zip(log.joints, table.T, strict=True):
+                columns[f"{quantity}:{robot.joint_names[joint]}"] = column
+    for name, column in columns.items():
+        if not np.isfinite(column).all():
+            place = places[min(int(np.argmin(np.isfinite(column))), len(places) - 1)]
+            problem = f"{place}, column {name!r} is empty or not finite"
+            raise error(log.source, problem, "remove the row")
 
 
 def _unwrapped(robot: Robot, log: Log, places: list[str]) -> Log:
@@ -236,57 +227,45 @@ def _unwrapped(robot: Robot, log: Log, places: list[str]) -> Log:
     """
     qpos = log.qpos.copy()
     command = log.command.copy()
-    wrapped = list[str]()
+    limited = list[str]()
     for number, joint in enumerate(log.joints):
         name, column = robot.joint_names[joint], qpos[:, number]
-        turns = np.zeros(len(column) - 1)
-        if robot.units[joint] == "rad":
-            steps = np.diff(column)
-            turns = np.rint(steps / TURN)
-            unclear = (np.abs(steps - TURN * turns) > CLEAR) | (np.abs(turns) > 2)
-            if (turns != 0).any() and unclear.any():
-                at = int(np.argmax(unclear))
-                problem = f"{places[at + 1]}: joint {name!r} jumps by {steps[at]:.3g} rad"
-                remedy = "give positions in rad, log more rows per second, or remove wrong rows"
-                raise error(log.source, problem, remedy)
-            column[1:] -= TURN * np.cumsum(turns)
-        if turns.any():
-            wrapped.append(name)
-        else:
+        steps = np.diff(column)
+        turns = np.rint(steps / TURN)
+        if robot.units[joint] != "rad":
+            turns[:] = 0
+        wraps = turns.any()
+        unclear = (np.abs(steps - TURN * turns) > CLEAR) | (np.abs(turns) > 2)
+        if wraps and unclear.any():
+            at = int(np.argmax(unclear))
+            problem = f"{places[at + 1]}: joint {name!r} jumps by {steps[at]:.3g} rad"
+            remedy = "give positions in rad, log more rows per second, or remove wrong rows"
+            raise error(log.source, problem, remedy)
+        if wraps and not robot.continuous[joint]:
+            limited.append(name)
+        elif not robot.continuous[joint]:
             _check_unit(robot, log, joint, column, places)
-        if log.kind == "setpoint" and (turns.any() or robot.continuous[joint]):
+        column[1:] -= TURN * np.cumsum(turns)
+        if log.kind == "setpoint" and (wraps or robot.continuous[joint]):
             measured = np.interp(log.command_time, log.time, column)
             command[:, number] -= TURN * np.rint((command[:, number] - measured) / TURN)
-    limited = [name for name in wrapped if not robot.continuous[robot.joint_names.index(name)]]
     if limited:
-        problem = (
-            f"{log.source}: the positions of {', '.join(limited)} jump by whole turns, and were"
-            " unwrapped"
-        )
-        warn(f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning)
+        problem = f"the positions of {', '.join(limited)} jump by whole turns, and were unwrapped"
+        remedy = "in the robot's file the type is not continuous: correct it"
+        warn(f"{log.source}: {problem}; {remedy}", LogWarning)
     return replace(log, qpos=qpos, command=command)
 
 
 def _check_unit(robot: Robot, log: Log, joint: int, column: Float64, places: list[str]) -> None:
-    """Raise InvalidArgumentError for positions that are not in the joint's unit, or far beyond its
-    limits.
-    """
-    name, unit, (low, high) = (
-        robot.joint_names[joint],
-        robot.units[joint],
-        (robot.lower[joint], robot.upper[joint]),
-    )
-    remedy = f"positions are in {unit}; degrees need the option degrees (--degrees)"
+    """Raise InvalidArgumentError for positions far beyond the joint's limits."""
+    name, unit = robot.joint_names[joint], robot.units[joint]
+    low, high = robot.lower[joint], robot.upper[joint]
     beyond = (column < low - BEYOND[unit]) | (column > high + BEYOND[unit])
-    if beyond.any() and not robot.continuous[joint]:
-        index = int(np.argmax(beyond))
-        problem = (
-            f"{places[index]}, column 'qpos:{name}' is far beyond the joint's limits, {low:g} to"
-            f" {high:g}"
-        )
-        raise error(
-            log.source,
-            problem,
-            f"{remedy}; a joint that turns freely is of type continuous",
-            column[index],
-        )
+    if not beyond.any():
+        return
+    index = int(np.argmax(beyond))
+    limits = f"far beyond the joint's limits, {low:g} to {high:g}"
+    remedy = f"positions are in {unit}; degrees need the option degrees (--degrees)"
+    remedy += "; a joint that turns freely is of type continuous"
+    problem = f"{places[index]}, column 'qpos:{name}' is {limits}"
+    raise error(log.source, problem, remedy, column[index])

@@ -1,5 +1,5 @@
-"""Logs from files: CSV and HDF5 with a column for each quantity and joint, recordings of a runner,
-and ROS bags.
+"""Logs from files: CSV with a column for each quantity and joint, recordings of a runner, and ROS
+bags.
 
 Columns are ``time`` [s] (or ``time_ms``, ``time_us``, ``time_ns``), ``qpos:JOINT``, and
 ``setpoint:JOINT``, ``effort:JOINT`` or ``measured_effort:JOINT``, optionally ``feedforward:JOINT``;
@@ -15,6 +15,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import file_path
 from batchpid.checks.warn import warn
 from batchpid.errors import MissingDependencyError
-from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked, interpolated
+from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
 from batchpid.sim.recording.recording_files import RecordingError, read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
@@ -35,8 +36,6 @@ BAGS = (".bag", ".mcap", ".db3")
 HDF5 = (".h5", ".hdf5")
 SECONDS = {None: 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 JOINT_STATE = "sensor_msgs/msg/JointState"
-_MEASURED = {"position": "qpos", "effort": "measured_effort"}
-_COMMANDED = {"position": "setpoint", "effort": "effort"}
 _TIME = re.compile(r"time[\s_]*[\[(]?(s|ms|us|ns)?[\])]?")
 
 
@@ -92,15 +91,17 @@ def read_logs(
 
 
 def _read(robot: Robot, path: Path, kind: CommandKind | None, reading: Reading) -> list[Log]:
+    if path.suffix.lower() in HDF5:
+        try:
+            return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
+        except RecordingError as bad:
+            remedy = "logs of other programs are CSV files with the columns time, qpos:JOINT, ..."
+            raise RecordingError(f"{bad}; {remedy}") from bad
     lines = None
     if path.suffix.lower() in BAGS or path.is_dir():
         columns = _read_bag(robot, path, reading)
-    elif file_path("log", path, (".csv", ".txt", *HDF5, *BAGS)).suffix.lower() in HDF5:
-        named = _read_hdf5(path)
-        if named is None:
-            return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
-        columns = named
     else:
+        file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
         columns, lines = read_csv(path, (*QUANTITIES, "time"))
     return checked(robot, _build(robot, str(path), columns, kind, reading), lines)
 
@@ -115,52 +116,47 @@ def logs_of_rollout(
     """
     info = rollout.info
     recorded: CommandKind = "effort" if info.control == "effort" else "setpoint"
+    follows = recorded == "setpoint"
     changes = np.abs(np.diff(rollout.time) - rollout.tick)
     obstacles = {
         f"is of the joints {', '.join(info.joint_names)}": info.joint_names != robot.joint_names,
         "was made with setpoints that are not of joints": info.own_command is not None,
         f"was made under control {info.control!r}": info.control not in (None, "pid", "effort"),
         f"holds {recorded}s": kind not in (None, recorded),
-        "was made with setpoint rates": bool(info.rates) and recorded == "setpoint",
+        "was made with setpoint rates": bool(info.rates) and follows,
         "has setpoints that a guard changed": bool(np.any(rollout.guarded)),
         "was made with a randomization": bool(info.randomization),
-        "has params that were changed": info.params_changed and recorded == "setpoint",
+        "has params that were changed": info.params_changed and follows,
         "has ticks of varied length": bool((changes > 1e-9 + 1e-6 * rollout.tick).any()),
         "has failed": not rollout.ok.all(),
     }
     for problem, holds in obstacles.items():
         if holds:
-            raise error(
-                source,
-                f"{problem}, which a fit cannot use",
-                "record another run under control pid or effort",
-            )
+            remedy = "record another run under control pid or effort"
+            raise error(source, f"{problem}, which a fit cannot use", remedy)
     joints = tuple(np.flatnonzero(robot.independent).tolist())
-    forwards = rollout.feedforward
+
+    def table(rows: Any) -> Float64:
+        return np.asarray(rows, float)[:, env, joints]
+
     logs = []
     for env in range(rollout.num_envs):
-        setpoint, qpos = (
-            np.asarray(table, float)[:, env, joints] for table in (rollout.setpoint, rollout.qpos)
-        )
-        name = source if rollout.num_envs == 1 else f"{source}, env {env}"
         log = Log(
-            name,
+            source if rollout.num_envs == 1 else f"{source}, env {env}",
             joints,
             recorded,
             rollout.time,
-            qpos,
+            table(rollout.qpos),
             rollout.time - rollout.tick,
-            setpoint,
-            True,
-            info.timestep,
-            info.compensate,
-            feedforward=None if forwards is None else np.asarray(forwards, float)[:, env, joints],
-            params=(
-                None
-                if info.params is None or recorded == "effort"
-                else info.params.for_envs(slice(env, env + 1))
-            ),
+            table(rollout.setpoint),
+            held=True,
+            timestep=info.timestep,
+            compensate=info.compensate,
         )
+        if rollout.feedforward is not None:
+            log = replace(log, feedforward=table(rollout.feedforward))
+        if info.params is not None and follows:
+            log = replace(log, params=info.params.for_envs(slice(env, env + 1)))
         logs += checked(robot, log)
     return logs
 
@@ -176,94 +172,52 @@ def _build(
     times = {name: match[1] for name in columns if (match := _TIME.fullmatch(name))}
     if not times:
         problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
-        raise error(
-            source, problem, "begin the header with time, in seconds, or time_ms, time_us, time_ns"
-        )
+        remedy = "begin the header with time, in seconds, or time_ms, time_us, time_ns"
+        raise error(source, problem, remedy)
     name, unit = next(iter(times.items()))
     time = SECONDS[unit] * columns[name]
     by = columns_by_joint(robot, source, columns, QUANTITIES, reading.prefix)
-    if not by["qpos"]:
-        remedy = f"measured positions are needed, e.g. qpos:{robot.joint_names[0]}"
-        raise error(source, "has no column qpos:JOINT", remedy)
-    measured = bool(by["measured_effort"]) and not by["effort"]
+    # Measured efforts stand for commands that were not logged.
+    measured = not by["effort"]
     by["effort"] = by["effort"] or by["measured_effort"]
     kind = kind or ("effort" if by["effort"] else "setpoint")
-    if not by[kind]:
-        remedy = f"commands are needed, e.g. {kind}:{robot.joint_names[0]}"
-        raise error(source, f"has no column {kind}:JOINT", remedy)
+    for quantity in ("qpos", kind):
+        if not by[quantity]:
+            remedy = f"positions and commands are needed, e.g. {quantity}:{robot.joint_names[0]}"
+            raise error(source, f"has no column {quantity}:JOINT", remedy)
     if kind == "effort" and by["feedforward"]:
-        raise error(
-            source,
-            "has a feedforward, which efforts include",
-            "give the gains of the law, or leave it out",
-        )
-    used = ("qpos", kind, *(("feedforward",) if by["feedforward"] else ()))
-    names = [name for name, free in zip(robot.joint_names, robot.independent, strict=True) if free]
-    names = [name for name in names if any(name in by[quantity] for quantity in used)]
-    tables = {}
+        remedy = "give the gains of the law, or leave it out"
+        raise error(source, "has a feedforward, which efforts include", remedy)
+    used = [name for name in ("qpos", kind, "feedforward") if by[name]]
+    joints = [
+        joint
+        for joint in np.flatnonzero(robot.independent).tolist()
+        if any(robot.joint_names[joint] in by[quantity] for quantity in used)
+    ]
+    tables = dict[str, Float64]()
     for quantity in used:
-        for joint in names:
-            if joint not in by[quantity]:
-                remedy = (
-                    "give all columns of a joint or none; a joint that is left out rests at the"
-                    " robot's start pose"
-                )
-                raise error(f"{source}: column {quantity}:{joint}", "is missing", remedy)
-        tables[quantity] = np.stack([by[quantity][joint] for joint in names], axis=1)
+        for joint in joints:
+            name = robot.joint_names[joint]
+            if name not in by[quantity]:
+                remedy = "give all columns of a joint or none: without columns it rests"
+                raise error(f"{source}: column {quantity}:{name}", "is missing", remedy)
+        rows = [by[quantity][robot.joint_names[joint]] for joint in joints]
+        tables[quantity] = np.stack(rows, axis=1)
         if reading.degrees and quantity in ("qpos", "setpoint"):
-            turns = [robot.units[robot.joint_names.index(joint)] == "rad" for joint in names]
-            tables[quantity] *= np.where(turns, np.pi / 180, 1.0)
-    joints = tuple(robot.joint_names.index(joint) for joint in names)
-    forward = tables.get("feedforward")
+            revolute = [robot.units[joint] == "rad" for joint in joints]
+            tables[quantity][:, revolute] = np.radians(tables[quantity][:, revolute])
     return Log(
         source,
-        joints,
+        tuple(joints),
         kind,
         time,
         tables["qpos"],
         time,
         tables[kind],
-        reading.hold,
-        feedforward=forward,
+        held=reading.hold,
+        feedforward=tables.get("feedforward"),
         measured=measured and kind == "effort",
     )
-
-
-def _read_hdf5(path: Path) -> dict[str, Float64] | None:
-    """Return the datasets of an HDF5 file by the last part of their names; None for a recording of
-    a runner.
-    """
-    import h5py
-
-    datasets = dict[str, Any]()
-
-    def note(name: str, node: Any) -> None:
-        if isinstance(node, h5py.Dataset):
-            datasets[name] = node
-
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            if "joint_names" in file.attrs:
-                return None
-            file.visititems(note)
-            columns = {
-                name: table
-                for name, table in datasets.items()
-                if table.ndim == 1 and table.dtype.kind in "iuf"
-            }
-            if not columns:
-                problem = (
-                    f"has no column 'time' and no qpos:JOINT, but {', '.join(list(datasets)[:6])}"
-                )
-                raise error(
-                    str(path), problem, "give one dataset of one number per row for each column"
-                )
-            return {
-                name.rpartition("/")[2].strip(): np.asarray(table, float)
-                for name, table in columns.items()
-            }
-    except (OSError, RuntimeError) as bad:
-        raise RecordingError(f"{path}: cannot be read as a log: {bad}") from bad
 
 
 def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
@@ -278,69 +232,45 @@ def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingDependencyError("rosbags", "a log in a ROS bag", "tune") from None
-    topics = {reading.topic: _MEASURED} | (
-        {reading.command_topic: _COMMANDED} if reading.command_topic else {}
-    )
-    samples = {topic: defaultdict[str, list[tuple[int, float]]](list) for topic in topics}
+    names = {f"{reading.prefix}{joint}" for joint in robot.joint_names}
+    topics = {reading.topic: {"position": "qpos", "effort": "measured_effort"}}
+    if reading.command_topic:
+        topics[reading.command_topic] = {"position": "setpoint", "effort": "effort"}
+    samples = defaultdict[tuple[str, str], dict[int, float]](dict)
+    others = set[str]()
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            chosen = [
-                connection
-                for connection in reader.connections
-                if connection.topic in topics and connection.msgtype == JOINT_STATE
-            ]
-            present = sorted(
-                connection.topic
-                for connection in reader.connections
-                if connection.msgtype == JOINT_STATE
-            )
-            for connection, received, raw in reader.messages(connections=chosen) if chosen else ():
-                message: Any = reader.deserialize(raw, connection.msgtype)
+            states = [line for line in reader.connections if line.msgtype == JOINT_STATE]
+            chosen = [line for line in states if line.topic in topics]
+            # Without a connection the reader would return all messages.
+            for line, received, raw in reader.messages(connections=chosen) if chosen else ():
+                message: Any = reader.deserialize(raw, line.msgtype)
                 stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec or received
-                for field, quantity in topics[connection.topic].items():
+                for field, quantity in topics[line.topic].items():
                     # A driver without such a value leaves the list empty.
-                    for joint, value in zip(message.name, getattr(message, field), strict=False):
-                        samples[connection.topic][f"{quantity}:{joint}"].append(
-                            (stamp, float(value))
-                        )
+                    for name, value in zip(message.name, getattr(message, field), strict=False):
+                        if name in names:
+                            samples[line.topic, f"{quantity}:{name}"][stamp] = float(value)
+                        else:
+                            others.add(name.removeprefix(reading.prefix))
     except Exception as bad:  # a damaged file can make the library raise anything
         raise error(str(path), f"cannot be read: {bad}", "correct or record it again") from None
-    for topic, columns in samples.items():
-        if not columns:
-            remedy = (
-                f"use one of its topics of {JOINT_STATE}: {', '.join(present) or 'there are none'}"
-            )
-            raise error(str(path), f"has no values in the topic {topic!r} of {JOINT_STATE}", remedy)
-    names = {f"{reading.prefix}{joint}" for joint in robot.joint_names}
-    joints = {name.partition(":")[2] for columns in samples.values() for name in columns}
-    others = ", ".join(joint.removeprefix(reading.prefix) for joint in sorted(joints - names))
-    stamps = [
-        [stamp for stamp, _ in rows]
-        for name, rows in samples[reading.topic].items()
-        if name in {f"qpos:{joint}" for joint in names}
-    ]
-    if not stamps:
-        remedy = (
-            f"the robot has {', '.join(robot.joint_names)}: give the prefix of the names, or"
-            " another topic"
-        )
-        raise error(
-            str(path),
-            f"has no positions of the robot's joints, but {others or 'other values'}",
-            remedy,
-        )
+    present = ", ".join(sorted(line.topic for line in states)) or "there are none"
+    left_out = ", ".join(sorted(others))
+    for topic in topics:
+        if all(place[0] != topic for place in samples):
+            problem = f"has no values in the topic {topic!r} of the robot's joints"
+            remedy = f"topics of {JOINT_STATE}: {present}; other joints: {left_out or 'none'}"
+            raise error(str(path), problem, remedy)
     if others:
-        warn(f"{path}: {others}: no joint of the robot, left out", LogWarning)
-    first, last = max(map(min, stamps)), min(map(max, stamps))
-    merged = {
-        "time": (
-            np.unique([stamp - first for stamp in max(stamps, key=len) if first <= stamp <= last])
-            / 1e9
-        )
-    }
-    for columns in samples.values():
-        for name, rows in columns.items():
-            if name.partition(":")[2] in names:
-                table = np.array(sorted((stamp - first, value) for stamp, value in rows))
-                merged[name] = interpolated(merged["time"], table[:, 0] / 1e9, table[:, 1:])[:, 0]
-    return merged
+        warn(f"{path}: {left_out}: no joint of the robot, left out", LogWarning)
+    stamps = [sorted(rows) for (_, name), rows in samples.items() if name.startswith("qpos")]
+    first = max(joint[0] for joint in stamps)
+    last = min(joint[-1] for joint in stamps)
+    time = np.array([stamp - first for stamp in max(stamps, key=len) if first <= stamp <= last])
+    columns = {"time": time / 1e9}
+    for (_, name), rows in samples.items():
+        moments = sorted(rows)
+        values = [rows[stamp] for stamp in moments]
+        columns[name] = np.interp(time, [stamp - first for stamp in moments], values)
+    return columns

@@ -14,7 +14,6 @@ robot's start pose, followers move with their leaders, and joints stop at their 
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -24,9 +23,8 @@ import numpy as np
 
 import batchpid as bp
 import batchpid.task_space as ts
-from batchpid import motors as actuator_model
-from batchpid.arrays.array_types import Document, Float64
-from batchpid.arrays.elementwise import TURN, namespace
+from batchpid import motors as motor_model
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.trees import leaves, mapped, structure
 from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
@@ -47,10 +45,10 @@ from batchpid.task_space.rigid_tree import RigidTree
 
 DIVERGED = 1e4
 """Position beyond which a simulation has diverged [rad or m]."""
-MOVING = 0.01
-"""Speed from which a joint counts as sliding at the start [rad/s or m/s]."""
-PAYLOAD = "payload at the tool"
-"""Link at the place of the payload: the center of mass of the tool."""
+PAYLOAD = "payload"
+"""Name of the payload among masses of links."""
+Masses = tuple[tuple[str, float], ...]
+"""Factors of the masses of some links, and the mass of the payload [kg] under PAYLOAD."""
 
 
 class LogControl(NamedTuple):
@@ -76,20 +74,21 @@ class PlantCandidates(NamedTuple):
     and "slew" (limit of the setpoints' rate).
     """
     setpoint_delay: Float64
-    """Delay of the setpoints (n,) [s]."""
-    masses: tuple[tuple[tuple[str, float], ...], ...]
-    """Factors of the masses of some links of each candidate, and the mass of its payload [kg] under
-    PAYLOAD.
-    """
+    """Delay of the setpoints (n,), negative where they were logged late [s]."""
+    masses: Sequence[Masses]
 
     def repeated(self, times: int) -> PlantCandidates:
         """Return each candidate ``times`` times, one after the other."""
-        tables = [{name: np.repeat(rows, times, axis=0) for name, rows in self.law.items()}]
-        actuators = mapped(
-            lambda leaf: leaf if len(leaf) == 1 else np.repeat(leaf, times, axis=0), self.actuators
+
+        def rows(leaf: Float64) -> Float64:
+            return leaf if len(leaf) == 1 else np.repeat(leaf, times, axis=0)
+
+        return PlantCandidates(
+            mapped(rows, self.actuators),
+            {name: np.repeat(table, times, axis=0) for name, table in self.law.items()},
+            np.repeat(self.setpoint_delay, times),
+            [masses for masses in self.masses for _ in range(times)],
         )
-        masses = tuple(row for row in self.masses for _ in range(times))
-        return PlantCandidates(actuators, tables[0], np.repeat(self.setpoint_delay, times), masses)
 
 
 class Stretch(NamedTuple):
@@ -103,6 +102,7 @@ class Stretch(NamedTuple):
     start on.
     """
     past: int
+    """Number of steps before the start, equal in all stretches of a simulation."""
     feedforward: Float64 | None
     """Efforts that are added to the efforts of the law (past + steps, joints)."""
     step: Any
@@ -110,123 +110,110 @@ class Stretch(NamedTuple):
     before: Float64
     """Time from the row to that end [s] (rows,)."""
 
-    @property
-    def steps(self) -> int:
-        """Number of sim steps."""
-        return len(self.command) - self.past
-
 
 class Plant:
     """Logged ``joints`` of ``robot``, with a known ``payload`` at its tool [kg]."""
 
     def __init__(self, robot: Robot, joints: tuple[int, ...], payload: float = 0.0) -> None:
-        coupling, tree = robot.coupling, robot.dynamics(False).tree
+        logged = list(joints)
+        coupling = robot.coupling
         moves = np.isin(coupling.leader, joints)
         number = np.cumsum(moves) - 1
-        followers = [
-            Follower(
-                number[joint],
-                number[coupling.leader[joint]],
-                coupling.multiplier[joint],
-                coupling.offset[joint],
-            )
-            for joint in np.flatnonzero(moves & ~coupling.independent)
-        ]
-        self._robot = robot
-        self._moves = moves
-        self._followers = followers
+        followers = []
+        for joint in np.flatnonzero(moves & ~coupling.independent):
+            leader = number[coupling.leader[joint]]
+            ratio = coupling.multiplier[joint]
+            followers.append(Follower(number[joint], leader, ratio, coupling.offset[joint]))
+        tree = robot.rigid_tree.fixed_at(coupling.positions(robot.start), moves)
         self._payload = payload
-        self._description = _with_payload(tree, robot.rigid_tree)
-        self._trees = dict[Any, RigidTree]()
-        self.tree = self.tree_of(())
-        """Rigid tree of the logged joints as described, with the payload."""
-        columns = number[list(joints)]
-        self.columns = None if np.array_equal(columns, np.arange(self.tree.dof)) else columns
+        self._tool = robot.rigid_tree.tool
+        self._description = replace(tree, coupling=Coupling.of(tree.dof, followers))
+        self._trees = dict[Masses, RigidTree]()
+        self.columns = number[logged] if followers else None
         """Joints of the tree that are logged; None for all."""
-        free = robot.continuous[list(joints)]
-        self.low = np.where(free, -np.inf, robot.lower[list(joints)])[None]
-        self.high = np.where(free, np.inf, robot.upper[list(joints)])[None]
-        self.turns = free / TURN if free.any() else None
+        free = robot.continuous[logged]
+        self.low = np.where(free, -np.inf, robot.lower[logged])[None]
+        self.high = np.where(free, np.inf, robot.upper[logged])[None]
 
-    def tree_of(self, masses: tuple[tuple[str, float], ...]) -> RigidTree:
-        """Return the tree with other masses, as in :attr:`PlantCandidates.masses`."""
-        if masses not in self._trees:
-            tree = self._description
-            mass, inertia = np.array(tree.mass), np.array(tree.inertia)
-            mass[-1] = self._payload
-            for link, value in masses:
-                index = tree.index(link)
-                mass[index] = value + self._payload if link == PAYLOAD else value * mass[index]
-                inertia[index] *= value
-            tree = replace(tree, mass=mass, inertia=inertia)
-            tree = tree.fixed_at(self._robot.coupling.positions(self._robot.start), self._moves)
-            if len(self._trees) > 100:
-                self._trees.clear()
-            self._trees[masses] = replace(tree, coupling=Coupling.of(tree.dof, self._followers))
+    def tree_of(self, masses: Masses) -> RigidTree:
+        """Return the rigid tree of the logged joints with other masses.
+
+        A factor holds for all links of a body. The payload is at the tool's center of mass.
+        """
+        if masses in self._trees:
+            return self._trees[masses]
+        tree = self._description
+        bodies = np.array(tree.link_bodies)
+        mass = np.array(tree.mass)
+        inertia = np.array(tree.inertia)
+        payload = self._payload
+        for link, value in masses:
+            if link == PAYLOAD:
+                payload += value
+                continue
+            members = bodies == bodies[tree.index(link)]
+            mass[members] *= value
+            inertia[members] *= value
+        mass[tree.index(self._tool)] += payload
+        # An evaluation has some tens of robots; the next one has others.
+        if len(self._trees) > 100:
+            self._trees.clear()
+        self._trees[masses] = replace(tree, mass=mass, inertia=inertia)
         return self._trees[masses]
 
     @property
     def heavy_links(self) -> list[str]:
-        """Moving links with a mass."""
-        links = zip(self.tree.links, self.tree.link_bodies, self.tree.mass, strict=True)
-        return [link for link, body, mass in links if body >= 0 and mass > 0 and link != PAYLOAD]
-
-    def dynamics(self, masses: Sequence[Any], qpos: Float64, qvel: Float64) -> Dynamics:
-        """Return the dynamics of robots at ``qpos`` and ``qvel`` (n, joints), arrays that may
-        change.
-        """
-        return Dynamics(self, masses, qpos, qvel)
+        """First link of each moving body with a mass."""
+        tree = self._description
+        bodies = dict[int, str]()
+        for link, body, mass in zip(tree.links, tree.link_bodies, tree.mass, strict=True):
+            if body >= 0 and mass > 0:
+                bodies.setdefault(body, link)
+        return list(bodies.values())
 
 
 class Dynamics:
-    """Mass matrices and forces of n robots at the present poses of two arrays."""
+    """Mass matrices and forces of n robots at the present poses of two arrays (n, joints)."""
 
-    def __init__(self, plant: Plant, masses: Sequence[Any], qpos: Float64, qvel: Float64) -> None:
-        self._plant, self.masses, (rows, joints) = plant, masses, qpos.shape
-        self.matrix, self.force = np.empty((rows, joints, joints)), np.empty((rows, joints))
-        self._parts, first = list[Any](), 0
-        for row in range(1, rows + 1):
-            if row == rows or masses[row] != masses[first]:
-                self._parts.append(
-                    self._part(plant.tree_of(masses[first]), qpos, qvel, slice(first, row))
-                )
-                first = row
+    def __init__(
+        self, plant: Plant, masses: Sequence[Masses], qpos: Float64, qvel: Float64
+    ) -> None:
+        rows, joints = qpos.shape
+        self.matrix = np.empty((rows, joints, joints))
+        self.force = np.empty((rows, joints))
+        self._columns = plant.columns
+        self._parts = list[Any]()
+        # Robots of equal masses stand in line: one part for each kind.
+        starts = [row for row in range(rows) if not row or masses[row] != masses[row - 1]]
+        for first, last in zip(starts, [*starts[1:], rows], strict=True):
+            tree = plant.tree_of(masses[first])
+            q = qpos[first:last]
+            v = qvel[first:last]
+            if plant.columns is not None:
+                q = np.zeros((last - first, tree.dof))
+                v = np.zeros_like(q)
+            native = native_rows.bound(tree, ("mass_matrix", "bias"), q, v, 0)
+            self._parts.append((slice(first, last), tree, q, v, native))
+        self._state = qpos, qvel
 
-    def _part(self, tree: RigidTree, qpos: Float64, qvel: Float64, rows: slice) -> Any:
-        """Return a function that updates ``rows`` of the results."""
-        q = qpos[rows]
-        v = qvel[rows]
-        columns = self._plant.columns
-        names = ("mass_matrix", "bias")
-        if columns is not None:
-            q, v = np.zeros((len(q), tree.dof)), np.zeros((len(q), tree.dof))
-        native = native_rows.bound(tree, names, q, v, 0)
-
-        def update() -> None:
-            if columns is not None:
-                q[:, columns], v[:, columns] = qpos[rows], qvel[rows]
-                q[...], v[...] = tree.positions(q), tree.rates(v)
+    def update(self) -> None:
+        """Compute the matrices (n, joints, joints) and forces (n, joints) at the present poses."""
+        for rows, tree, q, v, native in self._parts:
+            if self._columns is not None:
+                q[:, self._columns] = self._state[0][rows]
+                v[:, self._columns] = self._state[1][rows]
+                q[...] = tree.positions(q)
+                v[...] = tree.rates(v)
             if native is None:
                 matrix, force = ts.mass_matrix(tree, q), ts.bias(tree, q, v)
             else:
                 native[0]()
                 matrix, force = native[1]
-            if columns is not None:
-                matrix, force = (
-                    np.ascontiguousarray(matrix[:, columns[:, None], columns]),
-                    force[:, columns],
-                )
-            if len(self._parts) == 1:
-                self.matrix, self.force = matrix, force
-            else:
-                self.matrix[rows], self.force[rows] = matrix, force
-
-        return update
-
-    def update(self) -> None:
-        """Compute the matrices (n, joints, joints) and forces (n, joints) at the present poses."""
-        for part in self._parts:
-            part()
+            if self._columns is not None:
+                matrix = matrix[:, self._columns[:, None], self._columns]
+                force = force[:, self._columns]
+            self.matrix[rows] = matrix
+            self.force[rows] = force
 
 
 class Control:
@@ -238,55 +225,45 @@ class Control:
         self,
         drive: LogControl,
         candidates: PlantCandidates,
+        dynamics: Dynamics,
         qpos: Float64,
         qvel: Float64,
-        asked: Any,
-        turns: Float64 | None,
+        efforts: Float64 | None = None,
     ) -> None:
-        """Begin at ``qpos`` and ``qvel`` (n, joints).
-
-        ``asked`` are the efforts asked for so far, the latest first (samples, n, joints), or None.
+        """Begin at ``qpos`` and ``qvel`` (n, joints), after the commanded ``efforts`` (samples, n,
+        joints), the latest first.
         """
         dt = drive.timestep
         count = len(qpos)
         actuators = candidates.actuators
-        self.friction = added_friction(Friction(), actuators)
-        k = law = None
+        k = law = guard = motors = None
         state = StepState(None)
         if drive.params is not None:
             law = PIDLaw.of(drive.params)
-            times = count // len(drive.params.kp)
-            params = mapped(
-                lambda leaf: np.tile(leaf, (times, 1)) if leaf.ndim == 2 else leaf, drive.params
-            )
-            params = changed_params(params, candidates.law)
-            params = params._replace(
-                measurement_rate=None
-            )  # the law of the layout decides, not the params
+            # The law of the layout decides on rates that are measured, not the params.
+            params = changed_params(_repeated(drive.params, count), candidates.law)
+            params = params._replace(measurement_rate=None)
+            k = bp.discretise(params, dt, count)
             offset = 0.0 if actuators.position_offset is None else actuators.position_offset
-            k, state = bp.discretise(params, dt, count), StepState(bp.init(params, qpos + offset))
-        guard = None
+            state = StepState(bp.init(params, qpos + offset))
         if "slew" in candidates.law:
-            guard = Guard(rate=candidates.law["slew"], turns=turns)
+            guard = Guard(rate=candidates.law["slew"])
             state = state._replace(guard=guard_model.init(guard, qpos))
-        motors = None
-        ideal = dict.fromkeys(actuator_model.JOINT_SIDE)
-        if not actuators._replace(**ideal).is_ideal:
-            history = actuator_model.init(
-                actuators, qpos, dt, qvel=qvel, effort=None if asked is None else asked[0]
-            )
-            if history.command is not None and asked is not None:
-                samples = np.minimum(np.arange(history.command.shape[1]), len(asked) - 1)
-                history = history._replace(command=asked[samples].swapaxes(0, 1))
-            motors, state = (
-                actuator_model.discretise(actuators, history, dt, count),
-                state._replace(motors=history),
-            )
+        if not actuators._replace(**dict.fromkeys(motor_model.JOINT_SIDE)).is_ideal:
+            history = motor_model.init(actuators, qpos, dt, qvel=qvel)
+            if history.command is not None and efforts is not None:
+                samples = np.minimum(np.arange(history.command.shape[1]), len(efforts) - 1)
+                history = history._replace(command=efforts[samples].swapaxes(0, 1))
+            motors = motor_model.discretise(actuators, history, dt, count)
+            state = state._replace(motors=history)
+        self.friction = added_friction(Friction(), actuators)
+        self.armature = np.zeros_like(qpos)
+        if actuators.armature is not None:
+            self.armature += actuators.armature
         if self.friction.coulomb is not None:
-            started = friction_model.started(qvel, np.zeros_like(qpos))
-            sliding = (np.abs(qvel) > MOVING).astype(float)
+            begin = (qvel, dynamics.force, self._inertia(dynamics.matrix), dt)
             state = state._replace(
-                friction=started._replace(sliding=sliding), age=np.ones_like(qpos)
+                friction=friction_model.init(self.friction, *begin), age=np.ones_like(qpos)
             )
         self._layout = Layout("effort" if law is None else "pid", law, actuators.measures, _MODEL)
         self._constants = Constants(
@@ -301,205 +278,55 @@ class Control:
         self.state = mapped(lambda leaf: np.array(leaf, order="C"), state)
         self._program: Any = None
 
+    def _inertia(self, matrix: Float64) -> Float64:
+        return matrix + self.armature[:, :, None] * np.eye(matrix.shape[1])
+
     def refresh(self, matrix: Float64) -> None:
         """Update the inertia of the friction model."""
-        if self.friction.coulomb is not None:
-            fresh = friction_model.refresh(
-                self.friction, self.state.friction, matrix, self._constants.timestep
-            )
-            for name in ("gain", "memory"):
-                getattr(self.state.friction, name)[...] = getattr(fresh, name)
+        if self.friction.coulomb is None:
+            return
+        dt = self._constants.timestep
+        state = self.state.friction
+        fresh = friction_model.refresh(self.friction, state, self._inertia(matrix), dt)
+        # In place: the program is bound to these arrays.
+        state.gain[...] = fresh.gain
+        state.memory[...] = fresh.memory
 
-    def advance(
-        self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64 | None
-    ) -> Float64:
+    def advance(self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64) -> Float64:
         """Return the efforts of motors and friction (n, joints), which the next call may reuse.
 
         ``command`` are setpoints or efforts, ``passive`` the compensated force and the feedforward.
         """
         inputs = command, qpos, qvel, passive
-        if self._program is None:
-            self._program = self._compiled(inputs) or ()
-        if not self._program:
+        if obstacle():
             self.state, effort = _step(self._layout, self._constants, self.state, inputs)
             return effort
-        run, state, results, effort = self._program
-        run(*state, *[table for table in inputs if table is not None], out=results)
-        return effort
+        if self._program is None:
+            self._program = self._compiled(inputs)
+        program, state, results = self._program
+        program(*state, *inputs, out=results)
+        return results[-1]
 
     def _compiled(self, inputs: Any) -> Any:
-        """Return the program, the arrays of its state, of its results, and of the efforts; None for
-        NumPy.
-        """
-        if obstacle():
-            return None
+        """Return the program, the arrays of its state, and of its results: state and efforts."""
         constants = mapped(lambda leaf: tuple(leaf) if leaf.ndim == 3 else leaf, self._constants)
         trace = _trace(self._layout, *map(structure, (constants, self.state, inputs)))
-        effort, state = np.zeros_like(inputs[1]), leaves(self.state)
-        program = ArrayProgram(
-            trace, leaves(constants), len(state) + len(leaves(inputs)), effort.shape
-        )
-        return program, state, (*leaves(_returned(self.state)), effort), effort
+        effort = np.zeros_like(inputs[1])
+        state = leaves(self.state)
+        count = len(state) + len(leaves(inputs))
+        program = ArrayProgram(trace, leaves(constants), count, effort.shape)
+        return program, state, (*leaves(_returned(self.state)), effort)
 
 
-def simulate(
-    plant: Plant,
-    drive: LogControl,
-    candidates: PlantCandidates,
-    states: Float64,
-    stretches: Sequence[Stretch],
-) -> list[Float64]:
-    """Return the positions (candidates, rows, joints) of all candidates at the rows of each
-    stretch.
-
-    ``states`` (candidates, 2, joints) are added to positions and velocities at the starts. A
-    simulation that diverges ends at inf.
-    """
-    many = len(stretches)
-    count = len(states)
-    dt = drive.timestep
-    rows, offset = candidates.repeated(many), candidates.actuators.position_offset
-    starts = np.array([[stretch.qpos, stretch.qvel] for stretch in stretches])
-    q, v = (np.concatenate(starts[:, side] + states[:, None, side]) for side in (0, 1))
-    if rows.actuators.position_offset is not None:
-        q -= rows.actuators.position_offset
-    # State of the robots: dynamics, compensation, the efforts before the first row, control.
-    dynamics = plant.dynamics(rows.masses, q, v)
-    dynamics.update()
-    compensation = _Compensation(plant, drive, dynamics, q, v, rows.actuators.position_offset)
-    efforts = None
-    past = min(stretch.past for stretch in stretches)
-    if drive.params is None and past:
-        held = compensation.now() if drive.through else None
-        earlier = np.stack(
-            [stretch.command[stretch.past - 1 :: -1][:past] for stretch in stretches], axis=1
-        )
-        efforts = np.tile(earlier, (1, count, 1)) + (0.0 if held is None else held)
-    control = Control(drive, rows, q, v, efforts, plant.turns)
-    if control.friction.coulomb is not None:
-        control.state.friction.effort[...] = dynamics.force
-    # Inputs of each step.
-    commands = _Commands(drive, rows, stretches)
-    forwards = None
-    if any(stretch.feedforward is not None for stretch in stretches):
-        tables = [
-            np.zeros_like(s.command) if s.feedforward is None else s.feedforward for s in stretches
-        ]
-        forwards = _padded([table[s.past :] for table, s in zip(tables, stretches, strict=True)])
-    # Inertias that are added to the mass matrix; damping is implicit.
-    armature = 0.0 if rows.actuators.armature is None else rows.actuators.armature
-    viscous = 0.0 if control.friction.viscous is None else control.friction.viscous
-    armature = np.zeros_like(q) + armature
-    added = armature + dt * viscous
-    native, steps = native_rows.in_use(), max(stretch.steps for stretch in stretches)
-    eye, shape = np.eye(q.shape[1]), (count, many, q.shape[1])
-    places, speeds = q.reshape(shape), v.reshape(shape)
-    out = [np.empty((count, len(stretch.step), q.shape[1])) for stretch in stretches]
-    # Rows of the logs that follow each step.
-    events = defaultdict[int, list[tuple[int, int]]](list)
-    for number, stretch in enumerate(stretches):
-        for row, step in enumerate(stretch.step):
-            events[int(step)].append((number, row))
-    diverged = np.zeros(len(q), bool)
-    with np.errstate(all="ignore"):
-        for step in range(steps):
-            if step:
-                dynamics.update()
-            if step % REFRESH_STEPS == 0:
-                bad = ~(np.abs(q) < DIVERGED).all(1)
-                diverged |= bad
-                q[bad] = v[bad] = 0.0
-                control.refresh(dynamics.matrix + armature[:, :, None] * eye)
-            passive, force = compensation.now(), dynamics.force
-            if passive is not None and not drive.through:
-                force, passive = force - passive, None
-            if forwards is not None:
-                forward = np.tile(forwards[step], (count, 1))
-                passive = forward if passive is None else passive + forward
-            effort = control.advance(commands.at(step), q, v, passive)
-            if native is not None:
-                native.move(
-                    *q.shape,
-                    dt,
-                    q,
-                    v,
-                    dynamics.matrix,
-                    effort - force,
-                    added,
-                    plant.low,
-                    plant.high,
-                )
-            else:
-                inertia = dynamics.matrix + added[:, :, None] * eye
-                v += dt * np.linalg.solve(inertia, (effort - force)[..., None])[..., 0]
-                q += dt * v
-                v[...] = np.where((q < plant.low) | (q > plant.high), 0.0, v)
-                np.clip(q, plant.low, plant.high, out=q)
-            for number, row in events.get(step, ()):
-                late = stretches[number].before[row]
-                out[number][:, row] = places[:, number] - late * speeds[:, number]
-    # Joints that diverged end at inf; the others are measured with their offset.
-    diverged |= ~(np.abs(q) < DIVERGED).all(1)
-    for number, table in enumerate(out):
-        table += 0.0 if offset is None else offset[:, None]
-        table[diverged.reshape(count, many)[:, number]] = np.inf
-    return out
-
-
-class _Compensation:
-    """Forces that the robot compensates by its description, at the present measured poses."""
-
-    def __init__(
-        self,
-        plant: Plant,
-        drive: LogControl,
-        dynamics: Dynamics,
-        qpos: Float64,
-        qvel: Float64,
-        offset: Float64 | None,
-    ) -> None:
-        self._dynamics: Dynamics | None = None
-        self._qpos = qpos
-        self._measured = qpos
-        self._offset = offset
-        self._updates = (
-            offset is not None or drive.compensate != "gravity+coriolis" or any(dynamics.masses)
-        )
-        if drive.compensate == "none":
-            return
-        if offset is not None:
-            self._measured = qpos + offset
-        speed = np.zeros_like(qvel) if drive.compensate == "gravity" else qvel
-        self._dynamics = (
-            plant.dynamics([()] * len(qpos), self._measured, speed) if self._updates else dynamics
-        )
-
-    def now(self) -> Float64 | None:
-        """Return the forces (n, joints); None without compensation."""
-        if self._dynamics is None:
-            return None
-        if self._offset is not None:
-            self._measured[...] = self._qpos + self._offset
-        if self._updates:
-            self._dynamics.update()
-        return self._dynamics.force
-
-
-_BLOCK = 64
 _MODEL = Model(when=lambda due, function, otherwise: otherwise)
 """The simulation refreshes the friction model by itself."""
 
 
-def _step(
-    layout: Layout, constants: Constants, state: StepState, inputs: tuple[Any, ...]
-) -> tuple[StepState, Any]:
+def _step(layout: Layout, constants: Constants, state: StepState, inputs: Any) -> Any:
     """Return state and efforts of a control step."""
-    command, qpos, qvel, passive = inputs
-    step = Step(0, 1)
-    if passive is None:
-        passive = namespace(qpos).zeros_like(qpos)
-    measured = Measured(qpos, qvel, passive)
-    new, outputs = control_step(layout, constants, state, command, measured, step)
+    command, *reading = inputs
+    measured = Measured(*reading)
+    new, outputs = control_step(layout, constants, state, command, measured, Step(0, 1))
     return new, outputs.qf
 
 
@@ -516,77 +343,138 @@ def _returned(state: StepState) -> StepState:
     """Return the leaves of a state that a program returns: without histories, which it changes in
     place.
     """
-    motors = None if state.motors is None else state.motors._replace(command=None, sensor=None)
-    return state._replace(motors=motors)
+    if state.motors is None:
+        return state
+    return state._replace(motors=state.motors._replace(command=None, sensor=None))
+
+
+def _repeated(params: bp.PIDParams, count: int) -> bp.PIDParams:
+    """Return ``params`` of some envs for ``count`` envs, one set after the other."""
+    times = count // len(params.kp)
+    return mapped(lambda leaf: np.tile(leaf, (times, 1)) if leaf.ndim == 2 else leaf, params)
 
 
 def changed_params(params: bp.PIDParams, law: Mapping[str, Float64]) -> bp.PIDParams:
     """Return the params of n candidates."""
     gain = law.get("gain", 1.0)
     factors = {"kp": gain, "ki": gain, "kd": gain * law.get("kd", 1.0)}
-    gains = {name: getattr(params, name) for name in factors}
-    changed = {name: table * factors[name] for name, table in gains.items() if table is not None}
-    params = params._replace(**changed)
-    if "saturation" in law:
-        most = params.kp * law["saturation"]
-        params = params._replace(effort_min=-most, effort_max=most)
-    return params
+    for name, factor in factors.items():
+        table = getattr(params, name)
+        if table is not None:
+            params = params._replace(**{name: table * factor})
+    if "saturation" not in law:
+        return params
+    most = params.kp * law["saturation"]
+    return params._replace(effort_min=-most, effort_max=most)
+
+
+def simulate(
+    plant: Plant,
+    drive: LogControl,
+    candidates: PlantCandidates,
+    states: Float64,
+    stretches: Sequence[Stretch],
+) -> list[Float64]:
+    """Return the positions (candidates, rows, joints) of all candidates at the rows of each
+    stretch.
+
+    ``states`` (candidates, 2, joints) are added to positions and velocities at the starts.
+    Positions are inf where a simulation has diverged.
+    """
+    dt = drive.timestep
+    many = len(stretches)
+    count = len(states)
+    rows = candidates.repeated(many)
+    offset = rows.actuators.position_offset
+    offset = 0.0 if offset is None else offset
+    starts = np.array([[stretch.qpos, stretch.qvel] for stretch in stretches])
+    q = np.concatenate(starts[:, 0] + states[:, None, 0]) - offset
+    v = np.concatenate(starts[:, 1] + states[:, None, 1])
+    # State of the robots: dynamics, compensation, control with the efforts before the first step.
+    dynamics = Dynamics(plant, rows.masses, q, v)
+    dynamics.update()
+    measured = np.array(q + offset)
+    speed = np.zeros_like(v) if drive.compensate == "gravity" else v
+    described = None
+    if drive.compensate != "none":
+        described = Dynamics(plant, [()] * len(q), measured, speed)
+        described.update()
+    commands = _padded([stretch.command for stretch in stretches])
+    past = stretches[0].past
+    efforts = None
+    if drive.params is None and past:
+        efforts = np.tile(commands[past - 1 :: -1][:past], (1, count, 1))
+        if described is not None and drive.through:
+            efforts = efforts + described.force
+    control = Control(drive, rows, dynamics, q, v, efforts)
+    forwards = None
+    if any(stretch.feedforward is not None for stretch in stretches):
+        tables = []
+        for stretch in stretches:
+            zero = np.zeros_like(stretch.command)
+            tables.append(zero if stretch.feedforward is None else stretch.feedforward)
+        forwards = _padded(tables)
+    # Setpoints of each robot are late by whole steps and a share of a step.
+    late = rows.setpoint_delay / dt
+    whole = np.floor(late).astype(int)
+    share = (late - whole)[:, None]
+    last = len(commands) - 1
+    stretch_of = np.tile(np.arange(many), count)
+    # Inertias that are added to the mass matrix: armature, and damping, which is implicit.
+    added = np.array(control.armature)
+    if control.friction.viscous is not None:
+        added += dt * control.friction.viscous
+    native = native_rows.in_use()
+    zero = np.zeros_like(q)
+    track = np.empty((len(commands) - past, 2, *q.shape))
+    with np.errstate(all="ignore"):
+        for step in range(len(track)):
+            if step:
+                dynamics.update()
+            if step % REFRESH_STEPS == 0:
+                control.refresh(dynamics.matrix)
+            command = commands[np.clip(past + step - whole, 0, last), stretch_of]
+            if share.any():
+                older = commands[np.clip(past + step - whole - 1, 0, last), stretch_of]
+                command += share * (older - command)
+            # What the robot compensates is added to the command, or cancels forces exactly.
+            force = dynamics.force
+            passive = zero
+            if described is not None:
+                measured[...] = q + offset
+                described.update()
+                if drive.through:
+                    passive = described.force
+                else:
+                    force = force - described.force
+            if forwards is not None:
+                passive = passive + np.tile(forwards[past + step], (count, 1))
+            effort = control.advance(command, q, v, passive) - force
+            if native is not None:
+                native.move(
+                    *q.shape, dt, q, v, dynamics.matrix, effort, added, plant.low, plant.high
+                )
+            else:
+                inertia = dynamics.matrix + added[:, :, None] * np.eye(q.shape[1])
+                v += dt * np.linalg.solve(inertia, effort[..., None])[..., 0]
+                q += dt * v
+                v[...] = np.where((q < plant.low) | (q > plant.high), 0.0, v)
+                np.clip(q, plant.low, plant.high, out=q)
+            track[step, 0] = q + offset
+            track[step, 1] = v
+    track = track.reshape(len(track), 2, count, many, q.shape[1])
+    positions = []
+    for number, stretch in enumerate(stretches):
+        place, rate = track[stretch.step, :, :, number].swapaxes(0, 1)
+        place = place - stretch.before[:, None, None] * rate
+        place = np.where(np.abs(place) < DIVERGED, place, np.inf)
+        positions.append(place.swapaxes(0, 1))
+    return positions
 
 
 def _padded(tables: Sequence[Float64]) -> Float64:
     """Return tables (steps, joints) as one (most steps, tables, joints), each with its last row
     repeated.
     """
-    most = max(map(len, tables))
-    return np.stack(
-        [table[np.minimum(np.arange(most), len(table) - 1)] for table in tables], axis=1
-    )
-
-
-class _Commands:
-    """Commands of n robots at the sim steps, late by their delay of setpoints, computed in blocks
-    of steps.
-    """
-
-    def __init__(
-        self, drive: LogControl, rows: PlantCandidates, stretches: Sequence[Stretch]
-    ) -> None:
-        self._table = _padded([stretch.command[stretch.past :] for stretch in stretches])
-        times = len(rows.setpoint_delay) // len(stretches)
-        self._stretch = np.tile(np.arange(len(stretches)), times)
-        late = rows.setpoint_delay / drive.timestep
-        self._whole = np.floor(late).astype(int)
-        self._share = (late - self._whole)[:, None]
-
-    def at(self, step: int) -> Float64:
-        """Return the commands (n, joints) of a step; steps come in order."""
-        place = step % _BLOCK
-        if place == 0:
-            steps = np.arange(step, min(step + _BLOCK, len(self._table)))[:, None] - self._whole
-            self._block = self._table[np.maximum(steps, 0), self._stretch]
-            if self._share.any():
-                older = self._table[np.maximum(steps - 1, 0), self._stretch]
-                self._block += self._share * (older - self._block)
-        return self._block[place]
-
-
-def _with_payload(tree: RigidTree, named: RigidTree) -> RigidTree:
-    """Return ``tree`` with a link without mass for the payload, at the center of mass of the tool
-    of ``named``.
-    """
-    tool = named.index(named.tool)
-    frame = named.bodies.link_frames[tool]
-    place = frame[:, :3] @ named.center[tool] + frame[:, 3]
-    carrier = tree.link_bodies.index(named.link_bodies[tool])
-    frame = tree.bodies.link_frames[carrier]
-    more: Document = {
-        "position": frame[:, :3].T @ (place - frame[:, 3]),
-        "wxyz": [1, 0, 0, 0],
-        "axis": [1, 0, 0],
-    }
-    more |= {"parent": carrier, "mass": 0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
-    tables: Document = {
-        name: np.concatenate([getattr(tree, name), np.array([row])]) for name, row in more.items()
-    }
-    links, types = (*tree.links, PAYLOAD), (*tree.joint_types, "fixed")
-    return replace(tree, links=links, joint_types=types, **tables)
+    steps = np.arange(max(map(len, tables)))
+    return np.stack([table[np.minimum(steps, len(table) - 1)] for table in tables], axis=1)

@@ -1,7 +1,9 @@
 """Unknowns of a fit: objects with a start, a typical size and a prior, and the candidates at their
 values.
 
-A positive unknown x of typical size s is fitted as log(x / s), in place of bounds; others as x / s.
+A positive unknown x of typical size s has the coordinate c with x / s = (c + sqrt(c^2 + 4 r^2)) / 2
+in place of a bound: x / s itself, but for values near zero. Efforts are linear in most unknowns, so
+that a logarithm would bend the valleys between them. The coordinate of the others is x / s.
 """
 
 from __future__ import annotations
@@ -17,30 +19,26 @@ from batchpid.motors.actuators import Actuators
 from batchpid.sim.identification.simulator import PAYLOAD, PlantCandidates
 from batchpid.sim.robot.robot import Robot
 
-FARTHEST = 7.0
-"""Largest distance of a logarithm from its start: there the slope ends."""
-
-
+ROUND = 0.03
+"""Value of a positive unknown, over its typical size, at which its coordinate is 0."""
 LEAST_START = 0.02
-"""Least start of a positive unknown, over its typical size: further down its logarithm has no
-slope.
-"""
+"""Least start of a positive unknown, over its typical size: at zero there is no slope."""
 
 
 class Kind(NamedTuple):
     """Kind of unknown, in SI units."""
 
     target: Literal["motor", "law", "robot", "log"]
-    """Part of a candidate that it changes."""
+    """Part of a candidate that it changes. Only motors are in the saved file."""
     per: Literal["joint", "robot", "link"]
     size: str | float
     """Typical size: a number, or the name of a typical value of each joint."""
     spread: float
-    """Standard deviation of the prior: of the logarithm, or over the typical size."""
+    """Standard deviation of the prior, over the typical size or the start, if that is larger."""
     neutral: float = 0.0
     """Value without effect."""
     field: str = ""
-    """Field of :class:`batchpid.Actuators`, for a motor."""
+    """Field of :class:`batchpid.Actuators`."""
     positive: bool = True
     most: float = np.inf
     """Largest value."""
@@ -51,9 +49,10 @@ KINDS = {
     "damping": Kind("motor", "joint", "damping", 4.0, field="viscous"),
     "friction": Kind("motor", "joint", "effort", 4.0, field="coulomb"),
     "strength": Kind("motor", "joint", 1.0, 0.3, 1.0, "strength"),
+    "effort_scale": Kind("log", "joint", 1.0, 0.3, 1.0, "strength"),
     "bias": Kind("motor", "joint", "effort", 10.0, field="bias", positive=False),
     "delay": Kind("motor", "robot", 2e-3, 3.0, field="command_delay", most=0.1),
-    "setpoint_delay": Kind("log", "robot", 5e-3, 3.0, most=0.3),
+    "setpoint_delay": Kind("log", "robot", 5e-3, 10.0, positive=False),
     "payload": Kind("robot", "robot", 0.1, 4.0),
     "load_friction": Kind("motor", "joint", 0.05, 2.0, field="load_friction", most=0.9),
     "static": Kind("motor", "joint", "friction", 2.0, field="static"),
@@ -65,13 +64,13 @@ KINDS = {
     "slew": Kind("law", "joint", "top_speed", 2.0, np.inf),
     "mass": Kind("robot", "link", 1.0, 0.05, 1.0),
 }
-"""Kinds of unknowns. "static" is the friction at rest in addition to "friction", "stribeck" the
-speed at which half of it is left. "gain" is a factor of all gains of the law, "kd" of kd alone,
-"saturation" the law's effort limit over its kp [rad or m], "slew" the limit of the setpoints' rate,
-"mass" a factor of a link's mass and inertia.
+"""Kinds of unknowns. "effort_scale" is the scale of measured efforts, "static" the friction at rest
+in addition to "friction", "stribeck" the speed at which half of it is left. "gain" is a factor of
+all gains of the law, "kd" of kd alone, "saturation" the law's effort limit over its kp [rad or m],
+"slew" the limit of the setpoints' rate, "mass" a factor of a link's mass and inertia.
 """
 BASIC = ("armature", "damping", "friction", "strength", "bias", "delay")
-"""Kinds that every fit has."""
+"""Kinds that a fit of efforts has."""
 EXTRAS = {
     "load_friction": ("load_friction",),
     "stribeck": ("static", "stribeck"),
@@ -107,25 +106,36 @@ class Unknown:
     link: str | None = None
 
     @property
-    def spread(self) -> float:
-        """Standard deviation of the prior, in the coordinate of the fit."""
-        return KINDS[self.kind].spread
+    def is_positive(self) -> bool:
+        """True if the coordinate is a logarithm."""
+        return KINDS[self.kind].positive
+
+    @property
+    def prior(self) -> tuple[float, float]:
+        """Mean and standard deviation of the prior, coordinates.
+
+        The mean is that of ideal motors for strengths, factors and signed unknowns, else the start.
+        """
+        kind = KINDS[self.kind]
+        if not kind.positive:
+            return 0.0, kind.spread
+        mean = self.coordinate(kind.neutral if kind.neutral == 1.0 else self.start)
+        return mean, kind.spread * max(mean, 1.0)
 
     def coordinate(self, value: float) -> float:
         """Return the coordinate of a value in the fit."""
-        if not KINDS[self.kind].positive:
-            return value / self.size
-        return float(np.log(max(value - self.floor, 1e-3 * self.size) / self.size))
+        share = (value - self.floor) / self.size
+        if not self.is_positive:
+            return share
+        share = max(share, 0.1 * ROUND)
+        return share - ROUND**2 / share
 
     def values(self, coordinates: Float64) -> Float64:
         """Return the values at some coordinates."""
-        if not KINDS[self.kind].positive:
-            return coordinates * self.size
-        begin = self.coordinate(self.start)
-        values = self.floor + self.size * np.exp(
-            np.clip(coordinates, begin - FARTHEST, begin + FARTHEST)
-        )
-        return np.minimum(values, KINDS[self.kind].most)
+        shares = coordinates
+        if self.is_positive:
+            shares = 0.5 * (coordinates + np.sqrt(coordinates**2 + 4 * ROUND**2))
+        return np.minimum(self.floor + self.size * shares, KINDS[self.kind].most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +159,7 @@ class Unknowns:
         """Return the unknowns of ``kinds``.
 
         ``starts`` (joints,) or (1,) are values of some kinds, others begin at their typical size.
-        ``sizes`` (joints,) are typical values by name. A positive unknown begins at
-        :data:`LEAST_START` of its typical size at least.
+        ``sizes`` (joints,) are typical values by name.
         """
         entries = list[Unknown]()
         for name in kinds:
@@ -158,99 +167,102 @@ class Unknowns:
             if kind.per == "link":
                 entries += [Unknown(name, None, 1.0, 1.0, link=link) for link in links]
                 continue
-            numbers: Sequence[int | None] = range(len(joints)) if kind.per == "joint" else (None,)
-            for joint in numbers:
-                size = (
-                    float(sizes[kind.size][joint or 0]) if isinstance(kind.size, str) else kind.size
-                )
-                start = (
-                    float(starts[name][joint or 0])
-                    if name in starts
-                    else size
-                    if kind.positive
-                    else 0.0
-                )
-                floor = (
-                    0.0
-                    if name not in DESCRIBED
-                    else getattr(robot, DESCRIBED[name])[joints[joint or 0]]
-                )
-                start = max(start, floor + LEAST_START * size) if kind.positive else start
-                entries.append(Unknown(name, joint, start, size, float(floor)))
+            for joint in range(len(joints)) if kind.per == "joint" else (None,):
+                column = joint or 0
+                size = sizes[kind.size][column] if isinstance(kind.size, str) else kind.size
+                floor = 0.0
+                if name in DESCRIBED:
+                    floor = getattr(robot, DESCRIBED[name])[joints[column]]
+                start = size if kind.positive else 0.0
+                if name in starts:
+                    start = starts[name][column]
+                if kind.positive:
+                    start = max(start, floor + LEAST_START * size)
+                entries.append(Unknown(name, joint, float(start), float(size), float(floor)))
         return cls(robot, joints, tuple(entries))
 
     @property
     def start(self) -> Float64:
         """Point at the start of a fit."""
-        return np.array([entry.coordinate(entry.start) for entry in self.entries])
+        return self.points(np.array([[entry.start for entry in self.entries]]))[0]
 
     @property
     def prior(self) -> Float64:
-        """Mean of the prior: ideal motors for strengths, factors and signed unknowns, else the
-        start.
-        """
-        means = [KINDS[entry.kind].neutral for entry in self.entries]
-        return np.array(
-            [
-                entry.coordinate(
-                    mean if mean == 1.0 or not KINDS[entry.kind].positive else entry.start
-                )
-                for entry, mean in zip(self.entries, means, strict=True)
-            ]
-        )
+        """Means and standard deviations of the prior (2, unknowns)."""
+        return np.array([entry.prior for entry in self.entries]).reshape(-1, 2).T
 
     @property
-    def spread(self) -> Float64:
-        """Standard deviations of the prior."""
-        return np.array([entry.spread for entry in self.entries])
+    def _delays(self) -> list[int]:
+        """Places of the delays of setpoints and efforts; none unless both are unknown.
+
+        The coordinate of the first one is their sum. Logs show the sum far better than its parts,
+        and a fit follows a valley that is straight.
+        """
+        kinds = [entry.kind for entry in self.entries]
+        both = ("setpoint_delay", "delay")
+        return [kinds.index(kind) for kind in both] if {*both} <= {*kinds} else []
 
     def values(self, points: Float64) -> Float64:
         """Return the values (n, unknowns) at ``points`` (n, unknowns)."""
-        columns = [entry.values(points[:, at]) for at, entry in enumerate(self.entries)]
-        return np.stack(columns, axis=1) if columns else points
+        values = np.array(points)
+        for at, entry in enumerate(self.entries):
+            values[:, at] = entry.values(points[:, at])
+        if self._delays:
+            setpoint, effort = self._delays
+            values[:, setpoint] -= values[:, effort]
+        return values
+
+    def points(self, values: Float64) -> Float64:
+        """Return the coordinates (n, unknowns) of ``values`` (n, unknowns)."""
+        points = np.array(values)
+        if self._delays:
+            setpoint, effort = self._delays
+            points[:, setpoint] += points[:, effort]
+        for at, entry in enumerate(self.entries):
+            points[:, at] = [entry.coordinate(value) for value in points[:, at]]
+        return points
 
     def tables(self, values: Float64) -> dict[str, Float64]:
-        """Return the values (n, joints) of all kinds of motor, law and log, by kind; neutral or
-        described elsewhere.
+        """Return the values (n, joints) of all kinds but masses, by kind; neutral or described
+        elsewhere.
         """
-        count, tables = len(values), dict[str, Float64]()
+        tables = dict[str, Float64]()
+        shape = len(values), len(self.joints)
         for name, described in DESCRIBED.items():
             row = getattr(self.robot, described)[list(self.joints)]
             if row.any():
-                tables[name] = np.tile(row, (count, 1)).astype(float)
+                tables[name] = np.tile(row, (len(values), 1)).astype(float)
         for at, entry in enumerate(self.entries):
             kind = KINDS[entry.kind]
-            if kind.per == "link" or entry.kind == "payload":
+            if kind.target == "robot":
                 continue
-            table = tables.setdefault(entry.kind, np.full((count, len(self.joints)), kind.neutral))
-            columns = slice(None) if entry.joint is None else slice(entry.joint, entry.joint + 1)
-            table[:, columns] = values[:, at : at + 1]
+            table = tables.setdefault(entry.kind, np.full(shape, kind.neutral))
+            columns = slice(None) if entry.joint is None else entry.joint
+            table[:, columns] = values[:, at, None] if entry.joint is None else values[:, at]
         return tables
 
     def candidates(self, values: Float64) -> PlantCandidates:
         """Return the candidates with ``values`` (n, unknowns)."""
-        tables = self.tables(values)
-        fields = {
-            KINDS[name].field: table
-            for name, table in tables.items()
-            if KINDS[name].target == "motor"
-        }
+        law = {}
+        fields = {}
+        setpoint_delay = np.zeros(len(values))
+        for name, table in self.tables(values).items():
+            if KINDS[name].target == "law":
+                law[name] = table
+            elif name == "setpoint_delay":
+                setpoint_delay = table[:, 0]
+            else:
+                fields[KINDS[name].field] = table
         if "static" in fields:
             fields["static"] = fields["static"] + fields["coulomb"]
-        longest = np.array([[fields["command_delay"].max()]]) if "command_delay" in fields else None
-        heavy = {
-            at: entry.link or PAYLOAD
-            for at, entry in enumerate(self.entries)
-            if entry.kind in ("payload", "mass")
-        }
-        masses = tuple(
-            tuple((link, float(row[at])) for at, link in heavy.items()) for row in values
-        )
-        delay = (
-            tables["setpoint_delay"][:, 0] if "setpoint_delay" in tables else np.zeros(len(values))
-        )
-        law = {name: table for name, table in tables.items() if KINDS[name].target == "law"}
-        return PlantCandidates(Actuators(**fields, max_delay=longest), law, delay, masses)
+        if "command_delay" in fields:
+            fields["max_delay"] = fields["command_delay"].max(keepdims=True)
+        masses = [list[tuple[str, float]]() for _ in values]
+        for at, entry in enumerate(self.entries):
+            if KINDS[entry.kind].target == "robot":
+                for row, value in zip(masses, values[:, at].tolist(), strict=True):
+                    row.append((entry.link or PAYLOAD, value))
+        return PlantCandidates(Actuators(**fields), law, setpoint_delay, list(map(tuple, masses)))
 
     def only(self, mask: Bool) -> Unknowns:
         """Return the unknowns of a mask (unknowns,); the others have their neutral value."""

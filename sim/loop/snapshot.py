@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
-from batchpid.arrays.trees import unflatten
 from batchpid.checks.validate import file_path, integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
@@ -123,14 +122,29 @@ class EnvStates:
     @staticmethod
     def join(parts: Sequence[EnvStates]) -> EnvStates:
         """Return the states of the envs of all ``parts``."""
+        if len(parts) == 1:
+            return parts[0]
         width = max(part.engine.shape[1] for part in parts)
         tables = []
         for part in parts:
             missing = width - part.engine.shape[1]
             engine = np.pad(part.engine, ((0, 0), (0, missing)), constant_values=np.nan)
             tables.append(replace(part, engine=engine).tables())
-        joined = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
-        return EnvStates(**unflatten(vars(parts[0]), joined, "."))
+        return EnvStates.of(
+            {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+        )
+
+    @staticmethod
+    def of(tables: Mapping[str, Rows]) -> EnvStates:
+        """Return the states whose arrays have these names, as in :meth:`tables`."""
+        parts: Document = {name: {} for name in _TABLES}
+        for name, rows in tables.items():
+            part, dot, leaf = name.partition(".")
+            if dot:
+                parts[part][leaf] = rows
+            else:
+                parts[part] = rows
+        return EnvStates(**parts)
 
     def tables(self) -> dict[str, Rows]:
         """Return all arrays by name, such as "friction.age"."""
@@ -303,14 +317,7 @@ class Snapshot:
         if "actuators" in head:
             actuators, _ = bp.motors.loads_actuators(head["actuators"], about["joints"])
         rest = {name: tables.pop(name, None) for name in ("episodes", "motion")}
-        parts: Document = {name: {} for name in _TABLES}
-        for name, rows in tables.items():
-            part, dot, leaf = name.partition(".")
-            if dot:
-                parts[part][leaf] = rows
-            else:
-                parts[part] = rows
-        return cls(about, steps, params, EnvStates(**parts), actuators, **rest)
+        return cls(about, steps, params, EnvStates.of(tables), actuators, **rest)
 
     def __repr__(self) -> str:
         about = self.about

@@ -86,6 +86,7 @@ def step_responses(
     labels = [] if command is None else [f"setpoint {label}" for label in command.labels]
     chosen, names = _chosen(run, joints)
     figure, blocks = _grid(names + labels, 2, title, run.time[-1])
+    # Joints come first, entries of another command after them.
     for joint, (above, below) in zip(chosen, blocks, strict=False):
         _draw_limits(above, run.info.lower[joint], run.info.upper[joint])
         _draw_setpoint(above, run, joint, band)
@@ -204,6 +205,7 @@ def fit_errors(
                 (fit.before, SECOND, "before"),
                 (fit.after, ENV, "after"),
             ):
+                # An error of 0 has no place on a logarithmic axis.
                 size = np.abs(errors[:, joint])
                 axes.semilogy(fit.time, np.maximum(size, 1e-9), color=colour, lw=0.8, label=label)
             held_out = fit.time[~fit.fitted]
@@ -321,6 +323,7 @@ def _draw_setpoint(axes: Axes, run: Rollout, joint: int, band: float | None) -> 
 
 def _draw_line(axes: Axes, time: Rows, values: Rows) -> None:
     """Draw one number of the setpoints (ticks, envs), as one line where all envs share it."""
+    # One label for all lines: a legend names the setpoint once.
     shared = (values == values[:, :1]).all()
     shown = np.where(np.isfinite(values), values, np.nan)[:, : 1 if shared else None]
     lines = axes.plot(time, shown, color=SETPOINT, lw=1.1, ls="--", zorder=3)
@@ -332,6 +335,7 @@ def _draw_limits(axes: Axes, low: float, high: float) -> None:
     for limit, sign in ((low, -1), (high, 1)):
         if math.isfinite(limit):
             far = limit + sign * 1e3 * max(1.0, abs(limit))
+            # Far, but finite: the range of the axes is set by the data.
             axes.axhspan(limit, far, fc="none", ec=LIMIT, alpha=0.25, hatch="////", lw=0, zorder=0)
             axes.axhline(limit, color=LIMIT, lw=0.9, zorder=2, label="limit")
 
@@ -364,6 +368,7 @@ def _show_efforts(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
     """Show all efforts, and the limit of the first run unless it is more than five times as far."""
     values = _finite(runs, "effort", joint)
     limit = float(runs[0].info.effort_limit[joint])
+    # A limit far away would flatten the curve.
     is_near = math.isfinite(limit) and np.abs(values).max(initial=0.0) > 0.2 * limit
     further = [0.0, limit, -limit] if is_near else [0.0]
     unit = OBSERVED["effort"].unit_for(runs[0].info.units[joint])
@@ -389,6 +394,7 @@ def _quantiles(values: Rows, *at: float) -> Rows:
     """Return quantiles over the finite envs of ``values`` (ticks, envs), (len(at), ticks); NaN
     without finite envs.
     """
+    # Infinity counts as missing: a median of two of them would be NaN with a warning.
     finite = np.where(np.isfinite(values), values, np.nan)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "All-NaN slice")

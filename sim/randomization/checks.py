@@ -78,6 +78,7 @@ def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robo
 
     Raises InvalidArgumentError if a leaf is off, or a draw may be out of its range.
     """
+    # A draw at an end of its range is the worst, since all operations are monotonic.
     leaves = params.leaves()
     for name, distribution in randomization.params.items():
         if name not in leaves:

@@ -167,6 +167,7 @@ class Randomization:
         rows = np.full((len(episodes), len(columns)), np.nan)
         for part, chosen, distribution in parts(name, value, columns):
             streams = generators(self.seed, part, episodes, self.each == "env", number)
+            # Each env draws from a stream of its own, in the order of the columns.
             size = 1 if distribution.shared else len(chosen)
             for row, generator in zip(rows, streams, strict=True):
                 row[chosen] = distribution.sample(generator, size)

@@ -116,19 +116,15 @@ class OperationalSpace:
         )
         """Tool in the link's frame (3,) [m]; None for its origin."""
         _check_coupling(tree, robot)
-        given = array(
-            "posture", robot.start if posture is None else posture, (1, tree.dof), tree.joint_names
-        )
-        self._posture = robot.coupled(given)
+        posture = robot.start if posture is None else posture
+        self._posture = robot.coupled(array("posture", posture, (1, tree.dof), tree.joint_names))
         if params is None:
             if not {"effort_limit", "effort_min", "effort_max"} & set(options):
                 options["effort_limit"] = robot.effort_limit
             params = ts.make_osc_params(tree, **options)
         elif options:
-            problem, remedy = (
-                "are given together with params",
-                "give them to the function that makes the params",
-            )
+            problem = "are given together with params"
+            remedy = "give them to the function that makes the params"
             raise InvalidArgumentError(next(iter(options)), problem, remedy=remedy)
         params = _of_one_row(
             instance("params", params, ts.OSCParams, "make them with make_osc_params()")
@@ -143,14 +139,14 @@ class OperationalSpace:
             )
         self._params = params
         self._k, self._timestep = ts.discretise(params, 1 / 2000), 1 / 2000
-        self._friction: tuple[Array, Array] | None = (
-            None  # Coulomb's, and the band of errors in which it is reduced
-        )
+        # Coulomb friction, and the band of errors in which it is reduced.
+        self._friction: tuple[Array, Array] | None = None
         # Damping and friction that the robot is known to have: the law acts against them.
-        modelled, known = DISSIPATION[robot.dissipation].modelled, known_joints(robot)
-        damping = known.viscous + np.array([joint.damping * modelled for joint in robot.joints])
+        modelled = DISSIPATION[robot.dissipation].modelled
+        motors = known_joints(robot)
+        damping = motors.viscous + np.array([joint.damping * modelled for joint in robot.joints])
         self._damping = damping[None] if damping.any() else None
-        coulomb = known.coulomb + robot.friction * modelled
+        coulomb = motors.coulomb + robot.friction * modelled
         band = np.array([BAND[unit] for unit in robot.units])
         self._known_friction = (coulomb[None], band[None]) if coulomb.any() else None
         chain = tree.chain(link)
@@ -158,12 +154,12 @@ class OperationalSpace:
         # then single joints.
         self._columns = np.zeros(tree.dof, np.intp)  # of the setpoint, for each joint; 0 for none
         entries, self._parts = dict(POSE_UNITS), dict[str, slice]()
-        for name, wanted in {
+        for name, is_part in {
             "twist": twist,
             "acceleration": acceleration,
             "wrench": wrench,
         }.items():
-            if flag(name, wanted):
+            if flag(name, is_part):
                 (words, linear, angular), first = OPTIONAL[name], len(entries)
                 entries |= zip(words.split(), [linear] * 3 + [angular] * 3, strict=True)
                 self._parts[name] = slice(first, first + 6)
@@ -278,9 +274,16 @@ class OperationalSpace:
         """
         if not self.is_native or native_rows.in_use() is None:
             return None
-        given = self._parts, self._columns, self._damping, self._friction, self._timestep
+        # Native code reads the caller's arrays where they are.
         return BoundOSC(
-            self._k, ts.Tool(self.tree, self.link, self.point), *given, (qpos, qvel, passive)
+            self._k,
+            ts.Tool(self.tree, self.link, self.point),
+            self._parts,
+            self._columns,
+            self._damping,
+            self._friction,
+            self._timestep,
+            (qpos, qvel, passive),
         )
 
     def _coefficients(self, setpoint: Array) -> ts.OSCCoefficients:
@@ -297,9 +300,10 @@ class OperationalSpace:
         arrays = {"pose": dynamics.pose, "jacobian": dynamics.jacobian, "chain": dynamics.chain}
         arrays |= {"setpoint": setpoint[:, :7], "twist": twist, "posture": posture, "qpos": qpos}
         coulomb, band = self._friction
-        found = native_law.friction(arrays, coulomb, band)
-        if found is not None:
-            return found
+        effort = native_law.friction(arrays, coulomb, band)
+        if effort is not None:
+            return effort
+        # Joint velocities of least squares that move the tool towards its setpoint.
         error = pose_error(setpoint[:, :7], dynamics.pose)
         j = dynamics.jacobian
         others = posture - qpos
@@ -356,10 +360,11 @@ def tool_pose(tree: ts.RigidTree, link: str, point: Array, qpos: Array) -> NDArr
 
 def _check_coupling(tree: ts.RigidTree, robot: Robot) -> None:
     """Raise InvalidArgumentError if ``tree`` has another coupling of the joints than ``robot``."""
-    ours, theirs = (
-        (each.leader, each.multiplier, each.offset) for each in (robot.coupling, tree.coupling)
-    )
-    if not all(map(np.array_equal, ours, theirs)):
+    fields = ("leader", "multiplier", "offset")
+    if not all(
+        np.array_equal(getattr(robot.coupling, name), getattr(tree.coupling, name))
+        for name in fields
+    ):
         problem = f"has {tree.coupling}, but the robot {robot.coupling}"
         raise InvalidArgumentError("tree", problem, remedy="pass robot.kinematic_tree(...)")
 

@@ -63,6 +63,7 @@ from batchpid.sim.randomization.checks import prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.tuning.cost import Weights
 from batchpid.sim.tuning.evaluation import (
     SETTLE_SECONDS,
@@ -203,55 +204,62 @@ class Candidates:
         """Run each of ``points`` (n, dimension) on its :meth:`runner`, and return the costs
         (n,).
         """
-        count = len(points)
-        w = self.weights
+        count, rows = len(points), len(self._rows)
         params = self.params(points)
-        limits = {name: getattr(params, name) for name in ("effort_min", "effort_max")}
-        limited = params.replace(
-            **{name: self.headroom * limit for name, limit in limits.items() if limit is not None}
-        )
+        limits = {}
+        for name in ("effort_min", "effort_max"):
+            limit = getattr(params, name)
+            if limit is not None:
+                limits[name] = self.headroom * limit
+        limited = params.replace(**limits)
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", StabilityWarning
-            )  # a candidate beyond the bound gets a penalty
-            runner.params = limited.for_envs(np.repeat(np.arange(count), len(self._rows)))
-        envs = np.tile(np.arange(len(self._rows)), count)
-        durations = None if self._durations is None else self._durations[envs]
-        moves, streams = self._moves.take(envs), self._rows[envs]
-        rollout, metrics = run_moves(
-            runner, moves, self.seconds, streams=streams, durations=durations
-        )
+            # A candidate beyond the bound gets a penalty in place of a warning.
+            warnings.simplefilter("ignore", StabilityWarning)
+            runner.params = limited.for_envs(np.repeat(np.arange(count), rows))
 
-        # Simulations may diverge: figures are limited. (candidates, moves, joints)
-        figures = (
-            np.minimum(figure, 1e6).reshape(count, len(self._rows), -1) for figure in metrics
+        # All moves of all candidates are one rollout. A move has the same drawn robot in each.
+        envs = np.tile(np.arange(rows), count)
+        rollout, metrics = run_moves(
+            runner,
+            self._moves.take(envs),
+            self.seconds,
+            streams=self._rows[envs],
+            durations=None if self._durations is None else self._durations[envs],
         )
-        m = StepMetrics(*(figure[:, : self._steps] for figure in figures))
+        # Simulations may diverge: figures are limited. (candidates, moves, joints)
+        figures = [np.minimum(figure, 1e6).reshape(count, rows, -1) for figure in metrics]
+        steps = StepMetrics(*(figure[:, : self._steps] for figure in figures))
+        total = self._cost_of_steps(steps)
+        if self._durations is not None:
+            total += self.weights.following * self._cost_of_motions(rollout, count)
+        # A candidate of which one move diverges is worse than all others, the earlier the worse.
+        lasted = rollout.ok.mean(0).reshape(count, -1)
+        diverged = DIVERGED_COST * (2 - lasted.mean(1))
+        total = np.where(lasted.min(1) < 1, diverged, np.minimum(total, DIVERGED_COST))
+        return total + self._stability_penalty(params, runner.timestep)
+
+    def _cost_of_steps(self, m: StepMetrics) -> Float64:
+        """Return the cost of moves that are made as steps of the setpoint (count,)."""
+        w = self.weights
         settling = np.minimum(m.settling_time, 1.5 * self.seconds)
-        cost = (
-            w.itae * np.log1p(m.itae / self._size)
-            + w.settling * settling
-            + w.overshoot * np.log1p(m.peak_deviation / self._size / 0.05)
-            + w.final * np.log1p(m.steady_state_error / self._band)
-            + w.chatter * np.log1p(np.maximum(m.effort_variation / self._smooth - 1, 0))
-            + w.saturation * m.saturation_share
-        )[..., self.robot.independent].mean(2)
+        excess = np.maximum(m.effort_variation / self._smooth - 1, 0)
+        cost = w.itae * np.log1p(m.itae / self._size)
+        cost += w.settling * settling
+        cost += w.overshoot * np.log1p(m.peak_deviation / self._size / 0.05)
+        cost += w.final * np.log1p(m.steady_state_error / self._band)
+        cost += w.chatter * np.log1p(excess)
+        cost += w.saturation * m.saturation_share
+        # A move is late when its last joint is.
         last = settling[..., arm_joints(self.robot)].max(2)
         late = np.log1p(np.maximum(last / self._limit - 1, 0) / 0.05).mean(1)
-        total = self._over_moves(cost) + w.late * late
-        if durations is not None:
-            error = (following_error(self.robot, rollout) / self._band)[
-                :, arm_joints(self.robot)
-            ].max(1)
-            followed = np.minimum(error, 1e6).reshape(count, -1)[:, self._steps :]
-            total += w.following * self._over_moves(np.log1p(followed / 10))
-        lasted = rollout.ok.mean(0).reshape(count, -1)
-        total = np.where(
-            lasted.min(1) < 1,
-            DIVERGED_COST * (2 - lasted.mean(1)),
-            np.minimum(total, DIVERGED_COST),
-        )
-        return total + self._stability_penalty(params, runner.timestep)
+        total: Float64 = self._over_moves(cost[..., self.robot.independent].mean(2)) + w.late * late
+        return total
+
+    def _cost_of_motions(self, rollout: Rollout, count: int) -> Float64:
+        """Return the cost of moves that are made as smooth motions (count,)."""
+        error = following_error(self.robot, rollout) / self._band
+        worst = np.minimum(error[:, arm_joints(self.robot)].max(1), 1e6)
+        return self._over_moves(np.log1p(worst.reshape(count, -1)[:, self._steps :] / 10))
 
     def _over_moves(self, cost: Float64) -> Float64:
         """Return the mean of ``cost`` (count, moves) over moves plus its largest, or twice the

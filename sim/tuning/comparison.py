@@ -59,9 +59,10 @@ class Comparison:
         engines the largest differences between them.
         """
         robot = self.robot
+        # Fingers need not settle: the figures are those of the arm.
         names = {None, *np.array(robot.joint_names)[arm_joints(robot)]}
         lines = [
-            table([self._row(each) for each in self.evaluations], HEADERS, "lrrrrrr"),
+            table([self._row(evaluation) for evaluation in self.evaluations], HEADERS, "lrrrrrr"),
             ABOUT,
         ]
         for evaluation in self.evaluations:
@@ -151,9 +152,8 @@ def compare(
     ----------
     gains
         Sets of gains: tuned, designed, sapien-tutorial, mjcf, drive, drive:STIFFNESS,DAMPING,
-        params files (.yaml or .json) that `batchpid tune` or batchpid.save_params wrote, or MJCF
-        files (.xml). Default: tuned, sapien-tutorial and drive for a bundled robot, else designed
-        and drive.
+        params files (.yaml or .json) that `batchpid tune` or batchpid.save_params wrote. Default:
+        tuned, sapien-tutorial and drive for a bundled robot, else designed and drive.
     moves
         Number of random moves, the tutorial's aside.
     seed
@@ -187,6 +187,7 @@ def compare(
     sets = [gain_set(robot, name) if isinstance(name, str) else name for name in gains]
     sets = sets or [gain_set(robot, name) for name in default_sets(robot)]
     titles = {name: load_engine(name).title for name in engines}
+    # The search of the same seed has other moves and other draws.
     unseen = tutorial_move(robot) + random_moves(robot, moves, seed + 1)
     draws = reseeded(randomization, seed + 1)
     pairs = list(product(sets, titles))
@@ -244,5 +245,6 @@ def median_and_worst(figures: Rows, style: str) -> str:
     """
     if np.isnan(figures).all():
         return "-"
+    # Infinite figures allow no interpolation between two of them.
     quantiles = np.nanquantile(figures, [0.5, 1.0], method="higher")
     return " / ".join("never" if math.isinf(value) else style.format(value) for value in quantiles)

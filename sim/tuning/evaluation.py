@@ -121,6 +121,7 @@ def arm_joints(robot: Robot) -> NDArray[np.bool_]:
     Followers do not count. A robot with fewer than three such joints (legs, a bare chain) is all
     arm.
     """
+    # From each leaf link to the root, every joint carries that leaf.
     above = {joint.child_link: joint for joint in robot.all_joints}
     leaves = Counter[str]()
     for link in set(above) - {joint.parent_link for joint in robot.all_joints}:
@@ -202,6 +203,7 @@ def evaluate_gains(
     :class:`batchpid.sim.Runner`. With ``follow`` the moves are made once more, as smooth motions of
     :func:`smooth_durations`, of which the first ``seconds`` are run, with setpoint rates.
     """
+    # Steps of the setpoint, then the same moves as smooth motions, in the same scenes.
     with Runner(
         robot, len(moves.start), params=params, **{"substeps": SUBSTEPS, **runner_options}
     ) as runner:

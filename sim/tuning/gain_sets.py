@@ -6,10 +6,7 @@ import difflib
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 import batchpid as bp
-from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.options.groups import ControlMode
 from batchpid.sim.robot.robot import Robot
@@ -38,8 +35,7 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "sapien-tutorial"
     are the gains in SAPIEN's tutorial, for a bundled robot, "mjcf" is
     :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or "drive:STIFFNESS,DAMPING" is the engine's
-    internal drive. Other names are params files, or an MJCF file (.xml), whose differences are
-    warnings.
+    internal drive. Other names are params files.
 
     Raises
     ------
@@ -74,27 +70,4 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
         raise InvalidArgumentError(
             "gains", "is neither a name nor a file", value=name, remedy=remedy
         )
-    if path.suffix.lower() == ".xml":
-        return GainSet(path.name, _of_mjcf(path, robot))
     return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
-
-
-def _of_mjcf(path: Path, robot: Robot) -> bp.PIDParams:
-    """Return the gains of the servos in an MJCF file of a robot with the same joints."""
-    joints = [robot.joint_names[joint] for joint in np.flatnonzero(robot.independent)]
-    other = Robot.load(path)
-    if missing := sorted(set(joints) - set(other.joint_names)):
-        raise InvalidArgumentError(
-            "gains", f"{path.name} lacks joints", value=", ".join(missing), remedy="rename them"
-        )
-    gains = other.mjcf_gains().for_joints([other.joint_names.index(joint) for joint in joints])
-    if gains.continuous is not None:
-        turning = ", ".join(
-            joint for joint, yes in zip(joints, gains.continuous[0], strict=True) if yes
-        )
-        warn(
-            f"{path}: continuous: errors are taken the short way round, which MuJoCo does not:"
-            f" {turning}",
-            UserWarning,
-        )
-    return gains.for_joints(robot.coupling.of_all(np.arange(len(joints))))

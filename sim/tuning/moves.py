@@ -217,6 +217,7 @@ def easy_pose(
         )
         return float(apart == 0), float(share >= 1), float(len(levels) - apart), max(share, _EASY)
 
+    # A joint that cannot hold itself nearly anywhere does not move.
     movable = (shares(poses) + robot.friction / robot.design_effort_limit >= 1).mean(0) <= _STUCK
     center = robot.start
     least = cost(center, float(shares(center[None]).max()))
@@ -225,6 +226,7 @@ def easy_pose(
             break
         changed = rng.random(poses.shape) < _CHANGED
         tried = robot.coupled(np.where(changed, center + spread * (poses - center), center))
+        # The contact of a pose takes long to compute: the easiest poses are tried first.
         share = shares(tried).max(1)
         for index in np.argsort(share, kind="stable")[:_TRIED]:
             if (move_cost := cost(tried[index], float(share[index]))) < least:
@@ -283,12 +285,14 @@ def _durations(
         step = target - start
         qpos = start + z * step
         still = np.zeros_like(qpos)
+        # The effort is linear in 1 / T^2: gravity, and the motion in unit time.
         gravity = motion_effort(robot, qpos, still, still)
         moving = motion_effort(robot, qpos, rate * step, acceleration * step) - gravity
         along = moving * step > 0  # there friction and damping take their share of the effort
         room = (
             share * np.where(moving > 0, limit - gravity, limit + gravity) - along * robot.friction
         )
+        # Without room somewhere on the line there is no motion, however slow.
         if (room > 0).all() and (np.abs(gravity) < limit).all():
             drag = along * robot.damping * np.abs(rate * step)  # room T^2 - drag T - |moving| >= 0
             durations[row] = (

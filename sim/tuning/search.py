@@ -213,6 +213,7 @@ def tune(
     weights = Weights() if weights is None else weights
     build = runner_options.get("build")
     engine = tuning_engine(build) if engine is None else engine
+    # Options of all rollouts; the search adds fast ones where moves are free of contact.
     scene: Document = {"engine": engine, "workers": workers, **runner_options}
     options: Document = {"substeps": SUBSTEPS, **scene}
 
@@ -335,6 +336,7 @@ def _evolve(
         )  # bad gains may leave the way of a move
         for generation in bar:
             samples = np.array([optimizer.ask() for _ in range(population)])
+            # The designed gains are the first candidate, so that every cost has a reference.
             if generation == 0:
                 samples[: len(firsts)] = firsts
             costs = candidates.costs(runner, samples)

@@ -72,21 +72,21 @@ class DataPool:
         """
         if self._user is not user:
             if self._user is not None:
-                for model, each, row in zip(
+                for model, data, row in zip(
                     self._user.models, self._taken, self._user.rows, strict=True
                 ):
-                    mujoco.mj_getState(model, each, row, STATE)
+                    mujoco.mj_getState(model, data, row, STATE)
             self._user, self._taken = user, self._new(len(user.rows))
             sound = np.all(
                 np.abs(user.rows[:, POSITIONS : POSITIONS + self.robot.model.nq]) <= FARTHEST,
                 axis=1,
             )
-            for model, each, row, finite in zip(
+            for model, data, row, finite in zip(
                 user.models, self._taken, user.rows, sound.tolist(), strict=True
             ):
-                mujoco.mj_setState(model, each, row, STATE)
+                mujoco.mj_setState(model, data, row, STATE)
                 if finite:
-                    mujoco.mj_step1(model, each)
+                    mujoco.mj_step1(model, data)
         return self._taken
 
     def leave(self, user: User) -> None:

@@ -59,7 +59,7 @@ class FileScene(NamedTuple):
     """``mujoco.MjSpec`` of a file.
 
     ``names`` has the body of each simulated link, ``frames`` the frame of the link in this body,
-    ``root`` the body of a floating base, or "". ``own`` (2, dof) is armature and damping that the
+    ``root`` the body of a floating base, or "". ``terms`` (2, dof) is armature and damping that the
     file's joints have in addition to the robot's description, in which leaders include their
     followers.
     """
@@ -68,7 +68,7 @@ class FileScene(NamedTuple):
     names: dict[str, str]
     frames: dict[str, BodyFrame]
     root: str
-    own: Float64
+    terms: Float64
 
 
 def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
@@ -204,10 +204,10 @@ def _of_followers(values: Float64, spec: SceneSpec) -> Float64:
     """Return the armature or damping (dof,) that moves from leaders to their followers: d_f and
     -m^2 d_f.
     """
-    coupling, own = coupling_of(spec.joints), np.zeros(len(values))
+    coupling, terms = coupling_of(spec.joints), np.zeros(len(values))
     follower = coupling.followers
-    own[follower] = values[follower]
+    terms[follower] = values[follower]
     np.subtract.at(
-        own, coupling.leader[follower], coupling.multiplier[follower] ** 2 * values[follower]
+        terms, coupling.leader[follower], coupling.multiplier[follower] ** 2 * values[follower]
     )
-    return own
+    return terms

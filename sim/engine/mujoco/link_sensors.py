@@ -89,11 +89,11 @@ class MujocoLinkSensors:
         values (M, size).
         """
         of_contacts, of_wrenches = np.split(values, [_CONTACT * self._contacts], axis=1)
-        found = {}
+        quantities = {}
         if self._rows:
             parts = of_contacts.reshape(-1, self._contacts, _CONTACT)
             rows = np.stack([parts[:, row].sum(1) for row in self._rows], axis=1)
-            found = {"contact_force": 0.0 - rows[..., 1:], "touching": rows[..., 0]}
+            quantities = {"contact_force": 0.0 - rows[..., 1:], "touching": rows[..., 0]}
         if self._wrenches:
-            found["wrench"] = of_wrenches.reshape(-1, self._wrenches, _WRENCH).copy()
-        return found
+            quantities["wrench"] = of_wrenches.reshape(-1, self._wrenches, _WRENCH).copy()
+        return quantities

@@ -229,4 +229,4 @@ def _write(element: Any, figures: Document) -> None:
     for key, values in figures.items():
         if element is not None and key in element.attrib:
             numbers = np.atleast_1d(values)[: len(element.get(key).split())]
-            element.set(key, " ".join(repr(float(each)) for each in numbers))
+            element.set(key, " ".join(repr(float(value)) for value in numbers))

@@ -68,7 +68,7 @@ class RobotMj:
     """Index of each joint in MuJoCo's qvel (dof,)."""
     bodies: dict[str, int]
     """Number of the body of each simulated link."""
-    own: Any = (0.0, 0.0)
+    terms: Any = (0.0, 0.0)
     """Armature and damping (2, dof) of the joints in addition to the description and the motors."""
     frames: Mapping[str, BodyFrame] = field(default_factory=dict)
     """Frames of simulated links in their bodies; of other links the frames are the same."""
@@ -118,8 +118,8 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     """Return the model of a file, with the damping of the robot's joints, and without their
     friction and motors.
     """
-    found = file_scene(spec, file)
-    scene, off = found.scene, mujoco.mjtDisableBit
+    parts = file_scene(spec, file)
+    scene, off = parts.scene, mujoco.mjtDisableBit
     option = scene.option
     option.disableflags &= ~(
         off.mjDSBL_GRAVITY | off.mjDSBL_ACTUATION | off.mjDSBL_CLAMPCTRL | off.mjDSBL_SENSOR
@@ -130,7 +130,7 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     if not spec.collisions:
         option.disableflags |= off.mjDSBL_CONTACT
     set_ground(scene, spec.ground)
-    add_link_sensors(scene, spec, found.names, found.frames)
+    add_link_sensors(scene, spec, parts.names, parts.frames)
     if drives:
         _add_drives(scene, spec)
     try:
@@ -140,16 +140,16 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         remedy = f"correct it; nothing may refer to {', '.join(REMOVED)}, which are left out"
         raise RobotError(f"{file.path}: {problem}; {remedy}") from error
     qpos, qvel = _places(model, spec)
-    armature, damping = found.own
+    armature, damping = parts.terms
     model.dof_armature[qvel], model.dof_frictionloss[qvel] = np.maximum(armature, 0.0), 0.0
     model.dof_damping[qvel] = np.maximum(damping + [joint.damping for joint in spec.joints], 0.0)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     base = None
-    if found.root:
-        joint = model.joint(model.body(found.root).jntadr[0])
+    if parts.root:
+        joint = model.joint(model.body(parts.root).jntadr[0])
         base = int(joint.qposadr[0]), int(joint.dofadr[0])
-    bodies = {link: model.body(name).id for link, name in found.names.items()}
-    return RobotMj(model, qpos, qvel, bodies, found.own, found.frames, base, is_file=True)
+    bodies = {link: model.body(name).id for link, name in parts.names.items()}
+    return RobotMj(model, qpos, qvel, bodies, parts.terms, parts.frames, base, is_file=True)
 
 
 def robot_spec(spec: SceneSpec) -> tuple[Any, dict[str, str]]:
@@ -184,7 +184,11 @@ def _unused(name: str, taken: Collection[str]) -> str:
     ``taken``.
     """
     numbered = (f"{name}_{number}" for number in count(2))
-    return name if name not in taken else next(each for each in numbered if each not in taken)
+    return (
+        name
+        if name not in taken
+        else next(candidate for candidate in numbered if candidate not in taken)
+    )
 
 
 def principal_inertia(inertia: SpatialInertia) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

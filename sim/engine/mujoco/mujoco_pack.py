@@ -298,7 +298,7 @@ class MujocoPack(ModelPack):
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
         self._actuators = actuators
-        armature, damping = self._robot.own
+        armature, damping = self._robot.terms
         values = {"dof_armature": np.maximum(armature + self._add_joints(actuators), 0.0)}
         if self.spec.mjcf is not None and self._variation.damping is not None:
             values["dof_damping"] = np.maximum(damping + self._variation.damping, 0.0)

@@ -40,7 +40,7 @@ struct Vec3 {
   float x, y, z;
 };
 
-// Exported functions: SYMBOLS in interface.py.
+// Exported functions, in the order of SYMBOLS in interface.py.
 struct Functions {
   VectorXf (*get_qpos)(Articulation *);
   VectorXf (*get_qvel)(Articulation *);

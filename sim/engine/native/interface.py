@@ -8,6 +8,7 @@ and the standard library.
 from __future__ import annotations
 
 import ctypes
+from typing import Any
 
 from batchpid.native.extensions import ROUNDED, VECTORIZED_ONLY, Extension
 from batchpid.native.operations import PROGRAMS
@@ -50,18 +51,27 @@ is float32.
 """
 
 
+def _all(kind: Any, *names: str) -> list[tuple[str, Any]]:
+    """Return fields of one type."""
+    return [(name, kind) for name in names]
+
+
 class Group(ctypes.Structure):
     """Group of robots, as Group in sim_step.h."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("gateway", "qf", "skip", "speed_limit")),
-        *((name, ctypes.c_void_p) for name in ("mujoco", "constraint", "joints")),
-        ("robots", ctypes.c_int64),
-        ("dof", ctypes.c_int64),
-        ("gravity", ctypes.c_int32),
-        ("coriolis", ctypes.c_int32),
-        ("velocities", ctypes.c_int32),
-        ("senses", ctypes.c_int32),
+        *_all(
+            ctypes.c_void_p,
+            "gateway",
+            "qf",
+            "skip",
+            "speed_limit",
+            "mujoco",
+            "constraint",
+            "joints",
+        ),
+        *_all(ctypes.c_int64, "robots", "dof"),
+        *_all(ctypes.c_int32, "gravity", "coriolis", "velocities", "senses"),
         ("message", ctypes.c_char * 256),
     ]
 
@@ -70,20 +80,39 @@ class Clearance(ctypes.Structure):
     """Shapes of robots in MuJoCo, and their clearances, as Clearance in clearance.h."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("kinematics", "models", "places", "turns")),
-        *((name, ctypes.c_void_p) for name in ("kinds", "sizes", "radii", "hulls", "vertices")),
-        *(
-            (name, ctypes.c_void_p)
-            for name in ("pairs", "bodies", "arms", "arm_ways", "begins", "travel")
+        *_all(
+            ctypes.c_void_p,
+            "kinematics",
+            "models",
+            "places",
+            "turns",
+            "kinds",
+            "sizes",
+            "radii",
+            "hulls",
+            "vertices",
+            "pairs",
+            "bodies",
+            "arms",
+            "arm_ways",
+            "begins",
+            "travel",
+            "last",
+            "moved",
+            "left",
+            "rate",
+            "wait",
+            "age",
+            "brief",
+            "near",
+            "open",
+            "no_shapes",
+            "some_types",
         ),
-        *(
-            (name, ctypes.c_void_p)
-            for name in ("last", "moved", "left", "rate", "wait", "age", "brief", "near", "open")
+        *_all(
+            ctypes.c_int64, "number", "ways", "size", "flags", "counts", "types_at", "affinities_at"
         ),
-        *((name, ctypes.c_void_p) for name in ("no_shapes", "some_types")),
-        *((name, ctypes.c_int64) for name in ("number", "ways", "size")),
-        *((name, ctypes.c_int64) for name in ("flags", "counts", "types_at", "affinities_at")),
-        *((name, ctypes.c_int32) for name in ("contact", "floats")),
+        *_all(ctypes.c_int32, "contact", "floats"),
     ]
 
 
@@ -91,15 +120,29 @@ class Mujoco(ctypes.Structure):
     """Robots in MuJoCo, as Mujoco in mujoco_step.h."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("step1", "step2", "set_log_handler", "clock")),
-        *((name, ctypes.c_void_p) for name in ("models", "data")),
-        *(
-            (name, ctypes.c_void_p)
-            for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")
+        *_all(
+            ctypes.c_void_p,
+            "step1",
+            "step2",
+            "set_log_handler",
+            "clock",
+            "models",
+            "data",
+            "qpos",
+            "qvel",
+            "applied",
+            "bias",
+            "qpos_at",
+            "qvel_at",
+            "qf",
+            "ctrl",
+            "stiffness",
+            "rate_gain",
+            "clearance",
+            "sensors",
+            "sensed",
         ),
-        *((name, ctypes.c_void_p) for name in ("ctrl", "stiffness", "rate_gain")),
-        *((name, ctypes.c_void_p) for name in ("clearance", "sensors", "sensed")),
-        *((name, ctypes.c_int64) for name in ("sensor_size", "base_qpos", "base_qvel")),
+        *_all(ctypes.c_int64, "sensor_size", "base_qpos", "base_qvel"),
     ]
 
 
@@ -107,17 +150,25 @@ class Constraint(ctypes.Structure):
     """Constraint of coupled joints, as Constraint in constraint.h."""
 
     _fields_ = [
-        *(
-            (name, ctypes.c_void_p)
-            for name in ("response", "push", "passive", "followers", "leaders")
+        *_all(
+            ctypes.c_void_p,
+            "response",
+            "push",
+            "passive",
+            "followers",
+            "leaders",
+            "multiplier",
+            "offset",
+            "wraps",
+            "unwrapped",
+            "asked",
+            "wrong",
+            "free",
+            "model",
+            "implicit",
+            "force",
         ),
-        *(
-            (name, ctypes.c_void_p)
-            for name in ("multiplier", "offset", "wraps", "unwrapped", "asked", "wrong", "free")
-        ),
-        *((name, ctypes.c_void_p) for name in ("model", "implicit", "force")),
-        ("rate_gain", ctypes.c_double),
-        ("position_gain", ctypes.c_double),
+        *_all(ctypes.c_double, "rate_gain", "position_gain"),
         ("size", ctypes.c_int64),
     ]
 
@@ -126,11 +177,10 @@ class ModelStruct(ctypes.Structure):
     """Rigid-body model of robots, as Model in model.h."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("tree", "rows", "inertias")),
+        *_all(ctypes.c_void_p, "tree", "rows", "inertias"),
         ("gravity", 3 * ctypes.c_double),
         ("dof", ctypes.c_int64),
-        ("varies", ctypes.c_int32),
-        ("base", ctypes.c_int32),
+        *_all(ctypes.c_int32, "varies", "base"),
     ]
 
 
@@ -138,13 +188,18 @@ class Refresh(ctypes.Structure):
     """Constants of the friction model, as Refresh in refresh.h."""
 
     _fields_ = [
-        *(
-            (name, ctypes.c_void_p)
-            for name in ("model", "armature", "coulomb", "viscous", "damping", "stiffness")
+        *_all(
+            ctypes.c_void_p,
+            "model",
+            "armature",
+            "coulomb",
+            "viscous",
+            "damping",
+            "stiffness",
+            "leader",
+            "multiplier",
         ),
-        *((name, ctypes.c_void_p) for name in ("leader", "multiplier")),
-        ("timestep", ctypes.c_double),
-        ("share", ctypes.c_double),
+        *_all(ctypes.c_double, "timestep", "share"),
         ("steps", ctypes.c_int64),
     ]
 
@@ -153,7 +208,7 @@ class Stage(ctypes.Structure):
     """Stage of a sim step, as Stage in tick.h."""
 
     _fields_ = [
-        *((name, ctypes.c_int32) for name in ("kind", "program")),
+        *_all(ctypes.c_int32, "kind", "program"),
         ("noise", 2 * ctypes.c_int32),
         ("every", ctypes.c_int64),
     ]
@@ -163,23 +218,44 @@ class Tick(ctypes.Structure):
     """Stages and arrays of ticks, as Tick in tick.h."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("stages", "transfers")),
-        *(
-            (name, ctypes.c_void_p)
-            for name in ("qpos", "qvel", "passive", "before", "pose", "rate", "qf")
+        *_all(
+            ctypes.c_void_p,
+            "stages",
+            "transfers",
+            "qpos",
+            "qvel",
+            "passive",
+            "before",
+            "pose",
+            "rate",
+            "qf",
+            "tree",
+            "bodies",
+            "armature",
+            "damping",
+            "leader",
+            "multiplier",
+            "matrix",
+            "control",
+            "measured_force",
+            "read_force",
+            "refresh",
+            "gain",
+            "memory",
+            "age",
+            "target",
+            "target_rate",
+            "base_pose",
+            "base_twist",
+            "left",
         ),
-        *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping")),
-        *((name, ctypes.c_void_p) for name in ("leader", "multiplier", "matrix", "control")),
-        *((name, ctypes.c_void_p) for name in ("measured_force", "read_force", "refresh")),
-        *((name, ctypes.c_void_p) for name in ("gain", "memory", "age", "target", "target_rate")),
-        *((name, ctypes.c_void_p) for name in ("base_pose", "base_twist", "left")),
         ("noise", 2 * ctypes.c_void_p),
         ("group", ctypes.c_void_p),
         ("timestep", ctypes.c_double),
-        *((name, ctypes.c_int64) for name in ("dof", "stage_count", "transfer_count")),
-        *((name, ctypes.c_int64) for name in ("tick", "step", "drawn", "ran")),
-        *((name, ctypes.c_int32) for name in ("matrix_steps",)),
-        *((name, ctypes.c_int32) for name in ("gravity", "coriolis", "late", "status", "unused")),
+        *_all(
+            ctypes.c_int64, "dof", "stage_count", "transfer_count", "tick", "step", "drawn", "ran"
+        ),
+        *_all(ctypes.c_int32, "matrix_steps", "gravity", "coriolis", "late", "status", "unused"),
     ]
 
 
@@ -189,9 +265,9 @@ class Transfer(ctypes.Structure):
     """
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("table", "row")),
-        *((name, ctypes.c_int64) for name in ("stride", "size")),
-        *((name, ctypes.c_int32) for name in ("kind", "unused")),
+        *_all(ctypes.c_void_p, "table", "row"),
+        *_all(ctypes.c_int64, "stride", "size"),
+        *_all(ctypes.c_int32, "kind", "unused"),
     ]
 
 

@@ -154,29 +154,26 @@ def engine_settings(spec: SceneSpec) -> Iterator[None]:
     Only one thread at a time enters the context.
     """
     with _building:
-        yield from _engine_settings(spec)
-
-
-def _engine_settings(spec: SceneSpec) -> Iterator[None]:
-    scene, body = physx.get_scene_config(), physx.get_body_config()
-    shape, material = physx.get_shape_config(), physx.get_default_material()
-    # Settings that are not given get SAPIEN's defaults.
-    gravity = np.array(spec.gravity, np.float32)
-    physx.set_scene_config(gravity=gravity, enable_tgs=spec.physics.solver == "TGS")
-    physx.set_body_config(
-        spec.physics.position_iterations, spec.physics.velocity_iterations, sleep_threshold=0.0
-    )
-    physx.set_shape_config()
-    physx.set_default_material(CONTACT_FRICTION, CONTACT_FRICTION, RESTITUTION)
-    try:
-        yield
-    finally:
-        physx.set_scene_config(scene)
-        physx.set_body_config(body)
-        physx.set_shape_config(shape)
-        physx.set_default_material(
-            material.static_friction, material.dynamic_friction, material.restitution
+        scene, body = physx.get_scene_config(), physx.get_body_config()
+        shape, material = physx.get_shape_config(), physx.get_default_material()
+        solver = spec.physics
+        # Settings that are not given get SAPIEN's defaults.
+        gravity = np.array(spec.gravity, np.float32)
+        physx.set_scene_config(gravity=gravity, enable_tgs=solver.solver == "TGS")
+        physx.set_body_config(
+            solver.position_iterations, solver.velocity_iterations, sleep_threshold=0.0
         )
+        physx.set_shape_config()
+        physx.set_default_material(CONTACT_FRICTION, CONTACT_FRICTION, RESTITUTION)
+        try:
+            yield
+        finally:
+            physx.set_scene_config(scene)
+            physx.set_body_config(body)
+            physx.set_shape_config(shape)
+            physx.set_default_material(
+                material.static_friction, material.dynamic_friction, material.restitution
+            )
 
 
 def new_system(spec: SceneSpec, gravity: NDArray[np.float64] | None = None) -> Any:

@@ -259,17 +259,17 @@ def _call(
         return []
     several = isinstance(returned, Iterable) and not isinstance(returned, str)
     watched = []
-    for each in returned if several else [returned]:
-        if isinstance(each, str) and each in links:
-            watched.append(links[each])
-        elif isinstance(each, sapien.Entity):
-            watched.append((each, None))
+    for item in returned if several else [returned]:
+        if isinstance(item, str) and item in links:
+            watched.append(links[item])
+        elif isinstance(item, sapien.Entity):
+            watched.append((item, None))
         else:
             raise InvalidArgumentError(
                 "build",
                 "returned something other than entities and names of the robot's links",
                 env=env,
-                value=each if isinstance(each, str) else type(each).__name__,
+                value=item if isinstance(item, str) else type(item).__name__,
                 remedy="return the entities and links whose poses are wanted, or None",
             )
     return watched

@@ -184,7 +184,7 @@ READINGS = {
     "effort of all joints with the other sign": ("effort", lambda log: {"command": -log.command}),
     "effort in thousandths of SI units": ("effort", lambda log: {"command": 1e3 * log.command}),
     "qpos of shoulder and elbow exchanged": ("setpoint", lambda log: {"qpos": log.qpos[:, ::-1]}),
-    "setpoints look like degrees": ("setpoint", lambda log: {"command": np.degrees(log.command)}),
+    "setpoints in degrees": ("setpoint", lambda log: {"command": np.degrees(log.command)}),
 }
 
 
@@ -240,7 +240,7 @@ def test_the_saved_file_is_what_was_found_and_holds_the_region(robot, found, tmp
     drawn = draw_motors(tmp_path / "motors.yaml", robot, 200)
     spread = drawn.strength.std(0)
     deviations = [
-        found.intervals.deviation[found.unknowns.entries.index(entry)]
+        found.fit.intervals.deviation[found.unknowns.entries.index(entry)]
         for entry in found.unknowns.entries
         if entry.kind == "strength"
     ]
