@@ -137,7 +137,10 @@ class Robot(RobotDescription):
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
         )
         # From here on links mean bodies: those that fixed joints hold together are one.
-        if (count := len({at.link for at in robot.bodies.values()})) > MAX_LINKS:
+        count = len(source.tables.bodies)
+        if count > MAX_LINKS:
+            count = len({at.link for at in robot.bodies.values()})
+        if count > MAX_LINKS:
             problem = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
             raise RobotError(f"{path}: {problem}; split the robot")
         motors = source.actuators if actuators is None else actuators

@@ -21,7 +21,7 @@ from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
 from batchpid.sim.robot.parts import FileDefaults, Joint, Mimic, MjcfFile
 from batchpid.sim.robot.repair import repair
 from batchpid.sim.robot.self_collision import DisabledPair
-from batchpid.sim.robot.tables import Body, Shape, Tables, breadth_first
+from batchpid.sim.robot.tables import NO_TURN, Body, Shape, Tables, breadth_first
 from batchpid.sim.robot.xml import number, numbers
 from batchpid.task_space.frames import from_rpy
 
@@ -211,7 +211,7 @@ def _read_tables(root: etree._Element, path: Path, added: list[str]) -> Tables:
 
 def _degrees(root: etree._Element) -> Iterator[Finding]:
     """Yield a finding for each origin with an angle of more than a turn, in degrees probably."""
-    for origin in root.iter("origin"):
+    for origin in root.iterfind(".//origin[@rpy]"):
         if max(map(abs, numbers(origin, "rpy", "0 0 0", "origin"))) > TURN:
             text = "roll, pitch or yaw of more than a turn, as if degrees were read as radians"
             detail = f"<{origin.getparent().tag}> rpy {origin.get('rpy')}"
@@ -241,7 +241,8 @@ def read_origin(element: etree._Element, where: str) -> tuple[Float64, Float64]:
     """Return position (3,) [m] and orientation (4,) of an element's ``<origin>``."""
     origin = element.find("origin")
     position = np.array(numbers(origin, "xyz", "0 0 0", where))
-    return position, from_rpy(numbers(origin, "rpy", "0 0 0", where))
+    rpy = numbers(origin, "rpy", "0 0 0", where)
+    return position, from_rpy(rpy) if any(rpy) else NO_TURN  # mostly
 
 
 def _check_tree(links: list[str], joints: list[Joint], path: Path, added: list[str]) -> None:

@@ -168,6 +168,7 @@ class MjcfActuators:
         if self.is_law:
             drive.compare_integral(self._is_dcmotor)
         drive.lack_motors(written if self.is_law else written | {"strength", "bias"})
+        # Masks of the joints that have a limit, a guard or an effect at all.
         limit = drive.motor("effort_limit", math.inf)
         is_weak = np.abs(self.effort_range).min(1) < limit
         limited, places = (
@@ -177,6 +178,7 @@ class MjcfActuators:
         guarded, turns = self.has_rate | places, self.has_rate & continuous
         late, biased = drive.motor("command_delay") > 0, drive.motor("bias") != 0
         law, dcmotor = np.full(len(limit), self.is_law), self._is_dcmotor
+        # Effects that MuJoCo's elements lack or place elsewhere, each with a mask of its joints.
         for joints, text in (
             (
                 law & late,
