@@ -134,7 +134,8 @@ class JAXBackend:
 
         def packed(layout: Any, shared: Any, own: Any, *inputs: Array, **named: Any) -> Any:
             tree, is_shared = layout
-            shared, own = iter(shared), iter(own)
+            shared = iter(shared)
+            own = iter(own)
             leaves = [next(shared if one else own) for one in is_shared]
             return function(self.jax.tree.unflatten(tree, leaves), *inputs, **named)
 
@@ -155,7 +156,8 @@ class JAXBackend:
             stacked = np.stack(shared) if shared else np.empty((0, 1, shape[1]), params.dtype)
             self.packed = ((tree, is_shared), jnp.asarray(stacked), own)
         # Buffers of other params have another shape or dtype, and are of no use.
-        self.dtype, self._spare = self.packed[1].dtype, None
+        self.dtype = self.packed[1].dtype
+        self._spare = None
 
     def array(self, value: Array) -> Array:
         """Return ``value`` as an array of this backend."""

@@ -218,7 +218,8 @@ def sine(
     growth = growth.hold(duration)
     a, rate, change = (part[: len(time), 0] for part in growth[1:])
     w = 2 * np.pi * positive("frequency", frequency, "Hz")
-    sin, cos = np.sin(w * time), np.cos(w * time)
+    sin = np.sin(w * time)
+    cos = np.cos(w * time)
     # Products of the growth and the wave, and their derivatives.
     rows = (a * sin, rate * sin + w * a * cos, (change - w**2 * a) * sin + 2 * w * rate * cos)
     shares = [row[(...,) + (None,) * way.ndim] for row in rows]
@@ -248,10 +249,8 @@ def trapezoidal(
         as it may.
     """
     x0, way = _move(start, target)
-    v, a = (
-        _limits("max_velocity", max_velocity, way, finite=False),
-        _limits("max_acceleration", max_acceleration, way),
-    )
+    v = _limits("max_velocity", max_velocity, way, finite=False)
+    a = _limits("max_acceleration", max_acceleration, way)
     distance = np.abs(way)
     moves = distance > _NO_WAY
     # Limits of s itself: the joints' limits, per metre or radian of the way.
@@ -291,7 +290,8 @@ def _trajectory(
     """Return x0 + way s and its derivatives; exactly the target, at rest, where the move is
     done.
     """
-    position, velocity = np.where(done, x0 + way, x0 + way * s), np.where(done, 0.0, way * rate)
+    position = np.where(done, x0 + way, x0 + way * s)
+    velocity = np.where(done, 0.0, way * rate)
     return Trajectory(time, position, velocity, np.where(done, 0.0, way * acceleration))
 
 

@@ -43,7 +43,10 @@ def number(argument: str, value: object, low: float, high: float, unit: str) -> 
     """Return ``value`` as a finite float within [low, high]; an infinite bound does not limit."""
     value = _scalar(argument, value, unit)
     if not low <= value <= high or math.isinf(value):  # NaN is in no range
-        ends = f"from {low:g} to {high:g}" if math.isfinite(high) else f">= {low:g}"
+        if math.isfinite(high):
+            ends = f"from {low:g} to {high:g}"
+        else:
+            ends = f">= {low:g}"
         raise InvalidArgumentError(
             argument, "out of range", value=value, remedy=f"use a number {ends} ({unit})"
         )
@@ -272,7 +275,8 @@ def entries(
     if np.all(good):
         return
     index = tuple(int(n) for n in np.argwhere(~np.asarray(good))[0])
-    place, value = index[-1] if index else None, values[index]
+    place = index[-1] if index else None
+    value = values[index]
     where: dict[str, Any] = {kind: place if place is None or names is None else names[place]}
     raise InvalidArgumentError(
         argument,
@@ -362,7 +366,10 @@ def check_keywords(owner: str, given: Collection[str], known: Collection[str]) -
     for name in given:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
-            remedy = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(known)}"
+            if near:
+                remedy = f"did you mean {near[0]!r}?"
+            else:
+                remedy = f"use one of {', '.join(known)}"
             raise InvalidArgumentError(name, f"is not an argument of {owner}", remedy=remedy)
 
 

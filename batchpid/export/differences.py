@@ -72,7 +72,10 @@ class Differences(list[str]):
 
     def _in_efforts(self, params: PIDParams, inertia: ArrayLike | None) -> PIDParams:
         """Return the params with gains in effort units."""
-        poses = None if inertia is None else _inertia(inertia, self.joints)
+        if inertia is None:
+            poses = None
+        else:
+            poses = _inertia(inertia, self.joints)
         if params.gain_units is None:
             return params
         if poses is None:
@@ -159,7 +162,9 @@ class Differences(list[str]):
 
 def joint_values(leaf: Array, joints: int, off: float) -> Float64:
     """Return a leaf of one env (joints,), ``off`` where it is None."""
-    return np.full(joints, off) if leaf is None else np.asarray(leaf[0], np.float64)
+    if leaf is None:
+        return np.full(joints, off)
+    return np.asarray(leaf[0], np.float64)
 
 
 def strategies(params: PIDParams) -> list[str]:

@@ -100,12 +100,17 @@ def to_ros2_control(
 
 def _gains(law: Differences, at: int) -> Document:
     """Return the gains of joint number ``at``, by name."""
-    params, gains = law.params, Document()
+    params = law.params
+    gains = Document()
     for key, option in LEAVES.items():
         leaf = getattr(params, option)
-        gains[key] = FIELDS[option].neutral if leaf is None else documents.plain(leaf[:, at])
+        if leaf is None:
+            gains[key] = FIELDS[option].neutral
+        else:
+            gains[key] = documents.plain(leaf[:, at])
     if gains["u_clamp_min"] >= gains["u_clamp_max"]:
-        problem, value = "must be below effort_max for control_toolbox", gains["u_clamp_min"]
+        problem = "must be below effort_max for control_toolbox"
+        value = gains["u_clamp_min"]
         raise InvalidArgumentError(
             "effort_min", problem, joint=law.joints[at], value=value, remedy="widen the limits"
         )
@@ -114,10 +119,14 @@ def _gains(law: Differences, at: int) -> Document:
     strategy = strategies(params)[at]
     tracks = strategy == "back_calculation"
     is_conditional = strategy == "conditional"
-    gains["antiwindup_strategy"] = "conditional_integration" if is_conditional else strategy
-    gains["tracking_time_constant"] = (
-        documents.plain(params.tracking_time[:, at]) if tracks else 0.0
-    )
+    if is_conditional:
+        gains["antiwindup_strategy"] = "conditional_integration"
+    else:
+        gains["antiwindup_strategy"] = strategy
+    if tracks:
+        gains["tracking_time_constant"] = documents.plain(params.tracking_time[:, at])
+    else:
+        gains["tracking_time_constant"] = 0.0
     weight = params.setpoint_weight_derivative
     gains["ff_velocity_scale"] = 0.0
     if weight is not None:

@@ -78,7 +78,9 @@ def tracking_time(
     time = build.array("tracking_time", value, Field("s", math.inf))
     time = _rule_of_thumb(kp, ki, kd) if time is None else time
     time = namespace(time).where(back, time, math.inf)
-    return None if is_everywhere(time, math.inf) else build.freeze(time)
+    if is_everywhere(time, math.inf):
+        return None
+    return build.freeze(time)
 
 
 def _rule_of_thumb(kp: Array, ki: Array, kd: Array) -> Array:

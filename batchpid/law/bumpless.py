@@ -69,14 +69,23 @@ def track(
     (origin, _), (lasting, _) = (
         origins(k, state, measurement, rate, xp) for rate in (setpoint_rate, None)
     )
-    rate = zero if measurement_rate is None else -measurement_rate
+    if measurement_rate is None:
+        rate = zero
+    else:
+        rate = -measurement_rate
     if setpoint_rate is not None:
         rate = rate + weighted_rate(k, setpoint_rate)
     # The law solved for its integral: I = u - P - D - feedforward, with the derivative filter
     # settled on its input.
     integral = effort - proportional(k, error, measurement, origin)
-    integral = integral if k.kd is None else integral - k.kd * rate
-    integral = integral if feedforward is None else integral - feedforward
+    if k.kd is None:
+        integral = integral
+    else:
+        integral = integral - k.kd * rate
+    if feedforward is None:
+        integral = integral
+    else:
+        integral = integral - feedforward
     return PIDState(
         integral=clip(integral, k.integral_min, k.integral_max, xp),
         measurement=None if state.measurement is None else measurement.copy(),

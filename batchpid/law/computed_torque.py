@@ -75,7 +75,10 @@ def advance_with_mass_matrix(
     p, i, d, arguments = (
         x if isinstance(x, float) else matrix_vector(mass_matrix, x) for x in terms[:4]
     )
-    arguments = arguments if feedforward is None else arguments + feedforward
+    if feedforward is None:
+        arguments = arguments
+    else:
+        arguments = arguments + feedforward
     return new, Terms(p, i, d, arguments, unsaturated, effort)
 
 
@@ -148,18 +151,25 @@ def _to_effort(
     passive = 0.0 if feedforward is None else feedforward
     effort = unsaturated = wanted + passive
     stops = k.ki_dt is not None and k.conditional is not None
-    change, deeper = new.integral - old.integral if stops else None, None
+    change = new.integral - old.integral if stops else None
+    deeper = None
     if low is not None or high is not None:
         # The acceleration is scaled as a whole, so that its direction stays.
         share = _share(wanted, passive, low, high, xp)
         effort = clip(share * wanted + passive, low, high, xp)
-        deeper = None if change is None else (share < 1) & (a * change > 0)
+        if change is None:
+            deeper = None
+        else:
+            deeper = (share < 1) & (a * change > 0)
     if k.effort_step is not None:
         # The change of the effort is scaled as a whole, for the same reason.
         reached = effort
         effort = clip(_towards(reached, old.effort, k.effort_step, xp), low, high, xp)
         new = new._replace(effort=effort.copy())
-        late = None if change is None else (reached - effort) * change > 0
+        if change is None:
+            late = None
+        else:
+            late = (reached - effort) * change > 0
         deeper = late if deeper is None else deeper | late
     if deeper is not None:
         if not isinstance(k.conditional, Everywhere):
@@ -182,10 +192,9 @@ def _towards(effort: Array, last: Array, step: Any, xp: ArrayModule) -> Array:
 
 def _share(wanted: Array, passive: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
     """Return s (envs, 1): the share of ``wanted`` that fits between ``passive`` and the limits."""
-    above, below = (
-        (xp.inf if high is None else high - passive),
-        (xp.inf if low is None else passive - low),
-    )
-    room, size = xp.where(wanted > 0, above, below), xp.abs(wanted)
+    above = xp.inf if high is None else high - passive
+    below = xp.inf if low is None else passive - low
+    room = xp.where(wanted > 0, above, below)
+    size = xp.abs(wanted)
     limited = (size > room) & (room > 0)
     return row_minimum(xp.where(limited, room / xp.where(limited, size, 1.0), 1.0))

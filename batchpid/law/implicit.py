@@ -80,7 +80,8 @@ def implicit_gains(params: PIDParams, dt: Array) -> ImplicitGains:
     c = params.setpoint_weight_derivative
     xp = namespace(kp, ki, kd, b, c, dt)
     ki_dt = 0.0 if ki is None else ki * dt
-    stiffness, damping = kp + 2 * ki_dt, kd + dt * (kp + ki_dt)
+    stiffness = kp + 2 * ki_dt
+    damping = kd + dt * (kp + ki_dt)
     per_step = 1 / (1 + dt * damping)
     on_rate = kd if c is None else c * kd
 

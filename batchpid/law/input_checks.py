@@ -48,7 +48,8 @@ def checked_inputs(
     of_params = {leaf.shape for leaf in params if leaf is not None and not isinstance(leaf, tuple)}
     known = {"state": [leaf.shape for leaf in state if leaf is not None]}
     known |= {name: [array.shape] for name, array in arrays.items() if array is not None}
-    (whole,), joints = known["measurement"], params.num_joints
+    (whole,) = known["measurement"]
+    joints = params.num_joints
     usual = {whole, (1, joints)}  # a look saves most of the time
     if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*known.values())):
         _check_shapes(np.broadcast_shapes(*of_params), joints, known)
@@ -121,7 +122,8 @@ def _check_shapes(
 
 def needs(params: PIDParams) -> PIDState:
     """Return which leaves of a state the params need, as bools."""
-    differentiates, weights = params.kd is not None, params.setpoint_weight is not None
+    differentiates = params.kd is not None
+    weights = params.setpoint_weight is not None
     weights_rate = differentiates and params.setpoint_weight_derivative is not None
     return PIDState(
         integral=params.ki is not None,
@@ -178,7 +180,9 @@ def checked_dt(dt: Array, dtype: DType) -> Array:
         return dt.astype(dtype, copy=False)
     if isinstance(dt, np.ndarray | np.generic):
         dt = dt.item()
-    return dt if hasattr(dt, "__array_namespace__") else time_step("dt", dt)
+    if hasattr(dt, "__array_namespace__"):
+        return dt
+    return time_step("dt", dt)
 
 
 def _as_array(name: str, value: Any, kinds: str = "iuf") -> Array:

@@ -126,7 +126,10 @@ class PIDParams(Record, _ParamsFields):
         # The strategies are traced, and cannot be read: their leaves stay.
         arrays = self.leaves()
         for name in ("tracking_time", "conditional"):
-            leaf = arrays[name].astype(params.dtype) if name in arrays else getattr(self, name)
+            if name in arrays:
+                leaf = arrays[name].astype(params.dtype)
+            else:
+                leaf = getattr(self, name)
             params = params._replace(**{name: leaf})
         params.check(params.num_envs)
         return params

@@ -195,7 +195,10 @@ def advance(
     if k.non_finite is not None:
         finite = xp.isfinite(r) & xp.isfinite(y)
         for optional in (r_rate, y_rate, ff):
-            finite = finite if optional is None else finite & xp.isfinite(optional)
+            if optional is None:
+                finite = finite
+            else:
+                finite = finite & xp.isfinite(optional)
         r, y, r_rate, y_rate, ff = (
             None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff)
         )
@@ -218,18 +221,20 @@ def advance(
     # The filter acts on the weighted rate, so that one state serves measurement and setpoint.
     d, derivative = 0.0, None
     if k.kd is not None:
-        rate = (
-            -y_rate if y_rate is not None else wrap(state.measurement - y, k.turns, xp) * k.per_dt
-        )
+        if y_rate is not None:
+            rate = -y_rate
+        else:
+            rate = wrap(state.measurement - y, k.turns, xp) * k.per_dt
         if r_rate is not None:
             rate = rate + weighted_rate(k, r_rate)
         elif k.c is not None:
             rate = (
                 rate + k.c * state.setpoint_seen * wrap(r - state.setpoint, k.turns, xp) * k.per_dt
             )
-        derivative = (
-            rate if k.decay is None else flush(k.decay * state.derivative + k.intake * rate, k.tiny)
-        )
+        if k.decay is None:
+            derivative = rate
+        else:
+            derivative = flush(k.decay * state.derivative + k.intake * rate, k.tiny)
         d = k.kd * derivative
         u = u + d
     if ff is not None:
@@ -303,13 +308,17 @@ def reset(
 def wrapped_error(k: Coefficients, r: Array, y: Array, xp: ArrayModule) -> Array:
     """Return the wrapped error, less the dead zone."""
     error = wrap(r - y, k.turns, xp)
-    return error if k.deadband is None else error - clip(error, -k.deadband, k.deadband, xp)
+    if k.deadband is None:
+        return error
+    return error - clip(error, -k.deadband, k.deadband, xp)
 
 
 def weighted_rate(k: Coefficients, r_rate: Array) -> Array:
     """Return a given setpoint rate times its weight."""
     weight = k.c if k.c_given is None else k.c_given
-    return r_rate if weight is None else weight * r_rate
+    if weight is None:
+        return r_rate
+    return weight * r_rate
 
 
 def origins(
@@ -377,5 +386,6 @@ def advance_drive(
     """
     state, terms = advance(k, state, setpoint, measurement, **inputs)
     xp = namespace(*k, terms.i, setpoint)
-    driven, target = k.kp > 0, nearest_turn(setpoint, measurement, k.turns, xp)
+    driven = k.kp > 0
+    target = nearest_turn(setpoint, measurement, k.turns, xp)
     return state, target + xp.where(driven, terms.filled().i, 0) / xp.where(driven, k.kp, 1)

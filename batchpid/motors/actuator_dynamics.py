@@ -120,12 +120,16 @@ def init(
     qpos, qvel, effort = in_dtype_of(actuators, qpos, qvel, effort)
     xp = namespace(*actuators, qpos)
     zeros = xp.zeros_like(qpos)
-    position, velocity = zeros + qpos, zeros if qvel is None else zeros + qvel
+    position = zeros + qpos
+    velocity = zeros if qvel is None else zeros + qvel
     requested = zeros if effort is None else zeros + effort
     command = sensor = encoder = key = step = None
     # Histories are as long as the longest delay may become, so that delays can grow in flight.
     if actuators.max_delay is not None:
-        samples = delay.samples_of(actuators.max_delay, dt) if samples is None else samples
+        if samples is None:
+            samples = delay.samples_of(actuators.max_delay, dt)
+        else:
+            samples = samples
         if actuators.command_delay is not None:
             command = delay.start(requested, samples)
         if actuators.sensor_delay is not None:
@@ -156,7 +160,8 @@ def discretise(
     faster. Raises InvalidArgumentError if dt is a number that is not positive, or above 1 s.
     """
     check_time_step("dt", dt)
-    a, xp = actuators, namespace(*actuators)
+    a = actuators
+    xp = namespace(*actuators)
     position = velocity = None
     if a.sensor_delay is not None:
         begins = 0, a.sensor_delay.shape[1]
@@ -225,8 +230,13 @@ def measure(
 
 def _motor(k: MotorCoefficients, effort: Array) -> Array:
     """Return s u + b."""
-    effort = effort if k.strength is None else k.strength * effort
-    return effort if k.bias is None else effort + k.bias
+    if k.strength is None:
+        effort = effort
+    else:
+        effort = k.strength * effort
+    if k.bias is None:
+        return effort
+    return effort + k.bias
 
 
 def _delivered(
@@ -272,7 +282,10 @@ def _encode(
     ``position`` and ``velocity`` are the noise, or None.
     """
     xp = namespace(qpos, qvel)
-    qpos = qpos if k.position_offset is None else qpos + k.position_offset
+    if k.position_offset is None:
+        qpos = qpos
+    else:
+        qpos = qpos + k.position_offset
     qpos = qpos if position is None else qpos + position
     qvel = qvel if velocity is None else qvel + velocity
     if k.position_resolution is not None:
@@ -322,12 +335,13 @@ def advance_measurement(
         qpos = encoder
     if k.position_delay is not None and k.velocity_delay is not None:
         sensor = push_history(sensor, qpos, qvel)
-        qpos, qvel = (
-            delay.read(sensor, k.position_delay, k.turns, xp),
-            delay.read(sensor, k.velocity_delay, None, xp),
-        )
+        qpos = delay.read(sensor, k.position_delay, k.turns, xp)
+        qvel = delay.read(sensor, k.velocity_delay, None, xp)
     if key is not None:
-        drawn = measurement_noise(k, key, step, qpos, xp) if drawn is None else drawn
+        if drawn is None:
+            drawn = measurement_noise(k, key, step, qpos, xp)
+        else:
+            drawn = drawn
         step = step + _ONE
     qpos, qvel = _encode(k, qpos, qvel, *(drawn or (None, None)))
     return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel
@@ -353,4 +367,6 @@ def _step(resolution: Array, xp: ArrayModule) -> Array:
     """Return the step of a sensor; 2^-60, which is below the last bit that matters, without a
     resolution.
     """
-    return None if resolution is None else xp.where(resolution > 0, resolution, 2.0**-60)
+    if resolution is None:
+        return None
+    return xp.where(resolution > 0, resolution, 2.0**-60)

@@ -33,7 +33,8 @@ def interpreter() -> Any:
     """
     native = load(PROGRAM)
     native.use(np.ndarray, np.empty)
-    rows, fixed = np.empty((2, 3)), np.empty((4, 1), np.float32)
+    rows = np.empty((2, 3))
+    fixed = np.empty((4, 1), np.float32)
     fixed.flags.writeable = False
     for entry in (rows, fixed):
         if native.look(entry) != (
@@ -54,11 +55,10 @@ def threads_for(numbers: int, threads: int | None = None) -> int:
     if most < 2:
         return 1
     if threads is None:
-        threads = (
-            len(os.sched_getaffinity(0))
-            if hasattr(os, "sched_getaffinity")
-            else os.cpu_count() or 1
-        )
+        if hasattr(os, "sched_getaffinity"):
+            threads = len(os.sched_getaffinity(0))
+        else:
+            threads = os.cpu_count() or 1
     return min(most, threads)
 
 
@@ -133,6 +133,7 @@ class ArrayProgram:
         full
             Bit mask of the further inputs that must be (rows, columns).
         """
-        native, new = interpreter(), (self.shape, self.dtype)
+        native = interpreter()
+        new = (self.shape, self.dtype)
         fixed = self._program, self.shape[0], tuple(inputs), tuple(outputs)
         return partial(native.call, native.bind(*fixed, given, full, new, self._threads))

@@ -135,7 +135,8 @@ def inverse_kinematics(
         best = search.solve(goal, rows, search.limits)
         # Most poses are reached from one of the first five starts.
         for first, last in ((0, 4), (4, starts - 1)):
-            left, drawn = np.flatnonzero(~search.reached(best)), shares[first:last]
+            left = np.flatnonzero(~search.reached(best))
+            drawn = shares[first:last]
             if not len(left) or not len(drawn):
                 continue
             began = np.concatenate([search.drawn(rows[left], share) for share in drawn])
@@ -240,7 +241,8 @@ class _Search(NamedTuple):
             return _Found(*native)
         count = len(goal)
         best = _Found(qpos.copy(), np.full((count, 2), np.inf), np.zeros((count, 1)))
-        going, q = np.arange(count), qpos
+        going = np.arange(count)
+        q = qpos
         for step in range(self.iterations + 1):
             at = _At(*tool, q)
             error = pose_error(goal[going], at.pose)
@@ -249,7 +251,8 @@ class _Search(NamedTuple):
             better = self.size(found) < self.size(best.rows(going))
             best.write(going[better], found.rows(better))
             stay = ~self.reached(found)
-            going, q = going[stay], self.tree.positions(_stepped(limits, at, q, error))[stay]
+            going = going[stay]
+            q = self.tree.positions(_stepped(limits, at, q, error))[stay]
             if not len(going):
                 break
         return best
@@ -277,7 +280,8 @@ def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Flo
     """Return the positions (n, dof) after a step within the limits."""
     damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
     # Joints that would pass a limit stop there, and the others take over their share.
-    free, move = np.ones(qpos.shape, bool), np.zeros_like(qpos)
+    free = np.ones(qpos.shape, bool)
+    move = np.zeros_like(qpos)
     for _ in range(_PASSES):
         part = np.where(free[:, None], at.jacobian, 0.0)
         rest = error - product(at.jacobian, np.where(free, 0.0, move))
@@ -285,7 +289,8 @@ def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Flo
         target = qpos + move
         within = np.clip(target, *limits)
         beyond = free & (target != within)
-        move, free = np.where(beyond, within - qpos, move), free & ~beyond
+        move = np.where(beyond, within - qpos, move)
+        free = free & ~beyond
         if not beyond.any():
             break
     # Geodesic acceleration: the curvature of the path of the tool.
@@ -316,7 +321,8 @@ def _goals_and_starts(
     rows = array("start", start, (envs, tree.dof), tree.joint_names)
     length = np.linalg.norm(goal[:, 3:], axis=1, keepdims=True)
     unit = np.abs(length - 1) < 1e-3
-    problem, remedy = "has a quaternion that is not of unit length", "normalise w, x, y, z"
+    problem = "has a quaternion that is not of unit length"
+    remedy = "normalise w, x, y, z"
     entries("pose", length, unit, problem, ["qw"], kind="entry", remedy=remedy)
     goal[:, 3:] /= length
     return goal, tree.positions(np.clip(rows, tree.lower, tree.upper))

@@ -54,15 +54,16 @@ def law(
     if isinstance(dynamics, Tool):
         tool = dynamics
         (qpos, qvel), *_ = prepared(tool.tree, qpos=inputs.qpos, qvel=inputs.qvel)
-        inputs, dynamics_arrays = (
-            inputs._replace(qpos=qpos, qvel=qvel),
-            (read_point(qpos, tool.point),),
-        )
+        inputs = inputs._replace(qpos=qpos, qvel=qvel)
+        dynamics_arrays = (read_point(qpos, tool.point),)
     arrays = (*inputs, None, None, *state, *k[:-1])
     if (native := native_rows.for_rows(inputs.qpos, *dynamics_arrays, *arrays)) is None:
         return None
     rows, dof = inputs.qpos.shape
-    wanted = wanted if state.integral is None else (*wanted, "integral")
+    if state.integral is None:
+        wanted = wanted
+    else:
+        wanted = (*wanted, "integral")
     results = [
         np.empty((rows, size or dof)) if name in wanted else None for name, size in _RESULTS.items()
     ]
@@ -99,7 +100,8 @@ def _of_tree(
     """Return the arguments of ``law`` and ``bind`` between sizes and arrays, and the chain to the
     tool (dof,).
     """
-    constants, index = native_rows.native_tree(native, tree), tree.index(link)
+    constants = native_rows.native_tree(native, tree)
+    index = tree.index(link)
     body = tree.link_bodies[index]
     fixed = k.frame is not None, constants.tree, body, native_rows.tool(constants, index, point)
     return fixed, np.array(tree.chains[body], np.float64)
@@ -134,7 +136,8 @@ class BoundOSC:
         qpos, qvel, bias = reading
         (rows, dof), native = qpos.shape, native_rows.in_use()
         assert native is not None
-        self._parts, self._columns = {"setpoint": slice(0, 7), **parts}, columns
+        self._parts = {"setpoint": slice(0, 7), **parts}
+        self._columns = columns
         self._given = {
             name: np.zeros((rows, part.stop - part.start)) for name, part in self._parts.items()
         }

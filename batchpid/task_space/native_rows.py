@@ -48,12 +48,16 @@ _trees: WeakKeyDictionary[RigidTree, _NativeTree] = WeakKeyDictionary()
 
 def in_use() -> Array:
     """Return the extension, or None where native code is not used."""
-    return None if os.environ.get(SWITCH) == "0" else _extension()
+    if os.environ.get(SWITCH) == "0":
+        return None
+    return _extension()
 
 
 @cache
 def _extension() -> Array:
-    return None if obstacle() else load(TASK_SPACE)
+    if obstacle():
+        return None
+    return load(TASK_SPACE)
 
 
 def kinematics(
@@ -70,11 +74,10 @@ def kinematics(
     The first three belong to a ``point`` (3,) or (..., 3) of the link ``index``. "jacobian_rate"
     and "bias" need ``qvel``. ``qpos`` and ``qvel`` are checked arrays (..., dof).
     """
-    native = (
-        in_use()
-        if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray))
-        else None
-    )
+    if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray)):
+        native = in_use()
+    else:
+        native = None
     if native is None or not (tree.fixed_base or _DYNAMICS.isdisjoint(wanted)):
         return None
     dof = tree.dof
@@ -106,7 +109,8 @@ def _arguments(
     native: Any, tree: RigidTree, found: dict[str, Float64], inputs: Any, index: int, point: Array
 ) -> list[Any]:
     """Return the arguments of ``kinematics`` in task_space.cpp."""
-    own, rows = native_tree(native, tree), len(inputs[0])
+    own = native_tree(native, tree)
+    rows = len(inputs[0])
     results = [found.get(name) for name in KINEMATICS[3:]]
     return [own.tree, tree.link_bodies[index], rows, *inputs, tool(own, index, point), *results]
 
@@ -135,7 +139,8 @@ def search(
     """
     if (native := in_use()) is None:
         return None
-    own, rows = native_tree(native, tree), len(start)
+    own = native_tree(native, tree)
+    rows = len(start)
     found = [start.copy(), np.full((rows, 2), np.inf), np.zeros((rows, 1))]
     arrays = goal, tool(own, index, point), *(limit[None] for limit in limits), tolerance[None]
     call(native.search, own.tree, tree.link_bodies[index], rows, iterations, *arrays, *found)
@@ -171,7 +176,9 @@ def for_rows(like: Array, *arrays: Array) -> Array:
     plain = _PLAIN.issuperset(map(type, arrays)) or all(
         x is None or isinstance(x, np.ndarray) for x in arrays
     )
-    return in_use() if plain and like.ndim == 2 else None
+    if plain and like.ndim == 2:
+        return in_use()
+    return None
 
 
 def call(function: Callable[..., None], *arguments: Any) -> None:
@@ -185,4 +192,6 @@ def call(function: Callable[..., None], *arguments: Any) -> None:
 
 
 def _contiguous(array: Array) -> Array:
-    return None if array is None else np.ascontiguousarray(array, np.float64)
+    if array is None:
+        return None
+    return np.ascontiguousarray(array, np.float64)

@@ -81,13 +81,17 @@ def init(params: OSCParams, qpos: Array) -> OSCState:
     (qpos,) = in_dtype_of(params, qpos)
     xp = namespace(*params, qpos)
     posture = xp.zeros_like(qpos) + qpos
-    integral = None if params.integral_gain is None else xp.zeros((len(posture), 6), posture.dtype)
+    if params.integral_gain is None:
+        integral = None
+    else:
+        integral = xp.zeros((len(posture), 6), posture.dtype)
     return OSCState(posture, integral)
 
 
 def reset(params: OSCParams, state: OSCState, qpos: Array, mask: Array) -> OSCState:
     """Return the state with the envs of ``mask`` (envs,) bool restarted at ``qpos`` (envs, dof)."""
-    xp, fresh = namespace(*state, qpos, mask), init(params, qpos)
+    xp = namespace(*state, qpos, mask)
+    fresh = init(params, qpos)
     chosen = xp.asarray(mask)[:, None]
     return OSCState(
         *[
@@ -183,10 +187,8 @@ class Task(NamedTuple):
 def in_frame(k: OSCCoefficients, d: TaskDynamics, inputs: OSCInputs) -> Task:
     """Return the dynamics, error and motion in the axes of the params' frame."""
     xp = namespace(*k, *d, *inputs)
-    error, limits = (
-        pose_error(inputs.setpoint, d.pose),
-        (k.position_error_limit, k.rotation_error_limit),
-    )
+    error = pose_error(inputs.setpoint, d.pose)
+    limits = (k.position_error_limit, k.rotation_error_limit)
     near = [
         _shortened(part, limit, xp)
         for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)
@@ -210,7 +212,9 @@ def task_acceleration(k: OSCCoefficients, task: Task) -> Array:
     """Return a (envs, 6) without I."""
     a = k.kp * task.near - k.kd * task.tool_twist
     a = a if task.twist is None else a + k.c * task.twist
-    return a if task.acceleration is None else a + k.acceleration_share * task.acceleration
+    if task.acceleration is None:
+        return a
+    return a + k.acceleration_share * task.acceleration
 
 
 def _integrated(k: OSCCoefficients, integral: Array, task: Task, held: Array) -> Array:
@@ -252,7 +256,8 @@ def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
     base = p.base
     task = p.task
     null = p.posture
-    least, most = -math.inf if low is None else low, math.inf if high is None else high
+    least = -math.inf if low is None else low
+    most = math.inf if high is None else high
     able = (base >= least) & (base <= most)
 
     def share(effort: Array, at: Array) -> Array:
@@ -314,7 +319,10 @@ def track(
     inputs = OSCInputs(setpoint, qpos, qvel, twist, acceleration)
     xp = namespace(*k, *dynamics, *inputs, effort)
     with quiet():
-        available = bias if feedforward is None else bias + feedforward
+        if feedforward is None:
+            available = bias
+        else:
+            available = bias + feedforward
         qacc = solve(mass, (effort - available)[..., None])[..., 0]
         stiff = k.posture_kp > 0
         rest = qacc - posture_acceleration(k, dynamics, qpos, qpos, qvel)[0]

@@ -76,16 +76,23 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
     kp = params.stiffness
     kd = params.damping
     ki = params.integral_gain
-    posture_kp, posture_kd = params.posture_stiffness, params.posture_damping
-    limit_kp, margin = params.limit_stiffness, params.limit_margin
-    limit_kd = None if limit_kp is None else 2 * xp.sqrt(limit_kp)
+    posture_kp = params.posture_stiffness
+    posture_kd = params.posture_damping
+    limit_kp = params.limit_stiffness
+    margin = params.limit_margin
+    if limit_kp is None:
+        limit_kd = None
+    else:
+        limit_kd = 2 * xp.sqrt(limit_kp)
     c = kd
     share = xp.ones_like(kp)
     ki_dt2 = None
     if params.discretization is not None:
         stiffness = kp if ki is None else kp + dt * ki
         share = 1 / (1 + dt * kd + dt * dt * stiffness)
-        c, kd, kp = kd * share, (kd + dt * stiffness) * share, stiffness * share
+        c = kd * share
+        kd = (kd + dt * stiffness) * share
+        kp = stiffness * share
         if ki is not None:
             ki = ki * share
             ki_dt2 = ki * dt * dt

@@ -67,7 +67,8 @@ def projections(
     task = gram(j, f[..., None])[..., 0]
 
     # Joints outside the chain, such as fingers, are controlled by computed torque.
-    a_c, a_o = a_n * chain, a_n * (1 - chain)
+    a_c = a_n * chain
+    a_o = a_n * (1 - chain)
     # The difference is 0 to the bit where neither inertia is bounded.
     held = product(
         spring_inertia - null_inertia, product(j, (a_n if springs is None else springs) * chain)
@@ -93,7 +94,8 @@ def _inertias(
     k: OSCCoefficients, mobility: Array, xp: ArrayModule
 ) -> tuple[Array, Array, Array, Array]:
     """Return L, L_n and L_s of the mobility A (envs, 6, 6), and where any is bounded."""
-    s0, both = k.smallest_eigenvalue[..., 0], k.axes
+    s0 = k.smallest_eigenvalue[..., 0]
+    both = k.axes
     if k.axes is not None and k.force_axes is not None:
         both = xp.maximum(k.axes, k.force_axes)
     null, springs, near = _selected_inverse(mobility, both, xp, s0, SPRING_BOUND * s0)

@@ -232,7 +232,8 @@ class RigidTree:
         ends in fingers.
         """
         moves = [kind != "fixed" for kind in self.joint_types]
-        depth, branches = [0] * len(self.links), [0] * len(self.links)
+        depth = [0] * len(self.links)
+        branches = [0] * len(self.links)
         for child, above in enumerate(self.parent[1:].tolist(), start=1):
             depth[child] = depth[above] + moves[child]
         for child, above in reversed(list(enumerate(self.parent.tolist()))[1:]):
@@ -247,7 +248,9 @@ class RigidTree:
     @property
     def held(self) -> RigidTree:
         """Same tree on a fixed base, with all joints independent."""
-        return self if self.fixed_base and self.coupling.is_identity else self._held
+        if self.fixed_base and self.coupling.is_identity:
+            return self
+        return self._held
 
     @cached_property
     def _held(self) -> RigidTree:
@@ -335,7 +338,8 @@ class RigidTree:
         links_of = list[list[int]]()
         frames = np.zeros((len(self.links), 3, 4))
         local = np.zeros((4, self.dof, 3, 4))  # at_zero, sine, cosine, slide
-        moves, slides = np.zeros((self.dof, self.dof)), np.zeros((self.dof, 1))
+        moves = np.zeros((self.dof, self.dof))
+        slides = np.zeros((self.dof, 1))
         for link, above in enumerate(self.parent):
             frames[link] = np.column_stack([matrix_of(self.wxyz[link]), self.position[link]])
             if link:
@@ -345,14 +349,16 @@ class RigidTree:
                 if body[-1] >= 0:
                     links_of[body[-1]].append(link)
                 continue
-            joint, turn = len(parents), _along_x(self.axis[link])
+            joint = len(parents)
+            turn = _along_x(self.axis[link])
             place = np.column_stack([frames[link][:, :3] @ turn, frames[link][:, 3]])
             local[0, joint] = place
             if self.joint_types[link] == "revolute":
                 local[1, joint, :, :3] = place[:, :3] @ _ABOUT_X
                 local[2, joint, :, :3] = place[:, :3] @ _ABOUT_X @ _ABOUT_X
             else:
-                local[3, joint, :, 3], slides[joint] = place[:, 0], 1.0
+                local[3, joint, :, 3] = place[:, 0]
+                slides[joint] = 1.0
             parents.append(body[above])
             moves[joint, joint] = 1.0
             if parents[-1] >= 0:

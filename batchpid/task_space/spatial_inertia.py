@@ -42,10 +42,12 @@ def spatial_matrix(inertia: SpatialInertia) -> Float64:
 
     S = [[m 1, -m C], [m C, I - m C C]] with C a = c x a.
     """
-    mass, cross = inertia.mass, _cross_matrix(inertia.center)
+    mass = inertia.mass
+    cross = _cross_matrix(inertia.center)
     matrix = np.zeros((6, 6))
     matrix[:3, :3] = mass * np.eye(3)
-    matrix[:3, 3:], matrix[3:, :3] = -mass * cross, mass * cross
+    matrix[:3, 3:] = -mass * cross
+    matrix[3:, :3] = mass * cross
     matrix[3:, 3:] = inertia.tensor - mass * cross @ cross
     return matrix
 

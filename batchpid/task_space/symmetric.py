@@ -45,11 +45,9 @@ def _cholesky(matrix: Array) -> Array:
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
-        return (
-            np.full_like(matrix, np.nan)
-            if matrix.ndim == 2
-            else np.stack([_cholesky(row) for row in matrix])
-        )
+        if matrix.ndim == 2:
+            return np.full_like(matrix, np.nan)
+        return np.stack([_cholesky(row) for row in matrix])
 
 
 def _sound(matrix: Array) -> tuple[Array, Array]:
@@ -96,7 +94,8 @@ def bounded_inverse(matrix: Array, smallest: Array, *smooth: Array) -> tuple[Arr
     ]
     with quiet():
         values, vectors = eigen(matrix)
-        positive, rows = xp.maximum(values, 0.0), xp.swapaxes(vectors, -1, -2)
+        positive = xp.maximum(values, 0.0)
+        rows = xp.swapaxes(vectors, -1, -2)
 
         def inverse_with(bound: Array, below: Array) -> Array:
             large = values >= bound

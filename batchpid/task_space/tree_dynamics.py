@@ -80,7 +80,8 @@ def _composite(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayModul
     packed = xp.concatenate([moment, tensor.reshape(*tensor.shape[:-2], 9)], axis=-1)
     composite = from_tips(tree, packed, xp)
     mass = from_tips(tree, bodies.mass, xp)
-    moment, tensor = composite[..., :3], composite[..., 3:].reshape(tensor.shape)
+    moment = composite[..., :3]
+    tensor = composite[..., 3:].reshape(tensor.shape)
     v, w = motions.linear, motions.angular
     linear = mass * v + cross(w, moment)
     angular = rotate(tensor, w) + cross(moment, v)

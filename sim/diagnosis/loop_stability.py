@@ -61,18 +61,27 @@ def _loop(
     coupling = robot.coupling
 
     def column(leaf: Array, neutral: float = 0.0) -> Float64:
-        rows = np.full((1, robot.dof), neutral) if leaf is None else np.asarray(leaf, np.float64)
+        if leaf is None:
+            rows = np.full((1, robot.dof), neutral)
+        else:
+            rows = np.asarray(leaf, np.float64)
         return np.broadcast_to(rows, (len(rows), robot.dof))[:, coupling.independent]
 
     def matrix(armature: Array) -> Float64:
-        rows = np.zeros(robot.dof) if armature is None else np.asarray(armature, np.float64)
+        if armature is None:
+            rows = np.zeros(robot.dof)
+        else:
+            rows = np.asarray(armature, np.float64)
         inertia = np.atleast_2d(rows)[:, None] * np.eye(robot.dof)
         return coupling.reduced(robot.mass_matrix(qpos) + inertia)
 
     loop: Document = {name: column(getattr(params, name)) for name in ("kp", "ki", "kd")}
     eye = np.eye(loop["kp"].shape[1])
     strength = column(motors.strength, 1.0)
-    viscous = np.zeros((1, robot.dof)) if motors.viscous is None else motors.viscous
+    if motors.viscous is None:
+        viscous = np.zeros((1, robot.dof))
+    else:
+        viscous = motors.viscous
     damping = np.stack([coupling.reduced_damping(robot.damping + row) for row in viscous])
     if params.gain_units is None:
         loop = {name: strength * gain for name, gain in loop.items()}
@@ -113,7 +122,10 @@ def stability_report(
     worst = int(np.argmax(bound.ratio))
     ratio = float(bound.ratio[worst])
     effect = "efforts alternate from step to step, and the joint chatters or diverges"
-    remedy = f"use at most {0.5 / ratio:.1g} times these gains" if ratio else ""
+    if ratio:
+        remedy = f"use at most {0.5 / ratio:.1g} times these gains"
+    else:
+        remedy = ""
     if np.isinf(ratio):
         remedy = "use a kd that is larger than kp times the delay and lag"
     if loop["delay"].any() or loop["lag"].any():
@@ -178,10 +190,15 @@ class StabilityCheck:
         """Warn if ``params`` pass the bound."""
         if not DISSIPATION[self._robot.dissipation].modelled:
             return
-        motors = None if actuators is None or actuators.is_ideal else actuators
+        if actuators is None or actuators.is_ideal:
+            motors = None
+        else:
+            motors = actuators
         rows = max(params.num_envs, 1 if motors is None else motors.num_envs)
         if motors is not None and rows > MOST:
-            params, motors, rows = _extreme(params), _extreme(motors), 1
+            params = _extreme(params)
+            motors = _extreme(motors)
+            rows = 1
         start = self._robot.start
         try:
             report = stability_report(self._robot, params, start, self._timestep, motors)

@@ -116,7 +116,10 @@ class _Preflight:
                 loaded.add(bodies[joint.parent_link])
         for link in robot.links:
             body = bodies[link.name]
-            excess = triangle_excess(link.inertia) if link.mass else 0.0
+            if link.mass:
+                excess = triangle_excess(link.inertia)
+            else:
+                excess = 0.0
             if excess > EXCESS:
                 self._note(
                     "inertia",

@@ -35,7 +35,8 @@ class SetpointCheck:
 
     def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
-        self._low, self._high = robot.lower - LIMIT_TOLERANCE, robot.upper + LIMIT_TOLERANCE
+        self._low = robot.lower - LIMIT_TOLERANCE
+        self._high = robot.upper + LIMIT_TOLERANCE
         self._warned: set[tuple[str, int]] = set()
 
     def check(self, argument: str, positions: Rows, envs: NDArray[np.bool_] | None = None) -> None:

@@ -70,12 +70,14 @@ class ConstraintEfforts:
         timestep: float,
         asked: NDArray[np.float32] | None = None,
     ) -> None:
-        joints, followers = len(coupling.leader), coupling.followers
+        joints = len(coupling.leader)
+        followers = coupling.followers
         self._coupling = coupling
         self._followers = followers
         self._jacobian = coupling.jacobian
         self.wraps, self.unwrapped = wraps, np.zeros((robots, joints))
-        self._rate_gain, self._position_gain = RATE_GAIN / timestep, POSITION_GAIN / timestep**2
+        self._rate_gain = RATE_GAIN / timestep
+        self._position_gain = POSITION_GAIN / timestep**2
         self._response = np.zeros((robots, len(followers), joints))
         self._push, self._passive = (
             np.zeros((robots, joints, len(followers))),
@@ -117,10 +119,8 @@ class ConstraintEfforts:
         None: the passive forces are the engine's own.
         """
         self._model, self._force = model, force
-        self._native.model, self._native.force = (
-            model.address,
-            None if force is None else force.address,
-        )
+        self._native.model = model.address
+        self._native.force = None if force is None else force.address
 
     def update(
         self,
@@ -158,7 +158,8 @@ class ConstraintEfforts:
 
     def apply(self, effort: NDArray[np.floating], qpos: Float64, qvel: Float64) -> Float64:
         """Return ``effort`` with the constraint efforts added."""
-        coupling, followers = self._coupling, self._followers
+        coupling = self._coupling
+        followers = self._followers
         self.unwrapped[...] = np.where(
             self.wraps, qpos + WRAP * np.rint((self.unwrapped - qpos) / WRAP), qpos
         )

@@ -32,7 +32,8 @@ class MissedContacts:
 
     def __init__(self, spec: SceneSpec, size: int, ground: bool) -> None:
         self._contacts, tree = contacts_of(spec, ground), description_tree(spec).held
-        slides, parents = tree.bodies.slides.ravel() > 0, tree.body_parents
+        slides = tree.bodies.slides.ravel() > 0
+        parents = tree.body_parents
         body, balls = self._contacts.balls
         farthest = np.zeros(
             tree.dof + 1
@@ -40,7 +41,10 @@ class MissedContacts:
         np.maximum.at(farthest, body, np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3])
         for joint in reversed(range(tree.dof)):
             limits = spec.joints[joint].lower, spec.joints[joint].upper
-            travel = np.abs(np.clip(limits, -_LONGEST, _LONGEST)).max() if slides[joint] else 0.0
+            if slides[joint]:
+                travel = np.abs(np.clip(limits, -_LONGEST, _LONGEST)).max()
+            else:
+                travel = 0.0
             offset = np.linalg.norm(tree.bodies.at_zero[joint][:, 3])
             farthest[parents[joint]] = max(
                 farthest[parents[joint]], offset + travel + farthest[joint]
@@ -81,7 +85,8 @@ class MissedContacts:
                 tick += int(closes[0])
                 distances = self._contacts.least_distances(qpos[tick, row])
                 margins = np.array([distances[pair] for pair in self._pairs]) + DEPTH
-                self._centers[row], self._margins[row] = qpos[tick, row], margins
+                self._centers[row] = qpos[tick, row]
+                self._margins[row] = margins
                 if (margins < 0).any():
                     first[row] = tables[tick:, row] = steps[tick]
                 tick += 1

@@ -42,7 +42,10 @@ class NativeModel:
     @cached_property
     def _structure(self) -> tuple[ModelStruct, Any]:
         tree, rows = self._tree.tables
-        inertias = self._tree.inertias()[None] if self._inertias is None else self._inertias
+        if self._inertias is None:
+            inertias = self._tree.inertias()[None]
+        else:
+            inertias = self._inertias
         arrays: dict[str, Rows] = {"tree": tree, "rows": rows, "inertias": inertias}
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
         numbers = {
@@ -138,7 +141,10 @@ class NativeRefresh:
     ) -> None:
         self._native = native.extension("_gateway")
         shape = (size, armature.shape[1])
-        viscous = 0.0 if friction.viscous is None else friction.viscous
+        if friction.viscous is None:
+            viscous = 0.0
+        else:
+            viscous = friction.viscous
         named = {"armature": armature, "coulomb": friction.most, "viscous": viscous}
         named |= dict(zip(("damping", "stiffness"), drive, strict=True))
         arrays = {

@@ -138,9 +138,12 @@ class VariedMasses:
 
     def _inertia(self, body: BodyParts, row: int) -> SpatialInertia:
         """Return the inertia of a body with its links as in ``row``, and with the payload."""
-        parts, variation = [], self._variation
+        parts = []
+        variation = self._variation
         for part in body.parts:
-            (mass, center, tensor), column, share = part.inertia, part.column, 1.0
+            (mass, center, tensor) = part.inertia
+            column = part.column
+            share = 1.0
             if variation.link_mass is not None and column is not None:
                 share = float(np.nan_to_num(variation.link_mass[row, column], nan=1.0))
             if variation.center_of_mass is not None and column is not None:
@@ -184,7 +187,10 @@ def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
         one if more is None else more if one is None else one + more for one, more in both
     )
     if static is not None:
-        static = static if own.coulomb is None else static + own.coulomb
+        if own.coulomb is None:
+            static = static
+        else:
+            static = static + own.coulomb
     if coulomb is None and (rubs := Friction(None, None, static, load=load).most) is not None:
         coulomb = np.zeros_like(rubs)
     return Friction(coulomb, viscous, static, added.stribeck, load)

@@ -31,10 +31,12 @@ class OwnController:
 
     def __init__(self, options: RunnerOptions) -> None:
         assert not isinstance(options.control, str)
-        self._options, self._controller = options, options.control
-        self._reporting = (
-            options.control.reporting if isinstance(options.control, OperationalSpace) else None
-        )
+        self._options = options
+        self._controller = options.control
+        if isinstance(options.control, OperationalSpace):
+            self._reporting = options.control.reporting
+        else:
+            self._reporting = None
         self._structure: Any = None
 
     def init(self, envs: int) -> dict[str, Rows]:
@@ -146,7 +148,10 @@ def _check_effort(effort: Array, qpos: Array) -> None:
     if effort.shape != qpos.shape:
         # The number of rows depends on the groups.
         has_rows = effort.shape[:1] == qpos.shape[:1]
-        shape = ("envs", *effort.shape[1:]) if has_rows else effort.shape
+        if has_rows:
+            shape = ("envs", *effort.shape[1:])
+        else:
+            shape = effort.shape
         problem = f"returned an effort of shape {shape}, not (envs, {qpos.shape[1]})"
         raise InvalidArgumentError(
             "control", problem, remedy="return (state, effort), effort of shape (envs, dof)"

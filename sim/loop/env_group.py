@@ -70,7 +70,9 @@ class EnvGroup:
         self._steps = 0  # sim steps before the run
         self._moves = False  # whether the run gives rates of setpoints
         self._runs_whole = False  # whether the native code runs whole ticks
-        self._options, self._controller, self._ticks = options, controller, ticks
+        self._options = options
+        self._controller = controller
+        self._ticks = ticks
         self.acting = ActingDraws(options, params)
         self._faults = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._sensors = LinkSensors(options, pack.size)
@@ -87,7 +89,8 @@ class EnvGroup:
         is_read = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
         has_parts = bool(self._sensors.values or self._pushes.counts)
         self._observes_natively = is_read and not has_parts
-        qpos, everyone = pack.read_qpos(), np.ones(pack.size, bool)
+        qpos = pack.read_qpos()
+        everyone = np.ones(pack.size, bool)
         law = bp.init(params, qpos) if controller is None else controller.init(pack.size)
         setup = self._setup(None)
         state = reset_guard(setup, StepState(law), qpos, everyone)
@@ -126,7 +129,8 @@ class EnvGroup:
         self._set_params(params, self._executor.read_state())
 
     def _set_params(self, params: bp.PIDParams, state: StepState) -> None:
-        before, old = self._executor.setup, self.acting.acting_params
+        before = self._executor.setup
+        old = self.acting.acting_params
         self.acting.set_params(params)
         setup = self._setup(state.motors)
         state = with_params(before, setup, state, old, self.acting.acting_params)
@@ -195,7 +199,8 @@ class EnvGroup:
 
     def _vary(self, mask: NDArray[np.bool_]) -> None:
         """Put the draws of the envs of ``mask`` (M,) into effect, before these envs are placed."""
-        randomization, acting = self._options.randomization, self.acting
+        randomization = self._options.randomization
+        acting = self.acting
         rows = np.flatnonzero(mask).tolist()
         if randomization is None or acting.draws is None or not rows:
             return
@@ -257,8 +262,10 @@ class EnvGroup:
 
     def _run_tick(self, substeps: int) -> None:
         """Run the present tick, or the rest of it, and observe it."""
-        executor, rows = self._executor, self._ticks[self.tick]
-        done, before = self._step, self._steps + self.tick * substeps
+        executor = self._executor
+        rows = self._ticks[self.tick]
+        done = self._step
+        before = self._steps + self.tick * substeps
         command = rows.command
         if done == 0:
             self._push(substeps)
@@ -283,7 +290,8 @@ class EnvGroup:
         self._find_contacts(self.tick, self.tick + 1, substeps)
 
     def _take_results(self) -> None:
-        outputs, last = self._executor.results(), self._last
+        outputs = self._executor.results()
+        last = self._last
         last.effort[...] = outputs.motor
         last.saturated[...] = False if outputs.saturated is None else outputs.saturated
         last.guarded[...] = False if outputs.guarded is None else outputs.guarded
@@ -336,8 +344,12 @@ class EnvGroup:
 
     def read(self) -> EnvStates:
         """Return the state of these envs, physics and controller."""
-        state, last = self._executor.read_state(), self._last
-        law, motors, friction, guard = state.law, state.motors, {}, {}
+        state = self._executor.read_state()
+        last = self._last
+        law = state.law
+        motors = state.motors
+        friction = {}
+        guard = {}
         if state.age is not None:
             friction = {**state.friction._asdict(), AGE: state.age}
         if state.guard is not None:
@@ -381,11 +393,14 @@ class EnvGroup:
         self._faults.write(states.containment)
         pack.suspend(self._faults.suspended)
         pack.write_qf(states.effort)
-        last.effort[...], last.saturated[...] = states.effort, states.saturated
+        last.effort[...] = states.effort
+        last.saturated[...] = states.saturated
         self._sensors.write(states.sensors)
         self._pushes.write(states.pushes)
         law: Any = states.controller
-        friction, motors, guard = dict(states.friction), dict(states.actuators), dict(states.guard)
+        friction = dict(states.friction)
+        motors = dict(states.actuators)
+        guard = dict(states.guard)
         state = StepState(
             law=law if self._controller else bp.PIDState(**law),
             age=friction.pop(AGE, None),
@@ -437,14 +452,19 @@ class EnvGroup:
             return
         qpos, qvel = faults.start_qpos, faults.start_qvel
         if faults.suspends:
-            qpos, qvel = faults.suspended_qpos, np.zeros_like(qvel)
+            qpos = faults.suspended_qpos
+            qvel = np.zeros_like(qvel)
         self._place(failed, qpos, qvel)
 
     def _place(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64) -> None:
         """Place the envs of ``mask`` (M,), and restart their control."""
-        pack, acting, executor = self.pack, self.acting, self._executor
-        setup, state = executor.setup, executor.read_state()
-        constants, model = setup.constants, setup.layout.model
+        pack = self.pack
+        acting = self.acting
+        executor = self._executor
+        setup = executor.setup
+        state = executor.read_state()
+        constants = setup.constants
+        model = setup.layout.model
         rows = np.flatnonzero(mask)
         # 1: the robots
         base = None if pack.spec.fixed_base else self._faults.start_base[rows]
@@ -458,7 +478,8 @@ class EnvGroup:
             self._contacts.place(mask)
         executor.measure()
         # 2: guard and motors, from the robots' state as the engine has it
-        qpos, qvel = pack.read_qpos(), pack.read_qvel()
+        qpos = pack.read_qpos()
+        qvel = pack.read_qvel()
         state = reset_guard(setup, state, qpos, mask)
         if acting.motors is not None and state.motors is not None:
             self._episode[mask] += 1

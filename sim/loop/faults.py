@@ -66,7 +66,10 @@ class Fault(NamedTuple):
             "effort": "the effort that its controller returned is not finite",
         }
         cause = texts.get(self.cause, f"the {self.cause} given for it is not finite")
-        action = "held until it is reset" if self.action == "hold" else "reset"
+        if self.action == "hold":
+            action = "held until it is reset"
+        else:
+            action = "reset"
         return (
             f"env {self.env}, {self.kind} {self.joint!r}: {cause}, at step {self.step}"
             f" ({self.time:g} s); {action}"
@@ -200,7 +203,8 @@ class FaultContainment(StateRows):
 
         ``returned`` is the effort of the caller's own controller, within the limits; or None.
         """
-        qpos, qvel = pack.read_qpos(), pack.read_qvel()
+        qpos = pack.read_qpos()
+        qvel = pack.read_qvel()
         bad = ~(np.abs(qpos) <= FARTHEST) | ~np.isfinite(qvel) | pack.strays()[:, None]
         # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first
         # joint.
@@ -217,7 +221,8 @@ class FaultContainment(StateRows):
 
     def pop_unplaced(self) -> Bool:
         """Return the envs that failed since the last call (M,), which are to be placed."""
-        unplaced, self._unplaced = self._unplaced, np.zeros_like(self._unplaced)
+        unplaced = self._unplaced
+        self._unplaced = np.zeros_like(self._unplaced)
         return unplaced
 
     def observe(self, rows: Arrays) -> None:

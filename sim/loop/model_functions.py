@@ -58,7 +58,9 @@ def steps_natively(pack: EnginePack) -> TypeGuard[CompiledPack]:
 def _joint_mass_matrix(pack: EnginePack, qpos: Float64) -> Float64:
     """Return the effective mass matrix of the joints, armature of the motors included."""
     matrix = pack.joint_mass_matrix(qpos)
-    return matrix + pack.armature[:, None] * np.eye(pack.dof) if pack.armature.any() else matrix
+    if pack.armature.any():
+        return matrix + pack.armature[:, None] * np.eye(pack.dof)
+    return matrix
 
 
 BLOCK = 64

@@ -146,14 +146,16 @@ class NativeExecutor:
     def is_waiting(self) -> bool:
         """Count the sim steps that ran; return whether the rest waits for noise."""
         assert self._program is not None
-        tick, motors = self._program.tick, self._buffers.state.motors
+        tick = self._program.tick
+        motors = self._buffers.state.motors
         if motors is not None and motors.step is not None:
             motors.step[...] += tick.ran
         return bool(tick.status & _NO_NOISE)
 
     def _noise(self) -> Any:
         """Return the noise of positions and velocities in the next sim steps (steps, M, dof)."""
-        layout, motors = self.setup.layout, self._buffers.state.motors
+        layout = self.setup.layout
+        motors = self._buffers.state.motors
         if motors is None or not layout.measures:
             return ()
         return layout.model.noise.from_step(self.setup.constants.motors, motors, self.before)

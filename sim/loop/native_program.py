@@ -101,7 +101,10 @@ class TickProgram:
         self._place(**buffers.measured._asdict(), before=buffers.before, left=left)
         # SAPIEN knows neither measured states nor the model of varied robots.
         if layout.gravity and (layout.measures or not reads_force):
-            field = "measured_force" if layout.measures else "read_force"
+            if layout.measures:
+                field = "measured_force"
+            else:
+                field = "read_force"
             setattr(self.tick, field, pack.force_model().address)
         # Programs have no key of the noise, counts, or state of a controller.
         state, motors = buffers.state, buffers.state.motors
@@ -144,10 +147,17 @@ class TickProgram:
     def _transfers(self, table: Table) -> ctypes.Array[interface.Transfer]:
         """Return the copies between the tables of the ticks and the arrays of a sim step."""
         command, seen, fault = table.arrays
-        outputs, measured = self.outputs, self._buffers.measured
+        outputs = self.outputs
+        measured = self._buffers.measured
         none = np.zeros(measured.qpos.shape, bool)
-        saturated = none if outputs.saturated is None else outputs.saturated
-        guarded = none if outputs.guarded is None else outputs.guarded
+        if outputs.saturated is None:
+            saturated = none
+        else:
+            saturated = outputs.saturated
+        if outputs.guarded is None:
+            guarded = none
+        else:
+            guarded = outputs.guarded
         copies: list[tuple[str, Rows, Rows]] = [
             *[
                 ("read", rows, row)
@@ -166,7 +176,8 @@ class TickProgram:
             *[("write_bytes", rows, row) for rows, row in zip(fault, table.fault, strict=True)],
         ]
         if seen.base_pose is not None and seen.base_twist is not None:
-            pose, twist = np.zeros((len(none), 7)), np.zeros((len(none), 6))
+            pose = np.zeros((len(none), 7))
+            twist = np.zeros((len(none), 6))
             self._place(base_pose=pose, base_twist=twist)
             copies.append(("write_floats", seen.base_pose, pose))
             copies.append(("write_floats", seen.base_twist, twist))
@@ -216,7 +227,8 @@ class TickProgram:
         """
         shape = self._buffers.before.shape
         constants = mapped(_split, self._setup.constants)
-        inputs, state = leaves(values), leaves(values.state)
+        inputs = leaves(values)
+        state = leaves(values.state)
         layout = self._setup.layout._replace(model=Model())
         histories = tuple(array.ndim == 3 for array in state)
         traced = _trace(stages, layout, histories, structure(constants), structure(values))
@@ -248,7 +260,8 @@ class TickProgram:
         return values
 
     def _add_inertia(self, values: Values) -> Values:
-        refresh, state = self._setup.layout.model.refresh, self._buffers.state
+        refresh = self._setup.layout.model.refresh
+        state = self._buffers.state
         self.tick.refresh = refresh.address
         self._references.append(refresh)
         self._place(age=state.age, gain=state.friction.gain, memory=state.friction.memory)
@@ -332,7 +345,8 @@ def _trace(
     ``constants`` and ``inputs`` are structures of the constants and of the values before it.
     ``histories`` says which arrays of the state are histories, which a program changes in place.
     """
-    first, count = len(leaves(constants)), len(leaves(inputs))
+    first = len(leaves(constants))
+    count = len(leaves(inputs))
     result_parts: list[Any] = []
 
     def function(*symbols: Symbol) -> list[Any]:
@@ -345,9 +359,11 @@ def _trace(
         changed = _Changed(values.state, values.seen, values.outputs)
         numbers = {symbol: number for number, symbol in enumerate(symbols[first:])}
         outputs = set(map(id, leaves(changed.outputs)))
-        results, places = list[Any](), list[_Place]()
+        results = list[Any]()
+        places = list[_Place]()
         for at, leaf in enumerate(leaves(changed)):
-            is_state, number = at < len(histories), numbers.get(leaf)
+            is_state = at < len(histories)
+            number = numbers.get(leaf)
             if is_state and (number == at or histories[at]):
                 places.append(_Place(False, at))
             # An output that is an input is copied, since the next sim step changes the input.
@@ -365,7 +381,9 @@ def _trace(
 
 def _split(array: Array) -> Any:
     """Return an array (n, envs, dof) as a tuple of n arrays, and other arrays unchanged."""
-    return tuple(array) if array.ndim == 3 else array
+    if array.ndim == 3:
+        return tuple(array)
+    return array
 
 
 def _row_size(array: Rows) -> int:
@@ -374,4 +392,6 @@ def _row_size(array: Rows) -> int:
     """
     if array.ndim == 0:
         return -1
-    return 0 if array.ndim == 2 else array[0].size
+    if array.ndim == 2:
+        return 0
+    return array[0].size

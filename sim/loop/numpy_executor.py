@@ -84,8 +84,12 @@ class NumPyExecutor:
         Raises ControllerError if a controller in Python does.
         """
         setup = self.setup
-        constants, layout = setup.constants, setup.layout._replace(moves=moves)
-        controller = None if isinstance(setup.options.control, str) else setup.options.control
+        constants = setup.constants
+        layout = setup.layout._replace(moves=moves)
+        if isinstance(setup.options.control, str):
+            controller = None
+        else:
+            controller = setup.options.control
         self._first = begin
         engine = {
             "targets": self._write_targets,
@@ -98,7 +102,9 @@ class NumPyExecutor:
             values = Values(self._state, command, self.measured, step, self.measured)
             with controller_errors(controller, index + 1):
                 values = sim_step(layout, constants, values, engine)
-            self._state, self.outputs, self.measured = values.state, values.outputs, values.measured
+            self._state = values.state
+            self.outputs = values.outputs
+            self.measured = values.measured
             if self.failed:
                 return index + 1
         return end
@@ -142,7 +148,8 @@ class EngineSteps:
 
     def measure(self) -> Measured:
         """Return a reading of the robots."""
-        qpos, qvel = self._pack.read_qpos(), self._pack.read_qvel()
+        qpos = self._pack.read_qpos()
+        qvel = self._pack.read_qvel()
         return Measured(qpos, qvel, self._passive_force(qpos))
 
     def advance(self, qf: Rows) -> tuple[Measured, bool]:
@@ -167,7 +174,10 @@ class EngineSteps:
         """Return the native sim step of the present robots."""
         pack: Any = self._setup.pack  # a CompiledPack, which takes long to check
         if self._step is None or self._bound is not pack.calls:
-            parts = self._parts if self.native_force else (False, False)
+            if self.native_force:
+                parts = self._parts
+            else:
+                parts = (False, False)
             drives = self._setup.layout.control == "drive"
             self._bound = pack.calls
             self._step = pack.compiled_step(*parts, True, self._setup.speed_limit, drives)

@@ -95,7 +95,8 @@ class EnvStates:
         ``stiction``, ``guard`` and ``pushes`` tell whether the envs have Coulomb friction, a guard
         and pushes; ``parts`` are the states of controller, actuators and sensors.
         """
-        counts, rows = np.zeros(num_envs, np.int64), np.zeros((num_envs, dof))
+        counts = np.zeros(num_envs, np.int64)
+        rows = np.zeros((num_envs, dof))
         return cls(
             engine=np.zeros((num_envs, 0)),
             effort=rows.astype(np.float32),
@@ -170,7 +171,8 @@ class EnvStates:
         sizes = np.array(engine_sizes)[:, None]
         engine = np.zeros((len(sizes), sizes.max()))
         _compare(self.tables(), replace(fresh, engine=engine).tables())
-        joint, cause = self.containment["joint"], self.containment["cause"]
+        joint = self.containment["joint"]
+        cause = self.containment["cause"]
         of_command = np.isin(cause, [CAUSES.index(name) for name in COMMAND_CAUSES])
         joints = np.where(of_command, command_size, self.effort.shape[1])
         if ((joint < 0) | (joint >= joints) | (cause < 0) | (cause >= len(CAUSES))).any():
@@ -213,7 +215,8 @@ class Snapshot:
         different = [key for key, ours in about.items() if self.about.get(key) != ours]
         if different:
             key = different[0]
-            ours, theirs = about[key], self.about.get(key)
+            ours = about[key]
+            theirs = self.about.get(key)
             problem = f"{key} {reprlib.repr(theirs)}, not {reprlib.repr(ours)}"
             if _DIGITS in (len(str(ours)), len(str(theirs))):
                 problem = f"another {key}"
@@ -336,7 +339,8 @@ def _compare(theirs: dict[str, Rows], ours: dict[str, Rows]) -> None:
         for tables in (theirs, ours)
     )
     for name in kinds.keys() | expected.keys():
-        kind, other = kinds.get(name), expected.get(name)
+        kind = kinds.get(name)
+        other = expected.get(name)
         if kind != other:
             problem = f"has {kind} for {name}, not {other}"
             raise InvalidArgumentError("snapshot", problem, remedy="take a new one")

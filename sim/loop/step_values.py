@@ -144,7 +144,9 @@ def when(due: Any, function: Callable[[], Any], otherwise: Array) -> Any:
     """Return ``function()`` if ``due``, a bool or an array, has a True entry; else
     ``otherwise``.
     """
-    return function() if np.any(due) else otherwise
+    if np.any(due):
+        return function()
+    return otherwise
 
 
 class Model(NamedTuple):

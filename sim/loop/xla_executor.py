@@ -75,7 +75,9 @@ class XLAExecutor:
         self.setup = setup
         self._engine = EngineSteps(setup)
         self.failed = False
-        pack, constants, layout = setup.pack, setup.constants, setup.layout
+        pack = setup.pack
+        constants = setup.constants
+        layout = setup.layout
         rows = (pack.size, pack.dof)
 
         def spread(part: Any) -> Any:
@@ -90,7 +92,10 @@ class XLAExecutor:
         )
         with own_settings("float64"):
             self._constants = put(arrays)
-            self._bodies = put(scene_tree(pack.spec).tables) if uses_bodies else None
+            if uses_bodies:
+                self._bodies = put(scene_tree(pack.spec).tables)
+            else:
+                self._bodies = None
         self.write_state(state)
         self.measure()
 
@@ -111,13 +116,18 @@ class XLAExecutor:
     def read_state(self) -> StepState:
         """Return the state of the control as new NumPy arrays."""
         state: StepState = self._numpy(self._state)
-        return state if state.age is None else state._replace(age=state.age.astype(np.int64))
+        if state.age is None:
+            return state
+        return state._replace(age=state.age.astype(np.int64))
 
     def write_state(self, state: StepState) -> None:
         """Replace the state of the control."""
         import jax
 
-        age = None if state.age is None else state.age.astype(np.int32)
+        if state.age is None:
+            age = None
+        else:
+            age = state.age.astype(np.int32)
         with own_settings("float64"):
             self._state = put(jax.tree.map(padded, state._replace(age=age)))
 
@@ -128,8 +138,10 @@ class XLAExecutor:
 
     def run(self, command: Command, moves: bool, begin: int, end: int) -> int:
         """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
-        setup, step = self.setup, self._engine.compiled()
-        control, controller = setup.options.control, setup.controller
+        setup = self.setup
+        step = self._engine.compiled()
+        control = setup.options.control
+        controller = setup.controller
         layout = setup.layout._replace(model=Model(), moves=moves)
         traced = None if controller is None else controller.traced
         with own_settings("float64"):
@@ -175,7 +187,8 @@ def tick(
     from jax import lax
 
     xp = jax.numpy
-    end, address = span[1], lax.bitcast_convert_type(span[2:], np.uint32)
+    end = span[1]
+    address = lax.bitcast_convert_type(span[2:], np.uint32)
 
     def mass_matrix(qpos: Array) -> Array:
         assert bodies is not None
@@ -188,7 +201,8 @@ def tick(
     with_model = layout._replace(model=model)
 
     def body(carry: Carry) -> Carry:
-        index, status = carry.progress[0], carry.progress[1]
+        index = carry.progress[0]
+        status = carry.progress[1]
 
         def engine(layout: Layout, constants: Constants, values: Values) -> Values:
             nonlocal status
@@ -203,7 +217,8 @@ def tick(
 
     # The loop may end before its first sim step, so its results have values before.
     qpos = measured.qpos
-    zero, none = xp.zeros_like(qpos), xp.zeros(qpos.shape, bool)
+    zero = xp.zeros_like(qpos)
+    none = xp.zeros(qpos.shape, bool)
     outputs = Outputs(zero, zero, none, returned=None if controller is None else zero)
     carry = Carry(xp.stack([span[0], xp.zeros_like(end)]), state, measured, outputs, qpos)
     return lax.while_loop(

@@ -204,7 +204,9 @@ class Scene(Group):
         """Return the MJCF file that the engine simulates as it is; None for others, and in
         SAPIEN.
         """
-        return robot.mjcf if self.engine == "mujoco" else None
+        if self.engine == "mujoco":
+            return robot.mjcf
+        return None
 
     def fit(self, robot: Robot) -> Self:
         engine = self.load_engine()
@@ -278,7 +280,8 @@ class Scene(Group):
         for link in links:
             choice(argument, link, [link.name for link in robot.links])
             if bodies[link].link == root and (argument == "wrenches" or robot.fixed_base):
-                problem, remedy = f"names {link!r}, which no joint moves", "name one further along"
+                problem = f"names {link!r}, which no joint moves"
+                remedy = "name one further along"
                 raise InvalidArgumentError(argument, problem, remedy=remedy)
         return links
 
@@ -424,7 +427,9 @@ class Control(Group):
     @property
     def control_name(self) -> str:
         """Name of the control; of a :class:`Controller` its class."""
-        return self.control if isinstance(self.control, str) else type(self.control).__name__
+        if isinstance(self.control, str):
+            return self.control
+        return type(self.control).__name__
 
     @property
     def sets_positions(self) -> bool:
@@ -486,7 +491,8 @@ class Ray:
     def __post_init__(self) -> None:
         check_plain(self)
         if "://" in instance("address", self.address or "", str, "pass HOST:PORT"):
-            problem, remedy = "must be HOST:PORT, 'auto' or 'local'", "leave out the protocol"
+            problem = "must be HOST:PORT, 'auto' or 'local'"
+            remedy = "leave out the protocol"
             raise InvalidArgumentError("address", problem, value=self.address, remedy=remedy)
         instance("runtime_env", self.runtime_env or {}, dict, "pass a dict as for ray.init")
 
@@ -533,6 +539,7 @@ class Workers(Group):
             )
         cluster = Ray() if self.cluster == "ray" else self.cluster
         if self.workers is not None:
-            problem, remedy = "is not for a cluster", "pass cluster=Ray(cpus_per_node=...)"
+            problem = "is not for a cluster"
+            remedy = "pass cluster=Ray(cpus_per_node=...)"
             raise InvalidArgumentError("workers", problem, value=self.workers, remedy=remedy)
         return self.changed(cluster=instance("cluster", cluster, Ray, "pass 'ray' or Ray(...)"))

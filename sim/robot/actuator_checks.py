@@ -43,7 +43,10 @@ def known_joints(robot: RobotDescription) -> KnownJoints:
     """Return friction, damping and armature of the robot's own actuators, which its controller
     knows.
     """
-    own = bp.Actuators() if robot.actuators is None else robot.actuators
+    if robot.actuators is None:
+        own = bp.Actuators()
+    else:
+        own = robot.actuators
     coulomb, viscous, armature = (
         np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
         for leaf in (own.coulomb, own.viscous, own.armature)

@@ -41,7 +41,8 @@ def collision_groups(
     cliques = _cliques(bodies, ignored, free)
     cliques = sorted(cliques, key=lambda clique: -len(_within(clique, ignored)))[:_MAX_CLIQUES]
     by_words_0_and_1 = set(ignored).difference(*(_within(clique, ignored) for clique in cliques))
-    left, stars = by_words_0_and_1, list[str]()
+    left = by_words_0_and_1
+    stars = list[str]()
     while left and len(stars) < _MAX_STARS:
         degree = Counter(body for pair in left for body in pair)
         centre = max(bodies, key=lambda body: degree[body])  # the first of the largest
@@ -57,7 +58,8 @@ def collision_groups(
                 zero |= (centre == body) << number
                 one |= (frozenset((centre, body)) not in by_words_0_and_1) << number
             if body not in stars:
-                zero, one = zero | _OTHERS, one | _OTHERS
+                zero = zero | _OTHERS
+                one = one | _OTHERS
         two = sum(1 << number for number, clique in enumerate(cliques) if body in clique)
         words[body] = (zero, one, two, _ROBOT)
     return words, frozenset(left)
@@ -74,7 +76,8 @@ def link_groups(
     root of a fixed base.
     """
     simulated = merge_links(tables, separate)
-    placements, root = simulated.links, simulated.bodies[0].name
+    placements = simulated.links
+    root = simulated.bodies[0].name
     bodies = rigid_bodies(tables.joints)
     neighbours = {
         frozenset((joint.parent_link, joint.child_link))
@@ -82,7 +85,8 @@ def link_groups(
         if joint.moves and not (fixed_base and joint.parent_link == root)
     }
     links = list(dict.fromkeys(shape.owner for shape in simulated.shapes))
-    ignored, free = set(ignored), set[Pair]()
+    ignored = set(ignored)
+    free = set[Pair]()
     for first, second in combinations(links, 2):
         pair = frozenset((placements[first].link, placements[second].link))
         if len(pair) == 1 or pair in neighbours:

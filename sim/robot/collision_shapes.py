@@ -65,7 +65,8 @@ def half_extents(shape: Shape) -> tuple[Float64, Float64]:
     """Return center (3,) and half size (3,) [m] of the box around a shape, in its frame."""
     if shape.kind == "mesh":
         vertices = hull(shape)
-        low, high = vertices.min(0), vertices.max(0)
+        low = vertices.min(0)
+        high = vertices.max(0)
         return (high + low) / 2, (high - low) / 2
     if shape.kind == "box":
         return np.zeros(3), np.array(shape.size)
@@ -121,7 +122,8 @@ def vertices_in_file(model: MjModel, indices: Any) -> Float64:
     """
     import mujoco
 
-    turned, place = np.zeros(9), model.mesh_pos[0]
+    turned = np.zeros(9)
+    place = model.mesh_pos[0]
     mujoco.mju_quat2Mat(turned, model.mesh_quat[0])
     return model.mesh_vert[indices].astype(float) @ turned.reshape(3, 3).T + place
 

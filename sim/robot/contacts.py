@@ -104,7 +104,8 @@ class Contacts:
         """Body of the tree that has each shape (shapes,), -1 for the base, and a ball around each
         shape (shapes, 4): center in the frame of the body, and radius [m].
         """
-        tree, at = self._tree, [self._tree.index(self.links[link]) for link in self._link]
+        tree = self._tree
+        at = [self._tree.index(self.links[link]) for link in self._link]
         frames = tree.bodies.link_frames[at].reshape(-1, 3, 4)
         centers = np.einsum("sij,sj->si", frames[:, :, :3], self._place) + frames[:, :, 3]
         return self._body, np.column_stack([centers, self._model.geom_rbound[: len(centers)]])
@@ -133,7 +134,8 @@ class Contacts:
         """
         with self._lock:
             centers = self._move(qpos)
-            radii, (first, second) = self._model.geom_rbound[: len(centers)], self._pairs.T
+            radii = self._model.geom_rbound[: len(centers)]
+            (first, second) = self._pairs.T
             apart = (
                 np.linalg.norm(centers[first] - centers[second], axis=1)
                 - radii[first]
@@ -194,7 +196,8 @@ class Contacts:
 
     def _lowest(self, index: int) -> float:
         """Return the height [m] of the lowest point of a shape, as placed."""
-        shape, place = self._shapes[index], self._data.geom_xpos[index]
+        shape = self._shapes[index]
+        place = self._data.geom_xpos[index]
         x, y, z = self._data.geom_xmat[index].reshape(3, 3)[
             2
         ]  # the shape's axes along the vertical

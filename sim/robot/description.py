@@ -254,7 +254,8 @@ class RobotDescription:
         """
         if self.settings is not None:
             return self.settings.target.copy()
-        above, below = self.upper - self.start, self.lower - self.start
+        above = self.upper - self.start
+        below = self.lower - self.start
         distance = np.where(above >= -below, above, below)
         return self.coupled(self.start + np.clip(0.25 * distance, -0.5, 0.5))
 
@@ -287,10 +288,8 @@ class RobotDescription:
         """Return seeded poses (count, dof), uniform within the limits and half a turn of the start;
         followers match.
         """
-        low, high = (
-            np.maximum(self.lower, self.start - np.pi),
-            np.minimum(self.upper, self.start + np.pi),
-        )
+        low = np.maximum(self.lower, self.start - np.pi)
+        high = np.minimum(self.upper, self.start + np.pi)
         return self.coupled(np.random.default_rng(seed).uniform(low, high, (count, self.dof)))
 
     @cached_property

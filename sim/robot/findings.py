@@ -48,7 +48,10 @@ class Finding:
     @property
     def figures(self) -> str:
         """Detail, envs and time in words."""
-        more = f" and {len(self.envs) - 1} more" if len(self.envs) > 1 else ""
+        if len(self.envs) > 1:
+            more = f" and {len(self.envs) - 1} more"
+        else:
+            more = ""
         env = f"env {self.envs[0]}{more}" if self.envs else ""
         time = "" if self.time is None else f"{self.time:.3g} s"
         return ", ".join(
@@ -62,7 +65,9 @@ class Finding:
     @property
     def _name(self) -> str:
         name = self.link if self.joint is None else self.joint
-        return "" if name is None else repr(name)
+        if name is None:
+            return ""
+        return repr(name)
 
 
 class Findings(list[Finding]):
@@ -126,7 +131,10 @@ def report(path: Path, repairs: Sequence[Finding], strict: bool) -> None:
     """
     if not repairs:
         return
-    count = "1 repair" if len(repairs) == 1 else f"{len(repairs)} repairs"
+    if len(repairs) == 1:
+        count = "1 repair"
+    else:
+        count = f"{len(repairs)} repairs"
     if not strict:
         warn(f"{path}: {count}; robot.check() and batchpid inspect list them", RepairWarning)
         return

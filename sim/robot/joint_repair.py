@@ -61,11 +61,9 @@ def free_joint_of(root: etree._Element) -> etree._Element | None:
     )
     if len(at_root) != 1 or at_root[0].get("type") not in FREE_TYPES or link is None:
         return None
-    return (
-        None
-        if link.find("inertial") is not None or link.find("collision") is not None
-        else at_root[0]
-    )
+    if link.find("inertial") is not None or link.find("collision") is not None:
+        return None
+    return at_root[0]
 
 
 def free_base(
@@ -76,12 +74,11 @@ def free_base(
     Return the pose (7,) at which the joint places the base, None without one.
     """
     if joint.get("type") == "planar":
-        text, remedy = (
-            "the base is free to move in all six directions",
-            "expect it to leave its plane",
-        )
+        text = "the base is free to move in all six directions"
+        remedy = "expect it to leave its plane"
         findings.append(finding_of(joint, "note", "joint-type", text, remedy))
-    parent, origin = ends_of(joint)[0], joint.find("origin")
+    parent = ends_of(joint)[0]
+    origin = joint.find("origin")
     for element in (joint, *(link for link in root.findall("link") if link.get("name") == parent)):
         root.remove(element)
     if origin is None:
@@ -104,9 +101,11 @@ def _type(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
     at_root = kind in FREE_TYPES and all(
         ends_of(other)[1] != parent for other in root.findall("joint")
     )
-    severity, remedy = "warning", "use revolute, continuous or prismatic joints"
+    severity = "warning"
+    remedy = "use revolute, continuous or prismatic joints"
     if at_root:
-        severity, remedy = "note", "load with fixed_base=False for a robot that is free to move"
+        severity = "note"
+        remedy = "load with fixed_base=False for a robot that is free to move"
     text = f"joints of type {kind!r} cannot be simulated by SAPIEN: fixed instead"
     yield finding_of(joint, severity, "joint-type", text, remedy)
 
@@ -120,7 +119,10 @@ def _axis(joint: etree._Element) -> Iterator[Finding]:
         joint.remove(axis)  # the default of the URDF, on which SAPIEN fails
         return
     direction = readable(axis, "xyz", "1 0 0")
-    length = 0.0 if direction is None else math.hypot(*direction)
+    if direction is None:
+        length = 0.0
+    else:
+        length = math.hypot(*direction)
     if direction is None or length < 1e-12:
         text = (
             f"<axis xyz={axis.get('xyz')!r}> has no direction: the x axis is used, the URDF's"
@@ -134,7 +136,8 @@ def _axis(joint: etree._Element) -> Iterator[Finding]:
 
 def _limits(joint: etree._Element) -> Iterator[Finding]:
     """Repair the limits: missing and placeholder limits become infinite."""
-    limit, kind = joint.find("limit"), joint.get("type")
+    limit = joint.find("limit")
+    kind = joint.get("type")
     if limit is None:
         limit = etree.SubElement(joint, "limit")
     placeholders = []
@@ -171,12 +174,14 @@ def _range(joint: etree._Element, limit: etree._Element) -> Iterator[Finding]:
         if values is None:
             text = f"<limit {key}={given[key]!r}> is not a number: no {key} limit"
             yield finding_of(joint, "warning", "limits", text, GIVE_RANGE)
-    lower, upper = (-math.inf if low is None else low[0]), (math.inf if high is None else high[0])
+    lower = -math.inf if low is None else low[0]
+    upper = math.inf if high is None else high[0]
     efforts = [limit.get(key) for key in ("effort", "velocity")]
     if lower == upper == 0 and (None in given.values() or efforts == [None, None]):
-        text = (
-            "no position limits" if None in given.values() else "position limits of 0, placeholders"
-        )
+        if None in given.values():
+            text = "no position limits"
+        else:
+            text = "position limits of 0, placeholders"
         yield finding_of(joint, "warning", "limits", f"{text}: motion without end", GIVE_RANGE)
         lower, upper = -math.inf, math.inf
     elif lower > upper and None in given.values():
@@ -184,7 +189,10 @@ def _range(joint: etree._Element, limit: etree._Element) -> Iterator[Finding]:
         yield finding_of(
             joint, "warning", "limits", f"no {missing} limit: no end there", GIVE_RANGE
         )
-        lower, upper = (-math.inf, upper) if missing == "lower" else (lower, math.inf)
+        if missing == "lower":
+            lower, upper = (-math.inf, upper)
+        else:
+            lower, upper = (lower, math.inf)
     elif lower > upper:
         yield finding_of(
             joint, "warning", "limits", "limits are swapped", "swap them", f"{lower:g}, {upper:g}"
@@ -235,7 +243,8 @@ def mimics(root: etree._Element) -> Iterator[Finding]:
         if (problem := _mimic_problem(joint, joints)) is not None:
             yield _independent(joint, problem)
             continue
-        chain, each = {name}, _leader(joint)
+        chain = {name}
+        each = _leader(joint)
         while each in joints and each not in sound and each not in chain:
             chain.add(each)
             each = _leader(joints[each])
@@ -248,7 +257,9 @@ def mimics(root: etree._Element) -> Iterator[Finding]:
 
 def _leader(joint: etree._Element) -> str | None:
     mimic = joint.find("mimic")
-    return None if mimic is None else mimic.get("joint")
+    if mimic is None:
+        return None
+    return mimic.get("joint")
 
 
 def _mimic_problem(joint: etree._Element, joints: dict[str | None, etree._Element]) -> str | None:
@@ -262,7 +273,8 @@ def _mimic_problem(joint: etree._Element, joints: dict[str | None, etree._Elemen
         return "is not in the file"
     if leader.get("type") == "fixed":
         return "does not move"
-    multiplier, offset = readable(mimic, "multiplier", "1"), readable(mimic, "offset", "0")
+    multiplier = readable(mimic, "multiplier", "1")
+    offset = readable(mimic, "offset", "0")
     if multiplier in (None, (0.0,)) or offset is None:
         return (
             f"with multiplier {mimic.get('multiplier')!r}, offset {mimic.get('offset')!r} cannot"

@@ -38,7 +38,8 @@ def merge_links(tables: Tables, separate: Separate = ()) -> Tables:
     Links ``separate`` begin a body. Raises RobotError if a mass comes from the volume of a mesh
     that cannot be read.
     """
-    links, inertias = place_links(tables, separate), link_inertias(tables)
+    links = place_links(tables, separate)
+    inertias = link_inertias(tables)
     parts: dict[str, list[SpatialInertia]] = defaultdict(list)
     members: dict[str, int] = defaultdict(int)
     for name, at in links.items():
@@ -89,7 +90,10 @@ def rigid_bodies(joints: Iterable[Joint]) -> dict[str, str]:
     bodies: dict[str, str] = {}
     for joint in joints:
         body = bodies.setdefault(joint.parent_link, joint.parent_link)
-        bodies[joint.child_link] = joint.child_link if joint.moves else body
+        if joint.moves:
+            bodies[joint.child_link] = joint.child_link
+        else:
+            bodies[joint.child_link] = body
     return bodies
 
 
@@ -146,7 +150,10 @@ def _moving_order(joints: Sequence[Joint], merged: Collection[str]) -> list[str]
     below: dict[str, list[Joint]] = defaultdict(list)
     for joint in joints:
         parent = body.setdefault(joint.parent_link, joint.parent_link)
-        body[joint.child_link] = parent if joint.name in merged else joint.child_link
+        if joint.name in merged:
+            body[joint.child_link] = parent
+        else:
+            body[joint.child_link] = joint.child_link
         if joint.name not in merged:
             below[parent].append(joint)
     ordered = below[joints[0].parent_link].copy()

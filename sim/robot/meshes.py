@@ -106,7 +106,9 @@ def mesh_problem(path: Path) -> str | None:
         with open(path, "rb") as file:
             data = file.read(SIZE_LIMIT + 1)
         if not data or len(data) > SIZE_LIMIT:
-            return "empty" if not data else f"larger than {SIZE_LIMIT >> 20} MiB"
+            if not data:
+                return "empty"
+            return f"larger than {SIZE_LIMIT >> 20} MiB"
         if data.startswith(LFS_POINTER):
             return LFS_PROBLEM
         if path.suffix.lower() == ".dae" and not _has_its_numbers(data):
@@ -117,11 +119,9 @@ def mesh_problem(path: Path) -> str | None:
         return str(error) or type(error).__name__
     if not len(corners):
         return "damaged, or without faces"
-    return (
-        None
-        if (np.abs(corners) <= LARGEST).all()
-        else f"vertices that are not within {LARGEST:g} m"
-    )
+    if (np.abs(corners) <= LARGEST).all():
+        return None
+    return f"vertices that are not within {LARGEST:g} m"
 
 
 def _has_its_numbers(data: bytes) -> bool:

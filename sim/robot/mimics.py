@@ -45,7 +45,8 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
         ends = sorted(
             (end - offset) / multiplier for end in (joints[index].lower, joints[index].upper)
         )
-        low, high = max(limits[leader][0], ends[0]), min(limits[leader][1], ends[1])
+        low = max(limits[leader][0], ends[0])
+        high = min(limits[leader][1], ends[1])
         if low < high:
             limits[leader] = (float(low), float(high))
     for index in coupling.followers.tolist():
@@ -65,5 +66,8 @@ def _image(coupling: Coupling, index: int, end: float) -> float:
     """Return the position of follower ``index`` where its leader is at ``end``, which may be
     infinite.
     """
-    multiplier, offset = float(coupling.multiplier[index]), float(coupling.offset[index])
-    return offset if multiplier == 0 else multiplier * end + offset
+    multiplier = float(coupling.multiplier[index])
+    offset = float(coupling.offset[index])
+    if multiplier == 0:
+        return offset
+    return multiplier * end + offset

@@ -54,7 +54,8 @@ _UNITS = "give sizes in metres, meshes in millimetres with <mesh scale='0.001 0.
 
 def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
     """Yield a finding for each implausible size, mass, inertia, load and angle."""
-    masses, (reach, next_joint) = robot.link_masses, _distances(robot)
+    masses = robot.link_masses
+    (reach, next_joint) = _distances(robot)
     length = max(reach, SHORT)
     total = sum(mass.mass for mass in masses.values())
     of_reach = f"the robot's chain of joints is {reach:.3g} m long"
@@ -79,10 +80,8 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
         size = max(mass.size, next_joint[name])
         if mass.size > 0 and not SPARSEST <= mass.mass / size**3 <= DENSEST:
             kind = "light" if mass.mass < SPARSEST * size**3 else "heavy"
-            text, remedy = (
-                f"no link of such a size is so {kind}",
-                "give <mass> in kg and <collision> in metres",
-            )
+            text = f"no link of such a size is so {kind}"
+            remedy = "give <mass> in kg and <collision> in metres"
             yield Finding(
                 "warning",
                 "mass",
@@ -96,10 +95,8 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
                 "no link has so much inertia for its mass: its radius of gyration exceeds the"
                 f" robot, {of_reach}"
             )
-            remedy, detail = (
-                "give <inertia> in kg m^2, about the centre of mass",
-                f"{mass.gyration:.3g} m",
-            )
+            remedy = "give <inertia> in kg m^2, about the centre of mass"
+            detail = f"{mass.gyration:.3g} m"
             yield Finding("warning", "inertia", text, remedy, link=name, detail=detail)
     yield from _loads(robot, max(reach, 1.0))
     yield from _degrees(robot)

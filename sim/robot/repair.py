@@ -82,7 +82,8 @@ def _elements(root: etree._Element) -> Iterator[Finding]:
     xacro: Counter[str] = Counter()
     stack = [root]
     while stack:
-        parent, seen = stack.pop(), set()
+        parent = stack.pop()
+        seen = set()
         for child in list(parent):
             tag = etree.QName(child).localname
             if child.tag in _READ[parent.tag] and (child.tag in _MANY or child.tag not in seen):
@@ -125,9 +126,11 @@ def _attributes(root: etree._Element) -> Iterator[Finding]:
                     )
             elif "," in text and (read := _without_commas(text, _NUMBERS.get(key, ()))) is not None:
                 element.set(key, read)
-                done, remedy = "points in place of decimal commas", "write decimal points"
+                done = "points in place of decimal commas"
+                remedy = "write decimal points"
                 if read == text.replace(",", " "):
-                    done, remedy = "blanks in place of the commas", "separate the numbers by blanks"
+                    done = "blanks in place of the commas"
+                    remedy = "separate the numbers by blanks"
                 problem = f"<{element.tag} {key}={text!r}> is read with {done}"
                 yield finding_of(element, "warning", "number", problem, remedy)
             elif text != value:
@@ -144,7 +147,9 @@ def _without_commas(text: str, counts: Sequence[int]) -> str | None:
     decimal = len(words) in counts and all(
         "," not in word or _DECIMAL_COMMA.fullmatch(word) for word in words
     )
-    return text.replace(",", ".") if decimal else None
+    if decimal:
+        return text.replace(",", ".")
+    return None
 
 
 def _refuse_xacro(root: etree._Element, path: Path) -> None:
@@ -167,12 +172,14 @@ def _links(root: etree._Element) -> Iterator[Finding]:
     seen: set[str | None] = {None}
     for link in root.findall("link"):
         if (name := link.get("name")) in seen:
-            text = (
-                "no joint can refer to a link without name"
-                if name is None
-                else "this name is used twice"
-            )
-            effect = "left out" if name is None else "the first link is kept, the other left out"
+            if name is None:
+                text = "no joint can refer to a link without name"
+            else:
+                text = "this name is used twice"
+            if name is None:
+                effect = "left out"
+            else:
+                effect = "the first link is kept, the other left out"
             yield finding_of(
                 link,
                 "warning",
@@ -189,7 +196,8 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
     seen: dict[str, tuple[str | None, str | None]] = {}
     names = {joint.get("name") for joint in root.findall("joint")}
     for joint in root.findall("joint"):
-        name, ends = joint.get("name"), ends_of(joint)
+        name = joint.get("name")
+        ends = ends_of(joint)
         if name is not None and seen.get(name) == ends:
             yield finding_of(
                 joint,
@@ -203,10 +211,14 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
         base = new = name or "{}_to_{}".format(*ends)
         number = 2
         while new in seen or (new != name and new in names):
-            new, number = f"{base}_{number}", number + 1
+            new = f"{base}_{number}"
+            number = number + 1
         if new != name:
             joint.set("name", new)
-            problem = "no name" if name is None else f"the name {name!r} is used twice"
+            if name is None:
+                problem = "no name"
+            else:
+                problem = f"the name {name!r} is used twice"
             yield finding_of(
                 joint,
                 "warning",

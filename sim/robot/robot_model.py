@@ -81,7 +81,8 @@ class RobotModel:
         result is the sum of the absolute values in each of its rows: diagonal gains for these sums
         are at least as stiff as gains for the matrix (Gershgorin's theorem).
         """
-        tree, joints = self.tree, np.asarray(qpos, np.float64)
+        tree = self.tree
+        joints = np.asarray(qpos, np.float64)
 
         def jacobians(link: str, point: Float64) -> tuple[Float64, Float64]:
             """Return the Jacobians of a point of the world in a link (6, dof), and with respect to
@@ -107,7 +108,8 @@ class RobotModel:
             turn = matrix_of(pose[3:])
             of_joints, of_base = jacobians(link, pose[:3] + turn @ tree.center[at])
             moving = of_joints + of_base @ follow
-            linear, angular = moving[:3], moving[3:]
+            linear = moving[:3]
+            angular = moving[3:]
             matrix += (
                 tree.mass[at] * linear.T @ linear
                 + angular.T @ turn @ tree.inertia[at] @ turn.T @ angular
@@ -140,7 +142,8 @@ def base_start(robot: Any, qpos: Float64, ground: bool) -> Float64:
     If the file does not place the base, it is upright at the origin. On a ``ground`` at height 0
     the lowest point is then on the ground, and otherwise not below.
     """
-    pose, model = np.array(robot.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64), robot.dynamics()
+    pose = np.array(robot.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64)
+    model = robot.dynamics()
     height = model.contacts.height(np.nan_to_num(qpos), base_too=True)
     if not np.isfinite(height):
         return pose

@@ -55,7 +55,8 @@ def _of_leaders(guard: bp.Guard, joints: Sequence[Joint]) -> bp.Guard:
         for leaf, none in zip(guard[:4], free[:4], strict=True)
     )
     for index in coupling.followers.tolist():
-        leader, multiplier = int(coupling.leader[index]), float(coupling.multiplier[index])
+        leader = int(coupling.leader[index])
+        multiplier = float(coupling.multiplier[index])
         if multiplier == 0:
             continue
         for fastest in (rate, acceleration):
@@ -105,10 +106,8 @@ def fit_guard(
     if guard is False or guard is None:
         return None
     if not sets_positions:
-        problem, remedy = (
-            "limits positions of joints, which this control does not take",
-            "use control 'pid' or 'drive'",
-        )
+        problem = "limits positions of joints, which this control does not take"
+        remedy = "use control 'pid' or 'drive'"
         raise InvalidArgumentError("guard", problem, value=control, remedy=remedy)
     limits = setpoint_guard(joints, None, None) if guard is True else guard
     limits = instance("guard", limits, bp.Guard, "pass True, or robot.guard(...)")

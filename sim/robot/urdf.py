@@ -64,14 +64,19 @@ def read_urdf(
     The element is repaired in place. Raises RobotError for a structure or number that SAPIEN cannot
     build, or a bad mesh.
     """
-    free_joint, base = free_joint_of(root), None
-    fixed_base = free_joint is None if fixed_base is None else fixed_base
+    free_joint = free_joint_of(root)
+    base = None
+    if fixed_base is None:
+        fixed_base = free_joint is None
+    else:
+        fixed_base = fixed_base
     if free_joint is not None and not fixed_base:
         base = free_base(root, free_joint, findings)
     _repair(root, path, findings, package_dirs, missing_meshes)
     added = [str(finding.link) for finding in findings if finding.code == "missing-link"]
     tables = _read_tables(root, path, added)
-    name, oddities = root.get("name", path.stem), tuple(_degrees(root))
+    name = root.get("name", path.stem)
+    oddities = tuple(_degrees(root))
     return Source(name, tables, tuple(findings), fixed_base, base, oddities)
 
 
@@ -116,7 +121,8 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
     """Make mesh paths absolute; drop the shapes whose file is missing or unreadable; return their
     names and why.
     """
-    missing, check = [], cache(mesh_problem)
+    missing = []
+    check = cache(mesh_problem)
     for collision in root.findall("link/collision"):
         mesh = collision.find("geometry/mesh")
         if mesh is None:
@@ -135,7 +141,8 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
 
 def _read_joint(element: etree._Element, path: Path) -> Joint:
     """Return a repaired joint."""
-    name, kind = element.get("name", ""), element.get("type", "")
+    name = element.get("name", "")
+    kind = element.get("type", "")
     where = f"{path}: joint {name!r}"
     parent, child = ends_of(element)
     if not parent or not child:

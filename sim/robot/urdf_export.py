@@ -76,7 +76,8 @@ def to_urdf(
 def _write(robot: RobotDescription, mass_factors: Mapping[str, float]) -> etree._Element:
     """Return the ``<robot>`` of the tables."""
     root = etree.Element("robot", name=robot.name)
-    tree, inertias = robot.rigid_tree, link_inertias(robot.tables)
+    tree = robot.rigid_tree
+    inertias = link_inertias(robot.tables)
     factors = {tree.link_bodies[tree.index(name)]: mass_factors[name] for name in mass_factors}
     for body in robot.links:
         link = etree.SubElement(root, "link", name=body.name)
@@ -115,7 +116,8 @@ def _write_joint(root: etree._Element, body: Body) -> None:
     if not joint.continuous:
         limits |= {"lower": joint.lower, "upper": joint.upper}
     etree.SubElement(element, "limit", {key: repr(limit) for key, limit in limits.items()})
-    damping, friction = repr(joint.damping), repr(joint.friction)
+    damping = repr(joint.damping)
+    friction = repr(joint.friction)
     etree.SubElement(element, "dynamics", damping=damping, friction=friction)
     if (mimic := joint.mimic) is not None:
         factors = {"multiplier": repr(mimic.multiplier), "offset": repr(mimic.offset)}
@@ -169,11 +171,9 @@ def _copy_unused(
             missing.append(mesh.get("filename", ""))
         else:
             mesh.set("filename", str(found))
-    return (
-        [f"visual meshes not found, written as they were: {', '.join(sorted({*missing}))}"]
-        if missing
-        else []
-    )
+    if missing:
+        return [f"visual meshes not found, written as they were: {', '.join(sorted({*missing}))}"]
+    return []
 
 
 def _lacking(robot: RobotDescription) -> Iterator[str]:

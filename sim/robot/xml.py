@@ -106,7 +106,10 @@ def _lenient(data: bytes) -> etree._Element:
     declared = " ".join(f'xmlns:{prefix}="urn:{prefix}"' for prefix in prefixes)
     wrapper = _parse(f"<file {declared}>{text}</file>".encode(errors="replace"))
     root = wrapper.find("{*}robot")
-    root = wrapper[0] if root is None and len(wrapper) else root
+    if root is None and len(wrapper):
+        root = wrapper[0]
+    else:
+        root = root
     if root is None:
         raise etree.XMLSyntaxError("no element", 0, 0, 0)
     wrapper.remove(root)
@@ -140,7 +143,10 @@ def readable(
     element: etree._Element | None, key: str, default: str, limit: bool = False
 ) -> tuple[float, ...] | None:
     """Return the numbers in an attribute, or None where :func:`numbers` raises."""
-    given = default if element is None else element.get(key, default)
+    if element is None:
+        given = default
+    else:
+        given = element.get(key, default)
     words = (given if given.strip() else default).split()
     largest = LARGEST_LIMIT if limit else LARGEST
     try:
@@ -150,7 +156,9 @@ def readable(
     if element is None:
         return values
     fits = all(abs(value) <= largest or (limit and math.isinf(value)) for value in values)
-    return values if fits and len(values) == len(words) == len(default.split()) else None
+    if fits and len(values) == len(words) == len(default.split()):
+        return values
+    return None
 
 
 def fault(
@@ -162,6 +170,9 @@ def fault(
     if element is None or readable(element, key, default, limit) is not None:
         return None
     count = len(default.split())
-    need = "one finite number" if count == 1 else f"{count} finite numbers"
+    if count == 1:
+        need = "one finite number"
+    else:
+        need = f"{count} finite numbers"
     within = f"within +-{LARGEST_LIMIT if limit else LARGEST:g}, which PhysX can hold"
     return f"<{element.tag} {key}={element.get(key)!r}> needs {need} {within}"

@@ -101,7 +101,8 @@ def _arms(
     balls around points of the body; the ball of a child contains everything that moves with it, at
     any pose. A way that moves both bodies of a pair, or neither, does not change their distance.
     """
-    model, dof = robot.model, len(robot.qvel)
+    model = robot.model
+    dof = len(robot.qvel)
     travel = np.tile([[-np.inf], [np.inf]], (1, dof))
     arms = np.ones(dof + 2 * (robot.base is not None))
     moved = np.zeros((model.nbody, len(arms)), bool)
@@ -109,12 +110,14 @@ def _arms(
     for shape, body in enumerate(model.geom_bodyid):
         balls[body].append((model.geom_pos[shape], model.geom_rbound[shape]))
     for body in reversed(range(1, model.nbody)):
-        joint, slide = int(model.body_jntadr[body]), 0.0
+        joint = int(model.body_jntadr[body])
+        slide = 0.0
         points = np.array([point for point, _ in balls[body]]).reshape(-1, 3)
         radii = np.array([radius for _, radius in balls[body]])
         farthest = (np.linalg.norm(points, axis=1) + radii).max(initial=0.0)
         if joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
-            moved[body, dof:], arms[dof + 1] = True, farthest
+            moved[body, dof:] = True
+            arms[dof + 1] = farthest
         elif joint >= 0:
             column = int(np.flatnonzero(robot.qvel == model.jnt_dofadr[joint])[0])
             moved[body, column] = True
@@ -150,7 +153,9 @@ def places() -> tuple[int, ...] | None:
         for address in addresses
     ]
     is_clear = len(flags) == 1 and flags[0] % 4 == 0 and all(len(words) == 1 for words in offsets)
-    return (flags[0], *(words[0] for words in offsets)) if is_clear else None
+    if is_clear:
+        return (flags[0], *(words[0] for words in offsets))
+    return None
 
 
 class GroupClearance:

@@ -47,11 +47,10 @@ def add_link_sensors(
             sensor.intprm[:3] = _FOUND_AND_FORCE, _NET_FORCE, 1
     for link in spec.wrenches or ():
         site = f"{link} (wrench)"
-        place = (
-            {}
-            if (frame := frames.get(link)) is None
-            else {"pos": frame.position, "quat": frame.wxyz}
-        )
+        if (frame := frames.get(link)) is None:
+            place = {}
+        else:
+            place = {"pos": frame.position, "quat": frame.wxyz}
         scene.body(names[link]).add_site(name=site, **place)
         for kind in (kinds.mjSENS_FORCE, kinds.mjSENS_TORQUE):
             scene.add_sensor(type=kind, objtype=objects.mjOBJ_SITE, objname=site)

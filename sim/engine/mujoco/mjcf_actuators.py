@@ -63,7 +63,8 @@ class MjcfActuators:
         self._independent = independent
         self.is_law = is_law
         limit = drive.motor("effort_limit", math.inf)
-        low, high = drive.value("effort_min", -math.inf), drive.value("effort_max", math.inf)
+        low = drive.value("effort_min", -math.inf)
+        high = drive.value("effort_max", math.inf)
         self.effort_range = np.array([np.maximum(low, -limit), np.minimum(high, limit)]).T
         self._stall, self._speed = (
             drive.motor("saturation_effort", math.inf),
@@ -86,7 +87,8 @@ class MjcfActuators:
         self.elements = [self._element(int(joint)) for joint in np.flatnonzero(independent)]
 
     def _element(self, joint: int) -> tuple[str, dict[str, str]]:
-        drive, name = self._drive, self._drive.joints[joint]
+        drive = self._drive
+        name = self._drive.joints[joint]
         low, high = self.effort_range[joint].tolist()
         if low >= high:
             problem = "must be below effort_max for MuJoCo"
@@ -146,7 +148,8 @@ class MjcfActuators:
         arm = (
             1.0 if self.is_law else float(self._strength[joint])
         )  # the gear, by which the motor's efforts are divided
-        element, voltage = {"motorconst": "1 1", "resistance": "1"}, 0.0
+        element = {"motorconst": "1 1", "resistance": "1"}
+        voltage = 0.0
         if self._has_line[joint]:
             voltage = 1.0
             element = {
@@ -171,13 +174,14 @@ class MjcfActuators:
         # Masks of the joints that have a limit, a guard or an effect at all.
         limit = drive.motor("effort_limit", math.inf)
         is_weak = np.abs(self.effort_range).min(1) < limit
-        limited, places = (
-            np.isfinite(self.effort_range).any(1),
-            np.isfinite([self._lower, self._upper]).any(0),
-        )
-        guarded, turns = self.has_rate | places, self.has_rate & continuous
-        late, biased = drive.motor("command_delay") > 0, drive.motor("bias") != 0
-        law, dcmotor = np.full(len(limit), self.is_law), self._is_dcmotor
+        limited = np.isfinite(self.effort_range).any(1)
+        places = np.isfinite([self._lower, self._upper]).any(0)
+        guarded = self.has_rate | places
+        turns = self.has_rate & continuous
+        late = drive.motor("command_delay") > 0
+        biased = drive.motor("bias") != 0
+        law = np.full(len(limit), self.is_law)
+        dcmotor = self._is_dcmotor
         # Effects that MuJoCo's elements lack or place elsewhere, each with a mask of its joints.
         for joints, text in (
             (

@@ -72,7 +72,10 @@ def to_mjcf(
     RobotError
         MuJoCo cannot build the robot.
     """
-    law = make_params(robot.dof, 0.0, measurement_rate="measured") if params is None else params
+    if params is None:
+        law = make_params(robot.dof, 0.0, measurement_rate="measured")
+    else:
+        law = params
     if guard is not None:
         guard.check(1, robot.joint_names)
         if params is None:
@@ -94,7 +97,8 @@ def to_mjcf(
     # The bodies are those that the engine simulates; inertias and efforts are then written with all
     # their digits.
     scene, names = robot_spec(spec)
-    scene.modelname, scene.option.disableflags = robot.name, 0
+    scene.modelname = robot.name
+    scene.option.disableflags = 0
     for row in spec.simulated.bodies:
         _set_inertia(scene.body(names[row.name]), row.spatial_inertia, row.name, drive)
     motors = MjcfActuators(drive, robot.independent, params is not None, guard)
@@ -159,10 +163,8 @@ def _set_joints(
     for follower in coupling.followers:
         tie = scene.add_equality(type=mujoco.mjtEq.mjEQ_JOINT)
         tie.objtype = mujoco.mjtObj.mjOBJ_JOINT
-        tie.name1, tie.name2 = (
-            robot.joint_names[follower],
-            robot.joint_names[coupling.leader[follower]],
-        )
+        tie.name1 = robot.joint_names[follower]
+        tie.name2 = robot.joint_names[coupling.leader[follower]]
         figures = [coupling.offset[follower], coupling.multiplier[follower]]
         tie.data = np.pad(figures, (0, len(tie.data) - 2))
     if np.any(tables.get("frictionloss", 0)):

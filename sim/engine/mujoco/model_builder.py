@@ -141,7 +141,8 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         raise RobotError(f"{file.path}: {problem}; {remedy}") from error
     qpos, qvel = _places(model, spec)
     armature, damping = parts.terms
-    model.dof_armature[qvel], model.dof_frictionloss[qvel] = np.maximum(armature, 0.0), 0.0
+    model.dof_armature[qvel] = np.maximum(armature, 0.0)
+    model.dof_frictionloss[qvel] = 0.0
     model.dof_damping[qvel] = np.maximum(damping + [joint.damping for joint in spec.joints], 0.0)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     base = None
@@ -159,10 +160,12 @@ def robot_spec(spec: SceneSpec) -> tuple[Any, dict[str, str]]:
 
     Raises RobotError if MuJoCo refuses a part of the robot.
     """
-    scene, off = mujoco.MjSpec(), mujoco.mjtDisableBit
+    scene = mujoco.MjSpec()
+    off = mujoco.mjtDisableBit
     _set_options(scene, spec)
     scene.option.disableflags |= off.mjDSBL_SPRING | off.mjDSBL_DAMPER
-    scene.compiler.fusestatic, scene.compiler.degree = False, False
+    scene.compiler.fusestatic = False
+    scene.compiler.degree = False
     try:
         names = _add_links(scene, spec)
         if spec.collisions:
@@ -184,11 +187,9 @@ def _unused(name: str, taken: Collection[str]) -> str:
     ``taken``.
     """
     numbered = (f"{name}_{number}" for number in count(2))
-    return (
-        name
-        if name not in taken
-        else next(candidate for candidate in numbered if candidate not in taken)
-    )
+    if name not in taken:
+        return name
+    return next(candidate for candidate in numbered if candidate not in taken)
 
 
 def principal_inertia(inertia: SpatialInertia) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -204,12 +205,15 @@ def principal_inertia(inertia: SpatialInertia) -> tuple[NDArray[np.float64], NDA
 def _set_options(scene: MjSpec, spec: SceneSpec) -> None:
     solver: MujocoSolver = spec.physics
     option, off = scene.option, mujoco.mjtDisableBit
-    option.timestep, option.gravity = spec.timestep, spec.gravity
+    option.timestep = spec.timestep
+    option.gravity = spec.gravity
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    option.iterations, option.tolerance = solver.iterations, solver.tolerance
-    option.cone = (
-        mujoco.mjtCone.mjCONE_ELLIPTIC if solver.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
-    )
+    option.iterations = solver.iterations
+    option.tolerance = solver.tolerance
+    if solver.elliptic:
+        option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    else:
+        option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     # A diverged env must stay visible: the loop suspends or resets it, and reports it.
     option.disableflags |= off.mjDSBL_AUTORESET | off.mjDSBL_ACTUATION
 
@@ -266,7 +270,8 @@ def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
         if shape.owner not in owners[shape.body]:
             owners[shape.body].append(shape.owner)
     ignored = {frozenset(pair) for pair in spec.ignored}
-    solid, split = [*owners], set[str]()
+    solid = [*owners]
+    split = set[str]()
     for first, second in combinations(solid, 2):
         pairs = [frozenset(pair) in ignored for pair in product(owners[first], owners[second])]
         if any(pairs) and not all(pairs):
@@ -300,7 +305,8 @@ def _add_drives(scene: MjSpec, spec: SceneSpec) -> None:
             name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-        actuator.forcelimited, actuator.forcerange = True, [-LARGEST_FORCE, LARGEST_FORCE]
+        actuator.forcelimited = True
+        actuator.forcerange = [-LARGEST_FORCE, LARGEST_FORCE]
 
 
 def _contact(spec: SceneSpec) -> Document:
@@ -314,15 +320,20 @@ def set_inertia(model: MjModel, robot: RobotMj, link: str, inertia: SpatialInert
     """Give a simulated link in a ``mujoco.MjModel`` this inertia, in the link's frame;
     ``mj_setConst`` comes next.
     """
-    body, welded = robot.bodies[link], tuple[int, ...]()
+    body = robot.bodies[link]
+    welded = tuple[int, ...]()
     if link in robot.frames:
         position, turn, welded = robot.frames[link]
         inertia = inertia.moved(position, turn)
     moments, wxyz = principal_inertia(inertia)
-    model.body_mass[body], model.body_ipos[body] = inertia.mass, inertia.center
-    model.body_iquat[body], model.body_inertia[body] = wxyz, moments
-    model.body_mass[[*welded]], model.body_inertia[[*welded]] = 0.0, 0.0
+    model.body_mass[body] = inertia.mass
+    model.body_ipos[body] = inertia.center
+    model.body_iquat[body] = wxyz
+    model.body_inertia[body] = moments
+    model.body_mass[[*welded]] = 0.0
+    model.body_inertia[[*welded]] = 0.0
     # Without the compiler's shortcuts for centers of mass at the body's origin, and bodies that are
     # moved by one joint.
-    model.body_sameframe[body], model.body_simple[body] = 0, 0
+    model.body_sameframe[body] = 0
+    model.body_simple[body] = 0
     model.dof_simplenum[:] = 0

@@ -68,7 +68,8 @@ class MujocoPack(ModelPack):
         self._worlds_vary = varied.ground_friction is not None or varied.gravity is not None
         self.qf = np.zeros((size, self.dof))
         self._actuators: Actuators | None = None
-        coupling, viscous = coupling_of(spec.joints), self.friction.viscous
+        coupling = coupling_of(spec.joints)
+        viscous = self.friction.viscous
         if not coupling.is_identity and spec.mjcf is None:  # else MuJoCo has the file's equalities
             self._constraint = ConstraintEfforts(
                 size, coupling, np.zeros(self.dof, bool), spec.timestep
@@ -169,7 +170,8 @@ class MujocoPack(ModelPack):
         try:
             everyone = self.data
             for row in np.flatnonzero(~self._suspended):
-                model, data = self.models[row], everyone[row]
+                model = self.models[row]
+                data = everyone[row]
                 data.qfrc_applied[self._moves] = effort[row]
                 mujoco.mj_step2(model, data)
                 self._sensed[row] += data.sensordata
@@ -201,7 +203,10 @@ class MujocoPack(ModelPack):
         arrays = {"qf": self.qf, "sensed": self._sensed}
         if drives:
             arrays |= {"stiffness": self._stiffness, "rate_gain": self._rate_gain}
-        constraint = None if self._constraint is None else self._constraint.address
+        if self._constraint is None:
+            constraint = None
+        else:
+            constraint = self._constraint.address
         return MujocoStep(
             self, self._robot, reads_force, speed_limit, arrays, self._suspended, constraint
         )
@@ -214,10 +219,12 @@ class MujocoPack(ModelPack):
                 bias = self.passive_force(True, True)
             else:
                 state = self.read_qpos(), self.read_qvel(), True, True, self.read_base_motion()
-                natively, model = self.steps_natively, self._bias_model
-                bias = (
-                    model.passive_force(*state) if natively else passive_force(self._tree, *state)
-                )
+                natively = self.steps_natively
+                model = self._bias_model
+                if natively:
+                    bias = model.passive_force(*state)
+                else:
+                    bias = passive_force(self._tree, *state)
             self._constraint.update(self.joint_mass_matrix, self.read_qpos(), bias, rows)
 
     # -- changes
@@ -249,7 +256,10 @@ class MujocoPack(ModelPack):
         return ~np.array([np.abs(data.qpos).max() <= FARTHEST for data in self.data])
 
     def take_sensed(self) -> dict[str, Float64]:
-        sums = self._sensors.quantities(self._sensed) if self._sensors.size else {}
+        if self._sensors.size:
+            sums = self._sensors.quantities(self._sensed)
+        else:
+            sums = {}
         self._sensed[...] = 0.0
         return sums
 
@@ -260,7 +270,8 @@ class MujocoPack(ModelPack):
         return np.hstack([turned_back(rows[:, 3:7], np.array(self.spec.gravity)), rows[:, 10:]])
 
     def push(self, rows: Sequence[int], twists: Float64) -> None:
-        data, turns = self.data, matrix_of(self._bases()[rows, 3:7])
+        data = self.data
+        turns = matrix_of(self._bases()[rows, 3:7])
         _, at = self._robot.base or (0, 0)
         for row, twist, turn in zip(rows, twists, turns, strict=True):
             data[row].qvel[at : at + 3] += twist[:3]
@@ -273,8 +284,12 @@ class MujocoPack(ModelPack):
         """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root
         at ``base``.
         """
-        everyone, floats = self.data, self._robot.base is not None
-        bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else base.copy()
+        everyone = self.data
+        floats = self._robot.base is not None
+        if base is None:
+            bases = np.tile(_ORIGIN, (len(rows), 1))
+        else:
+            bases = base.copy()
         at, moves = self._robot.base or (0, 0)
         bases[:, 10:] = np.einsum("eji,ej->ei", matrix_of(bases[:, 3:7]), bases[:, 10:])
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
@@ -285,7 +300,8 @@ class MujocoPack(ModelPack):
                 data.qpos[at : at + FLOATING + 1], data.qvel[moves : moves + FLOATING] = np.split(
                     root, [FLOATING + 1]
                 )
-            data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = position, velocity
+            data.qpos[self._robot.qpos] = position
+            data.qvel[self._robot.qvel] = velocity
             data.ctrl[:] = ctrl
             self.qf[row] = 0.0
             self._sensed[row] = 0.0
@@ -344,14 +360,16 @@ class MujocoPack(ModelPack):
 
     def _change_world(self, rows: Iterable[int]) -> None:
         """Set the gravity and friction that the scenes of robots ``rows`` have."""
-        gravity, friction = self._variation.gravity, self._variation.ground_friction
+        gravity = self._variation.gravity
+        friction = self._variation.ground_friction
         for row in rows if self._worlds_vary else ():
             model = self._own_model(row)
             if gravity is not None:
                 model.opt.gravity[:] = gravity[row]
             if friction is not None:
                 shapes, pairs, nominal = self._rubbing
-                share, base = friction[row] / max(nominal, _LEAST_FRICTION), self._robot.model
+                share = friction[row] / max(nominal, _LEAST_FRICTION)
+                base = self._robot.model
                 model.geom_friction[shapes, 0] = share * base.geom_friction[shapes, 0]
                 model.pair_friction[pairs, :2] = share * base.pair_friction[pairs, :2]
 

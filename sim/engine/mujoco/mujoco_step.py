@@ -75,7 +75,9 @@ def functions() -> dict[str, int] | None:
         has_addresses = bool(data._address and data.model._address)
     except (ValueError, OSError, AttributeError):
         return None
-    return {field: address or 0 for field, address in addresses.items()} if has_addresses else None
+    if has_addresses:
+        return {field: address or 0 for field, address in addresses.items()}
+    return None
 
 
 class MujocoStep(NativeStep):

@@ -49,7 +49,8 @@ class LinkSensors:
 
     def take(self) -> dict[str, Float64]:
         """Return the sums since the last call, and set them to 0."""
-        before, (size, contacts, _) = self._sums, self._velocities.shape
+        before = self._sums
+        (size, contacts, _) = self._velocities.shape
         shapes = {
             "contact_force": (contacts, 3),
             "touching": (contacts,),
@@ -86,7 +87,8 @@ class LinkSensors:
             self._sums["wrench"][row] += [_in_link(joints[at], forces[at]) for at in self._wrenches]
         if not self._contacts:
             return
-        velocities, touched = self._read_velocities(row), self._touched(row)
+        velocities = self._read_velocities(row)
+        touched = self._touched(row)
         for number, at in enumerate(self._contacts):
             if at not in touched:
                 continue
@@ -117,7 +119,8 @@ def _in_link(joint: Any, force: Float32) -> Float64:
     the link's origin.
     """
     placed = joint.pose_in_child.to_transformation_matrix().astype(np.float64)
-    axes, linear = placed[:3, :3], placed[:3, :3] @ force[:3]
+    axes = placed[:3, :3]
+    linear = placed[:3, :3] @ force[:3]
     return np.concatenate([linear, axes @ force[3:] + np.cross(placed[:3, 3], linear)])
 
 

@@ -95,7 +95,8 @@ class Pack(ModelPack):
                 ]
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
-        coupling, self._joint_qf = coupling_of(spec.joints), self.qf
+        coupling = coupling_of(spec.joints)
+        self._joint_qf = self.qf
         self._turning = np.array([], np.intp)
         if not coupling.is_identity:
             self._joint_qf = np.zeros_like(self.qf)
@@ -146,7 +147,8 @@ class Pack(ModelPack):
     def step(self) -> None:
         """Do one sim step of every scene, with constraint efforts on coupled joints."""
         if self._constraint is not None:
-            qpos, qvel = self._calls.qpos(np.float64), self._calls.qvel(np.float64)
+            qpos = self._calls.qpos(np.float64)
+            qvel = self._calls.qvel(np.float64)
             self._joint_qf[...] = self._constraint.apply(self.qf, qpos, qvel)
             self._calls.write_qf()
         self._stepped[...] = True
@@ -172,7 +174,8 @@ class Pack(ModelPack):
         drives: bool = False,
     ) -> SapienStep:
         constraint = None if self._constraint is None else self._constraint.address
-        reads, joints = (gravity, coriolis, velocities), self._joints if drives else None
+        reads = (gravity, coriolis, velocities)
+        joints = self._joints if drives else None
         sense = None if self._sensors is None else self._sensors.add
         return SapienStep(self.calls, self._stepped, *reads, speed_limit, constraint, joints, sense)
 
@@ -286,7 +289,9 @@ class Pack(ModelPack):
         return np.concatenate([roots[:, :7], velocity, roots[:, 10:]], axis=1)
 
     def take_sensed(self) -> dict[str, Float64]:
-        return {} if self._sensors is None else self._sensors.take()
+        if self._sensors is None:
+            return {}
+        return self._sensors.take()
 
     def write_state(
         self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None

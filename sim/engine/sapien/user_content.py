@@ -147,7 +147,8 @@ class SceneContent:
         self.watched = _call(build, scene, env, links)
         if not spec.collisions:
             _refuse_shapes(scene, env)
-        self._bodies, self._articulations = [], []
+        self._bodies = []
+        self._articulations = []
         for entity in scene.entities:
             if entity.per_scene_id in before:
                 continue
@@ -169,7 +170,9 @@ class SceneContent:
         """
 
         def velocity(values: Array) -> Array:
-            return np.zeros_like(values) if at_rest else values
+            if at_rest:
+                return np.zeros_like(values)
+            return values
 
         parts: list[Any] = [np.zeros(0, np.float32)]
         for entity, body in self._bodies:
@@ -202,7 +205,8 @@ class SceneContent:
 
         for entity, body in self._bodies:
             entity.set_pose(sapien.Pose(take(3), take(4)))
-            linear, angular = take(3), take(3)
+            linear = take(3)
+            angular = take(3)
             if not body.kinematic:
                 body.set_linear_velocity(linear)
                 body.set_angular_velocity(angular)

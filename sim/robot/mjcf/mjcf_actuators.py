@@ -54,7 +54,8 @@ def read_couplings(model: MjModel, names: Names, findings: list[Finding]) -> Cou
     couplings: Couplings = {}
     others: list[str] = []
     for equality in map(int, np.flatnonzero(model.eq_active0)):
-        follower, leader = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])
+        follower = int(model.eq_obj1id[equality])
+        leader = int(model.eq_obj2id[equality])
         if model.eq_type[equality] != _EQ.mjEQ_JOINT or follower not in names.joints:
             kind = _EQ(model.eq_type[equality]).name.removeprefix("mjEQ_").lower()
             others.append(f"{kind} {label(model.equality(equality))}")
@@ -71,7 +72,8 @@ def read_couplings(model: MjModel, names: Names, findings: list[Finding]) -> Cou
         elif name in couplings:
             problem = "is the second of the joint"
         if problem is not None:
-            text, remedy = f"{ALONE} an equality that {problem}", "give the joint a setpoint"
+            text = f"{ALONE} an equality that {problem}"
+            remedy = "give the joint a setpoint"
             findings.append(Finding("warning", "mimic", text, remedy, name))
             continue
         rest, rest_of_leader = model.qpos0[model.jnt_qposadr[[follower, leader]]].tolist()
@@ -146,7 +148,8 @@ def _add(
     ends = _input_range(model, actuator)
     if ends is not None and _servo(model, actuator) == (0.0, 0.0):
         least, most = sorted((model.actuator_gainprm[actuator, 0] * ends).tolist())
-        low, high = max(low, least), min(high, most)
+        low = max(low, least)
+        high = min(high, most)
     force = _magnitude((low, high), name, findings)
     tendon = int(model.actuator_trnid[actuator, 0])
     if model.actuator_trntype[actuator] == _TRN.mjTRN_TENDON and model.tendon_actfrclimited[tendon]:
@@ -175,7 +178,8 @@ def _effects(model: MjModel, actuator: int) -> Iterator[str]:
         int(getattr(model, f"actuator_{kind}type")[actuator]) for kind in ("gain", "bias", "dyn")
     )
     kp, kv = _servo(model, actuator)
-    gain, constant = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, 0]
+    gain = model.actuator_gainprm[actuator, 0]
+    constant = model.actuator_biasprm[actuator, 0]
     group = int(model.actuator_group[actuator])
     if model.actuator_plugin[actuator] >= 0:
         yield "a plugin"
@@ -223,7 +227,9 @@ def _input_range(model: MjModel, actuator: int) -> Any | None:
     first = actuator
     if hasattr(model, "actuator_ctrladr"):  # older versions have one input for each actuator
         first = int(model.actuator_ctrladr[actuator])
-    return model.actuator_ctrlrange[first] if model.actuator_ctrllimited[first] else None
+    if model.actuator_ctrllimited[first]:
+        return model.actuator_ctrlrange[first]
+    return None
 
 
 def _narrower(
@@ -231,7 +237,8 @@ def _narrower(
 ) -> Iterator[Finding]:
     """Yield a finding if a servo limits the setpoint of a joint to less than the joint's range."""
     kp, _ = _servo(model, actuator)
-    ends, gain = _input_range(model, actuator), model.actuator_gainprm[actuator, 0]
+    ends = _input_range(model, actuator)
+    gain = model.actuator_gainprm[actuator, 0]
     if _is_pid(model, actuator):  # of which the input is a position
         gain = kp
     if ends is None or kp <= 0 or not gain:
@@ -241,28 +248,37 @@ def _narrower(
     lower, upper = -math.inf, math.inf
     if model.jnt_limited[joint]:
         lower, upper = model.jnt_range[joint].tolist()
-    margin = 1e-3 * (upper - lower) if math.isfinite(upper - lower) else 0.0
+    if math.isfinite(upper - lower):
+        margin = 1e-3 * (upper - lower)
+    else:
+        margin = 0.0
     if low > lower + margin or high < upper - margin:
         text = "the setpoint is not limited to the range that the servo has in the file"
-        remedy, detail = "pass make_guard(lower=...)", f"{low:g} to {high:g}"
+        remedy = "pass make_guard(lower=...)"
+        detail = f"{low:g} to {high:g}"
         yield Finding("note", "actuator", text, remedy, name, detail=detail)
 
 
 def _field(model: MjModel, name: str, index: int) -> float:
     """Return an entry of a field that older versions of MuJoCo do not have, 0 there."""
     values = getattr(model, name, None)
-    return 0.0 if values is None else float(np.ravel(values[index])[0])
+    if values is None:
+        return 0.0
+    return float(np.ravel(values[index])[0])
 
 
 def _arms(model: MjModel, actuator: int, names: Names) -> dict[str, float]:
     """Return the moment arms of an actuator on the joints that it acts on by a constant arm, by
     name; none if it acts otherwise.
     """
-    kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    kind = int(model.actuator_trntype[actuator])
+    target = int(model.actuator_trnid[actuator, 0])
     outputs = getattr(model, "actuator_outadr", None)  # several of an orientation servo
     gear = float(model.actuator_gear[actuator if outputs is None else int(outputs[actuator]), 0])
     if kind in (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT):
-        return {names.joints[target]: gear} if target in names.joints else {}
+        if target in names.joints:
+            return {names.joints[target]: gear}
+        return {}
     if kind != _TRN.mjTRN_TENDON:
         return {}
     arms: dict[str, float] = defaultdict(float)
@@ -316,7 +332,8 @@ def _tendons(model: MjModel) -> Iterator[Finding]:
         "limited",
     ]
     pulled = model.actuator_trnid[model.actuator_trntype == _TRN.mjTRN_TENDON, 0].tolist()
-    acting, idle = [], []
+    acting = []
+    idle = []
     for tendon in range(model.ntendon):
         named = label(model.tendon(tendon))
         if any(np.any(getattr(model, f"tendon_{name}", [0])[tendon:][:1]) for name in effects):

@@ -116,7 +116,10 @@ def _strip(
     absent = {}
     for mesh in spec.meshes:
         folder = path.parent / (getattr(mesh, "compiler", spec).meshdir or "")
-        file = Path(mesh.file).name if spec.strippath else mesh.file
+        if spec.strippath:
+            file = Path(mesh.file).name
+        else:
+            file = mesh.file
         if mesh.file and (problem := _missing(folder / file)):
             absent[mesh.name] = f"{mesh.file} ({problem})"
     missing: dict[str, None] = {}
@@ -185,13 +188,13 @@ def _missing(path: Path) -> str | None:
     """Return the reason for which no program can read a mesh; None for other meshes."""
     try:
         with open(path, "rb") as file:
-            return LFS_PROBLEM if file.read(len(LFS_POINTER)) == LFS_POINTER else None
+            if file.read(len(LFS_POINTER)) == LFS_POINTER:
+                return LFS_PROBLEM
+            return None
     except OSError as error:
-        return (
-            "not found"
-            if isinstance(error, FileNotFoundError)
-            else f"cannot be read: {error.strerror}"
-        )
+        if isinstance(error, FileNotFoundError):
+            return "not found"
+        return f"cannot be read: {error.strerror}"
 
 
 def _refusal(path: Path, problem: str) -> str:
@@ -201,7 +204,10 @@ def _refusal(path: Path, problem: str) -> str:
         with suppress(OSError, ValueError):
             if _missing(path.parent / name) == LFS_PROBLEM:
                 return f"{path}: {name} is a git-lfs pointer instead of the file; run git lfs pull"
-    remedy = "restore the file" if "opening file" in problem else "correct it"
+    if "opening file" in problem:
+        remedy = "restore the file"
+    else:
+        remedy = "correct it"
     return f"{path}: MuJoCo cannot compile the file: {problem}; {remedy}"
 
 
@@ -275,6 +281,7 @@ class Names:
 def _new(name: str, taken: set[str]) -> str:
     new, number = name, 2
     while new in taken:
-        new, number = f"{name}_{number}", number + 1
+        new = f"{name}_{number}"
+        number = number + 1
     taken.add(new)
     return new

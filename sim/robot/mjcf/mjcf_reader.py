@@ -99,7 +99,8 @@ def home(model: MjModel) -> int | None:
 
 def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> MjcfFile:
     """Return the data of the file that the engine MuJoCo needs."""
-    model, loops = compiled.model, []
+    model = compiled.model
+    loops = []
     for equality in np.flatnonzero(model.eq_active0):
         at = [model.eq_obj1id[equality], model.eq_obj2id[equality]]
         if int(model.eq_type[equality]) not in (_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD):
@@ -142,11 +143,10 @@ def content_of(path: Path) -> str:
             for key, name in element.items():
                 if (key == "value" or key.startswith("file")) and name not in names:
                     names |= {name, Path(name).name}
-                    included = (
-                        [model.parent / name, path.parent / name]
-                        if element.tag in ("include", "model")
-                        else []
-                    )
+                    if element.tag in ("include", "model"):
+                        included = [model.parent / name, path.parent / name]
+                    else:
+                        included = []
                     models += [file for file in included if file.is_file() and file not in models]
     files = {
         (name, file)
@@ -236,10 +236,8 @@ def _unused(model: MjModel, names: Names, key: int | None) -> list[Finding]:
         if model.jnt_stiffness[joint] or np.any(
             getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[joint]
         ):
-            text, remedy = (
-                f"{ALONE} the spring of the joint",
-                "in SAPIEN add its effort in a controller",
-            )
+            text = f"{ALONE} the spring of the joint"
+            remedy = "in SAPIEN add its effort in a controller"
             detail = (
                 f"{model.jnt_stiffness[joint]:g} {'N/m' if names.is_slide(joint) else 'N m/rad'}"
             )
@@ -254,10 +252,8 @@ def _unused(model: MjModel, names: Names, key: int | None) -> list[Finding]:
                 )
             )
     for body in np.flatnonzero(model.body_gravcomp):
-        text, remedy = (
-            "gravity compensation of this body (gravcomp) is not simulated",
-            "let the controller compensate",
-        )
+        text = "gravity compensation of this body (gravcomp) is not simulated"
+        remedy = "let the controller compensate"
         if names.is_of_robot(body):
             found.append(Finding("note", "gravcomp", text, remedy, link=names.bodies[int(body)]))
     for body in np.flatnonzero(model.body_plugin >= 0):

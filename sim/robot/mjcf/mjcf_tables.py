@@ -81,7 +81,8 @@ def find_base(model: MjModel, names: Names, path: Path, findings: list[Finding])
                 f"{path}: body {names.bodies[body]!r}: {problem}; replace it by three hinges"
             )
     for body in sorted(left_out - soft):
-        text, remedy = f"is apart from the robot: {ALONE} it", "in SAPIEN add it with build="
+        text = f"is apart from the robot: {ALONE} it"
+        remedy = "in SAPIEN add it with build="
         findings.append(Finding("note", "loose-link", text, remedy, link=names.bodies[body]))
     names.leave_out(left_out)
     if floating:
@@ -95,7 +96,9 @@ def find_base(model: MjModel, names: Names, path: Path, findings: list[Finding])
     ]
     # The only body, if it is held at the origin, is the root in place of the world.
     is_root = not (others or scenery or model.body_jntnum[only])
-    return only if is_root and pose == [0, 0, 0, 1, 0, 0, 0] else 0
+    if is_root and pose == [0, 0, 0, 1, 0, 0, 0]:
+        return only
+    return 0
 
 
 def _roots_of_actuators(model: MjModel) -> set[int]:
@@ -127,7 +130,9 @@ class TableReader:
 
     def read(self, couplings: Couplings, is_held: bool) -> Tables:
         """Return the tables; ``is_held`` says whether a base on a free joint is fixed."""
-        model, base, names = self._model, self._base, self._names.bodies
+        model = self._model
+        base = self._base
+        names = self._names.bodies
         if base == 0:
             self._add(0, Body(names[0], None), ORIGIN)
         else:
@@ -150,10 +155,12 @@ class TableReader:
 
     def _read_body(self, body: int, parent: str | None, couplings: Couplings) -> None:
         """Read a body, and the joints between it and the row ``parent``; None for the root."""
-        model, name = self._model, self._names.bodies[body]
+        model = self._model
+        name = self._names.bodies[body]
         joints = [joint for joint in self._names.joints if model.jnt_bodyid[joint] == body]
         place = model.body_pos[body] - self._anchors[int(model.body_parentid[body])]
-        turn, anchor = model.body_quat[body].copy(), ORIGIN
+        turn = model.body_quat[body].copy()
+        anchor = ORIGIN
         if model.body_jntnum[body] > len(joints):  # on a free joint, which has the position
             place = ORIGIN
         row = Body(name, None)
@@ -185,8 +192,12 @@ class TableReader:
 
     def _read_joint(self, number: int, parent: str, link: str, couplings: Couplings) -> Joint:
         model = self._model
-        name, dof = self._names.joints[number], model.jnt_dofadr[number]
-        kind = "prismatic" if self._names.is_slide(number) else "continuous"
+        name = self._names.joints[number]
+        dof = model.jnt_dofadr[number]
+        if self._names.is_slide(number):
+            kind = "prismatic"
+        else:
+            kind = "continuous"
         lower, upper = -np.inf, np.inf
         if model.jnt_limited[number]:
             lower, upper = model.jnt_range[number].tolist()
@@ -213,10 +224,14 @@ class TableReader:
         self._read_shapes(body, row.name, anchor)
         if len(self._shapes) > before:
             self.solid[body] = row.name
-        mass, axes = float(model.body_mass[body]), model.body_iquat[body]
-        center, inertia = model.body_ipos[body] - anchor, np.diag(model.body_inertia[body])
+        mass = float(model.body_mass[body])
+        axes = model.body_iquat[body]
+        center = model.body_ipos[body] - anchor
+        inertia = np.diag(model.body_inertia[body])
         if mass == 0 and body in self.solid:
-            mass, center, inertia = NO_MASS, ORIGIN, 1e-3 * NO_MASS * np.eye(3)
+            mass = NO_MASS
+            center = ORIGIN
+            inertia = 1e-3 * NO_MASS * np.eye(3)
         if mass > 0:
             inertia, repair = possible_inertia(mass, inertia)
             if repair is not None:
@@ -274,15 +289,22 @@ class TableReader:
     def _report_shape(self, geom: int, body: int) -> None:
         """Report a plane or a height field. A plane of the world is replaced by a ground."""
         named = label(self._model.geom(geom))
-        kind = "plane" if self._model.geom_type[geom] == PLANE else "height field"
+        if self._model.geom_type[geom] == PLANE:
+            kind = "plane"
+        else:
+            kind = "height field"
         text = f"{ALONE} the {kind} {named} of the file"
-        height, (_, x, y, _) = float(self._model.geom_pos[geom, 2]), self._model.geom_quat[geom]
+        height = float(self._model.geom_pos[geom, 2])
+        (_, x, y, _) = self._model.geom_quat[geom]
         if body != 0 or kind != "plane":
             self._report("warning", body, text, "in SAPIEN add it with build=")
         elif height == x == y == 0:
             self._report("note", None, text, "SAPIEN has a ground at height 0")
         else:
-            where = f"at height {height:g} m" if x == y == 0 else "which is not level"
+            if x == y == 0:
+                where = f"at height {height:g} m"
+            else:
+                where = "which is not level"
             remedy = (
                 "SAPIEN has a ground at height 0 instead: add the plane with build= of Runner, or"
                 " pass ground=False"
@@ -341,7 +363,8 @@ def _hull(model: MjModel, mesh: int) -> Float64:
     The hull's graph has the layout of ``mesh_graph`` in MuJoCo's mjmodel.h: two counts, an address
     for each vertex, and the numbers of the vertices.
     """
-    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    first = int(model.mesh_vertadr[mesh])
+    count = int(model.mesh_vertnum[mesh])
     vertices = model.mesh_vert[first : first + count].astype(np.float64)
     begin = int(model.mesh_graphadr[mesh])
     if begin >= 0:
