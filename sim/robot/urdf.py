@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -122,14 +121,13 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
     names and why.
     """
     missing = []
-    check = cache(mesh_problem)
     for collision in root.findall("link/collision"):
         mesh = collision.find("geometry/mesh")
         if mesh is None:
             continue
         name = mesh.get("filename", "")
         found = find_mesh(name, path, package_dirs)
-        problem = None if found is None else check(found)
+        problem = None if found is None else mesh_problem(found)
         if found is None or problem is not None:
             missing.append(name if problem is None else f"{name} ({problem})")
             collision.getparent().remove(collision)
