@@ -127,7 +127,9 @@ def _problem(path: Path, changed: int, size: int) -> str | None:
             return LFS_PROBLEM
         if path.suffix.lower() == ".dae" and not _has_its_numbers(data):
             return "arrays of other lengths than it says"
-        if path.suffix.lower() == ".stl" and len(data) == 84 + _TRIANGLE.itemsize * int.from_bytes(data[80:84], "little"):
+        if path.suffix.lower() == ".stl" and len(data) == 84 + _TRIANGLE.itemsize * int.from_bytes(
+            data[80:84], "little"
+        ):
             # Most meshes of robots are such rows, which take a tenth of trimesh's time.
             corners = np.frombuffer(data, _TRIANGLE, offset=84)["corners"]
         else:

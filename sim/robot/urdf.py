@@ -67,10 +67,8 @@ def read_urdf(
     base = None
     if fixed_base is None:
         fixed_base = free_joint is None
-    else:
-        fixed_base = fixed_base
     if free_joint is not None and not fixed_base:
-        base = free_base(root, free_joint, findings)
+        base = free_base(root, free_joint)
     _repair(root, path, findings, package_dirs, missing_meshes)
     added = [str(finding.link) for finding in findings if finding.code == "missing-link"]
     tables = _read_tables(root, path, added)
