@@ -29,7 +29,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.arrays.elementwise import TURN, matrix_vector
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.engine import native
@@ -66,9 +66,9 @@ class ConstraintEfforts:
         self,
         robots: int,
         coupling: Coupling,
-        wraps: NDArray[np.bool_],
+        wraps: Bool,
         timestep: float,
-        asked: NDArray[np.float32] | None = None,
+        asked: Float32 | None = None,
     ) -> None:
         joints = len(coupling.leader)
         followers = coupling.followers

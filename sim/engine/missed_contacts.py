@@ -60,7 +60,7 @@ class MissedContacts:
             np.zeros((size, len(self._pairs))),
         )
 
-    def place(self, mask: NDArray[np.bool_]) -> None:
+    def place(self, mask: Bool) -> None:
         """Forget the distances of the robots of ``mask`` (size,), which are now in other states."""
         self._margins[mask] = 0.0
 

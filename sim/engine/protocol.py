@@ -288,13 +288,15 @@ class CompiledPack(EnginePack, Protocol):
         within a tick.
         """
 
+    @property
     def joint_model(self) -> CompiledModel:
-        """Return the native model of :meth:`joint_mass_matrix`, the same object for the life of the
+        """Native model of :meth:`joint_mass_matrix`, the same object for the life of the
         pack.
         """
 
+    @property
     def force_model(self) -> CompiledModel:
-        """Return the native model of :meth:`passive_force`, for compiled steps that do not read
+        """Native model of :meth:`passive_force`, for compiled steps that do not read
         this force.
         """
 

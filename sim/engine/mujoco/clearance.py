@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import MjModel
+from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import Clearance
 
@@ -90,9 +90,7 @@ def touching_pairs(model: MjModel) -> NDArray[np.int32]:
     return pairs[(welded[:, 0] != welded[:, 1]) & ~related & ~excluded].astype(np.int32)
 
 
-def _arms(
-    robot: RobotMj, pairs: NDArray[np.intp]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:
     """Return bounds of the closing speed of pairs of bodies per unit speed of each way (pairs,
     ways) [m or 1].
 

@@ -7,9 +7,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import MjModel, MjSpec
+from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 _FOUND_AND_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND) | 1 << int(
@@ -83,7 +82,7 @@ class MujocoLinkSensors:
         self._wrenches = len(spec.wrenches or ())
         self.size = int(model.nsensordata)
 
-    def quantities(self, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    def quantities(self, values: Float64) -> dict[str, Float64]:
         """Return the quantities of :meth:`batchpid.sim.engine.protocol.EnginePack.take_sensed` for
         values (M, size).
         """

@@ -30,7 +30,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.errors import InvalidArgumentError
@@ -56,9 +55,7 @@ class MjcfActuators:
         Mask (joints,) of the joints with a rate-limited setpoint.
     """
 
-    def __init__(
-        self, drive: Drive, independent: NDArray[np.bool_], is_law: bool, guard: Guard | None
-    ) -> None:
+    def __init__(self, drive: Drive, independent: Bool, is_law: bool, guard: Guard | None) -> None:
         self._drive = drive
         self._independent = independent
         self.is_law = is_law

@@ -12,9 +12,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import DType, Float64, Rows
+from batchpid.arrays.array_types import Bool, DType, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ModelPack
@@ -31,11 +30,11 @@ from batchpid.sim.engine.mujoco.model_builder import (
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.robot_model import description_tree, passive_force, turned_back
+from batchpid.sim.engine.robot_model import description_tree, passive_force
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import CONTACT_FRICTION
-from batchpid.task_space.frames import inverse, matrix_of
+from batchpid.task_space.frames import matrix_of, rotate, unrotate
 from batchpid.task_space.rigid_tree import RigidTree
 
 _KEPT = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
@@ -77,7 +76,7 @@ class MujocoPack(ModelPack):
             self._constraint.implicit[...] = spec.timestep * (0.0 if viscous is None else viscous)
             if self.steps_natively:
                 reads = spec.fixed_base and self.steps_read_force(True, True)
-                self._constraint.use(self._joint_model, None if reads else self._bias_model)
+                self._constraint.use(self.joint_model, None if reads else self._bias_model)
         if spec.mjcf is not None:
             links = *(spec.contacts or ()), *(spec.wrenches or ()), spec.carrier
             check_links(spec, spec.mjcf, filter(None, links))
@@ -94,7 +93,7 @@ class MujocoPack(ModelPack):
         self._sensors = MujocoLinkSensors(self.spec, robot.model, robot.bodies)
         self._sensed = np.zeros((self.size, self._sensors.size))
         self.models, self.rows = [self._pool.model] * self.size, self._pool.initial(self.size)
-        self._at, self._moves = _columns(robot.qpos), _columns(robot.qvel)
+        self._at, self._moves = robot.qpos, robot.qvel
         self._change_world(range(self.size))
         self._change_masses(range(self.size))
         self._update(range(self.size))
@@ -192,13 +191,13 @@ class MujocoPack(ModelPack):
         gravity: bool,
         coriolis: bool,
         velocities: bool,
-        speed_limit: NDArray[np.float64] | None,
+        speed_limit: Float64 | None,
         drives: bool = False,
     ) -> MujocoStep:
         return self._make_step(gravity and coriolis, speed_limit, drives)
 
     def _make_step(
-        self, reads_force: bool, speed_limit: NDArray[np.float64] | None, drives: bool = False
+        self, reads_force: bool, speed_limit: Float64 | None, drives: bool = False
     ) -> MujocoStep:
         arrays = {"qf": self.qf, "sensed": self._sensed}
         if drives:
@@ -232,9 +231,8 @@ class MujocoPack(ModelPack):
 
     def read_base(self) -> Float64:
         rows = self._bases()
-        rows[:, 10:] = turned_back(
-            inverse(rows[:, 3:7]), rows[:, 10:]
-        )  # MuJoCo's are in the body's axes
+        # MuJoCo's angular velocities are in the body's axes.
+        rows[:, 10:] = rotate(matrix_of(rows[:, 3:7]), rows[:, 10:])
         return rows
 
     def _bases(self) -> Float64:
@@ -247,7 +245,7 @@ class MujocoPack(ModelPack):
             [np.concatenate([data.qpos[parts[0]], data.qvel[parts[1]]]) for data in self.data]
         )
 
-    def strays(self) -> NDArray[np.bool_]:
+    def strays(self) -> Bool:
         """Return the robots (M,) whose base, or an object of the file, is beyond FARTHEST or not
         finite.
         """
@@ -267,7 +265,8 @@ class MujocoPack(ModelPack):
         if self.spec.fixed_base:
             return None
         rows = self._bases()
-        return np.hstack([turned_back(rows[:, 3:7], np.array(self.spec.gravity)), rows[:, 10:]])
+        gravity = unrotate(matrix_of(rows[:, 3:7]), np.array(self.spec.gravity))
+        return np.hstack([gravity, rows[:, 10:]])
 
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         data = self.data
@@ -308,7 +307,7 @@ class MujocoPack(ModelPack):
         self._evaluate(rows)
         self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
-    def suspend(self, mask: NDArray[np.bool_]) -> None:
+    def suspend(self, mask: Bool) -> None:
         """Leave the robots of ``mask`` (M,) where they are, and step the others."""
         self._suspended[...] = mask
 
@@ -477,10 +476,3 @@ class MujocoPack(ModelPack):
 
 
 _ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
-
-
-def _columns(indices: NDArray[np.intp]) -> Any:
-    """Return ``indices`` as a slice where they are consecutive, which NumPy reads faster."""
-    if (np.diff(indices) == 1).all():
-        return slice(int(indices[0]), int(indices[-1]) + 1)
-    return indices

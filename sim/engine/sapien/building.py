@@ -12,7 +12,6 @@ from threading import RLock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
@@ -184,7 +183,7 @@ def engine_settings(spec: SceneSpec) -> Iterator[None]:
             )
 
 
-def new_system(spec: SceneSpec, gravity: NDArray[np.float64] | None = None) -> Any:
+def new_system(spec: SceneSpec, gravity: Float64 | None = None) -> Any:
     """Return a new PhysX system, which has the solver and time step of ``spec``, and its or another
     gravity (3,).
     """
