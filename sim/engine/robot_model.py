@@ -38,11 +38,11 @@ def passive_force(
         turning = base[:, 3:]
         bodies = tree.bodies._replace(gravity=base[:, None, :3])
     force = zero
-    if coriolis or (gravity and tree.fixed_base):
+    if coriolis or gravity:
         force = ts.bias(
             tree, qpos, qvel if coriolis else zero, turning if coriolis else None, bodies=bodies
         )
-    if coriolis and not gravity and tree.fixed_base:
+    if coriolis and not gravity:
         force = force - ts.bias(tree, qpos, zero, bodies=bodies)
     return np.asarray(force, np.float64)
 

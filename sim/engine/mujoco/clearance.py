@@ -44,12 +44,13 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
     """Return the tables of shapes and pairs for ``Clearance`` in ``clearance.h``, the same for
     every robot.
 
-    None if there are no proofs: no shapes can touch, or the fields to change are not found in this
-    version of MuJoCo.
+    None if there are no proofs: the model is a file's, no shapes can touch, or the fields to change
+    are not found in this version of MuJoCo.
     """
     model = robot.model
     pairs = touching_pairs(model)
-    if not len(pairs) or places() is None:
+    # Models of files, which have frames, can hold any element.
+    if robot.frames or not len(pairs) or places() is None:
         return None
     bodies = model.geom_bodyid[pairs]
     arms, travel = _arms(robot, bodies)

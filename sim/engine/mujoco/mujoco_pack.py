@@ -202,29 +202,24 @@ class MujocoPack(ModelPack):
         arrays = {"qf": self.qf, "sensed": self._sensed}
         if drives:
             arrays |= {"stiffness": self._stiffness, "rate_gain": self._rate_gain}
-        if self._constraint is None:
-            constraint = None
-        else:
-            constraint = self._constraint.address
+        constraint = None if self._constraint is None else self._constraint.address
         return MujocoStep(
             self, self._robot, reads_force, speed_limit, arrays, self._suspended, constraint
         )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
-        if self._constraint is not None:
-            if (
-                self.spec.fixed_base
-            ):  # the bias is the passive force, with the bits that native steps read
-                bias = self.passive_force(True, True)
+        if self._constraint is None:
+            return
+        if self.spec.fixed_base:
+            # The bias is the passive force, with the bits that native steps read.
+            bias = self.passive_force(True, True)
+        else:
+            state = self.read_qpos(), self.read_qvel(), True, True, self.read_base_motion()
+            if self.steps_natively:
+                bias = self._bias_model.passive_force(*state)
             else:
-                state = self.read_qpos(), self.read_qvel(), True, True, self.read_base_motion()
-                natively = self.steps_natively
-                model = self._bias_model
-                if natively:
-                    bias = model.passive_force(*state)
-                else:
-                    bias = passive_force(self.rigid_tree, *state)
-            self._constraint.update(self.joint_mass_matrix, self.read_qpos(), bias, rows)
+                bias = passive_force(self.rigid_tree, *state)
+        self._constraint.update(self.joint_mass_matrix, self.read_qpos(), bias, rows)
 
     # -- changes
     # ----------------------------------------------------------------------------------------------
@@ -254,10 +249,7 @@ class MujocoPack(ModelPack):
         return ~np.array([np.abs(data.qpos).max() <= FARTHEST for data in self.data])
 
     def take_sensed(self) -> dict[str, Float64]:
-        if self._sensors.size:
-            sums = self._sensors.quantities(self._sensed)
-        else:
-            sums = {}
+        sums = self._sensors.quantities(self._sensed)
         self._sensed[...] = 0.0
         return sums
 
@@ -274,6 +266,7 @@ class MujocoPack(ModelPack):
         _, at = self._robot.base or (0, 0)
         for row, twist, turn in zip(rows, twists, turns, strict=True):
             data[row].qvel[at : at + 3] += twist[:3]
+            # MuJoCo's angular velocities are in the body's axes.
             data[row].qvel[at + 3 : at + FLOATING] += turn.T @ twist[3:]
         self._evaluate(rows)
 
@@ -285,14 +278,13 @@ class MujocoPack(ModelPack):
         """
         everyone = self.data
         floats = self._robot.base is not None
-        if base is None:
-            bases = np.tile(_ORIGIN, (len(rows), 1))
-        else:
-            bases = base.copy()
+        bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else base.copy()
         at, moves = self._robot.base or (0, 0)
+        # MuJoCo's angular velocities are in the body's axes.
         bases[:, 10:] = np.einsum("eji,ej->ei", matrix_of(bases[:, 3:7]), bases[:, 10:])
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
             data = everyone[row]
+            # Everything else of the scene returns to its start, but drives keep their targets.
             ctrl = data.ctrl.copy()
             rest(self.models[row], data)
             if floats:
@@ -323,6 +315,7 @@ class MujocoPack(ModelPack):
                 if not np.array_equal(
                     getattr(self.models[row], name)[self._robot.qvel], table[row]
                 ):
+                    # A copy only where it differs: a model takes much memory.
                     model = self._own_model(row)
                     getattr(model, name)[self._robot.qvel] = table[row]
                     mujoco.mj_setConst(model, self._scratch)

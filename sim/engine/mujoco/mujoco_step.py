@@ -121,7 +121,7 @@ class MujocoStep(NativeStep):
         robots.sensor_size = arrays["sensed"].shape[1]
         robots.base_qpos, robots.base_qvel = robot.base or (0, 0)
         clearance = None
-        shapes = None if robot.is_file else shape_tables(robot)
+        shapes = shape_tables(robot)
         if shapes is not None:
             clearance = GroupClearance(shapes, kinematics, pack.models, data, dof)
             robots.clearance = clearance.address

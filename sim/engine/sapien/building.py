@@ -183,13 +183,9 @@ def engine_settings(spec: SceneSpec) -> Iterator[None]:
             )
 
 
-def new_system(spec: SceneSpec, gravity: Float64 | None = None) -> Any:
-    """Return a new PhysX system, which has the solver and time step of ``spec``, and its or another
-    gravity (3,).
-    """
-    with engine_settings(
-        spec if gravity is None else replace(spec, gravity=tuple(gravity.tolist()))
-    ):
+def new_system(spec: SceneSpec) -> Any:
+    """Return a new PhysX system with the solver, time step and gravity of ``spec``."""
+    with engine_settings(spec):
         system = physx.PhysxCpuSystem()
     system.timestep = spec.timestep
     return system

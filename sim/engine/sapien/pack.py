@@ -13,6 +13,7 @@ that is the whole interface between loop and engine.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -117,8 +118,11 @@ class Pack(ModelPack):
 
     def _system(self, row: int) -> Any:
         """Return a new system for ``row``."""
+        spec = self.spec
         gravity = self._variation.gravity
-        return new_system(self.spec, None if gravity is None else gravity[row])
+        if gravity is not None:
+            spec = replace(spec, gravity=tuple(gravity[row].tolist()))
+        return new_system(spec)
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
         """Return a new scene in ``system`` and the robot in it, for ``row``, with its masses and
@@ -247,8 +251,6 @@ class Pack(ModelPack):
 
     def strays(self) -> Bool:
         """Return the robots (M,) whose floating base is not finite or beyond FARTHEST."""
-        if self.spec.fixed_base:
-            return np.zeros(self.size, bool)
         return np.array(~(np.abs(self.read_base()) <= FARTHEST).all(1))
 
     def read_base(self) -> Float64:
