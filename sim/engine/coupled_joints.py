@@ -134,6 +134,7 @@ class ConstraintEfforts:
 
         ``mass_matrix`` is a function of positions; native code does not need it.
         """
+        # Native code has the mass matrices of its own model.
         if self._model is not None:
             mask = np.zeros(len(qpos), bool)
             mask[rows] = True
@@ -150,6 +151,7 @@ class ConstraintEfforts:
             response,
             np.where(sound[:, 0], passive[rows], 0.0),
         )
+        # Once for all sim steps until the next update: each then takes two small products.
         self._push[rows] = jacobian.T @ np.linalg.inv(response @ jacobian.T)
 
     def place(self, rows: Sequence[int], qpos: Rows) -> None:
@@ -160,6 +162,7 @@ class ConstraintEfforts:
         """Return ``effort`` with the constraint efforts added."""
         coupling = self._coupling
         followers = self._followers
+        # Of all positions that differ by whole jumps, that nearest to the last one.
         self.unwrapped[...] = np.where(
             self.wraps, qpos + WRAP * np.rint((self.unwrapped - qpos) / WRAP), qpos
         )

@@ -364,6 +364,7 @@ def load_engine(name: str = "sapien") -> Engine:
     MissingDependencyError
         MuJoCo is too old.
     """
+    # Engines are imported at their first use: one of them need not be installed.
     module = MODULES[choice("engine", name, MODULES)]
     if name == "mujoco" and module not in modules:
         _require_mujoco()
@@ -376,6 +377,7 @@ def load_engine(name: str = "sapien") -> Engine:
 
 def _require_mujoco() -> None:
     try:
+        # A module that came with the oldest version that has all that is used here.
         import_module("mujoco.batch")
     except ImportError as error:
         raise MissingDependencyError("mujoco>=3.17", "the engine 'mujoco'") from error

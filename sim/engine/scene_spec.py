@@ -144,6 +144,7 @@ class VariedMasses:
             column = part.column
             share = 1.0
             if variation.link_mass is not None and column is not None:
+                # The inertia tensor grows with the mass, as of the same body of another density.
                 share = float(np.nan_to_num(variation.link_mass[row, column], nan=1.0))
             if variation.center_of_mass is not None and column is not None:
                 displacement = variation.center_of_mass[row, 3 * column : 3 * column + 3]
@@ -189,5 +190,6 @@ def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
     if static is not None and own.coulomb is not None:
         static = static + own.coulomb
     if coulomb is None and (rubs := Friction(None, None, static, load=load).most) is not None:
+        # Friction of the other kinds alone still needs an array of Coulomb friction.
         coulomb = np.zeros_like(rubs)
     return Friction(coulomb, viscous, static, added.stribeck, load)

@@ -70,12 +70,14 @@ class DataPool:
         kept in its rows.
         """
         if self._user is not user:
+            # The states of the pack that used the memory before are read out first.
             if self._user is not None:
                 for model, data, row in zip(
                     self._user.models, self._taken, self._user.rows, strict=True
                 ):
                     mujoco.mj_getState(model, data, row, STATE)
             self._user, self._taken = user, self._new(len(user.rows))
+            # MuJoCo warns of states that are not finite, and the loop finds them by itself.
             sound = np.all(
                 np.abs(user.rows[:, POSITIONS : POSITIONS + self.robot.model.nq]) <= FARTHEST,
                 axis=1,

@@ -111,7 +111,7 @@ def to_mjcf(
         motors.effort_range,
     )
     try:
-        # MjSpec has no actuators of the kind <pid>, so they are added to the text.
+        # Actuators are added to the text, which then has all their digits.
         scene.compile()
         root = _exact(scene)
         section = etree.SubElement(root, "actuator")
@@ -139,7 +139,6 @@ def _set_inertia(body: Any, inertia: SpatialInertia, link: str, drive: Drive) ->
     """Set the inertia of a body: the nearest of a physical body, which MuJoCo requires."""
     low, middle, high = np.linalg.eigvalsh(inertia.tensor)
     if low <= 0 or low + middle < high:
-        # A little more than the smallest, since rounding of the principal moments may take it away.
         inertia = inertia._replace(tensor=nearest_physical(inertia.tensor * (1 + 1e-9)))
         drive.append(f"inertia: of the body that is nearest to link {link!r}, which no body has")
     body.inertia, body.iquat = principal_inertia(inertia)

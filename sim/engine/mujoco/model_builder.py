@@ -277,6 +277,7 @@ def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
     for first, second in combinations(solid, 2):
         pairs = [frozenset(pair) in ignored for pair in product(owners[first], owners[second])]
         if any(pairs) and not all(pairs):
+            # MuJoCo excludes whole bodies, so these get one for each link with shapes.
             split |= {first, second}
     bodies = {owner: names[link] for link in solid for owner in owners[link]}
     taken = {"world", *names.values()}
@@ -307,6 +308,7 @@ def _add_drives(scene: MjSpec, spec: SceneSpec) -> None:
             name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        # The limit of the drive replaces this one later.
         actuator.forcelimited = True
         actuator.forcerange = [-LARGEST_FORCE, LARGEST_FORCE]
 

@@ -279,6 +279,7 @@ def rounded_tree(spec: SceneSpec) -> RigidTree:
         row = Body(body.name, None, mass=link.mass, center=np.asarray(place.p, float))
         row = row._replace(inertia=axes @ moments @ axes.T)
         if body.joint is not None:
+            # SAPIEN's joint has a frame in the parent and one in the child: the link between has the first.
             above = f"{body.name} (joint)"
             moving = replace(body.joint, axis=(1.0, 0.0, 0.0))
             rows.append(_placed(Body(above, moving), link.joint.pose_in_parent))

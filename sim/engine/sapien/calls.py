@@ -104,6 +104,7 @@ class NativeCalls:
         ]
         self._native = extension("_gateway")
         self.gateway = self._native.gateway(functions(), *pointers, qf.shape[1])
+        # The pack's own arrays, which native code reads at each call.
         self.qf, self.skip = qf, skip
 
     def qpos(self, dtype: DType) -> Rows:
@@ -240,6 +241,7 @@ class SapienStep(NativeStep):
         return super().prepare()
 
     def may_have_failed(self, status: int) -> bool:
+        # A return to Python for the sensors is no failure.
         failed = super().may_have_failed(status & ~_SENSE)
         if self._sense is not None:
             self._sense()

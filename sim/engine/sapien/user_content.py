@@ -142,6 +142,7 @@ class SceneContent:
     def __init__(
         self, spec: SceneSpec, build: Build, scene: SapienScene, env: int, links: Frames
     ) -> None:
+        # What exists now is the robot and the ground; the rest is the user's.
         before = {entity.per_scene_id for entity in scene.entities}  # the robot and the ground
         self.watched = _call(build, scene, env, links)
         if not spec.collisions:
@@ -206,6 +207,7 @@ class SceneContent:
             entity.set_pose(sapien.Pose(take(3), take(4)))
             linear = take(3)
             angular = take(3)
+            # PhysX refuses velocities of kinematic bodies.
             if not body.kinematic:
                 body.set_linear_velocity(linear)
                 body.set_angular_velocity(angular)
