@@ -34,8 +34,7 @@ class ModelPack(SingleOwner):
     selects native code.
     """
 
-    _tree: RigidTree
-    """Rigid tree of the model, with a fixed or floating base."""
+    rigid_tree: RigidTree
 
     def __init__(
         self,
@@ -68,7 +67,7 @@ class ModelPack(SingleOwner):
 
     @cached_property
     def _joint_model(self) -> NativeModel:
-        model = NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
+        model = NativeModel(self, "fixed" if self.spec.fixed_base else "free")
         if self._masses.added:
             model.vary(range(self.size), self.size, self._masses.added)
         return model
@@ -81,7 +80,7 @@ class ModelPack(SingleOwner):
 
     @cached_property
     def _force_model(self) -> NativeModel:
-        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "held")
+        return NativeModel(self, "fixed" if self.spec.fixed_base else "held")
 
     def joint_mass_matrix(self, qpos: Rows) -> Float64:
         """Return the mass matrices of the joints at ``qpos`` (M, dof, dof) [kg m^2 or kg]; a
@@ -90,11 +89,13 @@ class ModelPack(SingleOwner):
         if self.steps_natively:
             return self._joint_model.mass_matrix(qpos)
         added = self._masses.added
-        return ts.mass_matrix(self._tree, qpos, self._tree.varied(added) if added else None)
+        return ts.mass_matrix(
+            self.rigid_tree, qpos, self.rigid_tree.varied(added) if added else None
+        )
 
     @cached_property
     def _passive_force(self) -> Callable[..., Float64]:
-        return passive_force_of(self.spec, self.steps_natively)
+        return passive_force_of(self, self.steps_natively)
 
     def _change(self, rows: Sequence[int], variation: Variation) -> None:
         """Set the differences of the robots ``rows`` from the model, in the fields that vary."""

@@ -77,6 +77,10 @@ class EnginePack(Protocol):
     friction: Friction
     armature: Float64
 
+    @property
+    def rigid_tree(self) -> RigidTree:
+        """Tree of the robots of ``spec`` as the engine has them, all joints independent."""
+
     def read_qpos(self, dtype: DType = np.float64) -> Rows:
         """Return the joint positions [rad or m]."""
 
@@ -297,7 +301,7 @@ class CompiledPack(EnginePack, Protocol):
 
 @dataclass
 class Engine:
-    """Physics engine: it makes packs, and the rigid trees of its robots."""
+    """Physics engine: it makes packs of robots."""
 
     name: str
     """Value of the option ``engine``."""
@@ -321,8 +325,6 @@ class Engine:
     allocates its memory. Raises RobotError if the engine cannot build the robot, and
     InvalidArgumentError if the function ``build`` of the spec is wrong.
     """
-    scene_tree: Callable[[SceneSpec], RigidTree]
-    """Rigid tree of the robot of a spec as the engine has it: the same object for equal specs."""
     native_obstacle: Callable[[], str]
     """Reason for which native code cannot call the engine, in a sentence; "" if it can."""
 

@@ -11,7 +11,6 @@ import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.contacts import Contacts
 from batchpid.sim.robot.simulated_links import rigid_tree
@@ -73,10 +72,3 @@ def contacts_of(spec: SceneSpec, ground: bool) -> Contacts:
     """
     ignored = {frozenset(pair) for pair in spec.ignored}
     return Contacts(description_tree(spec), spec.simulated.shapes, ignored, ground)
-
-
-def scene_tree(spec: SceneSpec) -> RigidTree:
-    """Return the rigid tree of the robot of ``spec`` as its engine simulates it, the same object
-    for equal specs.
-    """
-    return load_engine(spec.engine).scene_tree(spec)

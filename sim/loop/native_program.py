@@ -22,7 +22,6 @@ from batchpid.native.tracing import Trace, trace
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
 from batchpid.sim.engine.protocol import CompiledPack
-from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
 from batchpid.sim.loop.control_step import COUPLING_STEPS, STAGES, SimStage
 from batchpid.sim.loop.step_setup import Setup, moves_drives
@@ -269,7 +268,7 @@ class TickProgram:
 
     def _add_mass_matrix(self, values: Values) -> Values:
         _, pack, _, constants, _ = self._setup
-        tree, bodies = scene_tree(pack.spec).tables
+        tree, bodies = pack.rigid_tree.tables
         self._place(pose=values.seen.qpos, rate=values.seen.qvel, tree=tree, bodies=bodies)
         self._place(matrix=self._buffers.state.matrix, armature=constants.armature)
         self._place(damping=constants.damping, **constants.coupling.native())

@@ -18,7 +18,6 @@ from batchpid.arrays.array_types import Array, Float64, Pytree, Rows
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine.native import xla
-from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import sim_step, uses_mass_matrix
 from batchpid.sim.loop.custom import controller_errors
@@ -93,7 +92,7 @@ class XLAExecutor:
         with own_settings("float64"):
             self._constants = put(arrays)
             if uses_bodies:
-                self._bodies = put(scene_tree(pack.spec).tables)
+                self._bodies = put(pack.rigid_tree.tables)
             else:
                 self._bodies = None
         self.write_state(state)

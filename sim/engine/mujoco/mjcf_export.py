@@ -216,6 +216,9 @@ def _exact(scene: MjSpec) -> Any:
         _write(element.find("inertial"), figures)
     for element in root.iterfind("worldbody//joint[@name]"):
         joint = scene.joint(element.get("name"))
+        if joint.actfrclimited:
+            # MuJoCo leaves out a range that is nearly 0, and then refuses to read the joint.
+            element.set("actuatorfrcrange", "0 0")
         fields = ("axis", "range", "actuatorfrcrange", "armature", "damping", "frictionloss")
         _write(
             element,

@@ -31,7 +31,7 @@ from batchpid.sim.engine.mujoco.model_builder import (
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_back
+from batchpid.sim.engine.robot_model import description_tree, passive_force, turned_back
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import CONTACT_FRICTION
@@ -139,13 +139,13 @@ class MujocoPack(ModelPack):
         return self._passive_force(*state).astype(dtype)
 
     @cached_property
-    def _tree(self) -> RigidTree:  # type: ignore[override]
-        return scene_tree(self.spec)
+    def rigid_tree(self) -> RigidTree:  # type: ignore[override]
+        return description_tree(self.spec)
 
     @cached_property
     def _bias_model(self) -> NativeModel:
         """Model of the forces in the equations of motion of the joints, for constraint efforts."""
-        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
+        return NativeModel(self, "fixed" if self.spec.fixed_base else "free")
 
     # -- stepping
     # ----------------------------------------------------------------------------------------------
@@ -224,7 +224,7 @@ class MujocoPack(ModelPack):
                 if natively:
                     bias = model.passive_force(*state)
                 else:
-                    bias = passive_force(self._tree, *state)
+                    bias = passive_force(self.rigid_tree, *state)
             self._constraint.update(self.joint_mass_matrix, self.read_qpos(), bias, rows)
 
     # -- changes

@@ -266,7 +266,7 @@ def link_frames(spec: SceneSpec, robot: Any) -> Frames:
 
 
 @lru_cache(maxsize=8)
-def scene_tree(spec: SceneSpec) -> RigidTree:
+def rounded_tree(spec: SceneSpec) -> RigidTree:
     """Return the tree of the robot of ``spec`` as PhysX rounds it, all joints independent, the same
     object for equal specs.
 

@@ -18,7 +18,7 @@ from batchpid.arrays.array_types import Float32, Float64
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 
-class LinkSensors:
+class SapienLinkSensors:
     """Sums of the sensors of ``spec`` over sim steps. ``robots`` and ``systems`` are a pack's own
     lists.
     """

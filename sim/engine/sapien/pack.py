@@ -33,11 +33,11 @@ from batchpid.sim.engine.sapien.building import (
     engine_settings,
     link_frames,
     new_system,
-    scene_tree,
+    rounded_tree,
     set_inertia,
 )
 from batchpid.sim.engine.sapien.calls import EngineCalls, SapienStep, engine_calls
-from batchpid.sim.engine.sapien.link_sensors import LinkSensors
+from batchpid.sim.engine.sapien.link_sensors import SapienLinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
@@ -109,7 +109,9 @@ class Pack(ModelPack):
             if self.steps_natively:
                 self._constraint.use(self._joint_model, None)
         self._sensors = (
-            LinkSensors(spec, self.robots, self.systems) if spec.contacts or spec.wrenches else None
+            SapienLinkSensors(spec, self.robots, self.systems)
+            if spec.contacts or spec.wrenches
+            else None
         )
         self._bind()
         if variation is not None:
@@ -187,8 +189,8 @@ class Pack(ModelPack):
             )
 
     @cached_property
-    def _tree(self) -> RigidTree:  # type: ignore[override]
-        return scene_tree(self.spec)
+    def rigid_tree(self) -> RigidTree:  # type: ignore[override]
+        return rounded_tree(self.spec)
 
     def _renew(self, rows: Sequence[int]) -> None:
         """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence

@@ -72,6 +72,7 @@ class DoubleIntegrators:
         self.spec, self.size, self.first_env, self.dof = spec, size, first_env, len(spec.joints)
         self.qf = np.zeros((size, self.dof))
         self.friction, self.armature = Friction(), np.zeros((1, self.dof))
+        self.rigid_tree = sliders(spec)
         self._state, self._moves = np.zeros((2, size, self.dof)), np.ones((size, 1))
 
     def read_qpos(self, dtype=np.float64):
@@ -157,7 +158,6 @@ ENGINE = engines.Engine(
     physics={"accurate": Solver(1)},
     group_size=4,
     make_pack=lambda spec, size, first_env=0, **_: DoubleIntegrators(spec, size, first_env),
-    scene_tree=sliders,
     native_obstacle=lambda: "a toy",
 )
 
