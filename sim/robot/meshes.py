@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -23,6 +24,8 @@ from batchpid.sim.robot.xml import LARGEST, LFS_POINTER, parse_bytes
 
 FORMATS = (".stl", ".obj", ".dae", ".glb")
 SIZE_LIMIT = 2**27  # bytes of a mesh file
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attributes", "<u2")])
+"""Row of a binary STL."""
 LFS_PROBLEM = "a git-lfs pointer instead of the mesh: run git lfs pull"
 
 
@@ -40,15 +43,13 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
         r"^(file:/*)?\$\(find ([^)]+)\)", r"package://\2", name.strip().replace("\\", "/")
     )  # xacro, Windows
     spellings = dict.fromkeys([name, unquote(name)])
-    places = [
-        os.path.splitext(place)
-        for spelling in spellings
-        for place in _candidates(spelling, path, package_dirs)
-    ]
+    # The places are a generator: nearly every mesh is at the first one.
     for change in (str, str.lower, str.upper, str.title):
-        for stem, suffix in places:
-            if os.path.isfile(file := stem + change(suffix)):
-                return Path(file).absolute()
+        for spelling in spellings:
+            for place in _candidates(spelling, path, package_dirs):
+                stem, suffix = os.path.splitext(place)
+                if os.path.isfile(file := stem + change(suffix)):
+                    return Path(file).absolute()
     return None
 
 
@@ -88,7 +89,8 @@ def read_mesh(path: str | Path) -> Any:
     """Return the result of ``trimesh`` for a mesh file, in metres. Raises errors of many types."""
     from trimesh import load
 
-    mesh: Any = load(path, force="mesh", process=False)
+    # Materials are textures to decode, of which nothing here needs any.
+    mesh: Any = load(path, force="mesh", process=False, skip_materials=True)
     factor, _, unit = str(mesh.metadata.get("units", "")).partition(
         " * "
     )  # of COLLADA: "0.01 * meters"
@@ -99,6 +101,18 @@ def read_mesh(path: str | Path) -> Any:
 
 def mesh_problem(path: Path) -> str | None:
     """Return the reason for which a mesh file cannot be used, or None."""
+    try:
+        status = path.stat()
+    except OSError as error:
+        return str(error)
+    return _problem(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=4096)
+def _problem(path: Path, changed: int, size: int) -> str | None:
+    """Return :func:`mesh_problem`. Robots of a family share meshes, and most are loaded again: a
+    file is read once until it changes.
+    """
     if path.suffix.lower() not in FORMATS:
         return f"format not among {', '.join(FORMATS)}"
     try:
@@ -112,8 +126,14 @@ def mesh_problem(path: Path) -> str | None:
             return LFS_PROBLEM
         if path.suffix.lower() == ".dae" and not _has_its_numbers(data):
             return "arrays of other lengths than it says"
-        mesh = read_mesh(path)
-        corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+        if path.suffix.lower() == ".stl" and len(data) == 84 + _TRIANGLE.itemsize * int.from_bytes(
+            data[80:84], "little"
+        ):
+            # Most meshes of robots are such rows, which take a tenth of trimesh's time.
+            corners = np.frombuffer(data, _TRIANGLE, offset=84)["corners"]
+        else:
+            mesh = read_mesh(path)
+            corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
     except Exception as error:
         return str(error) or type(error).__name__
     if not len(corners):

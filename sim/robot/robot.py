@@ -71,7 +71,7 @@ class Robot(RobotDescription):
         fixed_base
             True to fix the root link to the world. Default True, unless the file has a floating
             base: the root of an MJCF file has a free joint, or the root of a URDF is a link without
-            mass and shapes and its only joint is floating or planar: then the root is that joint's
+            mass and shapes and its only joint is floating: then the root is that joint's
             child.
         self_collision
             ``"auto"``: links that are neighbours, or touch or overlap at the start pose or in

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -68,10 +67,8 @@ def read_urdf(
     base = None
     if fixed_base is None:
         fixed_base = free_joint is None
-    else:
-        fixed_base = fixed_base
     if free_joint is not None and not fixed_base:
-        base = free_base(root, free_joint, findings)
+        base = free_base(root, free_joint)
     _repair(root, path, findings, package_dirs, missing_meshes)
     added = [str(finding.link) for finding in findings if finding.code == "missing-link"]
     tables = _read_tables(root, path, added)
@@ -122,14 +119,13 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
     names and why.
     """
     missing = []
-    check = cache(mesh_problem)
     for collision in root.findall("link/collision"):
         mesh = collision.find("geometry/mesh")
         if mesh is None:
             continue
         name = mesh.get("filename", "")
         found = find_mesh(name, path, package_dirs)
-        problem = None if found is None else check(found)
+        problem = None if found is None else mesh_problem(found)
         if found is None or problem is not None:
             missing.append(name if problem is None else f"{name} ({problem})")
             collision.getparent().remove(collision)
