@@ -54,7 +54,7 @@ class MissedContacts:
         self._centers = np.zeros((size, tree.dof))
         self._margins = np.zeros((size, len(first)))
 
-    def place(self, mask: Bool) -> None:
+    def place(self, mask: NDArray[np.bool_]) -> None:
         """Forget the distances of the robots of ``mask`` (size,), which are now in other states."""
         self._margins[mask] = 0.0
 

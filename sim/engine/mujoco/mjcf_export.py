@@ -185,11 +185,11 @@ def _start(model: MjModel, robot: RobotDescription, motors: MjcfActuators) -> di
         qpos[:7] = base_start(robot, robot.start, robot.has_ground)
     for at, name in enumerate(robot.joint_names):
         qpos[model.joint(name).qposadr] = robot.start[at]
-    for actuator, at in enumerate(np.flatnonzero(robot.independent)):
+    for actuator, joint in enumerate(np.flatnonzero(robot.independent)):
         if motors.is_law:
-            ctrl[model.actuator_ctrladr[actuator]] = robot.start[at]
-        if motors.has_rate[at]:  # the setpoint is the first of the states
-            act[model.actuator_actadr[actuator]] = robot.start[at]
+            ctrl[model.actuator_ctrladr[actuator]] = robot.start[joint]
+        if motors.has_rate[joint]:  # the setpoint is the first of the states
+            act[model.actuator_actadr[actuator]] = robot.start[joint]
     columns = {"qpos": qpos, "ctrl": ctrl, "act": act}
     return {"name": "home"} | {key: numbers_text(*row) for key, row in columns.items() if row.any()}
 
