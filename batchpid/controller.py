@@ -14,6 +14,7 @@ from batchpid.backends import JAXBackend, NumPyBackend, declined
 from batchpid.checks.validate import (
     choice,
     env_mask,
+    flag,
     instance,
     integer,
     names,
@@ -78,13 +79,10 @@ class BatchPID:
     ) -> None:
         self._backend, self._dt = choice("backend", backend, BACKENDS), time_step("dt", dt)
         self._shape = (integer("num_envs", num_envs, 1, MOST_ENVS), _checked(params).num_joints)
-        if joint_names is None:
-            self._names = None
-        else:
+        self._names: list[str] | None = None
+        if joint_names is not None:
             self._names = names("joint_names", joint_names, self.num_joints)
-        if threads is None:
-            threads = None
-        else:
+        if threads is not None:
             threads = integer("threads", threads, 1, MOST_THREADS)
         self._engine = BACKENDS[self._backend](self._dt, terms, threads)
         self._state: PIDState | None = None
@@ -234,10 +232,9 @@ class BatchPID:
             mask = np.ones(self.num_envs, bool)
         else:
             mask = env_mask("mask", mask, self.num_envs)
+        is_kept = flag("keep_integral", keep_integral)
         self._fast = declined
-        self._state = self._engine.call(
-            pid.reset, self._started(y), y, mask, keep_integral=bool(keep_integral)
-        )
+        self._state = self._engine.call(pid.reset, self._started(y), y, mask, keep_integral=is_kept)
 
     def track(
         self,

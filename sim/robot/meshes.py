@@ -16,12 +16,11 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-from lxml import etree
 
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
 from batchpid.sim.robot.tables import Shape
-from batchpid.sim.robot.xml import LARGEST, LFS_POINTER
+from batchpid.sim.robot.xml import LARGEST, LFS_POINTER, parse_bytes
 
 FORMATS = (".stl", ".obj", ".dae", ".glb")
 SIZE_LIMIT = 2**27  # bytes of a mesh file
@@ -148,9 +147,8 @@ def _has_its_numbers(data: bytes) -> bool:
     """Return whether the arrays of a COLLADA file are as long as it says: SAPIEN reads beyond them
     otherwise.
     """
-    root = etree.fromstring(
-        data, etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
-    )
+    # The arrays of a mesh are longer than the texts that libxml2 accepts by itself.
+    root = parse_bytes(data, huge_tree=True)
     sizes = {}
     for array in root.iter("{*}float_array"):
         sizes["#" + array.get("id", "")] = size = len((array.text or "").split())

@@ -80,9 +80,14 @@ def _drop_default_namespace(root: etree._Element) -> None:
         etree.cleanup_namespaces(root)
 
 
+def parse_bytes(data: bytes, **options: bool) -> etree._Element:
+    """Return the root element of untrusted XML; ``options`` are more of those of lxml's parser."""
+    safe = {"resolve_entities": False, "no_network": True, "load_dtd": False}
+    return etree.fromstring(data, etree.XMLParser(**safe, **options))
+
+
 def _parse(data: bytes) -> etree._Element:
-    options = {"resolve_entities": False, "no_network": True, "load_dtd": False}
-    return etree.fromstring(data, etree.XMLParser(**options, remove_comments=True, remove_pis=True))
+    return parse_bytes(data, remove_comments=True, remove_pis=True)
 
 
 def _lenient(data: bytes) -> etree._Element:
