@@ -68,9 +68,9 @@ class RobotDescription:
 
     ``tables`` are its bodies and shapes as in the file, after ``repairs``. ``joints`` are the
     degrees of freedom, the moving joints of ``all_joints``. ``settings`` come from a bundled robot,
-    ``defaults`` and ``mjcf`` from an MJCF file, else None. ``package_dirs`` are the folders in which meshes are looked up first.
-    ``actuators`` are its motors and sensors, None for ideal ones. ``base_start`` is the pose (7,)
-    at which the file places a floating base, None if it does not.
+    ``defaults`` and ``mjcf`` from an MJCF file, else None. ``package_dirs`` are the folders in
+    which meshes are looked up first. ``actuators`` are its motors and sensors, None for ideal ones.
+    ``base_start`` is the pose (7,) at which the file places a floating base, None if it does not.
     """
 
     name: str
