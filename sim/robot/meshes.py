@@ -74,7 +74,7 @@ def _ros_packages(package: str) -> Iterator[Path]:
     if not re.fullmatch(r"\w[\w.-]*", package):
         return
     prefixes, roots = (
-        [Path(each) for each in os.environ.get(variable, "").split(os.pathsep) if each]
+        [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
         for variable in ("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH")
     )
     yield from (prefix / "share" / package for prefix in prefixes)
@@ -180,7 +180,9 @@ def note_meshes(paths: Iterable[str]) -> None:
 
 def check_unchanged(path: Path) -> None:
     """Raise RobotError if a mesh file has changed since SAPIEN read it in this process."""
-    if (known := _in_use.get(str(path))) is not None and digest(path.read_bytes()) != known:
+    if (digest_in_use := _in_use.get(str(path))) is not None and digest(
+        path.read_bytes()
+    ) != digest_in_use:
         problem = (
             f"{path}: has changed since this process simulated it, and SAPIEN keeps the mesh that"
             " it read first"

@@ -69,10 +69,14 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
 
 def _drop_default_namespace(root: etree._Element) -> None:
     """Take elements out of a default namespace, which readers of robots ignore."""
-    found = [each for each in root.iter("{*}*") if each.prefix is None and each.tag.startswith("{")]
-    for element in found:
+    elements = [
+        element
+        for element in root.iter("{*}*")
+        if element.prefix is None and element.tag.startswith("{")
+    ]
+    for element in elements:
         element.tag = etree.QName(element).localname
-    if found:
+    if elements:
         etree.cleanup_namespaces(root)
 
 
@@ -149,10 +153,10 @@ def readable(
 ) -> tuple[float, ...] | None:
     """Return the numbers in an attribute, or None where :func:`numbers` raises."""
     if element is None:
-        given = default
+        text = default
     else:
-        given = element.get(key, default)
-    words = (given if given.strip() else default).split()
+        text = element.get(key, default)
+    words = (text if text.strip() else default).split()
     largest = LARGEST_LIMIT if limit else LARGEST
     try:
         values = tuple(float(word) for word in words if word.isascii() and "_" not in word)
