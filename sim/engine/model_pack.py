@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
@@ -50,7 +49,7 @@ class ModelPack(SingleOwner):
         self.steps_natively = natively
         self.dof, self._variation = len(spec.joints), variation or Variation()
         self._masses = VariedMasses(spec, size, self._variation)
-        self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
+        self._suspended: Bool = np.zeros(size, bool)
         self.friction = own_friction(spec, self._variation)
         armature = self._variation.armature  # vary() changes its rows
         self.armature = self._motors = np.zeros((1, self.dof)) if armature is None else armature
@@ -61,25 +60,19 @@ class ModelPack(SingleOwner):
         """Whether the robots have the masses and the gravity of the model."""
         return not self._masses.added and self._variation.gravity is None
 
-    def joint_model(self) -> NativeModel:
-        """Return the native code's model for :meth:`joint_mass_matrix`."""
-        return self._joint_model
-
     @cached_property
-    def _joint_model(self) -> NativeModel:
+    def joint_model(self) -> NativeModel:
+        """Native model of :meth:`joint_mass_matrix`."""
         model = NativeModel(self, "fixed" if self.spec.fixed_base else "free")
         if self._masses.added:
             model.vary(range(self.size), self.size, self._masses.added)
         return model
 
-    def force_model(self) -> NativeModel:
-        """Return the native code's model of the passive force, for compiled steps that do not read
-        it in the engine.
-        """
-        return self._force_model
-
     @cached_property
-    def _force_model(self) -> NativeModel:
+    def force_model(self) -> NativeModel:
+        """Native model of the passive force, for compiled steps that do not read it in the
+        engine.
+        """
         return NativeModel(self, "fixed" if self.spec.fixed_base else "held")
 
     def joint_mass_matrix(self, qpos: Rows) -> Float64:
@@ -87,7 +80,7 @@ class ModelPack(SingleOwner):
         floating base yields.
         """
         if self.steps_natively:
-            return self._joint_model.mass_matrix(qpos)
+            return self.joint_model.mass_matrix(qpos)
         added = self._masses.added
         return ts.mass_matrix(
             self.rigid_tree, qpos, self.rigid_tree.varied(added) if added else None
@@ -105,8 +98,8 @@ class ModelPack(SingleOwner):
 
     def _change_model(self, rows: Sequence[int]) -> None:
         """Update the masses of the robots ``rows`` in the native code's model."""
-        if self._masses.added and "_joint_model" in self.__dict__:
-            self._joint_model.vary(rows, self.size, self._masses.added)
+        if self._masses.added and "joint_model" in self.__dict__:
+            self.joint_model.vary(rows, self.size, self._masses.added)
 
     def _add_joints(self, actuators: Actuators | None) -> Float64:
         """Set friction and armature of ``actuators``; return the inertia that the engine has to add

@@ -78,6 +78,7 @@ class NativeModel:
         """
         tree = self._pack.rigid_tree
         if self._inertias is None:
+            # From now on each robot has inertias of its own.
             self.__dict__.pop("_structure", None)
             self._inertias = np.tile(tree.inertias(), (size, 1, 1))
         picked = np.asarray(rows, np.intp)

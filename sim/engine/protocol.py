@@ -288,13 +288,15 @@ class CompiledPack(EnginePack, Protocol):
         within a tick.
         """
 
+    @property
     def joint_model(self) -> CompiledModel:
-        """Return the native model of :meth:`joint_mass_matrix`, the same object for the life of the
+        """Native model of :meth:`joint_mass_matrix`, the same object for the life of the
         pack.
         """
 
+    @property
     def force_model(self) -> CompiledModel:
-        """Return the native model of :meth:`passive_force`, for compiled steps that do not read
+        """Native model of :meth:`passive_force`, for compiled steps that do not read
         this force.
         """
 
@@ -362,6 +364,7 @@ def load_engine(name: str = "sapien") -> Engine:
     MissingDependencyError
         MuJoCo is too old.
     """
+    # Engines are imported at their first use: one of them need not be installed.
     module = MODULES[choice("engine", name, MODULES)]
     if name == "mujoco" and module not in modules:
         _require_mujoco()
@@ -374,6 +377,7 @@ def load_engine(name: str = "sapien") -> Engine:
 
 def _require_mujoco() -> None:
     try:
+        # A module that came with the oldest version that has all that is used here.
         import_module("mujoco.batch")
     except ImportError as error:
         raise MissingDependencyError("mujoco>=3.17", "the engine 'mujoco'") from error

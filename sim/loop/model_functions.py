@@ -42,9 +42,7 @@ def model_functions(
         return model
     if constants.friction.coulomb is not None:
         inputs = constants.friction, constants.drive, constants.coupling, constants.timestep
-        refresh = NativeRefresh(
-            pack.joint_model(), pack.size, pack.armature, *inputs, REFRESH_STEPS
-        )
+        refresh = NativeRefresh(pack.joint_model, pack.size, pack.armature, *inputs, REFRESH_STEPS)
         model = model._replace(refresh=refresh)
     return model
 

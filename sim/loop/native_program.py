@@ -104,7 +104,7 @@ class TickProgram:
                 field = "measured_force"
             else:
                 field = "read_force"
-            setattr(self.tick, field, pack.force_model().address)
+            setattr(self.tick, field, pack.force_model.address)
         # Programs have no key of the noise, counts, or state of a controller.
         state, motors = buffers.state, buffers.state.motors
         if motors is not None:

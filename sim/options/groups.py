@@ -112,7 +112,6 @@ class Scene(OptionGroup):
         option(
             "snapshot",
             "recording",
-            "scene",
             flag="Physics engine; mujoco is several times as fast, and its contacts differ.",
         ),
     ] = DEFAULT_ENGINE

@@ -16,12 +16,11 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-from lxml import etree
 
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
 from batchpid.sim.robot.tables import Shape
-from batchpid.sim.robot.xml import LARGEST, LFS_POINTER
+from batchpid.sim.robot.xml import LARGEST, LFS_POINTER, parse_bytes
 
 FORMATS = (".stl", ".obj", ".dae", ".glb")
 SIZE_LIMIT = 2**27  # bytes of a mesh file
@@ -75,7 +74,7 @@ def _ros_packages(package: str) -> Iterator[Path]:
     if not re.fullmatch(r"\w[\w.-]*", package):
         return
     prefixes, roots = (
-        [Path(each) for each in os.environ.get(variable, "").split(os.pathsep) if each]
+        [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
         for variable in ("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH")
     )
     yield from (prefix / "share" / package for prefix in prefixes)
@@ -148,9 +147,8 @@ def _has_its_numbers(data: bytes) -> bool:
     """Return whether the arrays of a COLLADA file are as long as it says: SAPIEN reads beyond them
     otherwise.
     """
-    root = etree.fromstring(
-        data, etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
-    )
+    # The arrays of a mesh are longer than the texts that libxml2 accepts by itself.
+    root = parse_bytes(data, huge_tree=True)
     sizes = {}
     for array in root.iter("{*}float_array"):
         sizes["#" + array.get("id", "")] = size = len((array.text or "").split())
@@ -182,7 +180,9 @@ def note_meshes(paths: Iterable[str]) -> None:
 
 def check_unchanged(path: Path) -> None:
     """Raise RobotError if a mesh file has changed since SAPIEN read it in this process."""
-    if (known := _in_use.get(str(path))) is not None and digest(path.read_bytes()) != known:
+    if (digest_in_use := _in_use.get(str(path))) is not None and digest(
+        path.read_bytes()
+    ) != digest_in_use:
         problem = (
             f"{path}: has changed since this process simulated it, and SAPIEN keeps the mesh that"
             " it read first"

@@ -13,8 +13,8 @@ example-robot-data 6.0.0 and of the bundled ones:
 - its radius of gyration exceeds twice L and twice its size (0.6);
 - a joint bears more than a mass of 1000 L^3 kg at the distance L (10 L^3), by gravity or by
   inertia;
-- a limit or mimic offset of a hinge is from 4 pi to 1000 rad (10 rad), or an angle of an <origin>
-  is beyond 2 pi (4.7 rad), as if degrees were read as radians.
+- a limit or mimic offset of a hinge is from 4 pi to 1000 rad (10 rad), as if degrees were read as
+  radians.
 
 Mass and inertia are not checked for a fixed base and for links with less than a hundredth of the
 total mass: sensors, frames and stands often have arbitrary figures.
@@ -113,9 +113,7 @@ def _loads(robot: RobotDescription, length: float) -> Iterator[Finding]:
 
 
 def _degrees(robot: RobotDescription) -> Iterator[Finding]:
-    """Yield a finding for limits and mimic offsets of a hinge, and for angles of an origin, that
-    look like degrees.
-    """
+    """Yield a finding for limits and mimic offsets of a hinge that look like degrees."""
     for joint in robot.all_joints:
         offset = 0.0 if joint.mimic is None else joint.mimic.offset
         angles = {"lower": joint.lower, "upper": joint.upper, "mimic offset": offset}
@@ -128,7 +126,6 @@ def _degrees(robot: RobotDescription) -> Iterator[Finding]:
             text = "angles of many turns, as if degrees were read as radians"
             remedy = "give radians, and velocities in rad/s"
             yield Finding("warning", "degrees", text, remedy, joint.name, detail=", ".join(large))
-    yield from robot.oddities
 
 
 def _distances(robot: RobotDescription) -> tuple[float, dict[str, float]]:

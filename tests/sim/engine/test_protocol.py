@@ -54,7 +54,7 @@ def check_members(protocol, value):
 def test_an_engine_has_the_members_of_each_protocol(name):
     engine = engines.load_engine(name)
     check_members(Engine, engine)
-    spec = SceneSpec(PANDA.tables, (), PANDA.joints, DT, engine.physics["accurate"], engine=name)
+    spec = SceneSpec(PANDA.tables, (), PANDA.joints, DT, engine.physics["accurate"])
     pack = engine.make_pack(spec, 1)
     for protocol in (EnginePack, DrivenPack, CompiledPack):
         check_members(protocol, pack)

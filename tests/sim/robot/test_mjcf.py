@@ -365,13 +365,6 @@ def test_a_pid_has_gains_and_further_effects_are_told(load):
             '<motor joint="j" group="2"/></actuator><option actuatorgroupdisable="2"/><actuator>',
             "disables its group",
         ),
-        (
-            (
-                '<general joint="j" gainprm="8" biastype="affine" biasprm="0 -4" ctrlrange="-1 2"'
-                ' gear="-2"/>'
-            ),
-            "(-2 to 1)",
-        ),
     ],
 )
 def test_what_an_actuator_does_besides_is_told(load, actuator, said):
@@ -492,16 +485,12 @@ def test_all_that_is_left_out_is_named(load):
         "'goal'",
     ):
         assert name in told
-    for place, said in (
-        ('pos="0 0 -1"', "at height -1 m"),
-        ('euler="30 0 0"', "which is not level"),
-    ):
+    for place in ('pos="0 0 -1"', 'euler="30 0 0"'):
         (found,) = load(
             two_links().replace("<worldbody>", f"<worldbody>{floor.format(place)}")
         ).repairs
         assert (found.severity, found.code) == ("warning", "collision")
         assert "plane 'number 0'" in found.text
-        assert said in found.text
 
 
 def test_a_plain_file_needs_no_repair(load):

@@ -118,7 +118,6 @@ def test_a_limit_that_is_not_positive_counts_as_not_given(kind, key, text, tmp_p
         ('lower="-1.25"', 'lower="-170"', "'hinge' .lower -170 rad"),
         ('upper="1.25"', 'upper="90"', "'hinge' .upper 90 rad"),
         ('offset="0.25"', 'offset="45"', "'follower' .mimic offset 45 rad"),
-        ('rpy="0.125 0.25 0.5"', 'rpy="0 0 90"', "'arm' .*<inertial> rpy 0 0 90"),
     ],
 )
 def test_degrees_are_recognised(old, new, said, tmp_path):
