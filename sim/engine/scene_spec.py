@@ -37,7 +37,7 @@ class SceneSpec:
 
     ``tables`` are the rows of the robot's file; ``ignored`` are pairs of its links that do not
     collide; ``joints`` are the degrees of freedom, in the order of all arrays.
-    ``physics`` are the solver settings of ``engine``, in the engine's type. Without ``collisions``
+    ``physics`` are the solver settings, in the engine's type. Without ``collisions``
     scenes have no collision shapes and no ground, but the same masses and inertias. ``mjcf`` is the
     file that MuJoCo compiles in place of ``tables``. ``contacts`` and ``wrenches`` are links with
     sensors. ``carrier`` is the link that carries payloads, and ``varied_links`` are those whose mass
@@ -55,7 +55,6 @@ class SceneSpec:
     collisions: bool = True
     build: Build | None = field(default=None, compare=False)
     gravity: tuple[float, float, float] = GRAVITY
-    engine: str = "sapien"
     contacts: tuple[str, ...] | None = None
     wrenches: tuple[str, ...] | None = None
     mjcf: MjcfFile | None = None
@@ -145,6 +144,7 @@ class VariedMasses:
             column = part.column
             share = 1.0
             if variation.link_mass is not None and column is not None:
+                # The inertia tensor grows with the mass, as of the same body of another density.
                 share = float(np.nan_to_num(variation.link_mass[row, column], nan=1.0))
             if variation.center_of_mass is not None and column is not None:
                 displacement = variation.center_of_mass[row, 3 * column : 3 * column + 3]
@@ -173,9 +173,10 @@ def own_friction(spec: SceneSpec, variation: Variation | None = None) -> Frictio
         model = model._replace(coulomb=coupling_of(spec.joints).of_independent(variation.friction))
     if variation is not None and variation.damping is not None:
         model = model._replace(viscous=variation.damping.copy())
-    return (
-        model if spec.mjcf is None else model._replace(viscous=None)
-    )  # there MuJoCo computes the damping
+    if spec.mjcf is not None:
+        # MuJoCo computes the damping of a file.
+        return model._replace(viscous=None)
+    return model
 
 
 def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
@@ -186,11 +187,9 @@ def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
     coulomb, viscous = (
         one if more is None else more if one is None else one + more for one, more in both
     )
-    if static is not None:
-        if own.coulomb is None:
-            static = static
-        else:
-            static = static + own.coulomb
+    if static is not None and own.coulomb is not None:
+        static = static + own.coulomb
     if coulomb is None and (rubs := Friction(None, None, static, load=load).most) is not None:
+        # Friction of the other kinds alone still needs an array of Coulomb friction.
         coulomb = np.zeros_like(rubs)
     return Friction(coulomb, viscous, static, added.stribeck, load)

@@ -66,18 +66,16 @@ LIMIT_TOLERANCE = 1e-6  # rad or m
 class RobotDescription:
     """Robot as its file describes it; every array is in the order of ``joint_names``.
 
-    ``tables`` are its bodies and shapes as in the file, after ``repairs``; ``oddities`` are
-    findings about content that was read as it stands. ``joints`` are the degrees of freedom, the
-    moving joints of ``all_joints``. ``settings`` come from a bundled robot, ``defaults`` and ``mjcf`` from an MJCF
-    file, else None. ``package_dirs`` are the folders in which meshes are looked up first.
-    ``actuators`` are its motors and sensors, None for ideal ones. ``base_start`` is the pose (7,)
-    at which the file places a floating base, None if it does not.
+    ``tables`` are its bodies and shapes as in the file, after ``repairs``. ``joints`` are the
+    degrees of freedom, the moving joints of ``all_joints``. ``settings`` come from a bundled robot,
+    ``defaults`` and ``mjcf`` from an MJCF file, else None. ``package_dirs`` are the folders in
+    which meshes are looked up first. ``actuators`` are its motors and sensors, None for ideal ones.
+    ``base_start`` is the pose (7,) at which the file places a floating base, None if it does not.
     """
 
     name: str
     tables: Tables
     repairs: tuple[Finding, ...]
-    oddities: tuple[Finding, ...]
     path: Path
     srdf: Srdf
     self_collision: str
@@ -272,17 +270,17 @@ class RobotDescription:
         InvalidArgumentError
             The robot has no gains and ``options`` has no ``kp``.
         """
-        known: Document = {"joint_names": self.joint_names, "anti_windup": "conditional"}
+        defaults: Document = {"joint_names": self.joint_names, "anti_windup": "conditional"}
         if self.continuous.any():
-            known["continuous"] = self.continuous
+            defaults["continuous"] = self.continuous
         if not {"effort_min", "effort_max"} & set(options):
-            known["effort_limit"] = self.effort_limit
+            defaults["effort_limit"] = self.effort_limit
         if self.settings is not None:
-            known |= {gain: getattr(self.settings, gain) for gain in ("kp", "ki", "kd")}
+            defaults |= {gain: getattr(self.settings, gain) for gain in ("kp", "ki", "kd")}
         elif "kp" not in options:
             remedy = "pass kp=, ki=, kd= (scalar or per joint), or use robot.designed()"
             raise InvalidArgumentError("kp", f"robot {self.name!r} has no gains", remedy=remedy)
-        return bp.make_params(joints=self.dof, **(known | options))
+        return bp.make_params(joints=self.dof, **(defaults | options))
 
     def sample(self, count: int, seed: int = 0) -> Float64:
         """Return seeded poses (count, dof), uniform within the limits and half a turn of the start;

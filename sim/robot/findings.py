@@ -82,8 +82,10 @@ def summary(findings: Iterable[Finding]) -> list[str]:
     ``findings``.
     """
     causes: dict[tuple[str, ...], list[Finding]] = defaultdict(list)
-    for each in findings:
-        causes[each.severity, each.code, each._kind, each.text, each.remedy].append(each)
+    for finding in findings:
+        causes[finding.severity, finding.code, finding._kind, finding.text, finding.remedy].append(
+            finding
+        )
     return [_sentence(same) for same in causes.values()]
 
 
@@ -92,7 +94,8 @@ def _sentence(same: Sequence[Finding]) -> str:
     first = same[0]
     names = list(
         dict.fromkeys(
-            f"{each._name} ({each.figures})" if each.figures else each._name for each in same
+            f"{finding._name} ({finding.figures})" if finding.figures else finding._name
+            for finding in same
         )
     )
     if len(names) == 1:

@@ -38,7 +38,7 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     limits = [(joint.lower, joint.upper) for joint in joints]
     for index in coupling.followers.tolist():
         leader, multiplier, offset = (
-            each[index] for each in (coupling.leader, coupling.multiplier, coupling.offset)
+            column[index] for column in (coupling.leader, coupling.multiplier, coupling.offset)
         )
         if multiplier == 0 or joints[index].continuous:
             continue

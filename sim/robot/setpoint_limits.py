@@ -74,9 +74,9 @@ def _of_leaders(guard: bp.Guard, joints: Sequence[Joint]) -> bp.Guard:
         )
     for limits, none in zip((low, high, rate, acceleration), free, strict=False):
         limits[:, coupling.followers] = none
-    found = dict(zip(guard._fields, (low, high, rate, acceleration), strict=False))
+    leaves = dict(zip(guard._fields, (low, high, rate, acceleration), strict=False))
     return guard._replace(
-        **{name: None if np.isinf(limits).all() else limits for name, limits in found.items()}
+        **{name: None if np.isinf(limits).all() else limits for name, limits in leaves.items()}
     )
 
 

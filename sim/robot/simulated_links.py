@@ -97,8 +97,8 @@ def link_masses(tables: Tables, repairs: Iterable[Finding]) -> dict[str, LinkMas
         size = _size(tables.shapes_of(body.name))
         center = read_only(inertia.center)
         tensor = read_only(inertia.tensor)
-        kept = SpatialInertia(inertia.mass, center, tensor)
-        masses[body.name] = LinkMass(inertia.mass, source, gyration, size, kept)
+        frozen_inertia = SpatialInertia(inertia.mass, center, tensor)
+        masses[body.name] = LinkMass(inertia.mass, source, gyration, size, frozen_inertia)
     return masses
 
 

@@ -69,16 +69,25 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
 
 def _drop_default_namespace(root: etree._Element) -> None:
     """Take elements out of a default namespace, which readers of robots ignore."""
-    found = [each for each in root.iter("{*}*") if each.prefix is None and each.tag.startswith("{")]
-    for element in found:
+    elements = [
+        element
+        for element in root.iter("{*}*")
+        if element.prefix is None and element.tag.startswith("{")
+    ]
+    for element in elements:
         element.tag = etree.QName(element).localname
-    if found:
+    if elements:
         etree.cleanup_namespaces(root)
 
 
+def parse_bytes(data: bytes, **options: bool) -> etree._Element:
+    """Return the root element of untrusted XML; ``options`` are more of those of lxml's parser."""
+    safe = {"resolve_entities": False, "no_network": True, "load_dtd": False}
+    return etree.fromstring(data, etree.XMLParser(**safe, **options))
+
+
 def _parse(data: bytes) -> etree._Element:
-    options = {"resolve_entities": False, "no_network": True, "load_dtd": False}
-    return etree.fromstring(data, etree.XMLParser(**options, remove_comments=True, remove_pis=True))
+    return parse_bytes(data, remove_comments=True, remove_pis=True)
 
 
 def _lenient(data: bytes) -> etree._Element:
@@ -144,10 +153,10 @@ def readable(
 ) -> tuple[float, ...] | None:
     """Return the numbers in an attribute, or None where :func:`numbers` raises."""
     if element is None:
-        given = default
+        text = default
     else:
-        given = element.get(key, default)
-    words = (given if given.strip() else default).split()
+        text = element.get(key, default)
+    words = (text if text.strip() else default).split()
     largest = LARGEST_LIMIT if limit else LARGEST
     try:
         values = tuple(float(word) for word in words if word.isascii() and "_" not in word)

@@ -83,10 +83,6 @@ def read_couplings(model: MjModel, names: Names, findings: list[Finding]) -> Cou
         text = f"{ALONE} equality constraints other than of the robot's joints: {', '.join(others)}"
         remedy = "in SAPIEN expect closed loops to be open"
         findings.append(Finding("warning", "equality", text, remedy))
-    inactive = [label(model.equality(int(at))) for at in np.flatnonzero(model.eq_active0 == 0)]
-    if inactive:
-        text = f"equality constraints that the file has switched off: {', '.join(inactive)}"
-        findings.append(Finding("note", "equality", text, "expect no effect"))
     return couplings
 
 
@@ -116,7 +112,6 @@ def read_motors(
             _add(model, actuator, name, arm, motors, findings)
             if len(arms) == 1:
                 _add_gains(model, actuator, name, arm, motors)
-                findings += _narrower(model, names, actuator, name, arm)
     # A follower has no motor: its leader moves its armature, too.
     armature = dict(motors.armature)
     for follower in couplings:
@@ -232,33 +227,6 @@ def _input_range(model: MjModel, actuator: int) -> Any | None:
     return None
 
 
-def _narrower(
-    model: MjModel, names: Names, actuator: int, name: str, arm: float
-) -> Iterator[Finding]:
-    """Yield a finding if a servo limits the setpoint of a joint to less than the joint's range."""
-    kp, _ = _servo(model, actuator)
-    ends = _input_range(model, actuator)
-    gain = model.actuator_gainprm[actuator, 0]
-    if _is_pid(model, actuator):  # of which the input is a position
-        gain = kp
-    if ends is None or kp <= 0 or not gain:
-        return
-    joint = next(joint for joint, other in names.joints.items() if other == name)
-    low, high = sorted((gain / kp / arm * ends).tolist())
-    lower, upper = -math.inf, math.inf
-    if model.jnt_limited[joint]:
-        lower, upper = model.jnt_range[joint].tolist()
-    if math.isfinite(upper - lower):
-        margin = 1e-3 * (upper - lower)
-    else:
-        margin = 0.0
-    if low > lower + margin or high < upper - margin:
-        text = "the setpoint is not limited to the range that the servo has in the file"
-        remedy = "pass make_guard(lower=...)"
-        detail = f"{low:g} to {high:g}"
-        yield Finding("note", "actuator", text, remedy, name, detail=detail)
-
-
 def _field(model: MjModel, name: str, index: int) -> float:
     """Return an entry of a field that older versions of MuJoCo do not have, 0 there."""
     values = getattr(model, name, None)
@@ -319,31 +287,14 @@ def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
 
 
 def _tendons(model: MjModel) -> Iterator[Finding]:
-    """Yield findings of tendons that act on the joints by themselves, and of tendons that do not
-    act.
-    """
-    effects = [
-        "stiffness",
-        "stiffnesspoly",
-        "damping",
-        "dampingpoly",
-        "frictionloss",
-        "armature",
-        "limited",
+    """Yield a finding of tendons that act on the joints by themselves."""
+    effects = "stiffness", "damping", "frictionloss", "armature", "limited"
+    acting = [
+        label(model.tendon(tendon))
+        for tendon in range(model.ntendon)
+        if any(np.any(getattr(model, f"tendon_{name}")[tendon]) for name in effects)
     ]
-    pulled = model.actuator_trnid[model.actuator_trntype == _TRN.mjTRN_TENDON, 0].tolist()
-    acting = []
-    idle = []
-    for tendon in range(model.ntendon):
-        named = label(model.tendon(tendon))
-        if any(np.any(getattr(model, f"tendon_{name}", [0])[tendon:][:1]) for name in effects):
-            acting.append(named)
-        elif tendon not in pulled:
-            idle.append(named)
     if acting:
         text = f"{ALONE} springs, damping, friction, armature and limits of tendons: "
         remedy = "in SAPIEN expect their joints to move freely"
         yield Finding("warning", "tendon", text + ", ".join(acting), remedy)
-    if idle:
-        text = f"tendons without an effect are left out: {', '.join(idle)}"
-        yield Finding("note", "tendon", text, "expect no effect")

@@ -143,21 +143,21 @@ def _strip(
             geom.conaffinity = 0
             geom.mass = 0.0
             for pair in [
-                each
-                for each in spec.pairs
-                if geom.name in (each.geomname1, each.geomname2) and geom.name
+                element
+                for element in spec.pairs
+                if geom.name in (element.geomname1, element.geomname2) and geom.name
             ]:
                 spec.delete(pair)
         elif geom.meshname:
             used.add(geom.meshname)
     for site in spec.sites:
         site.material = ""
-    for each in [
+    for element in [
         *spec.materials,
         *spec.textures,
         *(mesh for mesh in spec.meshes if mesh.name not in used),
     ]:
-        spec.delete(each)
+        spec.delete(element)
     return tuple(missing), tuple(weighing)
 
 
@@ -199,7 +199,7 @@ def _missing(path: Path) -> str | None:
 
 def _refusal(path: Path, problem: str) -> str:
     """Return the message for a file that MuJoCo refuses."""
-    included = [each.get("file", "") for each in parse_xml(path).iter("{*}include")]
+    included = [element.get("file", "") for element in parse_xml(path).iter("{*}include")]
     for name in (*re.findall(r"'([^']+)'", problem), *included):
         with suppress(OSError, ValueError):
             if _missing(path.parent / name) == LFS_PROBLEM:
@@ -235,14 +235,14 @@ class Names:
         self._bodies = model.jnt_bodyid
         self._roots = model.body_rootid
         self._left_out: set[int] = set()
-        given = [model.body(body).name for body in range(1, model.nbody)]
+        names = [model.body(body).name for body in range(1, model.nbody)]
         self._links, self._joints = (
-            {"world", *given},
+            {"world", *names},
             {model.joint(joint).name for joint in range(model.njnt)},
         )
         self.bodies = {0: "world"}
         self.bodies |= {
-            body: name or self.new_link(f"body{body}") for body, name in enumerate(given, start=1)
+            body: name or self.new_link(f"body{body}") for body, name in enumerate(names, start=1)
         }
         self.joints = {
             joint: model.joint(joint).name or self.new_joint(f"joint{joint}")

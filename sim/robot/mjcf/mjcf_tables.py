@@ -294,22 +294,15 @@ class TableReader:
         else:
             kind = "height field"
         text = f"{ALONE} the {kind} {named} of the file"
-        height = float(self._model.geom_pos[geom, 2])
-        (_, x, y, _) = self._model.geom_quat[geom]
+        # A ground at another height, or not level, changes the run.
+        is_ground = not np.any([*self._model.geom_pos[geom, 2:], *self._model.geom_quat[geom, 1:3]])
         if body != 0 or kind != "plane":
             self._report("warning", body, text, "in SAPIEN add it with build=")
-        elif height == x == y == 0:
+        elif is_ground:
             self._report("note", None, text, "SAPIEN has a ground at height 0")
         else:
-            if x == y == 0:
-                where = f"at height {height:g} m"
-            else:
-                where = "which is not level"
-            remedy = (
-                "SAPIEN has a ground at height 0 instead: add the plane with build= of Runner, or"
-                " pass ground=False"
-            )
-            self._report("warning", None, f"{text}, {where}", remedy)
+            remedy = "SAPIEN has a level ground at height 0: add the plane with build="
+            self._report("warning", None, text, remedy)
 
     def _report(self, severity: str, body: int | None, text: str, remedy: str) -> None:
         link = None if body is None else self._names.bodies[body]
