@@ -149,14 +149,6 @@ class TickProgram:
         outputs = self.outputs
         measured = self._buffers.measured
         none = np.zeros(measured.qpos.shape, bool)
-        if outputs.saturated is None:
-            saturated = none
-        else:
-            saturated = outputs.saturated
-        if outputs.guarded is None:
-            guarded = none
-        else:
-            guarded = outputs.guarded
         copies: list[tuple[str, Rows, Rows]] = [
             *[
                 ("read", rows, row)
@@ -165,15 +157,17 @@ class TickProgram:
             ("write_floats", seen.qpos, measured.qpos),
             ("write_floats", seen.qvel, measured.qvel),
             ("write_floats", seen.effort, outputs.motor),
-            ("write_bytes", seen.saturated, saturated),
-            ("write_bytes", seen.guarded, guarded),
             ("write_bytes", seen.ok, np.ones(len(none), bool)),
             # One row, which each tick overwrites.
             ("write_floats", table.effort[None], outputs.motor),
-            ("write_bytes", table.saturated[None], saturated),
-            ("write_bytes", table.guarded[None], guarded),
             *[("write_bytes", rows, row) for rows, row in zip(fault, table.fault, strict=True)],
         ]
+        for name in ("saturated", "guarded"):
+            mask = getattr(outputs, name)
+            if mask is None:
+                mask = none
+            copies.append(("write_bytes", getattr(seen, name), mask))
+            copies.append(("write_bytes", getattr(table, name)[None], mask))
         if seen.base_pose is not None and seen.base_twist is not None:
             pose = np.zeros((len(none), 7))
             twist = np.zeros((len(none), 6))

@@ -86,10 +86,6 @@ class NumPyExecutor:
         setup = self.setup
         constants = setup.constants
         layout = setup.layout._replace(moves=moves)
-        if isinstance(setup.options.control, str):
-            controller = None
-        else:
-            controller = setup.options.control
         self._first = begin
         engine = {
             "targets": self._write_targets,
@@ -100,7 +96,7 @@ class NumPyExecutor:
             step = Step(index, end, layout.left(index, end, constants.timestep))
             self.before = self.measured.qpos  # where a robot that fails now is suspended
             values = Values(self._state, command, self.measured, step, self.measured)
-            with controller_errors(controller, index + 1):
+            with controller_errors(setup.controller, index + 1):
                 values = sim_step(layout, constants, values, engine)
             self._state = values.state
             self.outputs = values.outputs
