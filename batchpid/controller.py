@@ -77,6 +77,7 @@ class BatchPID:
         joint_names: Sequence[str] | None = None,
         threads: int | None = None,
     ) -> None:
+        # Sizes first: the params, the names and the engine are checked against them.
         self._backend, self._dt = choice("backend", backend, BACKENDS), time_step("dt", dt)
         self._shape = (integer("num_envs", num_envs, 1, MOST_ENVS), _checked(params).num_joints)
         self._names: list[str] | None = None
@@ -155,6 +156,7 @@ class BatchPID:
             raise InvalidArgumentError(
                 "params", problem, remedy="build them with that dtype, or a new BatchPID"
             )
+        # A later write by the caller would reach compiled constants, or not.
         params = frozen(params)
         self._engine.prepare(params, self._shape)
         self._params = params
@@ -206,6 +208,7 @@ class BatchPID:
         )
         if effort is not NotImplemented:
             return effort
+        # All arguments are read before the state changes.
         r = self._array("setpoint", setpoint)
         y = self._array("measurement", measurement, exact=True)
         rest = self._optional(
@@ -312,6 +315,7 @@ class BatchPID:
             problem = f"has shape {array.shape}, not {self._shape}"
             raise InvalidArgumentError(name, problem, remedy="give (num_envs, joints)")
         envs, joints = self._shape
+        # A view with two axes: the law takes (1 | envs, 1 | joints).
         if array.ndim <= 2 and all(
             n in (1, m) for n, m in zip(array.shape[::-1], (joints, envs), strict=False)
         ):
