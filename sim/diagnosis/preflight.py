@@ -50,6 +50,7 @@ def check(
     start = robot.start
     if qpos is not None:
         start = within("qpos", array("qpos", qpos, (1, robot.dof), names), 1e6, names)[0]
+    # The robot first, then what this run adds to it.
     preflight = _Preflight(robot)
     preflight.check_robot(start)
     if setpoint is not None:
@@ -160,6 +161,7 @@ class _Preflight:
                 remedy = "move their shapes 1 mm apart, or enable the pair in an .srdf"
                 other = f"with {pair.second!r}"
                 self._note("pairs-left-out", text, remedy, link=pair.first, detail=other)
+        # A floating base starts on its ground, which is no fault.
         model = robot.dynamics(ground=robot.fixed_base and robot.has_ground)
         if model.in_contact(start[None])[0]:
             self._warn(

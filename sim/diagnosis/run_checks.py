@@ -108,6 +108,7 @@ class MovingSetpointCheck:
         """
         if not self.is_watching:
             return
+        # Rates tell the law where the setpoint goes.
         if rated:
             self._last, self._moved = None, 0.0
             return

@@ -33,7 +33,10 @@ class ModelPack(SingleOwner):
     selects native code.
     """
 
-    rigid_tree: RigidTree
+    @property
+    def rigid_tree(self) -> RigidTree:
+        """Tree of the model; SAPIEN's own is another."""
+        return self.spec.rigid_tree
 
     def __init__(
         self,

@@ -4,15 +4,12 @@ gravity.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.contacts import Contacts
-from batchpid.sim.robot.simulated_links import rigid_tree
 from batchpid.task_space.rigid_tree import RigidTree
 
 
@@ -47,17 +44,9 @@ def passive_force(
     return np.asarray(force, np.float64)
 
 
-@lru_cache(maxsize=16)
-def description_tree(spec: SceneSpec) -> RigidTree:
-    """Return the rigid tree of the simulated bodies of ``spec``, not coupled; the same object for
-    equal specs.
-    """
-    return rigid_tree(spec.simulated, gravity=spec.gravity, fixed_base=spec.fixed_base)
-
-
 def contacts_of(spec: SceneSpec, ground: bool) -> Contacts:
     """Return the contacts of the robot of ``spec``, even of one without shapes there; ``ground`` is
     at height 0.
     """
     ignored = {frozenset(pair) for pair in spec.ignored}
-    return Contacts(description_tree(spec), spec.simulated.shapes, ignored, ground)
+    return Contacts(spec.rigid_tree, spec.simulated.shapes, ignored, ground)

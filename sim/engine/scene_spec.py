@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,9 +19,9 @@ from batchpid.motors.friction import Friction
 from batchpid.sim.robot.merging import merge_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
-from batchpid.sim.robot.simulated_links import BodyParts, varied_bodies
+from batchpid.sim.robot.simulated_links import BodyParts, rigid_tree, varied_bodies
 from batchpid.sim.robot.tables import Tables
-from batchpid.task_space.rigid_tree import GRAVITY
+from batchpid.task_space.rigid_tree import GRAVITY, RigidTree
 from batchpid.task_space.spatial_inertia import SpatialInertia, spatial_matrix, total
 
 Build = Callable[[Any, int], Any]
@@ -65,6 +66,11 @@ class SceneSpec:
     def simulated(self) -> Tables:
         """Tables of the simulated bodies."""
         return merge_links(self.tables, self.separate)
+
+    @cached_property
+    def rigid_tree(self) -> RigidTree:
+        """Rigid tree of the simulated bodies, all joints independent."""
+        return rigid_tree(self.simulated, gravity=self.gravity, fixed_base=self.fixed_base)
 
     @property
     def separate(self) -> tuple[str, ...]:

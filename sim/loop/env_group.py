@@ -17,7 +17,7 @@ from batchpid.arrays.elementwise import clip
 from batchpid.arrays.trees import flatten, leaves, structure
 from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.sim.engine.missed_contacts import MissedContacts
-from batchpid.sim.engine.protocol import DrivenPack, EnginePack
+from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.acting_draws import ActingDraws, variation
 from batchpid.sim.loop.arrays import Arrays, Command, Ticks
 from batchpid.sim.loop.custom import OwnController
@@ -117,7 +117,7 @@ class EnvGroup:
             self._executor = NativeExecutor(setup, state, self._last)
         else:
             self._executor = NumPyExecutor(setup, state)
-        if self._options.control == "drive" and isinstance(self.pack, DrivenPack):
+        if self._options.control == "drive" and hasattr(self.pack, "write_drive"):
             damping, stiffness = setup.constants.drive
             limit = self.acting.acting_params.effort_max
             if limit is None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.sim.engine.protocol import CompiledPack, CompiledStep, EnginePack
+from batchpid.sim.engine.protocol import CompiledStep, EnginePack
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import COUPLING_STEPS, sim_step
 from batchpid.sim.loop.custom import controller_errors
@@ -137,7 +137,8 @@ class EngineSteps:
         self._is_native = steps_natively(setup.pack)
         self.native_force = False
         """Whether the native sim step reads the passive force."""
-        if isinstance(setup.pack, CompiledPack):
+        # Not isinstance, which would make the pack's native models.
+        if hasattr(setup.pack, "steps_read_force"):
             self.native_force = self.reads_force and setup.pack.steps_read_force(*self._parts)
         self._step: CompiledStep | None = None
         self._bound: object = None

@@ -90,8 +90,10 @@ def fit_actuators(
             " three",
             remedy=f"use control 'pid', or leave only {', '.join(DRIVEN)}",
         )
+    # Ideal ones have no leaf that a joint could change.
     if not actuators.num_joints:
         return actuators
     motors = {name: getattr(actuators, name) for name in ("bias", *JOINT_SIDE)}
+    # The leader carries friction and armature of its followers.
     motors = {name: leaf * robot.independent for name, leaf in motors.items() if leaf is not None}
     return actuators.replace(**motors, continuous=robot.continuous)

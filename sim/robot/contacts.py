@@ -70,6 +70,7 @@ class Contacts:
         self._link = np.array([self.links.index(shape.body) for shape in shapes], np.intp)
         bodies = [tree.link_bodies[tree.index(link)] for link in self.links]
         self._body = np.array([bodies[link] for link in self._link], np.intp)
+        # One flat model of all shapes: poses are written into its data, without joints.
         spec = mujoco.MjSpec()
         for shape in self._shapes:
             add_geom(spec, spec.worldbody, shape)
@@ -80,6 +81,7 @@ class Contacts:
         )  # on the world, shapes are where they are in their links
         self._place = self._data.geom_xpos.copy()
         self._turn = self._data.geom_xmat.reshape(-1, 3, 3).copy()
+        # PhysX lets the children of a fixed root collide with it.
         first = 1 if tree.fixed_base else 0
         above = zip(tree.links[1:], tree.parent[1:].tolist(), strict=True)
         free = {frozenset((link, tree.links[parent])) for link, parent in above if parent >= first}
@@ -231,6 +233,7 @@ class Contacts:
         ]  # the shape's axes along the vertical
         if shape.kind == "mesh":
             mesh = self._model.geom_dataid[index]
+            # The lowest vertex of a hull; other shapes have a formula.
             start = self._model.mesh_vertadr[mesh]
             vertices = self._model.mesh_vert[start : start + self._model.mesh_vertnum[mesh]]
             return float(place[2] + (vertices @ np.array([x, y, z])).min())

@@ -160,6 +160,7 @@ class RobotDescription:
         it gives none.
         """
         limits = self.effort_limit
+        # The dynamics of 50 poses take time that most robots need not spend.
         if np.isfinite(limits).all():
             return read_only(limits)
         qpos = self.sample(POSES)
@@ -252,6 +253,7 @@ class RobotDescription:
         """
         if self.settings is not None:
             return self.settings.target.copy()
+        # Toward the farther limit, so that the move is inside.
         above = self.upper - self.start
         below = self.lower - self.start
         distance = np.where(above >= -below, above, below)
@@ -286,6 +288,7 @@ class RobotDescription:
         """Return seeded poses (count, dof), uniform within the limits and half a turn of the start;
         followers match.
         """
+        # A joint without limits would have no range to draw from.
         low = np.maximum(self.lower, self.start - np.pi)
         high = np.minimum(self.upper, self.start + np.pi)
         return self.coupled(np.random.default_rng(seed).uniform(low, high, (count, self.dof)))
@@ -386,5 +389,6 @@ class RobotDescription:
 @lru_cache(maxsize=8)
 def _model(robot: RobotDescription, ground: bool) -> RobotModel:
     ignored = frozenset(map(frozenset, robot.ignored_pairs))
+    # Merged, since the engines simulate merged links, too.
     simulated = merge_links(robot.tables)
     return RobotModel(rigid_tree(simulated), robot.coupling, simulated, ignored, ground)

@@ -19,6 +19,7 @@ GIVE_RANGE = "give <limit lower= upper=>"
 def repair(joint: etree._Element) -> Iterator[Finding]:
     """Repair a joint, except its mimic."""
     yield from _type(joint)
+    # They mean nothing for a fixed joint, and their faults are none.
     if joint.get("type") == "fixed":
         for tag in ("axis", "limit", "dynamics"):
             if (element := joint.find(tag)) is not None:
@@ -48,6 +49,7 @@ def free_joint_of(root: etree._Element) -> etree._Element | None:
     joints = root.findall("joint")
     children = {ends_of(joint)[1] for joint in joints}
     at_root = [joint for joint in joints if ends_of(joint)[0] not in children]
+    # With a second joint at the root, the link there is a part of the robot.
     if len(at_root) != 1 or at_root[0].get("type") != "floating":
         return None
     for link in root.findall("link"):
@@ -136,6 +138,7 @@ def _range(joint: etree._Element, limit: etree._Element) -> Iterator[Finding]:
             yield finding_of(joint, "warning", "limits", text, GIVE_RANGE)
         ends.append(endless if values is None else values[0])
     lower, upper = ends
+    # The URDF's default of a missing end is 0, which may be on the wrong side.
     is_given = limit.get("lower") is not None and limit.get("upper") is not None
     # Exporters write 0 for all four numbers of a joint whose limits they do not know.
     is_placeholder = lower == upper == 0 and not {"effort", "velocity"} & set(limit.attrib)
@@ -156,6 +159,7 @@ def _dynamics(joint: etree._Element) -> Iterator[Finding]:
     dynamics = joint.find("dynamics")
     for key in ("damping", "friction") if dynamics is not None else ():
         values = readable(dynamics, key, "0")
+        # A negative damping would add energy in every step.
         if values is None or values[0] < 0:
             text = f"<dynamics {key}={dynamics.get(key)!r}> must be a number >= 0: 0 is used"
             yield finding_of(joint, "warning", "dynamics", text, "correct the URDF")

@@ -134,9 +134,11 @@ def _inertial(link: etree._Element) -> Iterator[Finding]:
     if not value or not value[0]:
         link.remove(inertial)  # SAPIEN does not use it
         return
+    # Every entry is named, since each may be wrong by itself.
     for problem in filter(None, (fault(inertia, key, "0") for key in MOMENTS)):
         text = f"{problem}: the inertia tensor counts as not given"
         yield finding_of(link, "warning", "inertia", text, "correct <inertia>")
+    # One unreadable entry makes the whole tensor unknown.
     parts = [readable(inertia, key, "0") for key in MOMENTS]
     if None in parts:
         tensor = np.zeros((3, 3))

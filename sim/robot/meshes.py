@@ -63,6 +63,7 @@ def _candidates(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Iterat
             folder / within for folder in (*package_dirs, *above, *_ros_packages(package[1]))
         )
         return
+    # A plain path may be relative to any folder above, as in a package.
     relative = re.sub(r"^file:(//(localhost)?)?", "", name)
     yield from (folder / relative for folder in (above[0], *package_dirs, *above[1:]))
 
@@ -94,6 +95,7 @@ def read_mesh(path: str | Path) -> Any:
     factor, _, unit = str(mesh.metadata.get("units", "")).partition(
         " * "
     )  # of COLLADA: "0.01 * meters"
+    # trimesh leaves the vertices in the file's unit.
     if unit == "meters":
         mesh.vertices = np.asarray(mesh.vertices) * float(factor)
     return mesh

@@ -65,6 +65,7 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
         if size > LARGEST * length:
             text = f"no robot has such large collision shapes: {of_reach}"
             yield Finding("warning", "scale", text, _UNITS, link=name, detail=f"{size:.3g} m")
+    # A single small link is common, such as a sensor.
     largest = max(sizes.values(), default=math.inf)
     if largest < SMALLEST * reach:
         text = f"no robot has such small collision shapes, at most {largest:.2g} m: {of_reach}"
@@ -75,6 +76,7 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
         at_rest = robot.fixed_base and robot.bodies[name].link == root
         if mass.source in ("shapes", "none") or mass.mass < JUDGED * total or at_rest:
             continue
+        # A link may be longer than its shapes.
         size = max(mass.size, next_joint[name])
         if mass.size > 0 and not SPARSEST <= mass.mass / size**3 <= DENSEST:
             kind = "light" if mass.mass < SPARSEST * size**3 else "heavy"
@@ -101,6 +103,7 @@ def _loads(robot: RobotDescription, length: float) -> Iterator[Finding]:
     poses = robot.sample(POSES, seed=0)
     gravity = np.abs(robot.holding_efforts(poses)).max(0)
     inertia = np.diagonal(robot.mass_matrix(poses), axis1=1, axis2=2).max(0)
+    # A slide bears the mass itself, whatever its distance.
     arms = np.where([joint.type == "prismatic" for joint in robot.joints], 1.0, length)
     masses = np.maximum(gravity / (-GRAVITY[2] * arms), inertia / arms**2)
     for at in np.flatnonzero(masses > LOAD * length**3):

@@ -50,6 +50,7 @@ def repair(root: etree._Element, path: Path) -> list[Finding]:
     Raises RobotError if the file is a xacro that was not expanded, or has no joint.
     """
     findings = [*_elements(root), *_attributes(root)]
+    # After the removal of elements without effect, where an expression does no harm.
     _refuse_xacro(root, path)
     if root.find("joint") is None:
         remedy = "a xacro has to be expanded first: xacro FILE.xacro > FILE.urdf"
@@ -75,6 +76,7 @@ def _elements(root: etree._Element) -> Iterator[Finding]:
         seen = set()
         for child in list(parent):
             tag = etree.QName(child).localname
+            # Elements within those that are kept are looked at in turn.
             if child.tag in _READ[parent.tag] and (child.tag in _MANY or child.tag not in seen):
                 seen.add(child.tag)
                 stack += [child] if child.tag in _READ else []
@@ -162,6 +164,7 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
             yield finding_of(joint, "warning", "repeated-name", text, "remove the copy")
             root.remove(joint)
             continue
+        # The number that makes a new name is the first that nobody has.
         base = new = name or "{}_to_{}".format(*ends)
         number = 2
         while new in seen or (new != name and new in names):
@@ -187,6 +190,7 @@ def _tree(root: etree._Element) -> Iterator[Finding]:
             yield Finding(
                 "warning", "missing-link", text, "correct the name, or add the link", link=name
             )
+    # A robot of one link has no joints that could name it.
     joined = {end for pair in ends for end in pair}
     for name, link in links.items():
         if joined and name not in joined:

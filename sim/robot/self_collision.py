@@ -137,11 +137,13 @@ def self_contact(robot: Any) -> SelfContact:
     if robot.self_collision == "none":
         computed = tuple(DisabledPair(*pair, "User") for pair in combinations(solid, 2))
     elif robot.self_collision == "auto" and len({bodies[link] for link in solid}) > 1:
+        # The first pose is the start; the others judge how often a pair touches.
         rest, *close = [
             {frozenset(near[:2]) for near in contacts.near(qpos, GAP)}
             for qpos in (robot.start, *robot.sample(SAMPLES, seed=0))
         ]
         computed = disabled_pairs(solid, _adjacent_links(robot.all_joints, solid), rest, close)
+    # The .srdf comes last, so that its reason holds.
     listed = {pair.links: pair for pair in (*computed, *robot.srdf.disabled)}
     pairs = [
         pair

@@ -65,6 +65,7 @@ def varied_bodies(
         place = inertias[carrier].moved(at.position, at.wxyz).center
     varied = {}
     for body in merge_links(tables, separate).bodies:
+        # A body without mass of its links varies as it is simulated.
         members = parts[body.name] or [Part(body.spatial_inertia, np.eye(3), None)]
         if body.name == at.link or any(part.column is not None for part in members):
             varied[body.name] = BodyParts(members, place if body.name == at.link else None)

@@ -84,6 +84,7 @@ def _repair(
         raise RobotError(
             f"{path}: {problem}; is this a robot's file (not SDF, xacro, a part of an MJCF)?"
         )
+    # Before the repairs and the check of the tree, whose time is the square of the number.
     if max(len(root.findall(tag)) for tag in ("link", "joint")) > MOST_READ:
         raise RobotError(
             f"{path}: has more than {MOST_READ} links or joints; remove what the robot does not"
@@ -124,6 +125,7 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
             missing.append(name if problem is None else f"{name} ({problem})")
             collision.getparent().remove(collision)
         else:
+            # SAPIEN would simulate the file that it read before.
             check_unchanged(file)
             mesh.set("filename", str(file))
     return missing
@@ -196,6 +198,7 @@ def _read_tables(root: etree._Element, path: Path, added: list[str]) -> Tables:
                 read_shape(geometry, name, place, where)
                 for geometry in collision.iterfind("geometry/*")
             ]
+    # Links of a loop are below no root, and so left behind.
     tables = breadth_first(bodies, shapes)
     if len(tables.bodies) != len(bodies):
         root_link = tables.bodies[0].name

@@ -82,6 +82,7 @@ def _write(robot: RobotDescription, mass_factors: Mapping[str, float]) -> etree.
     for body in robot.links:
         link = etree.SubElement(root, "link", name=body.name)
         factor = factors.get(tree.link_bodies[tree.index(body.name)])
+        # A factor of the rigid body holds for each of its links.
         if factor is not None and body.name in inertias:
             # A mass of shapes becomes a number.
             mass, center, inertia = inertias[body.name]
@@ -168,6 +169,7 @@ def _copy_unused(
             continue  # left out, or the second of its name
         copied.add(owner)
         target.extend(deepcopy([child for child in parent if child.tag in COPIED]))
+    # Paths were relative to the source, which the new file may not be near.
     for mesh in root.iterfind("link/visual/geometry/mesh"):
         if (file := find_mesh(mesh.get("filename", ""), path, packages)) is None:
             missing.append(mesh.get("filename", ""))

@@ -37,6 +37,7 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
     try:
         with open(path, "rb") as file:
             data = file.read(SIZE_LIMIT + 1)
+        # One byte more than allowed is read, and no more.
         if len(data) > SIZE_LIMIT:
             raise RobotError(
                 f"{path}: larger than {SIZE_LIMIT >> 20} MiB; remove what the robot does not need"
@@ -108,6 +109,7 @@ def _lenient(data: bytes) -> etree._Element:
     ):  # comments and processing instructions, in linear time
         first, *rest = text.split(start)
         text = first + "".join(part.partition(end)[2] for part in rest)
+    # An ampersand that begins no entity.
     text = re.sub(r"&(?!\w+;|#)", "&amp;", text)
     prefixes = sorted(set(re.findall(r"[<\s]([A-Za-z_]\w{0,40}):", text)) - {"xml", "xmlns"})[
         :MOST_PREFIXES
@@ -117,8 +119,6 @@ def _lenient(data: bytes) -> etree._Element:
     root = wrapper.find("{*}robot")
     if root is None and len(wrapper):
         root = wrapper[0]
-    else:
-        root = root
     if root is None:
         raise etree.XMLSyntaxError("no element", 0, 0, 0)
     wrapper.remove(root)

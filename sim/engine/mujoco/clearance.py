@@ -180,24 +180,24 @@ class GroupClearance:
         bodies = models[0].nbody
         floats = bool((models[0].jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
         ways = dof + 2 * floats
-        addresses = {
+        arrays = tables | {
             # Native code reads the places of shapes where MuJoCo writes them.
-            "models": [model._address for model in models],
-            "places": [scene.geom_xpos.ctypes.data for scene in data],
-            "turns": [scene.geom_xmat.ctypes.data for scene in data],
-        }
-        arrays: Arrays = {name: np.array(rows, np.uint64) for name, rows in addresses.items()}
-        arrays |= tables | {name: np.zeros((robots, ways)) for name in ("moved", "rate")}
-        arrays |= {
+            "models": np.array([model._address for model in models], np.uint64),
+            "places": np.array([scene.geom_xpos.ctypes.data for scene in data], np.uint64),
+            "turns": np.array([scene.geom_xmat.ctypes.data for scene in data], np.uint64),
+            "moved": np.zeros((robots, ways)),
+            "rate": np.zeros((robots, ways)),
             "last": np.zeros((robots, dof + 7 * floats)),
             "open": np.zeros((robots, bodies), np.int8),
+            "left": np.zeros((robots, pairs), np.uint16),
+            "wait": np.ones(robots, np.int32),
+            "no_shapes": np.zeros(bodies, np.int32),
+            "some_types": np.zeros(bodies, np.int32),
+            "brief": np.zeros(robots, np.int8),
+            # No pair is near, and no proof is young enough: the first step checks all pairs.
+            "near": np.full((robots, _MOST_NEAR), -1, np.int32),
+            "age": np.full(robots, _NEVER, np.int32),
         }
-        arrays |= {"left": np.zeros((robots, pairs), np.uint16), "wait": np.ones(robots, np.int32)}
-        arrays |= {name: np.zeros(bodies, np.int32) for name in ("no_shapes", "some_types")}
-        arrays["brief"] = np.zeros(robots, np.int8)
-        # No pair is near, and no proof is young enough: the first step checks all pairs.
-        arrays["near"] = np.full((robots, _MOST_NEAR), -1, np.int32)
-        arrays["age"] = np.full(robots, _NEVER, np.int32)
         self.arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         # Native code has their addresses.
         self._kept = models, data

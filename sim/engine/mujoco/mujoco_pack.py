@@ -30,12 +30,11 @@ from batchpid.sim.engine.mujoco.model_builder import (
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.robot_model import description_tree, passive_force
+from batchpid.sim.engine.robot_model import passive_force
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import CONTACT_FRICTION
 from batchpid.task_space.frames import matrix_of, rotate, unrotate
-from batchpid.task_space.rigid_tree import RigidTree
 
 _KEPT = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
 """Parts of the state in snapshots: all but the targets of drives, which every tick writes."""
@@ -138,10 +137,6 @@ class MujocoPack(ModelPack):
         return self._passive_force(*state).astype(dtype)
 
     @cached_property
-    def rigid_tree(self) -> RigidTree:  # type: ignore[override]
-        return description_tree(self.spec)
-
-    @cached_property
     def _bias_model(self) -> NativeModel:
         """Model of the forces in the equations of motion of the joints, for constraint efforts."""
         return NativeModel(self, "fixed" if self.spec.fixed_base else "free")
@@ -156,7 +151,7 @@ class MujocoPack(ModelPack):
         """Do one sim step of every robot, with constraint efforts on coupled joints."""
         if self.steps_natively:
             if self._own_step is None:
-                self._own_step = self._make_step(False, None)
+                self._own_step = self.compiled_step(False, False, True, None)
             self._own_step.may_have_failed(self._own_step(self.qf, *np.empty((3, *self.qf.shape))))
             return
         effort = self.qf
@@ -194,15 +189,11 @@ class MujocoPack(ModelPack):
         speed_limit: Float64 | None,
         drives: bool = False,
     ) -> MujocoStep:
-        return self._make_step(gravity and coriolis, speed_limit, drives)
-
-    def _make_step(
-        self, reads_force: bool, speed_limit: Float64 | None, drives: bool = False
-    ) -> MujocoStep:
         arrays = {"qf": self.qf, "sensed": self._sensed}
         if drives:
             arrays |= {"stiffness": self._stiffness, "rate_gain": self._rate_gain}
         constraint = None if self._constraint is None else self._constraint.address
+        reads_force = gravity and coriolis
         return MujocoStep(
             self, self._robot, reads_force, speed_limit, arrays, self._suspended, constraint
         )

@@ -143,18 +143,6 @@ class NativeCalls:
 EngineCalls = PythonCalls | NativeCalls
 
 
-def engine_calls(
-    robots: Sequence[Any],
-    systems: Sequence[Any],
-    qf: Float32,
-    skip: Bool,
-    native: bool,
-) -> EngineCalls:
-    """Return native calls, or Python's; both take the arguments before ``native``."""
-    make = NativeCalls if robots and native else PythonCalls
-    return make(robots, systems, qf, skip)
-
-
 def pointer(wrapper: Any, kind: str) -> int:
     """Return the address of the C++ object in ``wrapper``, a "robot", "system" or "joint".
 

@@ -35,7 +35,7 @@ from batchpid.sim.engine.sapien.building import (
     rounded_tree,
     set_inertia,
 )
-from batchpid.sim.engine.sapien.calls import EngineCalls, SapienStep, engine_calls
+from batchpid.sim.engine.sapien.calls import EngineCalls, NativeCalls, PythonCalls, SapienStep
 from batchpid.sim.engine.sapien.link_sensors import SapienLinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
@@ -140,12 +140,11 @@ class Pack(ModelPack):
         """Prepare the calls of every sim step, for the present robots and systems."""
         robots = self.robots
         self._joints = [joint for robot in robots for joint in robot.active_joints]
-        self._calls = engine_calls(
-            robots,
-            self.systems,
-            self._joint_qf[: len(robots)],
-            self._suspended[: len(robots)],
-            self.steps_natively,
+        make = NativeCalls if robots and self.steps_natively else PythonCalls
+        # After close() there are no robots, and the arrays are empty.
+        size = len(robots)
+        self._calls: EngineCalls = make(
+            robots, self.systems, self._joint_qf[:size], self._suspended[:size]
         )
 
     def step(self) -> None:
@@ -191,7 +190,7 @@ class Pack(ModelPack):
             )
 
     @cached_property
-    def rigid_tree(self) -> RigidTree:  # type: ignore[override]
+    def rigid_tree(self) -> RigidTree:
         return rounded_tree(self.spec)
 
     def _renew(self, rows: Sequence[int]) -> None:

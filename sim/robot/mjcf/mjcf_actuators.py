@@ -60,6 +60,7 @@ def read_couplings(model: MjModel, names: Names, findings: list[Finding]) -> Cou
             kind = _EQ(model.eq_type[equality]).name.removeprefix("mjEQ_").lower()
             others.append(f"{kind} {label(model.equality(equality))}")
             continue
+        # From here on it couples joints of the robot: one leader, linear, or a finding.
         name = names.joints[follower]
         offset, multiplier, *higher = model.eq_data[equality, :5].tolist()
         problem = None
@@ -124,6 +125,7 @@ def read_motors(
             text = "no actuator of the file moves the joint: it is controlled as all others"
             remedy = "give it gains of 0 to let it move freely"
             findings.append(Finding("warning", "actuator", text, remedy, name))
+        # A limit of 0 counts as none.
         limit = motors.effort_limit.get(name, math.inf) or math.inf
         if model.jnt_actfrclimited[joint]:
             limit = min(limit, _magnitude(model.jnt_actfrcrange[joint], name, findings))
@@ -141,6 +143,7 @@ def _add(
     if model.actuator_forcelimited[actuator]:
         low, high = model.actuator_forcerange[actuator].tolist()
     ends = _input_range(model, actuator)
+    # The range of a servo's control is one of positions, not of forces.
     if ends is not None and _servo(model, actuator) == (0.0, 0.0):
         least, most = sorted((model.actuator_gainprm[actuator, 0] * ends).tolist())
         low = max(low, least)
@@ -154,6 +157,7 @@ def _add(
 
 def _servo(model: MjModel, actuator: int) -> tuple[float, float]:
     """Return the gains kp and kv of an actuator, both 0 for a motor and for unknown laws."""
+    # A plugin's parameters have other meanings.
     is_known = model.actuator_plugin[actuator] < 0
     if is_known and model.actuator_biastype[actuator] == _BIAS.mjBIAS_AFFINE:
         kp, kv = (-model.actuator_biasprm[actuator, 1:3]).tolist()
@@ -179,6 +183,7 @@ def _effects(model: MjModel, actuator: int) -> Iterator[str]:
     if model.actuator_plugin[actuator] >= 0:
         yield "a plugin"
         return
+    # A <pid> has a law of its own; the rest is about <general> and its shortcuts.
     if _is_pid(model, actuator):
         if dynamics != _DYN.mjDYN_NONE:
             yield "an integral, or a limit of the setpoint's rate"
@@ -274,6 +279,7 @@ def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
     """Return the magnitude of a symmetric range, else the smaller one that is not zero, with a
     finding.
     """
+    # Limits here are symmetric; the smaller is safe in both directions.
     magnitudes = sorted(abs(float(end)) for end in ends)
     if magnitudes[0] != magnitudes[1]:
         text = (

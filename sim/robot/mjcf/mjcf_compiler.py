@@ -112,6 +112,7 @@ def _strip(
     """Remove textures, geoms that add neither shape nor mass, and those of missing meshes; return
     the latter.
     """
+    # A <pair> makes geoms collide whatever their masks say.
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     absent = {}
     for mesh in spec.meshes:
@@ -126,6 +127,7 @@ def _strip(
     weighing: dict[tuple[str, str], None] = {}
     used: set[str] = set()
     for geom in list(spec.geoms):
+        # A texture that is missing would stop the compilation.
         geom.material = ""
         drawn_only = not (geom.contype | geom.conaffinity) and geom.name not in paired
         weighs = _weighs(spec, geom)
@@ -165,6 +167,7 @@ def _weighs(spec: Any, geom: Any) -> bool:
     """Return whether the mass of a geom's body depends on the geom."""
     inferred = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     low, high = spec.compiler.inertiagrouprange
+    # A geom adds no mass by its own mass, by its density, or by its group.
     weightless = (
         geom.mass == 0
         or (math.isnan(geom.mass) and geom.density == 0)

@@ -78,6 +78,7 @@ def read_mjcf(path: Path, name: str, fixed_base: bool | None, missing_meshes: st
         return read_only(np.array([values.get(joint, 0.0) for joint in joints], np.float64))
 
     defaults = FileDefaults(column(start))
+    # A file of motors alone has no gains to offer.
     if any((*motors.kp.values(), *motors.kv.values())):
         defaults = replace(defaults, kp=column(motors.kp), kv=column(motors.kv))
     armature = column(motors.armature)
@@ -102,6 +103,7 @@ def home(model: MjModel) -> int | None:
 def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> MjcfFile:
     """Return the data of the file that the engine MuJoCo needs."""
     model = compiled.model
+    # Loops between links, which MuJoCo closes and a tree cannot have.
     loops = []
     for equality in np.flatnonzero(model.eq_active0):
         at = [model.eq_obj1id[equality], model.eq_obj2id[equality]]
@@ -138,6 +140,7 @@ def content_of(path: Path) -> str:
     names = set[str]()
     folders = set[Path]()
     models = [path]
+    # The list grows while it is read: included models include others.
     for model in models:
         folders.add(model.parent)
         for element in parse_xml(model).iter():
@@ -171,6 +174,7 @@ def _in_radians(model: MjModel, names: Names) -> Iterator[Finding]:
     """Yield a finding if all limited hinges have ranges within 3.2 degrees, as if radians were read
     as degrees.
     """
+    # Slides are in metres in either case.
     hinges = [joint for joint in names.joints if not names.is_slide(joint)]
     ranges = model.jnt_range[[joint for joint in hinges if model.jnt_limited[joint]]]
     if ranges.size and np.abs(ranges).max() <= np.deg2rad(3.2):
