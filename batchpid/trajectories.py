@@ -238,9 +238,10 @@ def trapezoidal(
     *,
     max_velocity: ArrayLike,
     max_acceleration: ArrayLike,
-    synchronise: bool = True,
 ) -> Trajectory:
-    """Return the fastest move from rest to rest within limits of velocity and acceleration.
+    """Return the fastest straight move from rest to rest within limits of velocity and acceleration.
+
+    All joints of an env start and arrive together.
 
     Parameters
     ----------
@@ -249,9 +250,6 @@ def trapezoidal(
     max_velocity, max_acceleration
         Limits > 0, a number, (joints,) or (envs, joints) [rad/s, rad/s^2 or m/s, m/s^2]. Infinite:
         no velocity limit.
-    synchronise
-        All joints of an env start and arrive together, on a straight line; else each goes as fast
-        as it may.
     """
     x0, move = _move(start, target)
     v = _limits("max_velocity", max_velocity, move, finite=False)
@@ -261,10 +259,10 @@ def trapezoidal(
     # Limits of s itself: the joints' limits, per metre or radian of the move.
     vs = np.divide(v, distance, out=np.full(move.shape, np.inf), where=moves)
     as_ = np.divide(a, distance, out=np.full(move.shape, np.inf), where=moves)
-    if synchronise:
-        vs, as_ = (np.broadcast_to(limit.min(-1, keepdims=True), move.shape) for limit in (vs, as_))
-        moves = np.broadcast_to(moves.any(-1, keepdims=True), move.shape)
-    # A joint that does not move gets any number, and a duration of 0.
+    # The slowest joint sets the pace of all.
+    vs, as_ = (np.broadcast_to(limit.min(-1, keepdims=True), move.shape) for limit in (vs, as_))
+    moves = np.broadcast_to(moves.any(-1, keepdims=True), move.shape)
+    # An env that does not move gets any number, and a duration of 0.
     as_ = np.where(moves, as_, 1.0)
     peak = np.minimum(
         np.where(moves, vs, 1.0), np.sqrt(as_)

@@ -441,14 +441,8 @@ class RigidTree:
             link = self.index(name)
             moved = moved_matrix(matrices, self.bodies.link_frames[link])
             of_bodies[self.link_bodies[link]] = of_bodies.get(self.link_bodies[link], 0.0) + moved
-        return self.with_added(of_bodies)
-
-    def with_added(self, added: Mapping[int, Float64]) -> Bodies:
-        """Return the bodies of n robots with spatial inertias (n, 6, 6) added, by index, in the
-        axes of the bodies.
-        """
         rows = np.tile(self.inertias(), (len(next(iter(added.values()))), 1, 1))
-        for body, matrices in added.items():
+        for body, matrices in of_bodies.items():
             mass, center, tensor = np.split(rows[0, body], [1, 4])
             nominal = SpatialInertia(float(mass[0]), center, tensor.reshape(3, 3))
             rows[:, body] = inertia_rows(spatial_matrix(nominal) + matrices)
