@@ -14,6 +14,7 @@ from batchpid.backends import JAXBackend, NumPyBackend, declined
 from batchpid.checks.validate import (
     choice,
     env_mask,
+    flag,
     instance,
     integer,
     names,
@@ -76,12 +77,14 @@ class BatchPID:
         joint_names: Sequence[str] | None = None,
         threads: int | None = None,
     ) -> None:
+        # Sizes first: the params, the names and the engine are checked against them.
         self._backend, self._dt = choice("backend", backend, BACKENDS), time_step("dt", dt)
         self._shape = (integer("num_envs", num_envs, 1, MOST_ENVS), _checked(params).num_joints)
-        self._names = (
-            None if joint_names is None else names("joint_names", joint_names, self.num_joints)
-        )
-        threads = None if threads is None else integer("threads", threads, 1, MOST_THREADS)
+        self._names: list[str] | None = None
+        if joint_names is not None:
+            self._names = names("joint_names", joint_names, self.num_joints)
+        if threads is not None:
+            threads = integer("threads", threads, 1, MOST_THREADS)
         self._engine = BACKENDS[self._backend](self._dt, terms, threads)
         self._state: PIDState | None = None
         self._fast = declined  # fast call of the law on this very state
@@ -92,7 +95,10 @@ class BatchPID:
         self.params = params
 
     def __repr__(self) -> str:
-        started = "not started" if self._state is None else "started"
+        if self._state is None:
+            started = "not started"
+        else:
+            started = "started"
         envs, joints = self._shape
         backend = f"{self._backend!r}{' (native)' * self.native}"
         return (
@@ -150,6 +156,7 @@ class BatchPID:
             raise InvalidArgumentError(
                 "params", problem, remedy="build them with that dtype, or a new BatchPID"
             )
+        # A later write by the caller would reach compiled constants, or not.
         params = frozen(params)
         self._engine.prepare(params, self._shape)
         self._params = params
@@ -162,7 +169,9 @@ class BatchPID:
         until the next call.
         """
         self._fast, self._lent = declined, True
-        return None if self._state is None else PIDState(*map(read_only, self._state))
+        if self._state is None:
+            return None
+        return PIDState(*map(read_only, self._state))
 
     @property
     def terms(self) -> Terms | None:
@@ -171,7 +180,9 @@ class BatchPID:
             raise InvalidArgumentError(
                 "terms", "are not kept", remedy="build the BatchPID with terms=True"
             )
-        return None if self._terms is None else Terms(*map(read_only, self._terms))
+        if self._terms is None:
+            return None
+        return Terms(*map(read_only, self._terms))
 
     def __call__(
         self,
@@ -197,10 +208,9 @@ class BatchPID:
         )
         if effort is not NotImplemented:
             return effort
-        r, y = (
-            self._array("setpoint", setpoint),
-            self._array("measurement", measurement, exact=True),
-        )
+        # All arguments are read before the state changes.
+        r = self._array("setpoint", setpoint)
+        y = self._array("measurement", measurement, exact=True)
         rest = self._optional(
             measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward
         )
@@ -221,13 +231,13 @@ class BatchPID:
         joints).
         """
         y = self._array("measurement", measurement, exact=True)
-        mask = (
-            np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
-        )
+        if mask is None:
+            mask = np.ones(self.num_envs, bool)
+        else:
+            mask = env_mask("mask", mask, self.num_envs)
+        is_kept = flag("keep_integral", keep_integral)
         self._fast = declined
-        self._state = self._engine.call(
-            pid.reset, self._started(y), y, mask, keep_integral=bool(keep_integral)
-        )
+        self._state = self._engine.call(pid.reset, self._started(y), y, mask, keep_integral=is_kept)
 
     def track(
         self,
@@ -241,11 +251,9 @@ class BatchPID:
         """Make the next call on these same inputs return ``effort``: bumpless, as
         :func:`batchpid.track`.
         """
-        r, y, u = (
-            self._array("setpoint", setpoint),
-            self._array("measurement", measurement, exact=True),
-            self._array("effort", effort),
-        )
+        r = self._array("setpoint", setpoint)
+        y = self._array("measurement", measurement, exact=True)
+        u = self._array("effort", effort)
         rest = self._optional(
             measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward
         )
@@ -261,7 +269,8 @@ class BatchPID:
         if self._state is None:
             return self._engine.call(pid.init, y)
         if self._stale:
-            self._state, self._stale = self._state.matched_to(self._engine.call(pid.init, y)), False
+            self._state = self._state.matched_to(self._engine.call(pid.init, y))
+            self._stale = False
         return self._state
 
     def _optional(self, **values: Array) -> Document:
@@ -271,18 +280,20 @@ class BatchPID:
         }
 
     def _check_out(self, out: Any) -> None:
-        dtype, remedy = (
-            self._params.dtype,
-            "leave it out, or give np.empty((num_envs, joints), params.dtype)",
-        )
+        dtype = self._params.dtype
+        remedy = "leave it out, or give np.empty((num_envs, joints), params.dtype)"
         if self._backend != "numpy":
-            problem, remedy = f"is not for backend {self._backend!r}", "leave it out"
+            problem = f"is not for backend {self._backend!r}"
+            remedy = "leave it out"
         elif not isinstance(out, np.ndarray):
             problem = f"is a {type(out).__name__}, not an array of NumPy"
         elif out.dtype != dtype or out.shape != self._shape:
             problem = f"is {out.dtype} {out.shape}, not {dtype} {self._shape}"
         elif not (out.flags.c_contiguous and out.flags.writeable and out.flags.aligned):
-            problem = "cannot be written to" if not out.flags.writeable else "is not contiguous"
+            if not out.flags.writeable:
+                problem = "cannot be written to"
+            else:
+                problem = "is not contiguous"
         else:
             return
         raise InvalidArgumentError("out", problem, remedy=remedy)
@@ -304,6 +315,7 @@ class BatchPID:
             problem = f"has shape {array.shape}, not {self._shape}"
             raise InvalidArgumentError(name, problem, remedy="give (num_envs, joints)")
         envs, joints = self._shape
+        # A view with two axes: the law takes (1 | envs, 1 | joints).
         if array.ndim <= 2 and all(
             n in (1, m) for n, m in zip(array.shape[::-1], (joints, envs), strict=False)
         ):

@@ -47,7 +47,10 @@ class InvalidArgumentError(BatchPIDError, ValueError):
         where = "".join(
             f", {kind} {place!r}" for kind, place in places.items() if place is not None
         )
-        got = "" if value is None else f" (got {_SHORT.repr(value)})"
+        if value is None:
+            got = ""
+        else:
+            got = f" (got {_SHORT.repr(value)})"
         super().__init__(f"{argument}{where}: {problem}{got}; {remedy}")
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -67,10 +70,8 @@ class ControllerError(InvalidArgumentError):
         if isinstance(error, InvalidArgumentError):
             problem, remedy = error.problem, error.remedy
         else:
-            problem, remedy = (
-                f"{name} raised {type(error).__name__}: {error}",
-                "correct the controller",
-            )
+            problem = f"{name} raised {type(error).__name__}: {error}"
+            remedy = "correct the controller"
         super().__init__("control", problem, remedy=remedy)
         self.step = step
 
@@ -110,7 +111,10 @@ class MissingDependencyError(BatchPIDError, ImportError):
         self.extra = extra
         # Extras come from a checkout, as long as batchpid is on no index.
         requirement = package if extra is None else f".[{extra}]"
-        place = "" if extra is None else " in the checkout of batchpid"
+        if extra is None:
+            place = ""
+        else:
+            place = " in the checkout of batchpid"
         super().__init__(
             f"{purpose} needs the package {package!r}; install it with: pip install '{requirement}'{place}"
         )

@@ -72,6 +72,7 @@ class StepMetrics(NamedTuple):
         """
 
         def reduce(figure: Float64) -> Float64:
+            # Joints may lack different envs, so each column is reduced by itself.
             columns = (column[~np.isnan(column)] for column in figure.T)
             return np.array([statistic(column) if column.size else np.nan for column in columns])
 
@@ -138,12 +139,17 @@ def step_metrics(
         raise InvalidArgumentError("measurement", problem, remedy="pass a rollout's qpos")
     number("band", band, 1e-9, 1.0, "fraction of the move")
     number("tail", tail, 1e-9, 1.0, "share of the record")
-    r, floor = (
-        broadcast("setpoint", setpoint, y.shape),
-        broadcast("absolute_band", absolute_band, y.shape[1:]),
-    )
-    u = None if effort is None else broadcast("effort", effort, y.shape)
-    limited = None if saturated is None else read_array("saturated", saturated, "b")
+    # Everything takes the shape of the measurement.
+    r = broadcast("setpoint", setpoint, y.shape)
+    floor = broadcast("absolute_band", absolute_band, y.shape[1:])
+    if effort is None:
+        u = None
+    else:
+        u = broadcast("effort", effort, y.shape)
+    if saturated is None:
+        limited = None
+    else:
+        limited = read_array("saturated", saturated, "b")
     if start is not None:
         y = np.concatenate([broadcast("start", start, y.shape[1:])[None], y])
         r = np.concatenate([r[:1], r])
@@ -151,13 +157,17 @@ def step_metrics(
     # A joint with a NaN gets figures of inf, by judged() below: it must lose every comparison, not
     # drop out of it.
     finite = np.isfinite(y).all(0) & np.isfinite(r).all(0)
-    y, r = np.where(finite, y, 0.0), np.where(finite, r, 0.0)
+    y = np.where(finite, y, 0.0)
+    r = np.where(finite, r, 0.0)
     if continuous is not None:
         y, r = _unwrap(y, r, read_array("continuous", continuous, "b"))
 
+    # Figures of a move refer to where it ends, integrals to each row's own setpoint.
     move = r[-1] - y[0]
-    size, direction = np.abs(move), np.where(move < 0, -1.0, 1.0)
-    error, final_error = r - y, r[-1] - y
+    size = np.abs(move)
+    direction = np.where(move < 0, -1.0, 1.0)
+    error = r - y
+    final_error = r[-1] - y
     tolerance: Float64 = np.maximum(band * size, floor)
     # For a joint that hardly moves, rise and overshoot would measure noise; its deviation is still
     # reported.
@@ -166,7 +176,8 @@ def step_metrics(
     beyond = np.maximum(beyond, 0.0)
     progress = 1.0 - final_error / move
     overshoot = np.where(moves, beyond / size, np.nan)
-    high, low = _first_crossing(t, progress, 0.9), _first_crossing(t, progress, 0.1)
+    high = _first_crossing(t, progress, 0.9)
+    low = _first_crossing(t, progress, 0.1)
     rise = high - np.where(np.isfinite(high), low, 0.0)
     tail_rows = max(1, round(tail * len(t)))
 
@@ -194,7 +205,8 @@ def _first_crossing(t: Float64, progress: Float64, level: float) -> Float64:
     """
     reached = progress >= level
     k = np.maximum(np.argmax(reached, 0), 1)
-    before, after = _row(progress, k - 1), _row(progress, k)
+    before = _row(progress, k - 1)
+    after = _row(progress, k)
     share = np.clip((level - before) / (after - before), 0.0, 1.0)
     return np.where(reached.any(0), t[k - 1] + share * (t[k] - t[k - 1]), np.inf)
 
@@ -206,7 +218,8 @@ def _settling_time(t: Float64, error: Float64, tolerance: Float64) -> Float64:
     outside = np.abs(error) > tolerance
     last = len(t) - 1 - np.argmax(outside[::-1], 0)
     k = np.minimum(last, len(t) - 2)
-    before, after = _row(error, k), _row(error, k + 1)
+    before = _row(error, k)
+    after = _row(error, k + 1)
     edge = np.copysign(tolerance, before)
     share = np.clip((edge - before) / (after - before), 0.0, 1.0)
     settled = np.where(outside[-1], np.inf, t[k] + share * (t[k + 1] - t[k]))
@@ -224,6 +237,7 @@ def _row(table: Float64, k: Rows) -> Float64:
 
 def _unwrap(y: Float64, r: Float64, continuous: NDArray[np.bool_]) -> tuple[Float64, Float64]:
     """Return angles without jumps, and the setpoint nearest to the start."""
-    course, target = np.unwrap(y, axis=0), np.unwrap(r, axis=0)
+    course = np.unwrap(y, axis=0)
+    target = np.unwrap(r, axis=0)
     target = target - TURN * np.rint((target[-1] - course[0]) / TURN)
     return np.where(continuous, course, y), np.where(continuous, target, r)

@@ -72,7 +72,7 @@ GONE = (
     r"--(friction|payload|resume|window)\b",
     r"from_ros2_control",
     r"gain_units=.inertia",
-    r"held_out_error\(",
+    r"\.held_out_error\(",
     r"h5[.]partial",
     r"identification/(plant|columns|held_out|problem)\b",
     r"integral-limit",

@@ -50,7 +50,9 @@ def _as_dtype(x: Array, dtype: DType) -> Array:
 def clip(x: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
     """Return x within [low, high], either of which may be None; NaN stays NaN."""
     x = x if low is None else xp.maximum(x, low)
-    return x if high is None else xp.minimum(x, high)
+    if high is None:
+        return x
+    return xp.minimum(x, high)
 
 
 def _recorded(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -62,7 +64,9 @@ def _recorded(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
         @wraps(function)
         def call(*arrays: Array) -> Array:
             record = getattr(arrays[0], "record", None)
-            return function(*arrays) if record is None else record(name, *arrays)
+            if record is None:
+                return function(*arrays)
+            return record(name, *arrays)
 
         return call
 
@@ -93,7 +97,10 @@ def push_history(history: Array, *values: Array) -> Array:
     latest sample.
     """
     xp = namespace(history, *values)
-    sample = values[0] if len(values) == 1 else xp.concatenate(values, axis=1)
+    if len(values) == 1:
+        sample = values[0]
+    else:
+        sample = xp.concatenate(values, axis=1)
     return xp.concatenate((sample[:, None], history[:, :-1]), axis=1)
 
 
@@ -111,9 +118,9 @@ def replace_envs(state: Any, fresh: Any, mask: Array) -> Array:
     chosen = xp.asarray(mask)
 
     def choose(new: Array, old: Array) -> Array:
-        return (
-            None if old is None else xp.where(chosen.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-        )
+        if old is None:
+            return None
+        return xp.where(chosen.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
     return type(state)(*map(choose, fresh, state))
 
@@ -122,16 +129,18 @@ def wrap(angle: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:
     """Return an angle or a difference of angles, less its whole turns; ``turns_per_rad`` is 0 to
     keep them.
     """
-    return angle if turns_per_rad is None else angle - TURN * xp.rint(angle * turns_per_rad)
+    if turns_per_rad is None:
+        return angle
+    return angle - TURN * xp.rint(angle * turns_per_rad)
 
 
 def nearest_turn(angle: Array, near: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:
     """Return ``angle`` plus the whole turns that bring it within half a turn of ``near``; other
     arguments as in :func:`wrap`.
     """
-    return (
-        angle if turns_per_rad is None else angle - TURN * xp.rint((angle - near) * turns_per_rad)
-    )
+    if turns_per_rad is None:
+        return angle
+    return angle - TURN * xp.rint((angle - near) * turns_per_rad)
 
 
 def flush(x: Array, tiny: Array) -> Array:

@@ -112,10 +112,14 @@ def plain(name: str, kind: Kind, value: Any) -> Any:
     Raises InvalidArgumentError if a number is out of the bounds of its :class:`Field`, or the value
     has another type.
     """
-    kind, *metadata = get_args(kind) if get_origin(kind) is Annotated else (kind,)
+    if get_origin(kind) is Annotated:
+        kind, *metadata = get_args(kind)
+    else:
+        kind, *metadata = (kind,)
     bounds = next((one for one in metadata if isinstance(one, Field)), Field(low=-math.inf))
     if get_origin(kind) is Literal:
         return choice(name, value, get_args(kind))
+    # None is allowed where the type says so; a union of more is checked elsewhere.
     if NoneType in get_args(kind):
         kinds = [one for one in get_args(kind) if one is not NoneType]
         if value is None or len(kinds) > 1:
@@ -125,4 +129,6 @@ def plain(name: str, kind: Kind, value: Any) -> Any:
         return flag(name, value)
     if kind is int:
         return integer(name, value, int(bounds.low), int(bounds.high))
-    return number(name, value, bounds.low, bounds.high, bounds.unit) if kind is float else value
+    if kind is float:
+        return number(name, value, bounds.low, bounds.high, bounds.unit)
+    return value

@@ -63,7 +63,9 @@ class Record(tuple[Any, ...]):
     def num_joints(self) -> int:
         """Number of joints; 0 where all fields are off."""
         shapes = [leaf.shape for name, leaf in self.leaves().items() if name not in self.WHOLE]
-        return int(shapes[0][1]) if shapes else 0
+        if shapes:
+            return int(shapes[0][1])
+        return 0
 
     @property
     def num_envs(self) -> int:
@@ -100,9 +102,15 @@ class Record(tuple[Any, ...]):
 
         A leaf without a declared field may hold any numbers.
         """
-        joints = self.num_joints if joint_names is None else len(joint_names)
+        if joint_names is None:
+            joints = self.num_joints
+        else:
+            joints = len(joint_names)
         shapes = (1, joints), (num_envs, joints)
-        of = f", of {', '.join(joint_names)}" if joint_names else ""
+        if joint_names:
+            of = f", of {', '.join(joint_names)}"
+        else:
+            of = ""
         for name, leaf in self.leaves().items():
             if name in self.WHOLE:
                 continue
@@ -131,6 +139,7 @@ def with_fields(
     defaults = {name: field.default for name, field in fields.items()} | choices
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        # The declared fields take the place of **options.
         declared_signature = inspect.signature(function)
         shown = [
             one for one in declared_signature.parameters.values() if one.kind is not one.VAR_KEYWORD
@@ -167,13 +176,20 @@ class LeafBuilder:
         """Without a ``dtype``, use the dtype of the traced arrays among ``values``, else
         float64.
         """
-        self.joints, self.num_envs = integer("joints", joints, 1, MOST_JOINTS), 1
-        self.names = None if joint_names is None else names("joint_names", joint_names, self.joints)
+        self.joints = integer("joints", joints, 1, MOST_JOINTS)
+        self.num_envs = 1
+        if joint_names is None:
+            self.names = None
+        else:
+            self.names = names("joint_names", joint_names, self.joints)
         if dtype is None:
             traced: list[Array] = [value for value in values if is_traced(value)]
             floats = [value for value in traced if value.dtype.kind == "f"]
             xp = namespace(*traced)
-            dtype = xp.result_type(*floats) if floats else xp.asarray(0.0).dtype
+            if floats:
+                dtype = xp.result_type(*floats)
+            else:
+                dtype = xp.asarray(0.0).dtype
         try:
             self.dtype: DType = np.dtype(dtype)
         except TypeError:
@@ -188,6 +204,7 @@ class LeafBuilder:
         """
         if value is None:
             return None
+        # A number beyond float32 becomes infinite, and is judged by the bounds.
         with np.errstate(over="ignore"):
             array = read_array(name, value, traced=True).astype(self.dtype)
         return field.checked(name, self.rows(name, array), self.names)
@@ -195,7 +212,9 @@ class LeafBuilder:
     def option(self, name: str, value: Array, field: Field) -> Array:
         """Return an option's leaf: None where it is neutral on every joint of every env."""
         array = self.array(name, value, field)
-        return None if is_everywhere(array, field.neutral) else self.freeze(array)
+        if is_everywhere(array, field.neutral):
+            return None
+        return self.freeze(array)
 
     def options(self, fields: Mapping[str, Field], values: Mapping[str, Array]) -> Document:
         """Return the leaves of all ``fields``."""
@@ -207,6 +226,7 @@ class LeafBuilder:
 
         ``size``, ``low`` and ``high`` name the options of both ends, the lower and the upper one.
         """
+        # Either the size or its ends: the check of both together follows.
         end = Field(neutral=math.inf, low=-math.inf)
         fields = {size: end._replace(low=0.0), low: end, high: end}
         read = {name: self.array(name, values.get(name), field) for name, field in fields.items()}
@@ -219,14 +239,19 @@ class LeafBuilder:
         if value is None:
             return None
         array = self.rows(name, read_array(name, value, "b", traced=True))
-        return None if is_everywhere(array, False) else self.freeze(array.astype(self.dtype))
+        if is_everywhere(array, False):
+            return None
+        return self.freeze(array.astype(self.dtype))
 
     def freeze(self, array: Array) -> Array:
         """Return the leaf in the record's dtype and read-only: records are replaced, not edited."""
-        return array if array is None or is_traced(array) else frozen_array(array, self.dtype)
+        if array is None or is_traced(array):
+            return array
+        return frozen_array(array, self.dtype)
 
     def rows(self, name: str, array: Array) -> Array:
         """Return a scalar, (joints,) or (envs, joints) as (1 | envs, joints)."""
+        # The first option with several envs sets their number for the others.
         expected = f"(), ({self.joints},) or (envs, {self.joints})"
         rows = array[None] if array.ndim == 1 else array
         fits = array.ndim == 0 or rows.shape[1:] in ((1,), (self.joints,))
@@ -270,6 +295,7 @@ def frozen(record: R) -> R:
     Writeable arrays and views are copied. If all arrays are read-only, ``record`` itself is
     returned.
     """
+    # Most records are frozen already, and cost one look.
     exposed = [leaf for leaf in record if isinstance(leaf, np.ndarray) and _can_be_written(leaf)]
     if not exposed:
         return record

@@ -28,18 +28,18 @@ def leaves(tree: Pytree) -> list[Any]:
     """Return the leaves of a tree of tuples, in order."""
     if is_leaf(tree):
         return [tree]
-    return [leaf for part in tree for leaf in leaves(part)] if isinstance(tree, tuple) else []
+    if isinstance(tree, tuple):
+        return [leaf for part in tree for leaf in leaves(part)]
+    return []
 
 
 def mapped(function: Callable[[Any], Any], tree: Pytree) -> Any:
     """Return a tree of tuples with ``function`` applied to its leaves."""
     if is_leaf(tree):
         return function(tree)
-    return (
-        _rebuilt(tree, [mapped(function, part) for part in tree])
-        if isinstance(tree, tuple) and tree
-        else tree
-    )
+    if isinstance(tree, tuple) and tree:
+        return _rebuilt(tree, [mapped(function, part) for part in tree])
+    return tree
 
 
 def structure(tree: Pytree) -> Any:
@@ -66,6 +66,7 @@ def flatten(
         return {}
     if not isinstance(tree, Mapping | tuple | list):
         return {name or "state": read(tree)}
+    # Keys on the way become the name.
     named: Document = {}
     for key, part in parts(tree).items():
         named |= flatten(part, separator, read, f"{name}{separator}{key}" if name else key)
@@ -100,4 +101,6 @@ def _rebuilt(like: Pytree, parts: list[Any]) -> Any:
     """Return a mapping, tuple or list of the type of ``like`` with other parts."""
     if isinstance(like, Mapping):
         return dict(zip(like, parts, strict=True))
-    return type(like)(*parts) if hasattr(like, "_fields") else type(like)(parts)
+    if hasattr(like, "_fields"):
+        return type(like)(*parts)
+    return type(like)(parts)

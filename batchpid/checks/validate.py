@@ -43,7 +43,10 @@ def number(argument: str, value: object, low: float, high: float, unit: str) -> 
     """Return ``value`` as a finite float within [low, high]; an infinite bound does not limit."""
     value = _scalar(argument, value, unit)
     if not low <= value <= high or math.isinf(value):  # NaN is in no range
-        ends = f"from {low:g} to {high:g}" if math.isfinite(high) else f">= {low:g}"
+        if math.isfinite(high):
+            ends = f"from {low:g} to {high:g}"
+        else:
+            ends = f">= {low:g}"
         raise InvalidArgumentError(
             argument, "out of range", value=value, remedy=f"use a number {ends} ({unit})"
         )
@@ -118,6 +121,7 @@ def instance(argument: str, value: object, kind: type[T], remedy: str) -> T:
 
 def names(argument: str, value: Any, count: int | None = None) -> list[str]:
     """Return ``value`` as a list of different names, ``count`` of them if given."""
+    # A string is a sequence of names, too, and never meant.
     sequence = isinstance(value, Sequence) and not isinstance(value, str)
     if not sequence or not all(isinstance(name, str) for name in value):
         raise InvalidArgumentError(
@@ -143,6 +147,7 @@ def file_path(argument: str, value: object, suffixes: Collection[str] = ()) -> P
         raise InvalidArgumentError(
             argument, "must be a path", value=value, remedy="pass the file's name"
         )
+    # Whether the file is there is for the operating system to say.
     path = Path(value)
     if suffixes and path.suffix.lower() not in suffixes:
         raise InvalidArgumentError(
@@ -241,11 +246,11 @@ def array(
         raise InvalidArgumentError(
             argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy
         )
-    given = result.reshape(-1)
+    flat = result.reshape(-1)
     if not is_read or result.shape != shape:
         result = _broadcast(argument, result, shape, remedy)
     # The sum of squares costs a third, and is finite for most; BLAS uses threads for a longer one.
-    is_sound = given.size < 10_000 and math.isfinite(given.dot(given))
+    is_sound = flat.size < 10_000 and math.isfinite(flat.dot(flat))
     if finite and not is_sound and not (good := np.isfinite(result)).all():
         entries(
             argument, result, good, "is not finite", names, kind=kind, remedy="pass finite numbers"
@@ -271,8 +276,10 @@ def entries(
     """
     if np.all(good):
         return
+    # The first bad entry is enough to find the cause.
     index = tuple(int(n) for n in np.argwhere(~np.asarray(good))[0])
-    place, value = index[-1] if index else None, values[index]
+    place = index[-1] if index else None
+    value = values[index]
     where: dict[str, Any] = {kind: place if place is None or names is None else names[place]}
     raise InvalidArgumentError(
         argument,
@@ -362,7 +369,10 @@ def check_keywords(owner: str, given: Collection[str], known: Collection[str]) -
     for name in given:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
-            remedy = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(known)}"
+            if near:
+                remedy = f"did you mean {near[0]!r}?"
+            else:
+                remedy = f"use one of {', '.join(known)}"
             raise InvalidArgumentError(name, f"is not an argument of {owner}", remedy=remedy)
 
 

@@ -109,7 +109,8 @@ class Header:
         if joint_names is not None:
             self.joints = names("joint_names", joint_names, joints)
         if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
-            problem, remedy = "cannot be a name in C", "use letters, digits and _"
+            problem = "cannot be a name in C"
+            remedy = "use letters, digits and _"
             raise InvalidArgumentError("prefix", problem, value=prefix, remedy=remedy)
         params.check(1, self.joints)
         check_gain_units(params)
@@ -118,12 +119,18 @@ class Header:
         if tree is not None:
             self._check_tree(tree)
         self.names = Dialect(prefix, np.dtype(params.dtype), joints)
-        matrix = [] if params.gain_units is None else ["mass_matrix"]
+        if params.gain_units is None:
+            matrix = []
+        else:
+            matrix = ["mass_matrix"]
         self.inputs = ["setpoint", "measurement", *self._optional(inputs), *matrix]
         """Inputs of a step, in their order."""
         # init runs on a measurement of NaN: what is NaN afterwards is a copy of the measurement.
         nan = np.full((1, joints), math.nan, params.dtype)
-        held = None if guard is None else GuardState(nan, np.zeros_like(nan))
+        if guard is None:
+            held = None
+        else:
+            held = GuardState(nan, np.zeros_like(nan))
         self.state = pid.init(params, nan), held
         """State after init; NaN where it is the measurement."""
 
@@ -139,7 +146,10 @@ class Header:
         """Return the optional inputs of a step, in the order of RATES."""
         measures = isinstance(self.params.measurement_rate, MeasuredRate)
         if inputs is None:
-            inputs = ("measurement_rate", "feedforward") if measures else ("feedforward",)
+            if measures:
+                inputs = ("measurement_rate", "feedforward")
+            else:
+                inputs = ("feedforward",)
         chosen = {choice("inputs", name, RATES) for name in inputs}
         if measures and "measurement_rate" not in chosen:
             remedy = "add it, or use params.replace(measurement_rate='difference')"
@@ -149,6 +159,7 @@ class Header:
 
     def text(self) -> str:
         """Return the header."""
+        # The step is traced once, with placeholders for everything that is not a constant.
         constants = discretise(self.params, self.dt), self.guard or Guard()
         trees = constants, self.state, (...,) * len(self.inputs)
         traced = trace_trees(self._step, *map(structure, trees), dtype=self.params.dtype)
@@ -187,7 +198,9 @@ class Header:
         k, limits = constants
         law, held = state
         named = dict(zip(self.inputs, inputs, strict=True))
-        setpoint, rate = named["setpoint"], named.get("setpoint_rate")
+        setpoint = named["setpoint"]
+        rate = named.get("setpoint_rate")
+        # The guard comes before the law, as in a Runner.
         if held is not None:
             held, changed = guard_model.advance(limits, held, setpoint, self.dt)
             setpoint = held.setpoint
@@ -213,7 +226,9 @@ class Header:
     def extent(self, name: str) -> str:
         """Return the number of entries of an input."""
         n = self.names.size
-        return f"{n} * {n}" if name == "mass_matrix" else n
+        if name == "mass_matrix":
+            return f"{n} * {n}"
+        return n
 
     def _frame(self, tables: str, body: str, state: Document) -> str:
         """Return the whole header around the code of a step."""
@@ -238,6 +253,7 @@ class Header:
         fields = "".join(f"  {t} {name}[{n}];\n" for name in state) or "  char unused;\n"
         every = self._started(state)
         lasting = self._started({name: leaf for name, leaf in state.items() if name != "integral"})
+        # An input without effect would be a warning of the compiler.
         unused = "".join(
             f"  (void){name};\n"
             for name in ("state", *self.inputs)
@@ -305,6 +321,7 @@ class {p}_controller {{
         unused = "  (void)state;\n  (void)measurement;\n"
         lines = []
         for name, leaf in leaves.items():
+            # NaN marks what starts at the measurement; equal numbers need no table.
             numbers = [
                 "measurement[j]" if math.isnan(number) else self.names.number(number)
                 for number in leaf[0].tolist()
@@ -314,4 +331,6 @@ class {p}_controller {{
                 value = f"{name}[j]"
                 lines.append(f"  {self.names.table(name, leaf[0])}")
             lines.append(f"    state->{name}[j] = {value};\n")
-        return "".join([self.names.loop, *lines, "  }\n", unused]) if lines else unused
+        if lines:
+            return "".join([self.names.loop, *lines, "  }\n", unused])
+        return unused

@@ -24,7 +24,8 @@ def rigid_body(c: Dialect, tree: RigidTree) -> str:
     t = c.type
     n = c.size
     f = c.suffix
-    zero, one = c.number(0.0), c.number(1.0)
+    zero = c.number(0.0)
+    one = c.number(1.0)
     # A joint's rotation is linear in 1, sin q and 1 - cos q, so that three constant matrices a
     # joint are enough.
     rotations = {"turn": bodies.at_zero, "sine": bodies.sine, "cosine": bodies.cosine}

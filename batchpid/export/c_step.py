@@ -62,12 +62,16 @@ class Dialect(NamedTuple):
     @property
     def type(self) -> str:
         """C type of a number."""
-        return "float" if self.dtype == np.float32 else "double"
+        if self.dtype == np.float32:
+            return "float"
+        return "double"
 
     @property
     def suffix(self) -> str:
         """Suffix of literals and of the functions of ``math.h``."""
-        return "f" if self.dtype == np.float32 else ""
+        if self.dtype == np.float32:
+            return "f"
+        return ""
 
     @property
     def size(self) -> str:
@@ -82,7 +86,9 @@ class Dialect(NamedTuple):
     def number(self, value: float) -> str:
         """Return a number of the dtype as a literal that reads back as the same number."""
         if math.isinf(value):
-            return "-INFINITY" if value < 0 else "INFINITY"
+            if value < 0:
+                return "-INFINITY"
+            return "INFINITY"
         return f"{self.dtype.type(value).item()!r}{self.suffix}"
 
     def table(self, name: str, values: Array) -> str:
@@ -112,8 +118,11 @@ def statements(
     lines = [f"  {c.type} {arrays};\n"] if arrays else []
 
     def text(value: int) -> str:
-        return names[value] if value < len(names) else f"t{value}[j]"
+        if value < len(names):
+            return names[value]
+        return f"t{value}[j]"
 
+    # Loops are as long as they can be: a joint's values then stay in registers.
     in_loop = False
     for name, out, operands in operations:
         texts = [text(operand) for operand in operands]
@@ -182,6 +191,7 @@ def helpers(c: Dialect, body: str) -> Iterator[str]:
     p = c.prefix
     t = c.type
     n = c.size
+    # Only what is called is written, or a compiler would warn of unused functions.
     across = f"{p}_row_minimum(" in body
     for name, sign in (("max", ">"), ("min", "<")):
         if f"{p}_{name}(" in body or (across and name == "min"):

@@ -59,6 +59,7 @@ class Differences(list[str]):
 
     def _explicit(self, params: PIDParams) -> PIDParams:
         """Return the params of the explicit law at this time step."""
+        # No target has the implicit law, but all can have its gains at one time step.
         explicit = as_explicit(params, self.dt)
         if explicit is not params:
             share = explicit.kp[0] / np.where(params.kp[0] > 0, params.kp[0], np.inf)
@@ -72,13 +73,17 @@ class Differences(list[str]):
 
     def _in_efforts(self, params: PIDParams, inertia: ArrayLike | None) -> PIDParams:
         """Return the params with gains in effort units."""
-        poses = None if inertia is None else _inertia(inertia, self.joints)
+        if inertia is None:
+            poses = None
+        else:
+            poses = _inertia(inertia, self.joints)
         if params.gain_units is None:
             return params
         if poses is None:
             problem = "is missing for gains per mass_matrix"
             remedy = "pass inertia=, the diagonal of the mass matrix, or gains in effort units"
             raise InvalidArgumentError("inertia", problem, remedy=remedy)
+        # The gains fit the first pose; the others show how far they are off elsewhere.
         ratio = poses / poses[0]
         text = f"gains per mass_matrix are efforts at one inertia: {self.listed(poses[0])} kg m^2"
         text += " or kg"
@@ -159,7 +164,9 @@ class Differences(list[str]):
 
 def joint_values(leaf: Array, joints: int, off: float) -> Float64:
     """Return a leaf of one env (joints,), ``off`` where it is None."""
-    return np.full(joints, off) if leaf is None else np.asarray(leaf[0], np.float64)
+    if leaf is None:
+        return np.full(joints, off)
+    return np.asarray(leaf[0], np.float64)
 
 
 def strategies(params: PIDParams) -> list[str]:

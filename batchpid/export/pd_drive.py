@@ -61,7 +61,8 @@ class Drive(Differences):
     def lack_motors(self, has: Collection[str]) -> None:
         """Add the effects of the actuators that are on and not in ``has``."""
         for effect, field in EFFECTS.items():
-            values, off = self.motor(effect, field.neutral), field.neutral
+            values = self.motor(effect, field.neutral)
+            off = field.neutral
             if effect not in has:
                 text = _PROBLEMS.get(effect, "none in the target")
                 self.add(effect, text, values != off, values, field.unit.removeprefix("1"))
@@ -71,7 +72,9 @@ class Drive(Differences):
 
         The target passes the limit by up to one step, except at the joints of the mask ``clamps``.
         """
-        integrates, limits = self.value("ki") > 0, self.integral_limit
+        # A joint without ki has no integral that could differ.
+        integrates = self.value("ki") > 0
+        limits = self.integral_limit
         low, high = self.ends("integral")
         passes = np.isfinite(limits) & ~np.asarray(clamps)
         motors = [self.motor(effect, math.inf) for effect in ("effort_limit", "saturation_effort")]
@@ -86,6 +89,7 @@ class Drive(Differences):
             self.add(option, text, integrates & where, limits, "N m or N")
 
     def _compare(self) -> None:
+        # Options of the derivative matter where there is one, and come last.
         params = self.params
         low, high = self.ends("integral")
         excluded = ((low > 0) | (high < 0)) & (params.ki is not None)

@@ -76,6 +76,7 @@ def to_ros2_control(
     """
     law = Differences(params, joint_names, dt, inertia)
     gains = {joint: _gains(law, at) for at, joint in enumerate(law.joints)}
+    # The manager counts in whole hertz; a difference is reported below.
     rate = round(1 / law.dt)
     is_narrow = params.dtype != np.float64
     text = f"the target computes in float64, these params are {params.dtype}"
@@ -100,24 +101,34 @@ def to_ros2_control(
 
 def _gains(law: Differences, at: int) -> Document:
     """Return the gains of joint number ``at``, by name."""
-    params, gains = law.params, Document()
+    params = law.params
+    gains = Document()
     for key, option in LEAVES.items():
         leaf = getattr(params, option)
-        gains[key] = FIELDS[option].neutral if leaf is None else documents.plain(leaf[:, at])
+        if leaf is None:
+            gains[key] = FIELDS[option].neutral
+        else:
+            gains[key] = documents.plain(leaf[:, at])
     if gains["u_clamp_min"] >= gains["u_clamp_max"]:
-        problem, value = "must be below effort_max for control_toolbox", gains["u_clamp_min"]
+        problem = "must be below effort_max for control_toolbox"
+        value = gains["u_clamp_min"]
         raise InvalidArgumentError(
             "effort_min", problem, joint=law.joints[at], value=value, remedy="widen the limits"
         )
+    # control_toolbox refuses limits that exclude 0.
     gains["i_clamp_min"] = min(gains["i_clamp_min"], 0.0)
     gains["i_clamp_max"] = max(gains["i_clamp_max"], 0.0)
     strategy = strategies(params)[at]
     tracks = strategy == "back_calculation"
     is_conditional = strategy == "conditional"
-    gains["antiwindup_strategy"] = "conditional_integration" if is_conditional else strategy
-    gains["tracking_time_constant"] = (
-        documents.plain(params.tracking_time[:, at]) if tracks else 0.0
-    )
+    if is_conditional:
+        gains["antiwindup_strategy"] = "conditional_integration"
+    else:
+        gains["antiwindup_strategy"] = strategy
+    if tracks:
+        gains["tracking_time_constant"] = documents.plain(params.tracking_time[:, at])
+    else:
+        gains["tracking_time_constant"] = 0.0
     weight = params.setpoint_weight_derivative
     gains["ff_velocity_scale"] = 0.0
     if weight is not None:
@@ -127,6 +138,7 @@ def _gains(law: Differences, at: int) -> Document:
 
 def _compare(law: Differences) -> None:
     """Add the differences between the law and control_toolbox's, but for anti-windup."""
+    # A joint without kd does not show how its derivative is taken.
     acts = law.value("kd") > 0
     text = "u_clamp limits the PID alone, not its sum with a feedforward such as gravity"
     law.add("effort_limit", f"{text} compensation", law.limited)

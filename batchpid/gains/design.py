@@ -91,10 +91,13 @@ def pid_from_inertia(
     damping
         Viscous damping of the joints (joints,) [N m s/rad or N s/m].
     """
-    w, load = 2 * np.pi * np.asarray(bandwidth_hz, np.float64), np.asarray(damping, np.float64)
+    # Gains of three equal poles, with the joint's own damping as a part of kd.
+    w = 2 * np.pi * np.asarray(bandwidth_hz, np.float64)
+    load = np.asarray(damping, np.float64)
     # A joint whose own damping exceeds zeta needs the stiffness of a heavier one to be as fast.
     effective = np.maximum(inertia, load / (2 * damping_ratio * w))
-    kp, full = effective * w**2, 2 * damping_ratio * w * effective
+    kp = effective * w**2
+    full = 2 * damping_ratio * w * effective
     return {
         "kp": kp,
         "ki": kp / (INTEGRAL_TIME / w if integral_time is None else integral_time),
@@ -172,22 +175,26 @@ def design_gains(
         raise InvalidArgumentError(
             "load", f"has no effect with gain_units {gain_units!r}", remedy=remedy
         )
+    # A leader carries its followers, so gains are designed for the reduced inertias.
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
     coupling = getattr(robot, "coupling", Coupling.of(mass.shape[-1]))
-    mass, viscous = coupling.reduced(mass), coupling.reduced_damping(robot.damping)
+    mass = coupling.reduced(mass)
+    viscous = coupling.reduced_damping(robot.damping)
     diagonal = np.diagonal(mass, axis1=1, axis2=2)
     carried = np.maximum(diagonal.max(0), coupling.reduced_damping(least))
     # The loop with the mass matrix has unit inertias, and compensates the joints' damping.
-    inertia, damping = (
-        (carried, viscous) if gain_units == "effort" else (np.ones_like(carried), 0.0)
-    )
+    if gain_units == "effort":
+        inertia, damping = (carried, viscous)
+    else:
+        inertia, damping = (np.ones_like(carried), 0.0)
     while True:
         gains = pid_from_inertia(
             inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping
         )
-        filter_time = (
-            _filter_time(mass, gains, dt, viscous, gain_units, margin) if is_explicit else 0.0
-        )
+        if is_explicit:
+            filter_time = _filter_time(mass, gains, dt, viscous, gain_units, margin)
+        else:
+            filter_time = 0.0
         if (
             filter_time <= max(FILTER_SHARE / (2 * np.pi * bandwidth), FILTER_STEPS * dt)
             or bandwidth < 1e-3
@@ -201,6 +208,7 @@ def design_gains(
         "gain_units": gain_units,
         "discretization": discretization,
     }
+    # A limit that the caller names replaces the robot's.
     limit = getattr(robot, "design_effort_limit", None)
     if limit is not None and not {"effort_limit", "effort_min", "effort_max"} & set(options):
         designed["effort_limit"] = limit
@@ -220,7 +228,8 @@ def _filter_time(
     """
     joints = mass.shape[1]
     if gain_units == "mass_matrix":  # u = M a: every joint is a unit inertia, coupled to no other
-        mass, damping = np.eye(joints)[None], np.zeros(joints)
+        mass = np.eye(joints)[None]
+        damping = np.zeros(joints)
 
     def ratios(filter_time: float) -> Float64:
         return stability_bound(
@@ -241,7 +250,11 @@ def _filter_time(
         high *= 2
         if high > 1e3:
             return math.inf
+    # Bisection in the logarithm: 40 halvings exceed the precision of a float.
     for _ in range(40):
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if ratios(middle).max() > margin else (low, middle)
+        if ratios(middle).max() > margin:
+            low, high = (middle, high)
+        else:
+            low, high = (low, middle)
     return high

@@ -128,10 +128,9 @@ def stability_bound(
         lag=lag,
     )
     if model is not None or late.any() or slow.any():
-        one = np.eye(m.shape[-1])
-        unit = broadcast(
-            "model", one if model is None else model, m.shape, "give it the shape of mass_matrix"
-        )
+        matrix = np.eye(m.shape[-1]) if model is None else model
+        unit = broadcast("model", matrix, m.shape, "give it the shape of mass_matrix")
+        at_least("model", unit, -np.inf)
         return _late_bound(m, unit, [p, c, tau, b, late, slow], dt)
     passed = dt / (dt + 2 * tau)
     weight = np.sqrt(passed * dt * c + 0.5 * dt**2 * p)
@@ -144,7 +143,8 @@ def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) ->
     """Return the bound of loops whose efforts are late; ``columns`` are those of :func:`_loop`
     (..., joints).
     """
-    ratio, participation = np.zeros(m.shape[:-2]), np.zeros(m.shape[:-1])
+    ratio = np.zeros(m.shape[:-2])
+    participation = np.zeros(m.shape[:-1])
     for at in np.ndindex(*m.shape[:-2]):
         local = [column[at] for column in columns]
         # Frequencies are spaced by ratio where loci bend, and evenly up to the highest.
@@ -205,7 +205,8 @@ def _crossing(z: Rows, values: Rows) -> tuple[float, int]:
     # all with frequency.
     local = values * np.abs(z - 1)[:, None] ** 2
     nearest = np.abs(local[1:, :, None] - local[:-1, None, :]).argmin(2)
-    now, then = np.take_along_axis(values[:-1], nearest, 1), values[1:]
+    now = np.take_along_axis(values[:-1], nearest, 1)
+    then = values[1:]
     first = values[0]
     if ((first.real < 0) & (first.imag > 0)).any():
         return np.inf, 0
@@ -286,13 +287,15 @@ def _one_step(mass_matrix: ArrayLike, dt: float, *gains: ArrayLike) -> Float64:
     columns = dict(zip(("kp", "ki", "kd", "filter_time", "damping"), gains, strict=True))
     m, p, i, c, tau, b = _columns(mass_matrix, dt, **columns)
     shape = m.shape[:-1]
-    one, zero = np.broadcast_to(np.eye(shape[-1]), m.shape), np.zeros(m.shape)
+    one = np.broadcast_to(np.eye(shape[-1]), m.shape)
+    zero = np.zeros(m.shape)
 
     def diagonal(values: Float64) -> Float64:
         return values[..., None] * one
 
     # One step of the law, output first, and of the plant, semi-implicit, as block rows.
-    keep, take = tau / (tau + dt), dt / (tau + dt)
+    keep = tau / (tau + dt)
+    take = dt / (tau + dt)
     # d = keep d' - take w / dt on the negated measurement, so u = -p q + I + c d; w = q - q'.
     rate = [zero, diagonal(-take / dt), zero, diagonal(keep)]
     effort = [

@@ -106,7 +106,10 @@ class RecordFile(Generic[R]):
         """Return the record in a text, JSON if it begins with a brace and else YAML; otherwise as
         :meth:`load`.
         """
-        format = "json" if text.lstrip().startswith("{") else "yaml"
+        if text.lstrip().startswith("{"):
+            format = "json"
+        else:
+            format = "yaml"
         return self._built("text", parse("text", text, format), joint_names)
 
     def save(
@@ -168,8 +171,12 @@ class RecordFile(Generic[R]):
     ) -> tuple[R, list[str]]:
         """Return the record of a document and the names of its joints."""
         joints = self._joints(source, document)
-        order = list(joints) if joint_names is None else names("joint_names", joint_names)
-        missing, unknown = sorted(set(order) - set(joints)), sorted(set(joints) - set(order))
+        if joint_names is None:
+            order = list(joints)
+        else:
+            order = names("joint_names", joint_names)
+        missing = sorted(set(order) - set(joints))
+        unknown = sorted(set(joints) - set(order))
         if unknown or (missing and not self.partial):
             problem = f"does not hold these joints: missing {missing}, unknown {unknown}"
             remedy = f"the file's joints are {', '.join(joints)}"
@@ -227,7 +234,10 @@ def _column(source: str, name: str, field: Field, joints: Mapping[str, Document]
     columns: dict[str, list[object]] = {}
     for joint, options in joints.items():
         value = options.get(name, field.neutral)
-        columns[joint] = value if isinstance(value, list) else [value]
+        if isinstance(value, list):
+            columns[joint] = value
+        else:
+            columns[joint] = [value]
     envs = max(map(len, columns.values()))
     for joint, values in columns.items():
         if len(values) not in (1, envs):
@@ -271,7 +281,9 @@ def parse(source: str, text: str | bytes, format: str) -> Any:
     """Return the document in a text in ``format``; ``source`` names it in errors."""
     try:
         text = text.decode() if isinstance(text, bytes) else text
-        return _parse_json(text) if format == "json" else _parse_yaml(text)
+        if format == "json":
+            return _parse_json(text)
+        return _parse_yaml(text)
     except Exception as error:  # a damaged text can make the parser raise anything
         cause = " ".join(str(error).split())[:300] or type(error).__name__
         problem = f"cannot be read: {cause}"
@@ -306,7 +318,9 @@ def plain(column: Rows) -> Any:
     if column.dtype == np.float32:
         # The shortest digits that read back as the same number of its dtype: its float has more.
         values = [float(str(value)) for value in column]
-    return values[0] if len(values) == 1 else values
+    if len(values) == 1:
+        return values[0]
+    return values
 
 
 def _without_infinities(value: Any) -> Any:
@@ -317,7 +331,9 @@ def _without_infinities(value: Any) -> Any:
         return {key: _without_infinities(entry) for key, entry in value.items()}
     if isinstance(value, list):
         return [_without_infinities(entry) for entry in value]
-    return str(value) if isinstance(value, float) and math.isinf(value) else value
+    if isinstance(value, float) and math.isinf(value):
+        return str(value)
+    return value
 
 
 def _parse_json(text: str) -> Any:

@@ -20,7 +20,10 @@ def package_versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
     versions = {"python": platform.python_version()}
     for package in packages:
         try:
-            versions[package] = batchpid.__version__ if package == "batchpid" else version(package)
+            if package == "batchpid":
+                versions[package] = batchpid.__version__
+            else:
+                versions[package] = version(package)
         except PackageNotFoundError:
             continue
     return versions

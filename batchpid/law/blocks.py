@@ -44,7 +44,9 @@ def advance_in_blocks(
         return state, terms.effort
     if out is None:
         out = (jax.tree.map(jnp.zeros_like, state), jnp.zeros_like(measurement))
-    block, total = rows * joints, envs * joints
+    # All arrays are flat from here on; shared rows fill a block.
+    block = rows * joints
+    total = envs * joints
 
     def flat(x: Array) -> Array:  # a row that all envs share is repeated over a block
         if jnp.ndim(x) < 2:
@@ -56,7 +58,9 @@ def advance_in_blocks(
         start = jnp.minimum(n * block, total - block)
 
         def cut(x: Array) -> Array:
-            return jax.lax.dynamic_slice_in_dim(x, start, block) if jnp.shape(x) == (total,) else x
+            if jnp.shape(x) == (total,):
+                return jax.lax.dynamic_slice_in_dim(x, start, block)
+            return x
 
         new, terms = advance(*jax.tree.map(cut, arguments))
         done = new, terms.effort

@@ -69,15 +69,21 @@ def track(
     (origin, _), (lasting, _) = (
         origins(k, state, measurement, rate, xp) for rate in (setpoint_rate, None)
     )
-    rate = zero if measurement_rate is None else -measurement_rate
+    if measurement_rate is None:
+        rate = zero
+    else:
+        rate = -measurement_rate
     if setpoint_rate is not None:
         rate = rate + weighted_rate(k, setpoint_rate)
     # The law solved for its integral: I = u - P - D - feedforward, with the derivative filter
     # settled on its input.
     integral = effort - proportional(k, error, measurement, origin)
-    integral = integral if k.kd is None else integral - k.kd * rate
-    integral = integral if feedforward is None else integral - feedforward
+    if k.kd is not None:
+        integral = integral - k.kd * rate
+    if feedforward is not None:
+        integral = integral - feedforward
     return PIDState(
+        # What the next step compares with is set as if this sample had been the last.
         integral=clip(integral, k.integral_min, k.integral_max, xp),
         measurement=None if state.measurement is None else measurement.copy(),
         derivative=None if state.derivative is None else rate,

@@ -69,6 +69,7 @@ def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coe
     of another type, and unless dt is positive and finite; an array of JAX is not checked.
     """
     dt = checked_dt(dt, instance("params", params, PIDParams, "build them with make_params").dtype)
+    # The implicit law is the explicit one with other gains; what it adds is kept beside them.
     c = params.setpoint_weight_derivative
     c_given = None
     share = None
@@ -76,8 +77,10 @@ def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coe
     if implicit:
         c, c_given, share = implicit_gains(params, dt)[-3:]
         params = as_explicit(params, dt)
-    tau, tracking = params.derivative_filter_time, params.tracking_time
+    tau = params.derivative_filter_time
+    tracking = params.tracking_time
     same = {name: leaf for name, leaf in params._asdict().items() if name in Coefficients._fields}
+    # Leaves that time does not scale keep their names.
     k = Coefficients(
         **same,
         ki_dt=None if params.ki is None else params.ki * dt,
@@ -95,15 +98,20 @@ def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coe
         turns=None if params.continuous is None else params.continuous / TURN,
         tiny=None if tau is None and tracking is None else tiny_of(params.dtype),
     )
-    return k if num_envs is None else spread(k, num_envs)
+    if num_envs is None:
+        return k
+    return spread(k, num_envs)
 
 
 def spread(k: Coefficients, num_envs: int) -> Coefficients:
     """Return ``k`` with arrays of shape (num_envs, joints): NumPy then steps small batches twice as
     fast.
     """
-    xp, dtype = namespace(*k), k.kp.dtype
-    zeros, off = xp.zeros((num_envs, k.kp.shape[-1]), dtype), (type(None), tuple)
+    # Masks and options that are off have no rows.
+    xp = namespace(*k)
+    dtype = k.kp.dtype
+    zeros = xp.zeros((num_envs, k.kp.shape[-1]), dtype)
+    off = (type(None), tuple)
     return Coefficients(
         *(leaf if isinstance(leaf, off) else zeros + xp.asarray(leaf, dtype=dtype) for leaf in k)
     )

@@ -45,13 +45,15 @@ def checked_inputs(
     arrays |= {
         name: None if value is None else _as_array(name, value) for name, value in inputs.items()
     }
+    # Shapes are compared as sets: one look suffices where all are (envs, joints).
     of_params = {leaf.shape for leaf in params if leaf is not None and not isinstance(leaf, tuple)}
-    known = {"state": [leaf.shape for leaf in state if leaf is not None]}
-    known |= {name: [array.shape] for name, array in arrays.items() if array is not None}
-    (whole,), joints = known["measurement"], params.num_joints
+    shapes = {"state": [leaf.shape for leaf in state if leaf is not None]}
+    shapes |= {name: [array.shape] for name, array in arrays.items() if array is not None}
+    (whole,) = shapes["measurement"]
+    joints = params.num_joints
     usual = {whole, (1, joints)}  # a look saves most of the time
-    if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*known.values())):
-        _check_shapes(np.broadcast_shapes(*of_params), joints, known)
+    if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*shapes.values())):
+        _check_shapes(np.broadcast_shapes(*of_params), joints, shapes)
     return in_dtype_of(params, *arrays.values())
 
 
@@ -121,7 +123,8 @@ def _check_shapes(
 
 def needs(params: PIDParams) -> PIDState:
     """Return which leaves of a state the params need, as bools."""
-    differentiates, weights = params.kd is not None, params.setpoint_weight is not None
+    differentiates = params.kd is not None
+    weights = params.setpoint_weight is not None
     weights_rate = differentiates and params.setpoint_weight_derivative is not None
     return PIDState(
         integral=params.ki is not None,
@@ -169,6 +172,7 @@ def checked_dt(dt: Array, dtype: DType) -> Array:
 
     A number of NumPy would give its own dtype to the efforts. Values of JAX's arrays are not read.
     """
+    # One step for each env is checked entry by entry.
     if isinstance(dt, np.ndarray) and dt.ndim:
         if dt.dtype.kind not in "iuf" or not ((dt > 0) & (dt < np.inf)).all():
             raise InvalidArgumentError(
@@ -178,7 +182,9 @@ def checked_dt(dt: Array, dtype: DType) -> Array:
         return dt.astype(dtype, copy=False)
     if isinstance(dt, np.ndarray | np.generic):
         dt = dt.item()
-    return dt if hasattr(dt, "__array_namespace__") else time_step("dt", dt)
+    if hasattr(dt, "__array_namespace__"):
+        return dt
+    return time_step("dt", dt)
 
 
 def _as_array(name: str, value: Any, kinds: str = "iuf") -> Array:

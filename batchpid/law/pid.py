@@ -61,6 +61,7 @@ def init(params: PIDParams, measurement: Array) -> PIDState:
 
     Raises InvalidArgumentError if the measurement has another number of joints than the params.
     """
+    # A state holds what the options need, and nothing else.
     (measurement,) = checked_inputs(params, PIDState(), measurement)
     xp = namespace(*params, measurement)
     y = xp.zeros_like(measurement) + measurement
@@ -195,7 +196,8 @@ def advance(
     if k.non_finite is not None:
         finite = xp.isfinite(r) & xp.isfinite(y)
         for optional in (r_rate, y_rate, ff):
-            finite = finite if optional is None else finite & xp.isfinite(optional)
+            if optional is not None:
+                finite = finite & xp.isfinite(optional)
         r, y, r_rate, y_rate, ff = (
             None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff)
         )
@@ -218,18 +220,20 @@ def advance(
     # The filter acts on the weighted rate, so that one state serves measurement and setpoint.
     d, derivative = 0.0, None
     if k.kd is not None:
-        rate = (
-            -y_rate if y_rate is not None else wrap(state.measurement - y, k.turns, xp) * k.per_dt
-        )
+        if y_rate is not None:
+            rate = -y_rate
+        else:
+            rate = wrap(state.measurement - y, k.turns, xp) * k.per_dt
         if r_rate is not None:
             rate = rate + weighted_rate(k, r_rate)
         elif k.c is not None:
             rate = (
                 rate + k.c * state.setpoint_seen * wrap(r - state.setpoint, k.turns, xp) * k.per_dt
             )
-        derivative = (
-            rate if k.decay is None else flush(k.decay * state.derivative + k.intake * rate, k.tiny)
-        )
+        if k.decay is None:
+            derivative = rate
+        else:
+            derivative = flush(k.decay * state.derivative + k.intake * rate, k.tiny)
         d = k.kd * derivative
         u = u + d
     if ff is not None:
@@ -294,6 +298,7 @@ def reset(
     """
     (measurement,) = checked_inputs(params, state, measurement)
     mask = checked_mask(mask, state)
+    # Every env is started, and those of the mask are taken.
     fresh = init(params, measurement)
     if keep_integral:
         fresh = fresh._replace(integral=state.integral)
@@ -303,13 +308,17 @@ def reset(
 def wrapped_error(k: Coefficients, r: Array, y: Array, xp: ArrayModule) -> Array:
     """Return the wrapped error, less the dead zone."""
     error = wrap(r - y, k.turns, xp)
-    return error if k.deadband is None else error - clip(error, -k.deadband, k.deadband, xp)
+    if k.deadband is None:
+        return error
+    return error - clip(error, -k.deadband, k.deadband, xp)
 
 
 def weighted_rate(k: Coefficients, r_rate: Array) -> Array:
     """Return a given setpoint rate times its weight."""
     weight = k.c if k.c_given is None else k.c_given
-    return r_rate if weight is None else weight * r_rate
+    if weight is None:
+        return r_rate
+    return weight * r_rate
 
 
 def origins(
@@ -377,5 +386,7 @@ def advance_drive(
     """
     state, terms = advance(k, state, setpoint, measurement, **inputs)
     xp = namespace(*k, terms.i, setpoint)
-    driven, target = k.kp > 0, nearest_turn(setpoint, measurement, k.turns, xp)
+    # I / kp moves the target; a joint without kp has nothing to move it by.
+    driven = k.kp > 0
+    target = nearest_turn(setpoint, measurement, k.turns, xp)
     return state, target + xp.where(driven, terms.filled().i, 0) / xp.where(driven, k.kp, 1)

@@ -60,7 +60,8 @@ class Terms(NamedTuple):
 
     def filled(self) -> Terms:
         """Return all terms as new arrays (envs, joints), but for the effort."""
-        xp, finite = namespace(*self), self.finite
+        xp = namespace(*self)
+        finite = self.finite
         zero = xp.zeros_like(self.effort)
         if finite is None:
             terms = [zero + term for term in self[:5]]

@@ -120,12 +120,17 @@ def init(
     qpos, qvel, effort = in_dtype_of(actuators, qpos, qvel, effort)
     xp = namespace(*actuators, qpos)
     zeros = xp.zeros_like(qpos)
-    position, velocity = zeros + qpos, zeros if qvel is None else zeros + qvel
+    position = zeros + qpos
+    velocity = zeros if qvel is None else zeros + qvel
     requested = zeros if effort is None else zeros + effort
+    # What no effect needs is None, and costs nothing.
     command = sensor = encoder = key = step = None
     # Histories are as long as the longest delay may become, so that delays can grow in flight.
     if actuators.max_delay is not None:
-        samples = delay.samples_of(actuators.max_delay, dt) if samples is None else samples
+        if samples is None:
+            samples = delay.samples_of(actuators.max_delay, dt)
+        else:
+            samples = samples
         if actuators.command_delay is not None:
             command = delay.start(requested, samples)
         if actuators.sensor_delay is not None:
@@ -156,9 +161,11 @@ def discretise(
     faster. Raises InvalidArgumentError if dt is a number that is not positive, or above 1 s.
     """
     check_time_step("dt", dt)
-    a, xp = actuators, namespace(*actuators)
+    a = actuators
+    xp = namespace(*actuators)
     position = velocity = None
     if a.sensor_delay is not None:
+        # One history for both: positions side by side with velocities.
         begins = 0, a.sensor_delay.shape[1]
         position, velocity = (
             delay.discretise(a.sensor_delay, dt, state.sensor, begin) for begin in begins
@@ -192,6 +199,7 @@ def discretise(
             return leaf
         return xp.broadcast_to(leaf, (*leaf.shape[:-2], num_envs, leaf.shape[-1])).copy()
 
+    # The envelopes are tuples of their own.
     flat = {name: spread(leaf) for name, leaf in k._asdict().items() if not isinstance(leaf, tuple)}
     ends, commands = (Envelope(*map(spread, item)) for item in (k.envelope, k.commands))
     return k._replace(**flat, envelope=ends, commands=commands)
@@ -225,8 +233,11 @@ def measure(
 
 def _motor(k: MotorCoefficients, effort: Array) -> Array:
     """Return s u + b."""
-    effort = effort if k.strength is None else k.strength * effort
-    return effort if k.bias is None else effort + k.bias
+    if k.strength is not None:
+        effort = k.strength * effort
+    if k.bias is None:
+        return effort
+    return effort + k.bias
 
 
 def _delivered(
@@ -236,6 +247,7 @@ def _delivered(
     before, None without.
     """
     xp = namespace(effort, qpos, qvel)
+    # The lag is within the envelope, too: it cannot deliver what the motor does not have.
     low, high = limits(k.envelope, qvel)
     motor = clip(_motor(k, effort), low, high, xp)
     if k.intake is not None:
@@ -259,6 +271,7 @@ def _play(k: MotorCoefficients, encoder: Array, qpos: Array, qvel: Array) -> tup
     before.
     """
     xp = namespace(qpos, qvel)
+    # The encoder moves once the play is used up, and not before.
     behind = wrap(encoder - qpos, k.turns, xp)
     offset = clip(behind, -k.play, k.play, xp)
     return qpos + offset, qvel * (offset != behind).astype(qvel.dtype)
@@ -272,9 +285,11 @@ def _encode(
     ``position`` and ``velocity`` are the noise, or None.
     """
     xp = namespace(qpos, qvel)
-    qpos = qpos if k.position_offset is None else qpos + k.position_offset
+    if k.position_offset is not None:
+        qpos = qpos + k.position_offset
     qpos = qpos if position is None else qpos + position
     qvel = qvel if velocity is None else qvel + velocity
+    # Resolution comes last: noise and offset are rounded, as in an encoder.
     if k.position_resolution is not None:
         qpos = xp.rint(qpos / k.position_resolution) * k.position_resolution
     if k.velocity_resolution is not None:
@@ -322,12 +337,13 @@ def advance_measurement(
         qpos = encoder
     if k.position_delay is not None and k.velocity_delay is not None:
         sensor = push_history(sensor, qpos, qvel)
-        qpos, qvel = (
-            delay.read(sensor, k.position_delay, k.turns, xp),
-            delay.read(sensor, k.velocity_delay, None, xp),
-        )
+        qpos = delay.read(sensor, k.position_delay, k.turns, xp)
+        qvel = delay.read(sensor, k.velocity_delay, None, xp)
     if key is not None:
-        drawn = measurement_noise(k, key, step, qpos, xp) if drawn is None else drawn
+        if drawn is None:
+            drawn = measurement_noise(k, key, step, qpos, xp)
+        else:
+            drawn = drawn
         step = step + _ONE
     qpos, qvel = _encode(k, qpos, qvel, *(drawn or (None, None)))
     return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel
@@ -353,4 +369,6 @@ def _step(resolution: Array, xp: ArrayModule) -> Array:
     """Return the step of a sensor; 2^-60, which is below the last bit that matters, without a
     resolution.
     """
-    return None if resolution is None else xp.where(resolution > 0, resolution, 2.0**-60)
+    if resolution is None:
+        return None
+    return xp.where(resolution > 0, resolution, 2.0**-60)

@@ -55,7 +55,8 @@ def _resized(old: Array, new: Array) -> Array:
     """Return a history of the length of another; other arrays as they are."""
     if old.ndim < 3 or old.shape == new.shape:
         return old
-    xp, samples = old.__array_namespace__(), new.shape[1]
+    xp = old.__array_namespace__()
+    samples = new.shape[1]
     if samples < old.shape[1]:
         return old[:, :samples].copy()
     oldest = xp.broadcast_to(old[:, -1:], (old.shape[0], samples - old.shape[1], old.shape[2]))

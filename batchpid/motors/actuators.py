@@ -236,10 +236,14 @@ def make_actuators(
 def _check_together(leaves: Document, joint_names: Sequence[str] | None) -> None:
     """Raise InvalidArgumentError for effects that lack another one, or contradict it."""
     if (leaves["saturation_effort"] is None) != (leaves["no_load_speed"] is None):
-        missing = "no_load_speed" if leaves["no_load_speed"] is None else "saturation_effort"
+        if leaves["no_load_speed"] is None:
+            missing = "no_load_speed"
+        else:
+            missing = "saturation_effort"
         remedy = "give both ends of the torque-speed line, or none"
         raise InvalidArgumentError(missing, "is missing", remedy=remedy)
-    static, coulomb = leaves["static"], leaves["coulomb"]
+    static = leaves["static"]
+    coulomb = leaves["coulomb"]
     if static is None:
         if leaves["stribeck"] is not None:
             remedy = "give static, or leave it out"
@@ -267,4 +271,6 @@ def _longest_delay(leaves: Document, max_delay: float | None) -> float | None:
             raise InvalidArgumentError(name, "out of range", value=delay, remedy=remedy)
     if max_delay is None and len(most) == len(delays):
         longest = max(most.values(), default=0.0)
-    return longest if delays else None
+    if delays:
+        return longest
+    return None

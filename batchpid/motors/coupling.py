@@ -48,7 +48,9 @@ def _of_followers(method: Callable[[Coupling, Any], Any]) -> Callable[[Coupling,
 
     @wraps(method)
     def call(self: Coupling, given: Array) -> Array:
-        return method(self, given) if self.shares else given
+        if self.shares:
+            return method(self, given)
+        return given
 
     return call
 
@@ -96,7 +98,9 @@ class Coupling(NamedTuple):
                 passed.add(leader)
                 _, leader, factor, shift = direct[leader]
                 multiplier, offset = multiplier * factor, offset + multiplier * shift
-            leaders[joint], multipliers[joint], offsets[joint] = leader, multiplier, offset
+            leaders[joint] = leader
+            multipliers[joint] = multiplier
+            offsets[joint] = offset
         independent = np.array([joint not in direct for joint in range(joints)], bool)
         of_leader = [
             [item for item in sorted(direct) if leaders[item] == joint] for joint in range(joints)
@@ -152,7 +156,8 @@ class Coupling(NamedTuple):
         """Return the efforts G^T u on the independent joints for u = ``effort``; zero for
         followers.
         """
-        xp, acting = namespace(effort), self.of_independent(effort)
+        xp = namespace(effort)
+        acting = self.of_independent(effort)
         for share in self.shares:  # the order of the sum is the same for any number of rows
             added = share.multiplier * take_columns(effort, share.joint)
             acting = xp.where(share.exists, acting + added, acting)

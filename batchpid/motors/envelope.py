@@ -64,7 +64,9 @@ def command_envelope(actuators: Actuators) -> Envelope:
     shift = 0.0 if actuators.bias is None else actuators.bias
 
     def command(end: Array) -> Array:
-        return None if end is None else (end - shift) / divisor
+        if end is None:
+            return None
+        return (end - shift) / divisor
 
     slope = None if k.slope is None else k.slope / divisor
     return Envelope(

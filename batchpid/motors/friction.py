@@ -75,7 +75,9 @@ class Friction(NamedTuple):
         joints.
         """
         parts = [leaf for leaf in (self.coulomb, self.static, self.load) if leaf is not None]
-        return sum(parts[1:], parts[0]) if parts else None
+        if parts:
+            return sum(parts[1:], parts[0])
+        return None
 
 
 class FrictionState(NamedTuple):

@@ -96,8 +96,14 @@ def make_guard(
     low, high = build.limits("", "lower", "upper", limits)
     if mask is not None:
         xp = namespace(mask)
-        low = None if low is None else xp.where(mask > 0, -math.inf, low)
-        high = None if high is None else xp.where(mask > 0, math.inf, high)
+        if low is None:
+            low = None
+        else:
+            low = xp.where(mask > 0, -math.inf, low)
+        if high is None:
+            high = None
+        else:
+            high = xp.where(mask > 0, math.inf, high)
     rates = {name: FIELDS[name] for name in ("rate", "acceleration")}
     return Guard(
         lower=build.freeze(low),

@@ -63,6 +63,7 @@ def normals(
 
     ``key`` is (envs, 2), ``step`` (..., envs) uint32; the results are (..., envs, joints).
     """
-    joint, table = xp.arange(joints, dtype=xp.uint32)[None], xp.asarray(quantiles(np.dtype(dtype)))
+    joint = xp.arange(joints, dtype=xp.uint32)[None]
+    table = xp.asarray(quantiles(np.dtype(dtype)))
     first, second, *_ = pcg4d(key[:, :1], key[:, 1:], step[..., None], joint)
     return table.take(first >> _HALF), table.take(second >> _HALF)

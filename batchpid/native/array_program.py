@@ -33,7 +33,8 @@ def interpreter() -> Any:
     """
     native = load(PROGRAM)
     native.use(np.ndarray, np.empty)
-    rows, fixed = np.empty((2, 3)), np.empty((4, 1), np.float32)
+    rows = np.empty((2, 3))
+    fixed = np.empty((4, 1), np.float32)
     fixed.flags.writeable = False
     for entry in (rows, fixed):
         if native.look(entry) != (
@@ -54,11 +55,10 @@ def threads_for(numbers: int, threads: int | None = None) -> int:
     if most < 2:
         return 1
     if threads is None:
-        threads = (
-            len(os.sched_getaffinity(0))
-            if hasattr(os, "sched_getaffinity")
-            else os.cpu_count() or 1
-        )
+        if hasattr(os, "sched_getaffinity"):
+            threads = len(os.sched_getaffinity(0))
+        else:
+            threads = os.cpu_count() or 1
     return min(most, threads)
 
 
@@ -83,13 +83,15 @@ class ArrayProgram:
         self.shape = shape
         self.dtype = np.dtype(dtype)
         self.masks = trace.masks
-        given = [np.ascontiguousarray(entry, dtype) for entry in (*constants, *trace.literals)]
+        prepared = [np.ascontiguousarray(entry, dtype) for entry in (*constants, *trace.literals)]
         if trace.prelude is not None:
-            rows = max((entry.shape[0] for entry in given if entry.ndim == 2), default=1)
-            result = ArrayProgram(trace.prelude, (), len(given), (rows, shape[1]), dtype)(*given)
-            given += [entry.astype(dtype) for entry in result]
+            rows = max((entry.shape[0] for entry in prepared if entry.ndim == 2), default=1)
+            result = ArrayProgram(trace.prelude, (), len(prepared), (rows, shape[1]), dtype)(
+                *prepared
+            )
+            prepared += [entry.astype(dtype) for entry in result]
         tables = trace.operations, trace.results, trace.registers
-        self.arguments = (*tables, inputs, tuple(given), *shape, self.dtype == np.float32)
+        self.arguments = (*tables, inputs, tuple(prepared), *shape, self.dtype == np.float32)
         """Arguments of ``make_program`` in make_program.h."""
         self._program = interpreter().program(*self.arguments)
         self._run = interpreter().run
@@ -133,6 +135,7 @@ class ArrayProgram:
         full
             Bit mask of the further inputs that must be (rows, columns).
         """
-        native, new = interpreter(), (self.shape, self.dtype)
+        native = interpreter()
+        new = (self.shape, self.dtype)
         fixed = self._program, self.shape[0], tuple(inputs), tuple(outputs)
         return partial(native.call, native.bind(*fixed, given, full, new, self._threads))

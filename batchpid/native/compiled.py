@@ -80,7 +80,10 @@ class CompiledLaw:
         fixed = [leaf for leaf in state if leaf is not None]
         written = [state[at] for at in lasting]
         masks = program.masks[len(lasting) :]
-        effort = np.empty(self._shape, program.dtype) if out is None else out
+        if out is None:
+            effort = np.empty(self._shape, program.dtype)
+        else:
+            effort = out
         shown = [
             np.empty(self._shape, bool if is_mask else program.dtype) for is_mask in masks[:-1]
         ]

@@ -81,12 +81,16 @@ class Symbol:
     @property
     def dtype(self) -> np.dtype[Any]:
         """Dtype of the array: bool for a mask, else the dtype of the trace."""
-        return np.dtype(bool) if self.is_mask else self._namespace.dtype
+        if self.is_mask:
+            return np.dtype(bool)
+        return self._namespace.dtype
 
     def astype(self, dtype: DType) -> Symbol:
         """Return a mask as numbers; return numbers unchanged."""
         assert np.dtype(dtype) == self._namespace.dtype
-        return self.record("add", self, -0.0) if self.is_mask else self
+        if self.is_mask:
+            return self.record("add", self, -0.0)
+        return self
 
     def copy(self) -> Symbol:
         """Return the same symbol: the results of a program are new arrays."""

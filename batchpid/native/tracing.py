@@ -67,7 +67,10 @@ def trace(
     late = _fused(late, results)
     used = {*results, *(operand for _, operands, _ in late for operand in operands)}
     shared = [result for _, _, result in early if result in used]
-    prelude = _assembled(early, first, shared, ()) if shared else None
+    if shared:
+        prelude = _assembled(early, first, shared, ())
+    else:
+        prelude = None
     return _assembled(
         late, [*first, *shared, *entries[constants:]], results, tuple(literals.values()), prelude
     )
@@ -90,7 +93,8 @@ def trace_trees(function: Callable[..., Any], *structures: Any, dtype: DType = n
 
 def _needed(noted: Iterable[_Operation], results: list[Symbol]) -> list[_Operation]:
     """Return the operations that ``results`` depend on."""
-    needed, operations = set(results), list[_Operation]()
+    needed = set(results)
+    operations = list[_Operation]()
     for name, operands, result in reversed([*noted]):
         if result in needed:
             needed.update(operands)
@@ -119,9 +123,10 @@ def _fused(operations: list[_Operation], results: list[Symbol]) -> list[_Operati
         fused[result] = (name, operands, result)
         for at in range(2 if name in ("add", "multiply") else 1):
             before = fused.get(operands[at])
-            pair = (
-                None if before is None or uses[operands[at]] > 1 else _PAIRS.get((before[0], name))
-            )
+            if before is None or uses[operands[at]] > 1:
+                pair = None
+            else:
+                pair = _PAIRS.get((before[0], name))
             if before is not None and pair is not None:
                 del fused[operands[at]]
                 fused[result] = (pair, (*before[1], operands[1 - at]), result)
@@ -161,9 +166,7 @@ def _assembled(
         numbers = [places[operand] for operand in operands]
         rows.append([OPERATIONS.index(name), places[result], *numbers, *(2 * numbers[:1])][:5])
         free += {places[one] for one in operands if last_use[one] == at and one not in lasting}
-    table, ends = (
-        np.array(rows, np.int32),
-        np.array([places[result] for result in results], np.int32),
-    )
+    table = np.array(rows, np.int32)
+    ends = np.array([places[result] for result in results], np.int32)
     masks = tuple(result.is_mask for result in results)
     return Trace(table.tobytes(), ends.tobytes(), masks, registers, literals, prelude)

@@ -42,7 +42,8 @@ def unrotate(turn: Array, vector: Array) -> Array:
 
 def in_axes(turn: Array, twists: Array) -> Array:
     """Return the columns of ``twists`` (..., 6, n) in the axes of matrices (..., 3, 3)."""
-    xp, columns = namespace(turn, twists), namespace(twists).moveaxis(twists, -1, -2)
+    xp = namespace(turn, twists)
+    columns = namespace(twists).moveaxis(twists, -1, -2)
     halves = [
         unrotate(turn[..., None, :, :], part) for part in (columns[..., :3], columns[..., 3:])
     ]
@@ -100,13 +101,12 @@ def wxyz_of(turn: Array) -> Array:
         [wy, xy, squares[2], yz],
         [wz, xz, yz, squares[3]],
     ]
-    q, best = xp.stack(rows[0], axis=-1), squares[0]
+    q = xp.stack(rows[0], axis=-1)
+    best = squares[0]
     for square, row in zip(squares[1:], rows[1:], strict=True):
         better = square > best
-        q, best = (
-            xp.where(better[..., None], xp.stack(row, axis=-1), q),
-            xp.where(better, square, best),
-        )
+        q = xp.where(better[..., None], xp.stack(row, axis=-1), q)
+        best = xp.where(better, square, best)
     q = q / xp.sqrt((q * q).sum(-1, keepdims=True))
     return xp.where(q[..., :1] < 0, -q, q)
 
@@ -124,8 +124,10 @@ def rotation_error(goal: Array, wxyz: Array) -> Array:
     atan2(|v|, w).
     """
     xp = namespace(goal, wxyz)
-    gw, g = goal[..., :1], goal[..., 1:]
-    qw, q = wxyz[..., :1], wxyz[..., 1:]
+    gw = goal[..., :1]
+    g = goal[..., 1:]
+    qw = wxyz[..., :1]
+    q = wxyz[..., 1:]
     w = gw * qw + (g * q).sum(-1, keepdims=True)
     v = qw * g - gw * q - cross(g, q)
     w, v = xp.where(w < 0, -w, w), xp.where(w < 0, -v, v)
@@ -148,8 +150,10 @@ def compose(a: Rows, b: Rows) -> Rows:
     """Return the rotation b followed by a: Hamilton's product of (..., 4) and (..., 4)."""
     aw, ax, ay, az = (a[..., k] for k in range(4))
     bw, bx, by, bz = (b[..., k] for k in range(4))
-    w, x = aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by
-    y, z = aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw
+    w = aw * bw - ax * bx - ay * by - az * bz
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
     return np.stack([w, x, y, z], axis=-1)
 
 
@@ -189,7 +193,8 @@ def to_rpy(q: Rows) -> NDArray[np.float64]:
     """
     (r00, r01, r02), (r10, r11, r12), (r20, _, _) = np.asarray(matrix_of(np.asarray(q, float)))
     yaw = np.arctan2(r10, r00)
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     return np.array(
         [np.arctan2(s * r02 - c * r12, c * r11 - s * r01), np.arctan2(-r20, c * r00 + s * r10), yaw]
     )

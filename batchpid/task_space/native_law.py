@@ -49,22 +49,24 @@ def law(
 
     Raises ValueError if an array has a wrong shape.
     """
+    # With a tool the extension computes the dynamics itself, from the tree's tables.
     tool: Tool | None = None
     dynamics_arrays: tuple[Any, ...] = dynamics
     if isinstance(dynamics, Tool):
         tool = dynamics
         (qpos, qvel), *_ = prepared(tool.tree, qpos=inputs.qpos, qvel=inputs.qvel)
-        inputs, dynamics_arrays = (
-            inputs._replace(qpos=qpos, qvel=qvel),
-            (read_point(qpos, tool.point),),
-        )
+        inputs = inputs._replace(qpos=qpos, qvel=qvel)
+        dynamics_arrays = (read_point(qpos, tool.point),)
     arrays = (*inputs, None, None, *state, *k[:-1])
     if (native := native_rows.for_rows(inputs.qpos, *dynamics_arrays, *arrays)) is None:
         return None
     rows, dof = inputs.qpos.shape
-    wanted = wanted if state.integral is None else (*wanted, "integral")
+    # The new integral is a result like the terms, though no caller names it.
+    needed = wanted
+    if state.integral is not None:
+        needed = (*wanted, "integral")
     results = [
-        np.empty((rows, size or dof)) if name in wanted else None for name, size in _RESULTS.items()
+        np.empty((rows, size or dof)) if name in needed else None for name, size in _RESULTS.items()
     ]
     fixed: tuple[Any, ...] = (k.frame is not None, *_WITHOUT_TREE)
     if tool is not None:
@@ -72,6 +74,7 @@ def law(
         dynamics_arrays = (*[None] * 5, chain)
     native_rows.call(native.law, rows, dof, *fixed, *dynamics_arrays, *arrays, *results)
     effort, integral, _, *parts, s1, s2, near = results
+    # The extension writes columns; the terms are one number for each env.
     shares = [None if entry is None else entry[:, 0] for entry in (s1, s2)]
     terms = OSCTerms._make((*parts, effort, *shares, None if near is None else near[:, 0] > 0))
     return (state if integral is None else state._replace(integral=integral)), terms
@@ -85,6 +88,7 @@ def friction(arrays: Mapping[str, Any], coulomb: Array, band: Array) -> Float64 
     qpos = arrays["qpos"]
     if (native := native_rows.for_rows(qpos, *arrays.values(), coulomb, band)) is None:
         return None
+    # Arrays that friction does not read have no entry, and go as None.
     rubbing_effort = np.empty(qpos.shape)
     dynamics_arrays = map({**arrays, "effort": rubbing_effort}.get, LAW)
     native_rows.call(
@@ -99,7 +103,8 @@ def _of_tree(
     """Return the arguments of ``law`` and ``bind`` between sizes and arrays, and the chain to the
     tool (dof,).
     """
-    constants, index = native_rows.native_tree(native, tree), tree.index(link)
+    constants = native_rows.native_tree(native, tree)
+    index = tree.index(link)
     body = tree.link_bodies[index]
     fixed = k.frame is not None, constants.tree, body, native_rows.tool(constants, index, point)
     return fixed, np.array(tree.chains[body], np.float64)
@@ -134,11 +139,13 @@ class BoundOSC:
         qpos, qvel, bias = reading
         (rows, dof), native = qpos.shape, native_rows.in_use()
         assert native is not None
-        self._parts, self._columns = {"setpoint": slice(0, 7), **parts}, columns
+        self._parts = {"setpoint": slice(0, 7), **parts}
+        self._columns = columns
         self._given = {
             name: np.zeros((rows, part.stop - part.start)) for name, part in self._parts.items()
         }
         self._posture = np.zeros_like(qpos)
+        # The call keeps the addresses of these arrays: they are written in place from now on.
         self.state = {"posture": np.zeros_like(qpos)}
         if k.ki_dt is not None:
             self.state["integral"] = np.zeros((rows, 6))
@@ -159,6 +166,7 @@ class BoundOSC:
             "effort": self.effort,
             "limited": self.limited,
         }
+        # Implicit damping appears to the law as an inertia of dt times it.
         if damping is not None:
             arrays |= {"damping": damping, "added_inertia": timestep * damping}
         rubbing: list[Float64 | None] = [None, None, None]

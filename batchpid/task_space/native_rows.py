@@ -48,12 +48,16 @@ _trees: WeakKeyDictionary[RigidTree, _NativeTree] = WeakKeyDictionary()
 
 def in_use() -> Array:
     """Return the extension, or None where native code is not used."""
-    return None if os.environ.get(SWITCH) == "0" else _extension()
+    if os.environ.get(SWITCH) == "0":
+        return None
+    return _extension()
 
 
 @cache
 def _extension() -> Array:
-    return None if obstacle() else load(TASK_SPACE)
+    if obstacle():
+        return None
+    return load(TASK_SPACE)
 
 
 def kinematics(
@@ -70,20 +74,21 @@ def kinematics(
     The first three belong to a ``point`` (3,) or (..., 3) of the link ``index``. "jacobian_rate"
     and "bias" need ``qvel``. ``qpos`` and ``qvel`` are checked arrays (..., dof).
     """
-    native = (
-        in_use()
-        if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray))
-        else None
-    )
+    if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray)):
+        native = in_use()
+    else:
+        native = None
+    # The mass matrix of a floating base is a Schur complement, which NumPy computes.
     if native is None or not (tree.fixed_base or _DYNAMICS.isdisjoint(wanted)):
         return None
     dof = tree.dof
     leading = qpos.shape[:-1]
     rows = math.prod(qpos.shape[:-1])
-    found = empty(wanted, leading, dof)
+    # The extension writes into arrays that it is given, by rows.
+    outputs = empty(wanted, leading, dof)
     inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
-    call(native.kinematics, *_arguments(native, tree, found, inputs, index, point))
-    return found
+    call(native.kinematics, *_arguments(native, tree, outputs, inputs, index, point))
+    return outputs
 
 
 def bound(
@@ -96,19 +101,27 @@ def bound(
     """
     if (native := in_use()) is None:
         return None
-    found = empty(wanted, qpos.shape[:1], tree.dof)
+    outputs = empty(wanted, qpos.shape[:1], tree.dof)
     return partial(
-        native.kinematics, *_arguments(native, tree, found, [qpos, qvel], index, None)
-    ), tuple(found.values())
+        native.kinematics, *_arguments(native, tree, outputs, [qpos, qvel], index, None)
+    ), tuple(outputs.values())
 
 
 def _arguments(
-    native: Any, tree: RigidTree, found: dict[str, Float64], inputs: Any, index: int, point: Array
+    native: Any, tree: RigidTree, outputs: dict[str, Float64], inputs: Any, index: int, point: Array
 ) -> list[Any]:
     """Return the arguments of ``kinematics`` in task_space.cpp."""
-    own, rows = native_tree(native, tree), len(inputs[0])
-    results = [found.get(name) for name in KINEMATICS[3:]]
-    return [own.tree, tree.link_bodies[index], rows, *inputs, tool(own, index, point), *results]
+    constants = native_tree(native, tree)
+    rows = len(inputs[0])
+    results = [outputs.get(name) for name in KINEMATICS[3:]]
+    return [
+        constants.tree,
+        tree.link_bodies[index],
+        rows,
+        *inputs,
+        tool(constants, index, point),
+        *results,
+    ]
 
 
 def empty(wanted: tuple[str, ...], leading: tuple[int, ...], dof: int) -> dict[str, Float64]:
@@ -135,19 +148,28 @@ def search(
     """
     if (native := in_use()) is None:
         return None
-    own, rows = native_tree(native, tree), len(start)
-    found = [start.copy(), np.full((rows, 2), np.inf), np.zeros((rows, 1))]
-    arrays = goal, tool(own, index, point), *(limit[None] for limit in limits), tolerance[None]
-    call(native.search, own.tree, tree.link_bodies[index], rows, iterations, *arrays, *found)
-    found[0] = tree.positions(found[0])
-    return found
+    constants = native_tree(native, tree)
+    rows = len(start)
+    outputs = [start.copy(), np.full((rows, 2), np.inf), np.zeros((rows, 1))]
+    arrays = (
+        goal,
+        tool(constants, index, point),
+        *(limit[None] for limit in limits),
+        tolerance[None],
+    )
+    call(
+        native.search, constants.tree, tree.link_bodies[index], rows, iterations, *arrays, *outputs
+    )
+    # A search moves leaders alone; their followers are set at the end.
+    outputs[0] = tree.positions(outputs[0])
+    return outputs
 
 
-def tool(own: _NativeTree, index: int, point: Array) -> Float64:
+def tool(constants: _NativeTree, index: int, point: Array) -> Float64:
     """Return the frames (1 | rows, 12) of a link in its body, with the origin at a ``point`` (3,)
     or (..., 3).
     """
-    tool = own.tools[index]
+    tool = constants.tools[index]
     if point is not None:
         tool = np.broadcast_to(tool, (*point.shape[:-1], 3, 4)).copy()
         tool[..., 3] += (tool[..., :3] * point[..., None, :]).sum(-1)
@@ -156,14 +178,17 @@ def tool(own: _NativeTree, index: int, point: Array) -> Float64:
 
 def native_tree(native: Any, tree: RigidTree) -> _NativeTree:
     """Return the constants of a tree for the extension."""
-    if (own := _trees.get(tree)) is not None:
-        return own
+    # Tables of a tree are built once, and go when the tree goes.
+    if (constants := _trees.get(tree)) is not None:
+        return constants
     bodies, (kinds, rows) = tree.bodies, tree.tables
     arguments = kinds, rows, np.array(bodies.armature), tuple(bodies.gravity.tolist())
     coupling = tree.coupling
     laws = coupling.leader.astype(np.int32), coupling.multiplier, coupling.offset
-    _trees[tree] = own = _NativeTree(native.tree(tree.dof, *arguments, *laws), bodies.link_frames)
-    return own
+    _trees[tree] = constants = _NativeTree(
+        native.tree(tree.dof, *arguments, *laws), bodies.link_frames
+    )
+    return constants
 
 
 def for_rows(like: Array, *arrays: Array) -> Array:
@@ -171,7 +196,9 @@ def for_rows(like: Array, *arrays: Array) -> Array:
     plain = _PLAIN.issuperset(map(type, arrays)) or all(
         x is None or isinstance(x, np.ndarray) for x in arrays
     )
-    return in_use() if plain and like.ndim == 2 else None
+    if plain and like.ndim == 2:
+        return in_use()
+    return None
 
 
 def call(function: Callable[..., None], *arguments: Any) -> None:
@@ -179,10 +206,13 @@ def call(function: Callable[..., None], *arguments: Any) -> None:
     converted.
     """
     try:
+        # Nearly all arrays fit as they are: the refusal is cheaper than a look at each.
         function(*arguments)
     except (ValueError, BufferError):
         function(*[_contiguous(one) if isinstance(one, np.ndarray) else one for one in arguments])
 
 
 def _contiguous(array: Array) -> Array:
-    return None if array is None else np.ascontiguousarray(array, np.float64)
+    if array is None:
+        return None
+    return np.ascontiguousarray(array, np.float64)

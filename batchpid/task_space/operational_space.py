@@ -78,16 +78,21 @@ def init(params: OSCParams, qpos: Array) -> OSCState:
     Raises InvalidArgumentError for params of another type.
     """
     instance("params", params, OSCParams, MAKE_PARAMS)
+    # The posture begins where the robot is, so that nothing pulls at first.
     (qpos,) = in_dtype_of(params, qpos)
     xp = namespace(*params, qpos)
     posture = xp.zeros_like(qpos) + qpos
-    integral = None if params.integral_gain is None else xp.zeros((len(posture), 6), posture.dtype)
+    if params.integral_gain is None:
+        integral = None
+    else:
+        integral = xp.zeros((len(posture), 6), posture.dtype)
     return OSCState(posture, integral)
 
 
 def reset(params: OSCParams, state: OSCState, qpos: Array, mask: Array) -> OSCState:
     """Return the state with the envs of ``mask`` (envs,) bool restarted at ``qpos`` (envs, dof)."""
-    xp, fresh = namespace(*state, qpos, mask), init(params, qpos)
+    xp = namespace(*state, qpos, mask)
+    fresh = init(params, qpos)
     chosen = xp.asarray(mask)[:, None]
     return OSCState(
         *[
@@ -133,6 +138,7 @@ def osc(
     if isinstance(dynamics, Tool):
         dynamics = task_dynamics(dynamics.tree, *inputs[1:3], dynamics.link, point=dynamics.point)
     with quiet():
+        # All that follows is in the axes in which the gains are given.
         task = in_frame(k, dynamics, inputs)
         # Accelerations of task and posture first, then their efforts, then the limits.
         a = task_acceleration(k, task)
@@ -183,10 +189,9 @@ class Task(NamedTuple):
 def in_frame(k: OSCCoefficients, d: TaskDynamics, inputs: OSCInputs) -> Task:
     """Return the dynamics, error and motion in the axes of the params' frame."""
     xp = namespace(*k, *d, *inputs)
-    error, limits = (
-        pose_error(inputs.setpoint, d.pose),
-        (k.position_error_limit, k.rotation_error_limit),
-    )
+    # Position and rotation have limits of their own: a far target does not drown a turn.
+    error = pose_error(inputs.setpoint, d.pose)
+    limits = (k.position_error_limit, k.rotation_error_limit)
     near = [
         _shortened(part, limit, xp)
         for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)
@@ -210,7 +215,9 @@ def task_acceleration(k: OSCCoefficients, task: Task) -> Array:
     """Return a (envs, 6) without I."""
     a = k.kp * task.near - k.kd * task.tool_twist
     a = a if task.twist is None else a + k.c * task.twist
-    return a if task.acceleration is None else a + k.acceleration_share * task.acceleration
+    if task.acceleration is None:
+        return a
+    return a + k.acceleration_share * task.acceleration
 
 
 def _integrated(k: OSCCoefficients, integral: Array, task: Task, held: Array) -> Array:
@@ -238,6 +245,7 @@ def posture_acceleration(
     a = springs - k.posture_kd * v
     if k.limit_kp is None:
         return a, springs
+    # Positive below the lower margin, negative above the upper one.
     depth = xp.maximum(k.limit_low - q, 0.0) - xp.maximum(q - k.limit_high, 0.0)
     pushed = k.limit_kp * depth
     return (
@@ -252,7 +260,8 @@ def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
     base = p.base
     task = p.task
     null = p.posture
-    least, most = -math.inf if low is None else low, math.inf if high is None else high
+    least = -math.inf if low is None else low
+    most = math.inf if high is None else high
     able = (base >= least) & (base <= most)
 
     def share(effort: Array, at: Array) -> Array:
@@ -314,12 +323,17 @@ def track(
     inputs = OSCInputs(setpoint, qpos, qvel, twist, acceleration)
     xp = namespace(*k, *dynamics, *inputs, effort)
     with quiet():
-        available = bias if feedforward is None else bias + feedforward
+        if feedforward is None:
+            available = bias
+        else:
+            available = bias + feedforward
+        # The acceleration that the model expects of the effort.
         qacc = solve(mass, (effort - available)[..., None])[..., 0]
+        # A joint without stiffness cannot ask for anything by its posture.
         stiff = k.posture_kp > 0
         rest = qacc - posture_acceleration(k, dynamics, qpos, qpos, qvel)[0]
         posture = qpos + xp.where(stiff, rest / xp.where(stiff, k.posture_kp, 1.0), 0.0)
         task = in_frame(k, dynamics, inputs)
-        wanted = product(task.dynamics.jacobian, qacc) + task.dynamics.jacobian_rate
-        integral = wanted - task_acceleration(k, task)
+        demand = product(task.dynamics.jacobian, qacc) + task.dynamics.jacobian_rate
+        integral = demand - task_acceleration(k, task)
         return OSCState(posture, clip(integral, -k.integral_limit, k.integral_limit, xp))

@@ -72,29 +72,39 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
     """
     instance("params", params, OSCParams, MAKE_PARAMS)
     check_time_step("dt", dt)
+    # Explicit gains first; the implicit law then replaces those that it changes.
     xp = namespace(*params, dt)
     kp = params.stiffness
     kd = params.damping
     ki = params.integral_gain
-    posture_kp, posture_kd = params.posture_stiffness, params.posture_damping
-    limit_kp, margin = params.limit_stiffness, params.limit_margin
-    limit_kd = None if limit_kp is None else 2 * xp.sqrt(limit_kp)
+    posture_kp = params.posture_stiffness
+    posture_kd = params.posture_damping
+    limit_kp = params.limit_stiffness
+    margin = params.limit_margin
+    if limit_kp is None:
+        limit_kd = None
+    else:
+        limit_kd = 2 * xp.sqrt(limit_kp)
     c = kd
     share = xp.ones_like(kp)
     ki_dt2 = None
     if params.discretization is not None:
         stiffness = kp if ki is None else kp + dt * ki
         share = 1 / (1 + dt * kd + dt * dt * stiffness)
-        c, kd, kp = kd * share, (kd + dt * stiffness) * share, stiffness * share
+        c = kd * share
+        kd = (kd + dt * stiffness) * share
+        kp = stiffness * share
         if ki is not None:
             ki = ki * share
             ki_dt2 = ki * dt * dt
+        # Posture and limits have no integral, and a simpler denominator.
         posture_kp, posture_kd = _implicit(posture_kp, posture_kd, dt)
         if limit_kp is not None:
             limit_kp, limit_kd = _implicit(limit_kp, limit_kd, dt)
     same = {
         name: leaf for name, leaf in params._asdict().items() if name in OSCCoefficients._fields
     }
+    # A joint with a margin of 0 is pushed from nowhere: its ends lie at infinity.
     part = {
         "limit_margin": None if margin is None else xp.where(margin > 0, margin, 1.0),
         "limit_low": (

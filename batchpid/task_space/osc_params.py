@@ -170,7 +170,8 @@ def make_osc_params(
     check_masses(instance("tree", tree, RigidTree, MAKE_TREE))
     joints = tree.joint_names
     rows = _read(options, {"axis": AXES, "joint": joints, "norm": ("norm",), "s0": ("s0",)})
-    motion, force = rows["axes"], rows["force_axes"]
+    motion = rows["axes"]
+    force = rows["force_axes"]
     if force is not None:
         both = force * (1.0 if motion is None else motion)
         entries("force_axes", both > 0, both == 0, "is an axis of motion, too", AXES, kind="entry")
@@ -186,7 +187,8 @@ def make_osc_params(
         rows["integral_limit"] = None
     # Joints without limits that turn are angles modulo 2 pi for the posture. Followers have no
     # posture and no limits of their own: their leader has them.
-    lower, upper = np.array([tree.lower]), np.array([tree.upper])
+    lower = np.array([tree.lower])
+    upper = np.array([tree.upper])
     if rows["limit_margin"] is None:
         rows["limit_stiffness"] = None
     else:

@@ -28,6 +28,7 @@ def whitened(matrix: Array, right: Array) -> Array:
     A matrix that is not positive definite gives NaN.
     """
     xp = namespace(matrix, right)
+    # JAX returns NaN by itself; NumPy would raise for the whole batch.
     if xp is not np:
         return xp.linalg.solve(xp.linalg.cholesky(matrix), right)
     matrix, sound = _sound(matrix)
@@ -45,11 +46,9 @@ def _cholesky(matrix: Array) -> Array:
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
-        return (
-            np.full_like(matrix, np.nan)
-            if matrix.ndim == 2
-            else np.stack([_cholesky(row) for row in matrix])
-        )
+        if matrix.ndim == 2:
+            return np.full_like(matrix, np.nan)
+        return np.stack([_cholesky(row) for row in matrix])
 
 
 def _sound(matrix: Array) -> tuple[Array, Array]:
@@ -62,6 +61,7 @@ def _sound(matrix: Array) -> tuple[Array, Array]:
 
 def gram(factor: Array, other: Array) -> Array:
     """Return the products Y^T Z (..., m, k) of (..., n, m) and (..., n, k)."""
+    # A sum in a fixed order: a row does not depend on the size of the batch.
     total = factor[..., 0, :, None] * other[..., 0, None, :]
     for row in range(1, factor.shape[-2]):
         total = total + factor[..., row, :, None] * other[..., row, None, :]
@@ -96,7 +96,9 @@ def bounded_inverse(matrix: Array, smallest: Array, *smooth: Array) -> tuple[Arr
     ]
     with quiet():
         values, vectors = eigen(matrix)
-        positive, rows = xp.maximum(values, 0.0), xp.swapaxes(vectors, -1, -2)
+        # Rounding may leave eigenvalues a little below 0.
+        positive = xp.maximum(values, 0.0)
+        rows = xp.swapaxes(vectors, -1, -2)
 
         def inverse_with(bound: Array, below: Array) -> Array:
             large = values >= bound

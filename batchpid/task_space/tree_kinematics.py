@@ -65,13 +65,13 @@ def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Any], Bodies, Any]:
     """
     instance("tree", tree, RigidTree, MAKE_TREE)
     xp = namespace(*arrays.values())
-    checked, shape = [], None
+    checked = []
+    shape = None
     for name, value in arrays.items():
-        array = (
-            value
-            if xp is not np or is_traced(value)
-            else read_array(name, value).astype(np.float64, copy=False)
-        )
+        if xp is not np or is_traced(value):
+            array = value
+        else:
+            array = read_array(name, value).astype(np.float64, copy=False)
         if array.ndim < 1 or array.shape[-1] != tree.dof:
             remedy = f"the last axis counts the joints {', '.join(tree.joint_names)}"
             raise InvalidArgumentError(
@@ -97,6 +97,7 @@ def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Any], Bodies, Any]:
 def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModule) -> Array:
     """Return the frames (..., dof, 3, 4) of the bodies in the world."""
     with quiet():
+        # Rodrigues' formula with the placement multiplied in: four constant matrices a joint.
         q = qpos[..., None, None]
         local = (
             bodies.at_zero
@@ -125,8 +126,11 @@ def velocities_of(
     """Return the velocities of the bodies, and their accelerations at q'' = 0, on a base that turns
     at ``turning``.
     """
-    linear, angular = motions.linear * qvel[..., None], motions.angular * qvel[..., None]
-    v, w = from_base(tree, linear, xp), from_base(tree, angular, xp)
+    linear = motions.linear * qvel[..., None]
+    angular = motions.angular * qvel[..., None]
+    # Velocities about the world's origin add up along the chain without a shift.
+    v = from_base(tree, linear, xp)
+    w = from_base(tree, angular, xp)
     if turning is not None:
         w = w + turning[..., None, :]
     return Velocities(
@@ -156,7 +160,8 @@ def from_tips(tree: RigidTree, parts: Array, xp: ArrayModule) -> Array:
 
 def frame_of_link(tree: RigidTree, bodies: Bodies, frames: Array, index: int) -> Array:
     """Return the frame (..., 3, 4) of a link, from the frames of the bodies."""
-    body, part = tree.link_bodies[index], bodies.link_frames[index]
+    body = tree.link_bodies[index]
+    part = bodies.link_frames[index]
     if body >= 0:
         return turned(frames[..., body, :, :], part)
     return part + namespace(frames).zeros_like(frames[..., 0, :, :])
@@ -167,7 +172,8 @@ def tool_frame(tree: RigidTree, bodies: Bodies, frames: Array, index: int, point
     frame = frame_of_link(tree, bodies, frames, index)
     if point is None:
         return frame
-    xp, at = namespace(frame, point), read_point(frame[..., 0, :], point)
+    xp = namespace(frame, point)
+    at = read_point(frame[..., 0, :], point)
     place = rotate(frame[..., :3], at + xp.zeros_like(frame[..., 3])) + frame[..., 3]
     return xp.concatenate([frame[..., :3], place[..., None]], axis=-1)
 
@@ -179,11 +185,10 @@ def read_point(like: Array, point: Array) -> Array:
     if point is None:
         return None
     xp = namespace(like, point)
-    at = (
-        read_array("point", point).astype(np.float64, copy=False)
-        if xp is np
-        else xp.asarray(point, like.dtype)
-    )
+    if xp is np:
+        at = read_array("point", point).astype(np.float64, copy=False)
+    else:
+        at = xp.asarray(point, like.dtype)
     shapes = dict.fromkeys([(3,), (*like.shape[:-1], 3)])
     if at.shape not in shapes:
         problem = f"has shape {at.shape}, not {' or '.join(map(str, shapes))}"
@@ -197,16 +202,21 @@ def jacobian_at(
     """Return the Jacobian (..., 6, dof) of a link's point at ``place`` (..., 3) in the world, J G
     of coupled joints.
     """
-    xp, body = namespace(place), tree.link_bodies[index]
+    xp = namespace(place)
+    body = tree.link_bodies[index]
     linear = motions.linear + cross(motions.angular, place[..., None, :])
     columns = xp.concatenate([linear, motions.angular], axis=-1)
-    moved = bodies.moves[body][:, None] > 0 if body >= 0 else xp.asarray(False)
+    if body >= 0:
+        moved = bodies.moves[body][:, None] > 0
+    else:
+        moved = xp.asarray(False)
     return tree.efforts(xp.moveaxis(xp.where(moved, columns, xp.zeros_like(columns)), -1, -2))
 
 
 def rate_at(tree: RigidTree, velocities: Velocities, index: int, place: Array) -> Array:
     """Return J' q' (..., 6) of a link's point at ``place`` (..., 3) in the world."""
-    xp, body = namespace(place), tree.link_bodies[index]
+    xp = namespace(place)
+    body = tree.link_bodies[index]
     if body < 0:
         return xp.concatenate([xp.zeros_like(place)] * 2, axis=-1)
     v, w, linear, angular = (leaf[..., body, :] for leaf in velocities)

@@ -47,7 +47,10 @@ def evaluated(
     """Return quantities by name: "pose", "jacobian" and "jacobian_rate" of a ``point`` of ``link``,
     "mass_matrix" and "bias"; "jacobian_rate" and "bias" need ``qvel``.
     """
-    inputs = {"qpos": qpos} if qvel is None else {"qpos": qpos, "qvel": qvel}
+    if qvel is None:
+        inputs = {"qpos": qpos}
+    else:
+        inputs = {"qpos": qpos, "qvel": qvel}
     (q, *rates), nominal, xp = prepared(tree, **inputs)
     v = rates[0] if rates else None
     index = 0 if link is None else tree.index(link)
@@ -61,7 +64,10 @@ def evaluated(
     quantities: dict[str, Array] = {}
     with quiet():
         motions = motions_of(tree, nominal, q, xp)
-        velocities = None if v is None else velocities_of(tree, motions, v, xp, turning)
+        if v is None:
+            velocities = None
+        else:
+            velocities = velocities_of(tree, motions, v, xp, turning)
         if link is not None:
             tool = tool_frame(tree, nominal, motions.frames, index, point)
             place = tool[..., 3]
@@ -86,7 +92,8 @@ def link_poses(
     With a ``point`` (3,) in the frame of the links [m], the positions of this point.
     """
     if isinstance(links, str):
-        problem, remedy = "must be a list of names", f"pass [{links!r}]"
+        problem = "must be a list of names"
+        remedy = f"pass [{links!r}]"
         raise InvalidArgumentError("links", problem, value=links, remedy=remedy)
     prepared(tree, qpos=qpos)
     names = tree.links if links is None else links
@@ -195,4 +202,6 @@ def forward_dynamics(tree: RigidTree, qpos: Array, qvel: Array, effort: Array) -
 
 def _in_frame(frame: str, pose: Array, columns: Array) -> Array:
     """Return twists (..., 6, n) in the axes of the world, or of a tool at ``pose`` (..., 7)."""
-    return columns if frame == "world" else in_axes(matrix_of(pose[..., 3:]), columns)
+    if frame == "world":
+        return columns
+    return in_axes(matrix_of(pose[..., 3:]), columns)

@@ -22,8 +22,10 @@ class Excitation(NamedTuple):
 
     def report(self) -> str:
         """Return the range and the largest speed of each joint."""
-        names, units = self.robot.joint_names, self.robot.units
-        low, high = self.motion.position.min(0), self.motion.position.max(0)
+        names = self.robot.joint_names
+        units = self.robot.units
+        low = self.motion.position.min(0)
+        high = self.motion.position.max(0)
         speed = np.abs(self.motion.velocity).max(0)
         rows = []
         still = []

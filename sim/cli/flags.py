@@ -84,7 +84,8 @@ def record_of(
         elif kind is not None and name in texts:
             rows.append(_flag(name, kind, default, texts[name]))
     for name in options:
-        kind, default = _plain_part(get_args(KINDS[name])[0]), OPTIONS_WITH_FLAG[name]
+        kind = _plain_part(get_args(KINDS[name])[0])
+        default = OPTIONS_WITH_FLAG[name]
         # A switch that is left out is left to the Runner: three values.
         if default is None and bool in get_args(kind):
             kind = Literal["on", "off"] | None
@@ -126,13 +127,21 @@ def _flag(name: str, kind: Kind, default: Any, text: str) -> tuple[str, Any, Any
     """Return a field of a dataclass; its help leaves out the defaults None, False, True and ()."""
 
     def hint(default: str) -> str:
-        return "" if default in ("None", "False", "True", "") else f"(default: {default})"
+        if default in ("None", "False", "True", ""):
+            return ""
+        return f"(default: {default})"
 
-    options = {"metavar": METAVARS[name]} if name in METAVARS else {}
+    if name in METAVARS:
+        options = {"metavar": METAVARS[name]}
+    else:
+        options = {}
     if default is None and Path in get_args(kind):
         options = {"metavar": "FILE"}
     described = Annotated[kind, tyro.conf.arg(help=text, help_behavior_hint=hint, **options)]
-    made = field() if default is inspect.Parameter.empty else field(default=default)
+    if default is inspect.Parameter.empty:
+        made = field()
+    else:
+        made = field(default=default)
     return name, described, made
 
 
@@ -142,13 +151,19 @@ def _plain_part(kind: Kind) -> Any:
     if get_origin(kind) is Annotated:
         inner, *notes = get_args(kind)
         part = _plain_part(inner)
-        return None if part is None else Annotated[(part, *notes)]
+        if part is None:
+            return None
+        return Annotated[(part, *notes)]
     if get_origin(kind) in (Union, UnionType):
         members = [member for member in get_args(kind) if _plain_part(member) or member is NoneType]
         return None if members in ([], [NoneType]) else Union[tuple(members)]  # noqa: UP007
     if get_origin(kind) is tuple:
-        return kind if get_args(kind)[0] in PLAIN or _plain_part(get_args(kind)[0]) else None
-    return kind if (kind in PLAIN and kind is not NoneType) or get_origin(kind) is Literal else None
+        if get_args(kind)[0] in PLAIN or _plain_part(get_args(kind)[0]):
+            return kind
+        return None
+    if (kind in PLAIN and kind is not NoneType) or get_origin(kind) is Literal:
+        return kind
+    return None
 
 
 def _words(text: str) -> str:

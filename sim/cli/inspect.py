@@ -99,7 +99,10 @@ class Inspection:
         """Return lines about the ground, and about the pairs of links that do not collide."""
         robot = self.robot
         pairs = robot.self_contact.pairs
-        ground = "Ground at height 0." if robot.has_ground else NO_GROUND
+        if robot.has_ground:
+            ground = "Ground at height 0."
+        else:
+            ground = NO_GROUND
         # A robot that hangs in the air by its trunk settles, and nothing else would say so.
         if robot.fixed_base and limbs(robot) > 1:
             ground = f"{ground} {LEGS}"

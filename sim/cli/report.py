@@ -78,8 +78,13 @@ class RunReport:
         if not self.is_held:
             return 0
         is_short = self.seconds < SHORTEST
-        settled = self.rollout.ok.all(0) if is_short else settled_envs(self.rollout, self.robot)
-        return 0 if settled.any() else NOT_SETTLED
+        if is_short:
+            settled = self.rollout.ok.all(0)
+        else:
+            settled = settled_envs(self.rollout, self.robot)
+        if settled.any():
+            return 0
+        return NOT_SETTLED
 
     @cached_property
     def columns(self) -> tuple[Sequence[str], Sequence[str], dict[str, Rows]]:
@@ -107,7 +112,10 @@ class RunReport:
             if has_effort:
                 figures["saturation_share"] = rollout.saturated.mean(0)
             return robot.joint_names, robot.units, figures
-        start = robot.start if rollout.info.start is None else rollout.info.start.astype(float)
+        if rollout.info.start is None:
+            start = robot.start
+        else:
+            start = rollout.info.start.astype(float)
         metrics = step_response_metrics(robot, rollout, start, with_effort=has_effort)
         return (
             robot.joint_names,
@@ -146,7 +154,10 @@ class RunReport:
         failed = np.flatnonzero(~rollout.ok.all(0))
         if failed.size:
             first = rollout.tick * (1 + np.argmin(rollout.ok.all(1)))
-            more = f" and {failed.size - LISTED} more" if failed.size > LISTED else ""
+            if failed.size > LISTED:
+                more = f" and {failed.size - LISTED} more"
+            else:
+                more = ""
             envs = ", ".join(map(str, failed[:LISTED]))
             lines.append(
                 f"FAILED: {failed.size} of {rollout.num_envs} envs, the first after {first:.3g} s:"

@@ -132,7 +132,8 @@ def rollout(
         _refuse("trajectory", trajectory, "has joint setpoints, and excludes --control osc")
         operational = OperationalSpace(robot, tool or default_tool(robot), posture=robot.target)
         options["control"] = operational
-        columns, goal = operational.command.names, operational.tool_pose(robot.target)
+        columns = operational.command.names
+        goal = operational.tool_pose(robot.target)
         center = robot.target
     else:
         _refuse("tool", tool, "is for control 'osc'")
@@ -150,11 +151,15 @@ def rollout(
         for name, value in {"setpoint": setpoint, "seconds": seconds, "substeps": substeps}.items():
             _refuse(name, value, "is as --trajectory says")
         motion = read_setpoints(robot, trajectory, timestep)
-        setpoints, options["substeps"] = motion.position, motion.substeps
+        setpoints = motion.position
+        options["substeps"] = motion.substeps
         center = center if motion.start is None else motion.start
         if rates:
             further = {"setpoint_rates": motion.rate, "setpoint_accelerations": motion.acceleration}
-        source = "from the file" if motion.has_rates else "central differences of the rows"
+        if motion.has_rates:
+            source = "from the file"
+        else:
+            source = "central differences of the rows"
         notes.append(f"Rates of the setpoints: {source if rates else 'not given'}.")
         if motion.steps and rates:
             notes.append(

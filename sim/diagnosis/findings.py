@@ -90,7 +90,10 @@ def _finding(
         detail = f"{run.error[-1, first, joint]:.2g} {run.robot.units[joint]} remain"
     elif run.failed[first]:
         faults = [fault for fault in run.info.faults if fault.env == first]
-        detail = f"{faults[-1].joint}: {faults[-1].cause}" if faults else ""
+        if faults:
+            detail = f"{faults[-1].joint}: {faults[-1].cause}"
+        else:
+            detail = ""
     else:
         detail = run.pressed[first]
     numbers = tuple(envs[rows].tolist())
@@ -132,12 +135,15 @@ class _Run:
         end = self.qpos[-1]
         if command is None:
             is_known = self.info.control != "effort"
-            return self.robot.coupled(self.rollout.setpoint[-1]) if is_known else end
+            if is_known:
+                return self.robot.coupled(self.rollout.setpoint[-1])
+            return end
         if command.size != 7 or self.info.tool is None or not self.robot.fixed_base:
             return end
         pose = self.rollout.setpoint[-1, :, :7].copy()
         pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-        tree, start = self.robot.rigid_tree, np.nan_to_num(end)
+        tree = self.robot.rigid_tree
+        start = np.nan_to_num(end)
         solution = ts.inverse_kinematics(tree, self.info.tool, pose, start, on_failure="return")
         self.out_of_reach = ~np.asarray(solution.success)[:, None]
         return np.asarray(solution.qpos)
@@ -157,7 +163,10 @@ class _Run:
         effort = self.rollout.effort.astype(np.float64)
         params = self.info.params
         if self.info.control == "drive" and params is not None:
-            rate = 0.0 if params.kd is None else params.kd * self.rollout.qvel
+            if params.kd is None:
+                rate = 0.0
+            else:
+                rate = params.kd * self.rollout.qvel
             effort += np.clip(params.kp * self.error - rate, -self.limit, self.limit)
         return effort
 
@@ -205,7 +214,10 @@ class _Run:
         nearest last.
         """
         # A floating base stands on its ground.
-        ground = self.info.ground if self.robot.fixed_base else False
+        if self.robot.fixed_base:
+            ground = self.info.ground
+        else:
+            ground = False
         near = self.robot.dynamics(ground).contacts.near(qpos, TOUCH)
         pairs = sorted(near, key=itemgetter(2), reverse=True)
         return {f"{link} on {other or 'the ground'}": distance for link, other, distance in pairs}
@@ -242,13 +254,15 @@ class Rule(NamedTuple):
 
 
 def _is_beyond_limits(run: _Run) -> Bool:
-    low, high = run.robot.lower - LIMIT_TOLERANCE, run.robot.upper + LIMIT_TOLERANCE
+    low = run.robot.lower - LIMIT_TOLERANCE
+    high = run.robot.upper + LIMIT_TOLERANCE
     return ~run.robot.continuous & ((run.goal < low) | (run.goal > high))
 
 
 def _oscillates(run: _Run) -> Bool:
     """Return the joints that buzz, or swing about their setpoint in the last half."""
-    wave, ends = run.error[len(run.error) // 2 :], run.error[run.tail]
+    wave = run.error[len(run.error) // 2 :]
+    ends = run.error[run.tail]
     turns = np.count_nonzero(np.diff(np.sign(wave - wave.mean(0)), axis=0), axis=0)
     is_large = np.ptp(ends, axis=0) / 2 >= np.maximum(np.abs(ends.mean(0)), run.band / 2)
     return np.asarray(run.buzzes | (is_large & (turns >= 3)))

@@ -11,7 +11,7 @@ armature and viscous friction of the motors are counted, each where it is known.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -61,18 +61,27 @@ def _loop(
     coupling = robot.coupling
 
     def column(leaf: Array, neutral: float = 0.0) -> Float64:
-        rows = np.full((1, robot.dof), neutral) if leaf is None else np.asarray(leaf, np.float64)
+        if leaf is None:
+            rows = np.full((1, robot.dof), neutral)
+        else:
+            rows = np.asarray(leaf, np.float64)
         return np.broadcast_to(rows, (len(rows), robot.dof))[:, coupling.independent]
 
     def matrix(armature: Array) -> Float64:
-        rows = np.zeros(robot.dof) if armature is None else np.asarray(armature, np.float64)
+        if armature is None:
+            rows = np.zeros(robot.dof)
+        else:
+            rows = np.asarray(armature, np.float64)
         inertia = np.atleast_2d(rows)[:, None] * np.eye(robot.dof)
         return coupling.reduced(robot.mass_matrix(qpos) + inertia)
 
     loop: Document = {name: column(getattr(params, name)) for name in ("kp", "ki", "kd")}
     eye = np.eye(loop["kp"].shape[1])
     strength = column(motors.strength, 1.0)
-    viscous = np.zeros((1, robot.dof)) if motors.viscous is None else motors.viscous
+    if motors.viscous is None:
+        viscous = np.zeros((1, robot.dof))
+    else:
+        viscous = motors.viscous
     damping = np.stack([coupling.reduced_damping(robot.damping + row) for row in viscous])
     if params.gain_units is None:
         loop = {name: strength * gain for name, gain in loop.items()}
@@ -113,7 +122,10 @@ def stability_report(
     worst = int(np.argmax(bound.ratio))
     ratio = float(bound.ratio[worst])
     effect = "efforts alternate from step to step, and the joint chatters or diverges"
-    remedy = f"use at most {0.5 / ratio:.1g} times these gains" if ratio else ""
+    if ratio:
+        remedy = f"use at most {0.5 / ratio:.1g} times these gains"
+    else:
+        remedy = ""
     if np.isinf(ratio):
         remedy = "use a kd that is larger than kp times the delay and lag"
     if loop["delay"].any() or loop["lag"].any():
@@ -151,12 +163,7 @@ class StabilityWarning(UserWarning):
 
 
 MOST = 64
-"""Largest number of envs with late motors that are checked one by one; of more, the ends of their
-ranges are.
-"""
-_LARGEST = "kp", "kd", "command_delay", "sensor_delay", "lag", "strength"
-_SMALLEST = "derivative_filter_time", "armature", "viscous"
-"""Columns of which the largest or smallest value of all envs makes a loop the least stable."""
+"""Largest number of envs that are checked: a draw of that many motors shows the range of all."""
 
 
 class StabilityCheck:
@@ -178,15 +185,18 @@ class StabilityCheck:
         """Warn if ``params`` pass the bound."""
         if not DISSIPATION[self._robot.dissipation].modelled:
             return
-        motors = None if actuators is None or actuators.is_ideal else actuators
+        motors = None
+        if actuators is not None and not actuators.is_ideal:
+            motors = actuators.for_envs(slice(0, MOST))
+        if params.num_envs > 1 and motors is not None:
+            params = params.for_envs(slice(0, MOST))
         rows = max(params.num_envs, 1 if motors is None else motors.num_envs)
-        if motors is not None and rows > MOST:
-            params, motors, rows = _extreme(params), _extreme(motors), 1
         start = self._robot.start
         try:
             report = stability_report(self._robot, params, start, self._timestep, motors)
         except InvalidArgumentError:  # the robot's mass matrix is not positive definite
             return
+        # A caller who changes gains in a loop is told once.
         is_beyond = report.robot_ratio >= 1
         if is_beyond and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
@@ -198,16 +208,3 @@ class StabilityCheck:
                 StabilityWarning,
             )
         self._has_warned = is_beyond
-
-
-def _extreme(record: Any) -> Any:
-    """Return params or actuators of one env with the end of the range of all envs that is the least
-    stable.
-    """
-    ends = {}
-    for names, reduce in ((_LARGEST, np.max), (_SMALLEST, np.min)):
-        for name in names:
-            leaf = getattr(record, name, None)
-            if leaf is not None:
-                ends[name] = reduce(leaf, 0, keepdims=True)
-    return record.for_envs(slice(0, 1))._replace(**ends)

@@ -29,7 +29,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.arrays.elementwise import TURN, matrix_vector
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.engine import native
@@ -66,16 +66,18 @@ class ConstraintEfforts:
         self,
         robots: int,
         coupling: Coupling,
-        wraps: NDArray[np.bool_],
+        wraps: Bool,
         timestep: float,
-        asked: NDArray[np.float32] | None = None,
+        asked: Float32 | None = None,
     ) -> None:
-        joints, followers = len(coupling.leader), coupling.followers
+        joints = len(coupling.leader)
+        followers = coupling.followers
         self._coupling = coupling
         self._followers = followers
         self._jacobian = coupling.jacobian
         self.wraps, self.unwrapped = wraps, np.zeros((robots, joints))
-        self._rate_gain, self._position_gain = RATE_GAIN / timestep, POSITION_GAIN / timestep**2
+        self._rate_gain = RATE_GAIN / timestep
+        self._position_gain = POSITION_GAIN / timestep**2
         self._response = np.zeros((robots, len(followers), joints))
         self._push, self._passive = (
             np.zeros((robots, joints, len(followers))),
@@ -117,10 +119,8 @@ class ConstraintEfforts:
         None: the passive forces are the engine's own.
         """
         self._model, self._force = model, force
-        self._native.model, self._native.force = (
-            model.address,
-            None if force is None else force.address,
-        )
+        self._native.model = model.address
+        self._native.force = None if force is None else force.address
 
     def update(
         self,
@@ -134,6 +134,7 @@ class ConstraintEfforts:
 
         ``mass_matrix`` is a function of positions; native code does not need it.
         """
+        # Native code has the mass matrices of its own model.
         if self._model is not None:
             mask = np.zeros(len(qpos), bool)
             mask[rows] = True
@@ -150,6 +151,7 @@ class ConstraintEfforts:
             response,
             np.where(sound[:, 0], passive[rows], 0.0),
         )
+        # Once for all sim steps until the next update: each then takes two small products.
         self._push[rows] = jacobian.T @ np.linalg.inv(response @ jacobian.T)
 
     def place(self, rows: Sequence[int], qpos: Rows) -> None:
@@ -158,7 +160,9 @@ class ConstraintEfforts:
 
     def apply(self, effort: NDArray[np.floating], qpos: Float64, qvel: Float64) -> Float64:
         """Return ``effort`` with the constraint efforts added."""
-        coupling, followers = self._coupling, self._followers
+        coupling = self._coupling
+        followers = self._followers
+        # Of all positions that differ by whole jumps, that nearest to the last one.
         self.unwrapped[...] = np.where(
             self.wraps, qpos + WRAP * np.rint((self.unwrapped - qpos) / WRAP), qpos
         )

@@ -27,7 +27,8 @@ class JointSpace:
     """
 
     def __init__(self, robot: Robot) -> None:
-        self._dof, self._floats = robot.dof, not robot.fixed_base
+        self._dof = robot.dof
+        self._floats = not robot.fixed_base
         self.index = np.flatnonzero(robot.independent)
         """Numbers of the joints in the robot (joints,)."""
         self.names = tuple(robot.joint_names[joint] for joint in self.index)
@@ -38,7 +39,8 @@ class JointSpace:
         """
         self.start = wrap(robot.start[self.index], self.turns, np)
         """Start pose (joints,) [rad or m]."""
-        lower, upper = robot.lower[self.index], robot.upper[self.index]
+        lower = robot.lower[self.index]
+        upper = robot.upper[self.index]
         middle = np.where(self.continuous, 0.0, self.start)
         self.low = np.where(np.isfinite(lower), lower, middle - np.pi)
         """Lower ends of the ranges (joints,) [rad or m]."""
@@ -47,9 +49,14 @@ class JointSpace:
 
     def bounds(self) -> tuple[Float64, Float64]:
         """Return bounds of what :meth:`observe` returns; positions may be pi beyond a limit."""
-        beyond, speed = np.where(self.continuous, 0.0, np.pi), np.full(len(self.index), MAX_SPEED)
-        base = np.repeat([FARTHEST, 1.0, MAX_SPEED], [3, 4, 6]) if self._floats else np.zeros(0)
-        low, high = (self.low - beyond, -speed, -base), (self.high + beyond, speed, base)
+        beyond = np.where(self.continuous, 0.0, np.pi)
+        speed = np.full(len(self.index), MAX_SPEED)
+        if self._floats:
+            base = np.repeat([FARTHEST, 1.0, MAX_SPEED], [3, 4, 6])
+        else:
+            base = np.zeros(0)
+        low = (self.low - beyond, -speed, -base)
+        high = (self.high + beyond, speed, base)
         return np.concatenate(low), np.concatenate(high)
 
     def observe(self, observed: Observation) -> Float64:
@@ -59,7 +66,10 @@ class JointSpace:
         Positions of continuous joints are in [-pi, pi].
         """
         qpos = wrap(observed.qpos[:, self.index].astype(np.float64), self.turns, np)
-        base = [] if observed.base_pose is None else [observed.base_pose, observed.base_twist]
+        if observed.base_pose is None:
+            base = []
+        else:
+            base = [observed.base_pose, observed.base_twist]
         return np.concatenate([qpos, observed.qvel[:, self.index], *base], axis=1)
 
     def of_robot(self, positions: Float64) -> Float64:

@@ -91,14 +91,19 @@ class ReachVectorEnv(RobotVectorEnv):
         self._max_increment = max_increment
         self._spec = own_command(options.get("control"))
         super().__init__(num_envs, robot, **options)
-        law = self.runner.params.continuous if self.runner.control == "pid" else None
-        turns = (
-            np.zeros(self.robot.dof) if law is None else np.asarray(law, np.float64).min(0) / TURN
-        )
+        if self.runner.control == "pid":
+            law = self.runner.params.continuous
+        else:
+            law = None
+        if law is None:
+            turns = np.zeros(self.robot.dof)
+        else:
+            turns = np.asarray(law, np.float64).min(0) / TURN
         joint_turns = np.minimum(self._joints.turns, turns[self._joints.index])
-        self._setpoint_turns = (
-            joint_turns if self._spec is None else np.zeros(len(self.action_names))
-        )
+        if self._spec is None:
+            self._setpoint_turns = joint_turns
+        else:
+            self._setpoint_turns = np.zeros(len(self.action_names))
         self._goal = np.zeros((self.num_envs, len(self.joint_names)))
 
     def spaces(self) -> tuple[spaces.Box, spaces.Box]:
@@ -125,9 +130,10 @@ class ReachVectorEnv(RobotVectorEnv):
                     "max_increment", "is needed for the command of this control", remedy=remedy
                 )
             fastest = self.robot.velocity_limit[joints.index]
-            max_increment = (
-                0.0 if spec is not None else np.minimum(fastest, MAX_SPEED) * self.step_seconds
-            )
+            if spec is not None:
+                max_increment = 0.0
+            else:
+                max_increment = np.minimum(fastest, MAX_SPEED) * self.step_seconds
         names = self.action_names
         kind: Any = "joint" if spec is None else "entry"
         self.max_increment = array(
@@ -153,11 +159,16 @@ class ReachVectorEnv(RobotVectorEnv):
         if self.actions == "setpoint":
             chosen = low + (action + 1) / 2 * (high - low)
         else:
-            last = setpoint if self._spec is not None else setpoint[:, self._joints.index]
+            if self._spec is not None:
+                last = setpoint
+            else:
+                last = setpoint[:, self._joints.index]
             chosen = np.clip(
                 wrap(last + action * self.max_increment, self._setpoint_turns, np), low, high
             )
-        return self._joints.of_robot(chosen) if self._spec is None else chosen
+        if self._spec is None:
+            return self._joints.of_robot(chosen)
+        return chosen
 
     def rate(self, setpoint: Float64, last: Float64) -> Float64 | None:
         """Return the rates of increments, the short way round on continuous joints; None for other
@@ -209,10 +220,9 @@ class ReachEnv(RobotEnv):
 
 def _finite_bounds(command: CommandSpec) -> tuple[Float64, Float64]:
     """Return the bounds of a command; raise InvalidArgumentError if one is infinite."""
-    low, high = np.asarray(command.lower), np.asarray(command.upper)
-    good, remedy = (
-        np.isfinite(low) & np.isfinite(high),
-        "let its command be a batchpid.sim.CommandSpec with lower= and upper=",
-    )
+    low = np.asarray(command.lower)
+    high = np.asarray(command.upper)
+    good = np.isfinite(low) & np.isfinite(high)
+    remedy = "let its command be a batchpid.sim.CommandSpec with lower= and upper="
     entries("control", low, good, "has no bounds", command.names, kind="entry", remedy=remedy)
     return low, high

@@ -43,7 +43,8 @@ class RobotEnv(SingleOwner, gymnasium.Env):
         if robot is not None:
             options["robot"] = robot
         self._envs = self.task(1, max_episode_steps=None, render_mode=render_mode, **options)
-        self.runner, self.render_mode = self._envs.runner, render_mode
+        self.runner = self._envs.runner
+        self.render_mode = render_mode
         self.metadata = self._envs.metadata  # type: ignore[misc]
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
@@ -72,7 +73,9 @@ class RobotEnv(SingleOwner, gymnasium.Env):
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture (height, width, 3) in RGB; None without a ``render_mode``."""
         pictures = self._envs.render()
-        return None if pictures is None else pictures[0]
+        if pictures is None:
+            return None
+        return pictures[0]
 
     def close(self) -> None:
         """Close the runner."""

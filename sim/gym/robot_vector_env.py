@@ -116,16 +116,21 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     ) -> None:
         name = type(self).__name__
         check_keywords(name, options, arguments_of(type(self)))
-        self.robot = robot if isinstance(robot, Robot) else Robot.load(robot)
+        if isinstance(robot, Robot):
+            self.robot = robot
+        else:
+            self.robot = Robot.load(robot)
         self.num_envs = checked_option("num_envs", num_envs)
         self.terminate_on_success = flag("terminate_on_success", terminate_on_success)
-        self.max_episode_steps = (
-            None
-            if max_episode_steps is None
-            else integer("max_episode_steps", max_episode_steps, 1, 10**9)
-        )
+        if max_episode_steps is None:
+            self.max_episode_steps = None
+        else:
+            self.max_episode_steps = integer("max_episode_steps", max_episode_steps, 1, 10**9)
         modes = {mode.value: mode for mode in AutoresetMode}
-        mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        if isinstance(autoreset_mode, AutoresetMode):
+            mode = autoreset_mode.value
+        else:
+            mode = autoreset_mode
         self.autoreset_mode = modes[choice("autoreset_mode", mode, modes)]
         timestep = checked_option("timestep", options.get("timestep", RunnerOptions.timestep))
         substeps = round(
@@ -144,9 +149,10 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self.action_names = getattr(self, "action_names", tuple(map(str, range(size))))
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.render_mode = (
-            None if render_mode is None else choice("render_mode", render_mode, ("rgb_array",))
-        )
+        if render_mode is None:
+            self.render_mode = None
+        else:
+            self.render_mode = choice("render_mode", render_mode, ("rgb_array",))
         self.metadata = {  # type: ignore[misc]
             **type(self).metadata,
             "render_fps": 1 / self.step_seconds,
@@ -200,9 +206,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         Default: ``qpos`` where setpoints are joint positions, else the neutral setpoint of the
             command.
         """
-        return (
-            qpos if self.runner.options.sets_positions else np.asarray(self.runner.command.neutral)
-        )
+        if self.runner.options.sets_positions:
+            return qpos
+        return np.asarray(self.runner.command.neutral)
 
     def command(self, action: Float64, setpoint: Float64) -> ArrayLike:
         """Return the setpoints of the Runner (envs, command size) for the actions (envs, size).
@@ -298,7 +304,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         streams: dict[int, int] = {}
         for env in np.flatnonzero(mask).tolist():
             if seeds is not None and (stream := seeds[env]) is not None:
-                self._generators[env], streams[env] = np.random.default_rng(stream), stream
+                self._generators[env] = np.random.default_rng(stream)
+                streams[env] = stream
         self._begin(mask, streams)
         return self._observation.copy(), self._info(mask)
 
@@ -351,7 +358,10 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if not self._is_stepping:
             raise CallOrderError("step_wait: no step is under way; call step_async(actions) first")
         try:
-            self._received = self.runner.recv() if self._received is None else self._received
+            if self._received is None:
+                self._received = self.runner.recv()
+            else:
+                self._received = self._received
             self._observe(self._received)
         except (
             Exception
@@ -376,7 +386,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if begins.any():  # in next-step mode this step begins the next episode
             self._begin(begins)
             reward = np.where(begins, 0.0, reward)
-            terminated, truncated = terminated & ~begins, truncated & ~begins
+            terminated = terminated & ~begins
+            truncated = truncated & ~begins
         self._done = terminated | truncated
         everywhere = np.ones(self.num_envs, bool)
         info = self._info(everywhere)
@@ -435,15 +446,15 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             self._starts[env] = self._returned("draw", drawn, dof, np.float64)
         self._steps[mask] = 0
         self._done = self._done & ~mask
-        seeds, rest = np.zeros(self.num_envs, np.int64), mask
-        randomization, observed = self.runner.options.randomization, None
+        seeds = np.zeros(self.num_envs, np.int64)
+        rest = mask
+        randomization = self.runner.options.randomization
+        observed = None
         if streams and randomization is not None:
             seeded = np.isin(np.arange(self.num_envs), list(streams))
             seeds[list(streams)] = list(streams.values())
-            observed, rest = (
-                self.runner.reset(self._starts, mask=seeded, seed=seeds),
-                mask & ~seeded,
-            )
+            observed = self.runner.reset(self._starts, mask=seeded, seed=seeds)
+            rest = mask & ~seeded
         if rest.any():
             observed = self.runner.reset(self._starts, mask=rest)
         assert observed is not None

@@ -41,14 +41,16 @@ class ActingDraws:
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Put params into effect."""
-        randomization, robot = self._options.randomization, self._options.robot
+        randomization = self._options.randomization
+        robot = self._options.robot
         self.params = self.acting_params = params
         if randomization is not None:
             self.acting_params = randomization.randomized_params(params, self.draws, robot)
 
     def set_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
         """Put actuators into effect; return them with the draws applied."""
-        randomization, robot = self._options.randomization, self._options.robot
+        randomization = self._options.randomization
+        robot = self._options.robot
         self.actuators = actuators
         if randomization is not None:
             actuators = randomization.randomized_actuators(actuators, self.draws, robot)
@@ -77,7 +79,8 @@ def make_pack(
 
 def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variation:
     """Return the differences of ``size`` robots from the model."""
-    randomization, robot = options.randomization, options.robot
+    randomization = options.randomization
+    robot = options.robot
     assert randomization is not None
     values = {}
     for name in PHYSICAL:
@@ -90,5 +93,8 @@ def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variati
         # Masses vary by a factor, the others by their value.
         if name == "link_mass":
             rows = rows / nominal
-        values[name] = rows[:, 0] if name in ("payload", "ground_friction") else rows
+        if name in ("payload", "ground_friction"):
+            values[name] = rows[:, 0]
+        else:
+            values[name] = rows
     return Variation(**values)

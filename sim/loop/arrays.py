@@ -81,8 +81,12 @@ class Arrays(NamedTuple):
         """Return the layout of all fields, for :meth:`from_fields`; a setpoint has ``command_size``
         (dof) numbers.
         """
-        row, table = (ticks, num_envs), (ticks, num_envs, dof)
-        setpoint = table if command_size is None else (*row, command_size)
+        row = (ticks, num_envs)
+        table = (ticks, num_envs, dof)
+        if command_size is None:
+            setpoint = table
+        else:
+            setpoint = (*row, command_size)
         sizes = Command(setpoint, setpoint, setpoint, table)
         layout: Layout = {
             f"command.{name}": (shape, np.float64) for name, shape in sizes._asdict().items()
@@ -145,7 +149,9 @@ class Ticks:
 
     def __getitem__(self, tick: int) -> Arrays:
         """Return the views at a tick, 0 or more."""
-        return self.made[tick] if tick < len(self.made) else self.first(tick + 1)[tick]
+        if tick < len(self.made):
+            return self.made[tick]
+        return self.first(tick + 1)[tick]
 
     def first(self, count: int) -> list[Arrays]:
         """Return the views at the first ``count`` ticks."""

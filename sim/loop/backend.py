@@ -21,11 +21,9 @@ def native_obstacle(options: RunnerOptions) -> str:
     if options.robot.dof > MOST_SUMMED:
         return f"more than {MOST_SUMMED} joints"
     engine = options.load_engine()
-    return (
-        ""
-        if "compiled_steps" in engine.capabilities
-        else f"the sim steps of {engine.name!r} are calls of Python"
-    )
+    if "compiled_steps" in engine.capabilities:
+        return ""
+    return f"the sim steps of {engine.name!r} are calls of Python"
 
 
 def describe(options: RunnerOptions) -> str:
@@ -35,8 +33,14 @@ def describe(options: RunnerOptions) -> str:
         return "law in XLA, in one program with native sim steps"
     lack = engine.native_obstacle()
     reason = "" if lack else native_obstacle(options)
-    law = "in NumPy" if lack or reason else "as a native program"
+    if lack or reason:
+        law = "in NumPy"
+    else:
+        law = "as a native program"
     if options.control == "drive":
         law = f"in {engine.title} (control 'drive')"
-    steps = f", a call each sim step ({reason})" if reason else ""
+    if reason:
+        steps = f", a call each sim step ({reason})"
+    else:
+        steps = ""
     return f"law {law}{steps}, {native.describe_calls(engine.title, lack)}"

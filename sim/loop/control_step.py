@@ -92,7 +92,8 @@ def mass_matrix(layout: Layout, constants: Constants, qpos: Array) -> Array:
     """Return the law's mass matrix (M, dof, dof): M + known armature + dt B, for the leaders
     only.
     """
-    xp, matrix = namespace(qpos), layout.model.mass_matrix(qpos)
+    xp = namespace(qpos)
+    matrix = layout.model.mass_matrix(qpos)
     if constants.armature is not None:
         matrix = matrix + xp.diag(constants.armature)
     if constants.damping is not None:
@@ -132,8 +133,13 @@ def carried(command: Command, left: Array) -> Command:
 
 
 def _sensors(layout: Layout, constants: Constants, values: Values) -> Values:
-    motors, (qpos, qvel, passive), model = values.state.motors, values.measured, layout.model
-    noise = values.noise if model.noise is None else model.noise(constants.motors, motors, qpos)
+    motors = values.state.motors
+    (qpos, qvel, passive) = values.measured
+    model = layout.model
+    if model.noise is None:
+        noise = values.noise
+    else:
+        noise = model.noise(constants.motors, motors, qpos)
     motors, qpos, qvel = advance_measurement(constants.motors, motors, qpos, qvel, noise)
     seen = Measured(qpos, qvel, passive)
     return values._replace(state=values.state._replace(motors=motors), seen=seen, noise=None)
@@ -151,21 +157,26 @@ def _inertia(layout: Layout, constants: Constants, values: Values) -> Values:
     """The inertia of the friction model, for the envs where it is ``REFRESH_STEPS`` old."""
     state, qpos = values.state, values.measured.qpos
     # The age counts from the env's own reset, so that an env does not depend on others.
-    xp, due = namespace(state.age), state.age == REFRESH_STEPS
+    xp = namespace(state.age)
+    due = state.age == REFRESH_STEPS
 
     def fresh() -> FrictionState:
         return replace_envs(state.friction, refreshed(layout, constants, state.friction, qpos), due)
 
-    friction, age = layout.model.when(due, fresh, state.friction), xp.where(due, 0, state.age) + 1
+    friction = layout.model.when(due, fresh, state.friction)
+    age = xp.where(due, 0, state.age) + 1
     return values._replace(state=state._replace(friction=friction, age=age))
 
 
 def _mass_matrix(layout: Layout, constants: Constants, values: Values) -> Values:
     """The mass matrix of the law, which is kept for ``law.matrix_steps``."""
-    (qpos, qvel, _), step, law = values.seen, values.step, layout.law
+    (qpos, qvel, _) = values.seen
+    step = values.step
+    law = layout.law
     assert law is not None
 
     def fresh() -> Any:
+        # Half way through the steps for which it serves, where its error is least on average.
         xp = namespace(qpos)
         steps = xp.minimum(law.matrix_steps, step.end - step.index).astype(qpos.dtype)
         return mass_matrix(layout, constants, half_way(qpos, qvel, steps, constants.timestep))
@@ -190,6 +201,7 @@ def _guard(layout: Layout, constants: Constants, values: Values) -> Values:
     state, changed = guard_model.advance(
         constants.guard, values.state.guard, setpoint, constants.timestep
     )
+    # The guard limits leaders; a follower's setpoint comes from its leader's.
     command = values.command._replace(setpoint=coupling.positions(state.setpoint))
     if layout.moves:
         command = command._replace(
@@ -268,7 +280,9 @@ def _drive(
     do not know whole turns, so the target of a continuous joint is the one next to qpos, which may
     jump at every sim step.
     """
-    (target, rate, *_), seen, state = values.command, values.seen, values.state
+    (target, rate, *_) = values.command
+    seen = values.seen
+    state = values.state
     target = nearest_turn(target, seen.qpos, constants.turns, namespace(seen.qpos))
     if constants.driven is not None:
         rates = {"setpoint_rate": rate if layout.moves else None, "feedforward": seen.passive}
@@ -310,7 +324,9 @@ _LAWS: dict[str, Callable[..., Values]] = {
 
 
 def _motors(layout: Layout, constants: Constants, values: Values) -> Values:
-    (qpos, qvel, _), state, outputs = values.measured, values.state, values.outputs
+    (qpos, qvel, _) = values.measured
+    state = values.state
+    outputs = values.outputs
     motors, effort = advance_effort(constants.motors, state.motors, outputs.qf, qpos, qvel)
     return values._replace(
         state=state._replace(motors=motors), outputs=outputs._replace(qf=effort, motor=effort)

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import clip
+from batchpid.arrays.trees import flatten, leaves, structure
 from batchpid.motors import ActuatorState, advance_measurement
-from batchpid.motors.friction import FrictionState
-from batchpid.motors.guard import GuardState
 from batchpid.sim.engine.missed_contacts import MissedContacts
-from batchpid.sim.engine.protocol import DrivenPack, EnginePack
+from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.acting_draws import ActingDraws, variation
 from batchpid.sim.loop.arrays import Arrays, Command, Ticks
 from batchpid.sim.loop.custom import OwnController
@@ -29,7 +28,7 @@ from batchpid.sim.loop.native_program import Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
 from batchpid.sim.loop.pushes import Pushes
 from batchpid.sim.loop.sensed import LinkSensors
-from batchpid.sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
+from batchpid.sim.loop.snapshot import EnvStates
 from batchpid.sim.loop.step_setup import (
     Setup,
     init_motors,
@@ -40,10 +39,13 @@ from batchpid.sim.loop.step_setup import (
     with_matrix,
     with_params,
 )
-from batchpid.sim.loop.step_values import StepState
+from batchpid.sim.loop.step_values import StepState, state_of
 from batchpid.sim.loop.xla_executor import XLAExecutor
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
+
+_RESULTS = ("effort", "saturated", "guarded")
+"""Results of a sim step that are observed, by name."""
 
 
 class EnvGroup:
@@ -70,7 +72,9 @@ class EnvGroup:
         self._steps = 0  # sim steps before the run
         self._moves = False  # whether the run gives rates of setpoints
         self._runs_whole = False  # whether the native code runs whole ticks
-        self._options, self._controller, self._ticks = options, controller, ticks
+        self._options = options
+        self._controller = controller
+        self._ticks = ticks
         self.acting = ActingDraws(options, params)
         self._faults = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._sensors = LinkSensors(options, pack.size)
@@ -87,7 +91,8 @@ class EnvGroup:
         is_read = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
         has_parts = bool(self._sensors.values or self._pushes.counts)
         self._observes_natively = is_read and not has_parts
-        qpos, everyone = pack.read_qpos(), np.ones(pack.size, bool)
+        qpos = pack.read_qpos()
+        everyone = np.ones(pack.size, bool)
         law = bp.init(params, qpos) if controller is None else controller.init(pack.size)
         setup = self._setup(None)
         state = reset_guard(setup, StepState(law), qpos, everyone)
@@ -112,7 +117,7 @@ class EnvGroup:
             self._executor = NativeExecutor(setup, state, self._last)
         else:
             self._executor = NumPyExecutor(setup, state)
-        if self._options.control == "drive" and isinstance(self.pack, DrivenPack):
+        if self._options.control == "drive" and hasattr(self.pack, "write_drive"):
             damping, stiffness = setup.constants.drive
             limit = self.acting.acting_params.effort_max
             if limit is None:
@@ -126,7 +131,8 @@ class EnvGroup:
         self._set_params(params, self._executor.read_state())
 
     def _set_params(self, params: bp.PIDParams, state: StepState) -> None:
-        before, old = self._executor.setup, self.acting.acting_params
+        before = self._executor.setup
+        old = self.acting.acting_params
         self.acting.set_params(params)
         setup = self._setup(state.motors)
         state = with_params(before, setup, state, old, self.acting.acting_params)
@@ -148,6 +154,7 @@ class EnvGroup:
         for them.
         """
         old, motors = state.motors, None
+        # Friction and armature behind the gear belong to the engine's joints.
         self.pack.write_joints(self.acting.set_actuators(actuators), rows)
         if self.acting.motors is not None:
             # New motors begin the streams of their noise again.
@@ -195,7 +202,8 @@ class EnvGroup:
 
     def _vary(self, mask: NDArray[np.bool_]) -> None:
         """Put the draws of the envs of ``mask`` (M,) into effect, before these envs are placed."""
-        randomization, acting = self._options.randomization, self.acting
+        randomization = self._options.randomization
+        acting = self.acting
         rows = np.flatnonzero(mask).tolist()
         if randomization is None or acting.draws is None or not rows:
             return
@@ -257,8 +265,10 @@ class EnvGroup:
 
     def _run_tick(self, substeps: int) -> None:
         """Run the present tick, or the rest of it, and observe it."""
-        executor, rows = self._executor, self._ticks[self.tick]
-        done, before = self._step, self._steps + self.tick * substeps
+        executor = self._executor
+        rows = self._ticks[self.tick]
+        done = self._step
+        before = self._steps + self.tick * substeps
         command = rows.command
         if done == 0:
             self._push(substeps)
@@ -283,10 +293,10 @@ class EnvGroup:
         self._find_contacts(self.tick, self.tick + 1, substeps)
 
     def _take_results(self) -> None:
-        outputs, last = self._executor.results(), self._last
-        last.effort[...] = outputs.motor
-        last.saturated[...] = False if outputs.saturated is None else outputs.saturated
-        last.guarded[...] = False if outputs.guarded is None else outputs.guarded
+        outputs = self._executor.results()
+        results = outputs.motor, outputs.saturated, outputs.guarded
+        for name, rows in zip(_RESULTS, results, strict=True):
+            getattr(self._last, name)[...] = False if rows is None else rows
 
     def _push(self, substeps: int) -> None:
         """Push the bases that are due before a tick of ``substeps`` sim steps."""
@@ -317,9 +327,8 @@ class EnvGroup:
         observation, last = rows.observation, self._last
         observation.qpos[...] = self._executor.qpos()
         observation.qvel[...] = self.pack.read_qvel(np.float32)
-        observation.effort[...] = last.effort
-        observation.saturated[...] = last.saturated
-        observation.guarded[...] = last.guarded
+        for name in _RESULTS:
+            getattr(observation, name)[...] = getattr(last, name)
         if observation.base_pose is not None and observation.base_twist is not None:
             pose, twist = np.split(self.pack.read_base(), [7], axis=1)
             observation.base_pose[...] = pose
@@ -336,22 +345,14 @@ class EnvGroup:
 
     def read(self) -> EnvStates:
         """Return the state of these envs, physics and controller."""
-        state, last = self._executor.read_state(), self._last
-        law, motors, friction, guard = state.law, state.motors, {}, {}
-        if state.age is not None:
-            friction = {**state.friction._asdict(), AGE: state.age}
-        if state.guard is not None:
-            guard = {**state.guard._asdict(), CHANGED: last.guarded.copy()}
+        last = self._last
+        # Each tick begins with a new mass matrix.
+        control = self._executor.read_state()._replace(matrix=None)
         return EnvStates(
             engine=self.pack.read_state(),
-            effort=last.effort.copy(),
-            saturated=last.saturated.copy(),
-            controller=law.leaves() if isinstance(law, bp.PIDState) else dict(law),
-            friction=friction,
-            actuators=(
-                {} if motors is None else {**motors.leaves(), EPISODE: self._episode.copy()}
-            ),
-            guard=guard,
+            **{name: getattr(last, name).copy() for name in _RESULTS},
+            episode=self._episode.copy(),
+            control=flatten(control),
             containment=self._faults.read(),
             sensors=self._sensors.read(),
             pushes=self._pushes.read(),
@@ -369,35 +370,36 @@ class EnvGroup:
         snapshot.
         """
         acting, last = self.acting, self._last
+        # The control step stays where nothing of it can have changed, since a new one takes time.
+        stays = pack is self.pack and self._controller is None
+        stays = stays and self._options.randomization is None
+        stays = stays and _are_equal((params, actuators), (acting.params, acting.actuators))
         self.pack = pack
-        # Params and actuators come before the state: they say which arrays it has.
         acting.draws = draws
-        acting.set_params(params)
-        state = self._executor.read_state()
-        if actuators is not None or acting.actuators is not None:
-            self._with_actuators(state, actuators)
+        # Params and actuators come before the state: they say which arrays it has.
+        if not stays:
+            acting.set_params(params)
+            if actuators is not None or acting.actuators is not None:
+                self._with_actuators(self._executor.read_state(), actuators)
         # Placing robots clears efforts and suspension, so these follow.
         pack.write_state_rows(states.engine)
         self._faults.write(states.containment)
         pack.suspend(self._faults.suspended)
         pack.write_qf(states.effort)
-        last.effort[...], last.saturated[...] = states.effort, states.saturated
+        for name in _RESULTS:
+            getattr(last, name)[...] = getattr(states, name)
+        self._episode[...] = states.episode
         self._sensors.write(states.sensors)
         self._pushes.write(states.pushes)
-        law: Any = states.controller
-        friction, motors, guard = dict(states.friction), dict(states.actuators), dict(states.guard)
-        state = StepState(
-            law=law if self._controller else bp.PIDState(**law),
-            age=friction.pop(AGE, None),
-            friction=FrictionState(**friction),
-        )
-        if motors:
-            self._episode = motors.pop(EPISODE).copy()
-            state = state._replace(motors=ActuatorState(**motors))
-        if guard:
-            last.guarded[...] = guard.pop(CHANGED)
-            state = state._replace(guard=GuardState(**guard))
-        self._prepare(self._setup(state.motors), state)
+        is_custom = self._controller is not None
+        state = state_of(states.control, is_custom, acting.motors is not None)
+        executor = self._executor
+        if stays:
+            executor.failed = False
+            executor.measure()
+            executor.write_state(with_matrix(executor.setup, state))
+        else:
+            self._prepare(self._setup(state.motors), state)
         if self._contacts is not None:
             self._contacts.place(np.ones(pack.size, bool))
 
@@ -409,6 +411,7 @@ class EnvGroup:
 
         ``returned`` is the effort of the caller's own controller, or None.
         """
+        # The fault is handled here, and the tick goes on.
         self._executor.failed = False
         if returned is not None:
             returned = clip(returned, *self._executor.setup.constants.limits, np)
@@ -437,14 +440,19 @@ class EnvGroup:
             return
         qpos, qvel = faults.start_qpos, faults.start_qvel
         if faults.suspends:
-            qpos, qvel = faults.suspended_qpos, np.zeros_like(qvel)
+            qpos = faults.suspended_qpos
+            qvel = np.zeros_like(qvel)
         self._place(failed, qpos, qvel)
 
     def _place(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64) -> None:
         """Place the envs of ``mask`` (M,), and restart their control."""
-        pack, acting, executor = self.pack, self.acting, self._executor
-        setup, state = executor.setup, executor.read_state()
-        constants, model = setup.constants, setup.layout.model
+        pack = self.pack
+        acting = self.acting
+        executor = self._executor
+        setup = executor.setup
+        state = executor.read_state()
+        constants = setup.constants
+        model = setup.layout.model
         rows = np.flatnonzero(mask)
         # 1: the robots
         base = None if pack.spec.fixed_base else self._faults.start_base[rows]
@@ -458,7 +466,8 @@ class EnvGroup:
             self._contacts.place(mask)
         executor.measure()
         # 2: guard and motors, from the robots' state as the engine has it
-        qpos, qvel = pack.read_qpos(), pack.read_qvel()
+        qpos = pack.read_qpos()
+        qvel = pack.read_qvel()
         state = reset_guard(setup, state, qpos, mask)
         if acting.motors is not None and state.motors is not None:
             self._episode[mask] += 1
@@ -478,3 +487,10 @@ class EnvGroup:
         else:
             state = state._replace(law=self._controller.reset(state.law, mask))
         executor.write_state(reset_friction(setup, state, mask))
+
+
+def _are_equal(one: Any, other: Any) -> bool:
+    """Return whether two trees have the same parts, and arrays with the same values."""
+    if structure(one) != structure(other):
+        return False
+    return all(map(np.array_equal, leaves(one), leaves(other)))

@@ -31,7 +31,8 @@ class Failure(NamedTuple):
 
         :meth:`of_worker` puts the name of the worker in front of the message of a WorkerError.
         """
-        error, text = self.error, "".join(traceback.format_exception(self.error))
+        error = self.error
+        text = "".join(traceback.format_exception(self.error))
         if isinstance(error, ControllerError):
             if not hasattr(
                 error, "__notes__"
@@ -46,7 +47,9 @@ class Failure(NamedTuple):
         WorkerError.
         """
         is_ours = type(self.error) is WorkerError
-        return self._replace(error=WorkerError(f"{name} {self.error}")) if is_ours else self
+        if is_ours:
+            return self._replace(error=WorkerError(f"{name} {self.error}"))
+        return self
 
 
 def order(failure: Failure) -> tuple[int, int]:
@@ -66,4 +69,6 @@ class RunError(Exception):
 
 def failure_of(error: Exception) -> Failure:
     """Return the failure in a RunError; for another exception of a loop, a failure at step 0."""
-    return error.failure if isinstance(error, RunError) else Failure(0, 0, 0, error)
+    if isinstance(error, RunError):
+        return error.failure
+    return Failure(0, 0, 0, error)

@@ -66,7 +66,10 @@ class Fault(NamedTuple):
             "effort": "the effort that its controller returned is not finite",
         }
         cause = texts.get(self.cause, f"the {self.cause} given for it is not finite")
-        action = "held until it is reset" if self.action == "hold" else "reset"
+        if self.action == "hold":
+            action = "held until it is reset"
+        else:
+            action = "reset"
         return (
             f"env {self.env}, {self.kind} {self.joint!r}: {cause}, at step {self.step}"
             f" ({self.time:g} s); {action}"
@@ -115,6 +118,7 @@ class FaultLog:
         if np.logical_and.reduce(arrays.observation.ok):  # ok.all() takes a call of Python
             return self
         fault = arrays.fault
+        # A fault is new if its step differs from that of the env's last one.
         log = self.restored(fault.step)
         new = list[Fault]()
         for env in np.flatnonzero((log._steps >= 0) & (log._steps != self._steps)).tolist():
@@ -200,7 +204,9 @@ class FaultContainment(StateRows):
 
         ``returned`` is the effort of the caller's own controller, within the limits; or None.
         """
-        qpos, qvel = pack.read_qpos(), pack.read_qvel()
+        # The comparison is also false for NaN.
+        qpos = pack.read_qpos()
+        qvel = pack.read_qvel()
         bad = ~(np.abs(qpos) <= FARTHEST) | ~np.isfinite(qvel) | pack.strays()[:, None]
         # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first
         # joint.
@@ -217,7 +223,9 @@ class FaultContainment(StateRows):
 
     def pop_unplaced(self) -> Bool:
         """Return the envs that failed since the last call (M,), which are to be placed."""
-        unplaced, self._unplaced = self._unplaced, np.zeros_like(self._unplaced)
+        unplaced = self._unplaced
+        # A new array, since the caller keeps the old one.
+        self._unplaced = np.zeros_like(self._unplaced)
         return unplaced
 
     def observe(self, rows: Arrays) -> None:

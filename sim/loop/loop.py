@@ -66,8 +66,12 @@ class Loop:
         self._steps = 0
         self._given: tuple[bool, ...] = ()
         self._workspace: dict[Any, Any] = {}
-        controller = None if isinstance(options.control, str) else OwnController(options)
-        count, size = envs.stop - envs.start, group_size(options)
+        if isinstance(options.control, str):
+            controller = None
+        else:
+            controller = OwnController(options)
+        count = envs.stop - envs.start
+        size = group_size(options)
         self.groups = list[EnvGroup]()
         # Each group has its own scenes; nothing else in the loop depends on the grouping.
         for first in range(0, count, size):
@@ -78,7 +82,10 @@ class Loop:
             self.groups.append(group)
         self.set_actuators(None if options.actuators is None else options.actuators.for_envs(envs))
         # Packs that share working memory cannot run in one native call.
-        self._batches = [[group] for group in self.groups] if self._workspace else [self.groups]
+        if self._workspace:
+            self._batches = [[group] for group in self.groups]
+        else:
+            self._batches = [self.groups]
 
     def _build(self, envs: slice, draws: Draws | None = None) -> EnginePack:
         first = self.options.first_env + self._first_env + envs.start
@@ -190,7 +197,8 @@ class Loop:
     ) -> None:
         # The contact caches of some engines, and the order in which they solve contacts, depend on
         # the past. A new world has no past.
-        randomization, pack = self.options.randomization, group.pack
+        randomization = self.options.randomization
+        pack = group.pack
         varies = randomization is not None and randomization.changes_robot
         if varies or not pack.state_is_complete:
             pack.close()
@@ -219,4 +227,6 @@ def group_size(options: RunnerOptions) -> int:
     size = options.load_engine().group_size
     is_native = options.backend == "numpy" and not native_obstacle(options)
     # Calls of NumPy and XLA have an overhead, which more envs share.
-    return size if is_native else max(size, ROWS)
+    if is_native:
+        return size
+    return max(size, ROWS)

@@ -91,6 +91,7 @@ class NativeExecutor:
     def run(self, command: Command, moves: bool, begin: int, end: int) -> int:
         """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
         # The tables of ticks are not used here, since the command may differ from theirs.
+        # A program for each kind of tick is made once, at the first such tick.
         program = self.start(moves, begin)
         if program.control is not None:
             program.control.load(command.setpoint)
@@ -146,14 +147,16 @@ class NativeExecutor:
     def is_waiting(self) -> bool:
         """Count the sim steps that ran; return whether the rest waits for noise."""
         assert self._program is not None
-        tick, motors = self._program.tick, self._buffers.state.motors
+        tick = self._program.tick
+        motors = self._buffers.state.motors
         if motors is not None and motors.step is not None:
             motors.step[...] += tick.ran
         return bool(tick.status & _NO_NOISE)
 
     def _noise(self) -> Any:
         """Return the noise of positions and velocities in the next sim steps (steps, M, dof)."""
-        layout, motors = self.setup.layout, self._buffers.state.motors
+        layout = self.setup.layout
+        motors = self._buffers.state.motors
         if motors is None or not layout.measures:
             return ()
         return layout.model.noise.from_step(self.setup.constants.motors, motors, self.before)

@@ -21,10 +21,9 @@ from batchpid.native.symbols import Symbol
 from batchpid.native.tracing import Trace, trace
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
-from batchpid.sim.engine.protocol import CompiledPack
-from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
 from batchpid.sim.loop.control_step import COUPLING_STEPS, STAGES, SimStage
+from batchpid.sim.loop.model_functions import steps_natively
 from batchpid.sim.loop.step_setup import Setup, moves_drives
 from batchpid.sim.loop.step_values import (
     Layout,
@@ -82,7 +81,7 @@ class TickProgram:
         self, setup: Setup, buffers: Buffers, table: Table, noise: Any, reads_force: bool
     ) -> None:
         _, pack, layout, constants, _ = setup
-        assert isinstance(pack, CompiledPack)
+        assert steps_natively(pack)
         self._setup, self._buffers = setup, buffers
         self._native = native.extension("_gateway")
         self._programs, self._stages = list[Any](), list[interface.Stage]()
@@ -101,8 +100,11 @@ class TickProgram:
         self._place(**buffers.measured._asdict(), before=buffers.before, left=left)
         # SAPIEN knows neither measured states nor the model of varied robots.
         if layout.gravity and (layout.measures or not reads_force):
-            field = "measured_force" if layout.measures else "read_force"
-            setattr(self.tick, field, pack.force_model().address)
+            if layout.measures:
+                field = "measured_force"
+            else:
+                field = "read_force"
+            setattr(self.tick, field, pack.force_model.address)
         # Programs have no key of the noise, counts, or state of a controller.
         state, motors = buffers.state, buffers.state.motors
         if motors is not None:
@@ -144,10 +146,9 @@ class TickProgram:
     def _transfers(self, table: Table) -> ctypes.Array[interface.Transfer]:
         """Return the copies between the tables of the ticks and the arrays of a sim step."""
         command, seen, fault = table.arrays
-        outputs, measured = self.outputs, self._buffers.measured
+        outputs = self.outputs
+        measured = self._buffers.measured
         none = np.zeros(measured.qpos.shape, bool)
-        saturated = none if outputs.saturated is None else outputs.saturated
-        guarded = none if outputs.guarded is None else outputs.guarded
         copies: list[tuple[str, Rows, Rows]] = [
             *[
                 ("read", rows, row)
@@ -156,17 +157,20 @@ class TickProgram:
             ("write_floats", seen.qpos, measured.qpos),
             ("write_floats", seen.qvel, measured.qvel),
             ("write_floats", seen.effort, outputs.motor),
-            ("write_bytes", seen.saturated, saturated),
-            ("write_bytes", seen.guarded, guarded),
             ("write_bytes", seen.ok, np.ones(len(none), bool)),
             # One row, which each tick overwrites.
             ("write_floats", table.effort[None], outputs.motor),
-            ("write_bytes", table.saturated[None], saturated),
-            ("write_bytes", table.guarded[None], guarded),
             *[("write_bytes", rows, row) for rows, row in zip(fault, table.fault, strict=True)],
         ]
+        for name in ("saturated", "guarded"):
+            mask = getattr(outputs, name)
+            if mask is None:
+                mask = none
+            copies.append(("write_bytes", getattr(seen, name), mask))
+            copies.append(("write_bytes", getattr(table, name)[None], mask))
         if seen.base_pose is not None and seen.base_twist is not None:
-            pose, twist = np.zeros((len(none), 7)), np.zeros((len(none), 6))
+            pose = np.zeros((len(none), 7))
+            twist = np.zeros((len(none), 6))
             self._place(base_pose=pose, base_twist=twist)
             copies.append(("write_floats", seen.base_pose, pose))
             copies.append(("write_floats", seen.base_twist, twist))
@@ -216,7 +220,8 @@ class TickProgram:
         """
         shape = self._buffers.before.shape
         constants = mapped(_split, self._setup.constants)
-        inputs, state = leaves(values), leaves(values.state)
+        inputs = leaves(values)
+        state = leaves(values.state)
         layout = self._setup.layout._replace(model=Model())
         histories = tuple(array.ndim == 3 for array in state)
         traced = _trace(stages, layout, histories, structure(constants), structure(values))
@@ -248,7 +253,8 @@ class TickProgram:
         return values
 
     def _add_inertia(self, values: Values) -> Values:
-        refresh, state = self._setup.layout.model.refresh, self._buffers.state
+        refresh = self._setup.layout.model.refresh
+        state = self._buffers.state
         self.tick.refresh = refresh.address
         self._references.append(refresh)
         self._place(age=state.age, gain=state.friction.gain, memory=state.friction.memory)
@@ -256,7 +262,7 @@ class TickProgram:
 
     def _add_mass_matrix(self, values: Values) -> Values:
         _, pack, _, constants, _ = self._setup
-        tree, bodies = scene_tree(pack.spec).tables
+        tree, bodies = pack.rigid_tree.tables
         self._place(pose=values.seen.qpos, rate=values.seen.qvel, tree=tree, bodies=bodies)
         self._place(matrix=self._buffers.state.matrix, armature=constants.armature)
         self._place(damping=constants.damping, **constants.coupling.native())
@@ -332,7 +338,8 @@ def _trace(
     ``constants`` and ``inputs`` are structures of the constants and of the values before it.
     ``histories`` says which arrays of the state are histories, which a program changes in place.
     """
-    first, count = len(leaves(constants)), len(leaves(inputs))
+    first = len(leaves(constants))
+    count = len(leaves(inputs))
     result_parts: list[Any] = []
 
     def function(*symbols: Symbol) -> list[Any]:
@@ -345,9 +352,11 @@ def _trace(
         changed = _Changed(values.state, values.seen, values.outputs)
         numbers = {symbol: number for number, symbol in enumerate(symbols[first:])}
         outputs = set(map(id, leaves(changed.outputs)))
-        results, places = list[Any](), list[_Place]()
+        results = list[Any]()
+        places = list[_Place]()
         for at, leaf in enumerate(leaves(changed)):
-            is_state, number = at < len(histories), numbers.get(leaf)
+            is_state = at < len(histories)
+            number = numbers.get(leaf)
             if is_state and (number == at or histories[at]):
                 places.append(_Place(False, at))
             # An output that is an input is copied, since the next sim step changes the input.
@@ -365,7 +374,9 @@ def _trace(
 
 def _split(array: Array) -> Any:
     """Return an array (n, envs, dof) as a tuple of n arrays, and other arrays unchanged."""
-    return tuple(array) if array.ndim == 3 else array
+    if array.ndim == 3:
+        return tuple(array)
+    return array
 
 
 def _row_size(array: Rows) -> int:
@@ -374,4 +385,6 @@ def _row_size(array: Rows) -> int:
     """
     if array.ndim == 0:
         return -1
-    return 0 if array.ndim == 2 else array[0].size
+    if array.ndim == 2:
+        return 0
+    return array[0].size

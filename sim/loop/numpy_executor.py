@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.sim.engine.protocol import CompiledPack, CompiledStep, EnginePack
+from batchpid.sim.engine.protocol import CompiledStep, EnginePack
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import COUPLING_STEPS, sim_step
 from batchpid.sim.loop.custom import controller_errors
@@ -84,8 +84,8 @@ class NumPyExecutor:
         Raises ControllerError if a controller in Python does.
         """
         setup = self.setup
-        constants, layout = setup.constants, setup.layout._replace(moves=moves)
-        controller = None if isinstance(setup.options.control, str) else setup.options.control
+        constants = setup.constants
+        layout = setup.layout._replace(moves=moves)
         self._first = begin
         engine = {
             "targets": self._write_targets,
@@ -96,9 +96,11 @@ class NumPyExecutor:
             step = Step(index, end, layout.left(index, end, constants.timestep))
             self.before = self.measured.qpos  # where a robot that fails now is suspended
             values = Values(self._state, command, self.measured, step, self.measured)
-            with controller_errors(controller, index + 1):
+            with controller_errors(setup.controller, index + 1):
                 values = sim_step(layout, constants, values, engine)
-            self._state, self.outputs, self.measured = values.state, values.outputs, values.measured
+            self._state = values.state
+            self.outputs = values.outputs
+            self.measured = values.measured
             if self.failed:
                 return index + 1
         return end
@@ -135,14 +137,16 @@ class EngineSteps:
         self._is_native = steps_natively(setup.pack)
         self.native_force = False
         """Whether the native sim step reads the passive force."""
-        if isinstance(setup.pack, CompiledPack):
+        # Not isinstance, which would make the pack's native models.
+        if hasattr(setup.pack, "steps_read_force"):
             self.native_force = self.reads_force and setup.pack.steps_read_force(*self._parts)
         self._step: CompiledStep | None = None
         self._bound: object = None
 
     def measure(self) -> Measured:
         """Return a reading of the robots."""
-        qpos, qvel = self._pack.read_qpos(), self._pack.read_qvel()
+        qpos = self._pack.read_qpos()
+        qvel = self._pack.read_qvel()
         return Measured(qpos, qvel, self._passive_force(qpos))
 
     def advance(self, qf: Rows) -> tuple[Measured, bool]:
@@ -167,7 +171,10 @@ class EngineSteps:
         """Return the native sim step of the present robots."""
         pack: Any = self._setup.pack  # a CompiledPack, which takes long to check
         if self._step is None or self._bound is not pack.calls:
-            parts = self._parts if self.native_force else (False, False)
+            if self.native_force:
+                parts = self._parts
+            else:
+                parts = (False, False)
             drives = self._setup.layout.control == "drive"
             self._bound = pack.calls
             self._step = pack.compiled_step(*parts, True, self._setup.speed_limit, drives)

@@ -39,7 +39,9 @@ class PIDLaw(NamedTuple):
     @property
     def matrix_steps(self) -> int:
         """Sim steps for which a mass matrix is kept within a tick."""
-        return 1 if self.implicit else MASS_MATRIX_STEPS
+        if self.implicit:
+            return 1
+        return MASS_MATRIX_STEPS
 
     def advance(
         self,

@@ -35,7 +35,10 @@ class Pushes(StateRows):
     def due(self, suspended: Bool, episodes: Int64) -> tuple[list[int], Float64]:
         """Return the envs that are pushed now, and the changes of their twists (n, 6)."""
         rows = np.flatnonzero((self.counts["steps"] >= self.counts["due"]) & ~suspended)
-        twists = self._draw("push", rows, episodes) if rows.size else np.zeros((0, 6))
+        if rows.size:
+            twists = self._draw("push", rows, episodes)
+        else:
+            twists = np.zeros((0, 6))
         self.counts["number"][rows] += 1
         self._take(rows, episodes)
         return rows.tolist(), twists

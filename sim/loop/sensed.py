@@ -26,7 +26,10 @@ class LinkSensors(StateRows):
         sums = pack.take_sensed() if self.values else {}
         for name, rows in sums.items():
             values = self.values[name]
-            values[...] = rows > 0 if values.dtype == bool else rows / substeps
+            if values.dtype == bool:
+                values[...] = rows > 0
+            else:
+                values[...] = rows / substeps
             values[failed] = 0
 
     def clear(self, mask: Bool) -> None:

@@ -45,7 +45,9 @@ class Setup(NamedTuple):
     def speed_limit(self) -> Array:
         """Speed beyond which a joint has failed (dof,); None for no limit."""
         limit = self.options.speed_limit
-        return None if limit is None else np.asarray(limit)
+        if limit is None:
+            return None
+        return np.asarray(limit)
 
 
 def make_setup(
@@ -123,7 +125,10 @@ def _constants(options: RunnerOptions, pack: EnginePack, params: bp.PIDParams) -
         driven = None
         if params.ki is not None and np.any(params.ki > 0):
             driven = bp.discretise(gains._replace(measurement_rate=None), timestep)
-        damping = np.zeros_like(gains.kp) if gains.kd is None else gains.kd
+        if gains.kd is None:
+            damping = np.zeros_like(gains.kp)
+        else:
+            damping = gains.kd
         return constants._replace(drive=(damping, gains.kp), driven=driven, turns=_turns(pack))
     return constants
 
@@ -157,7 +162,9 @@ def _turns(pack: EnginePack) -> Array:
     joints.
     """
     turns = np.array([joint.continuous / TURN for joint in pack.spec.joints])
-    return turns if turns.any() else None
+    if turns.any():
+        return turns
+    return None
 
 
 def reset_friction(setup: Setup, state: StepState, mask: Bool) -> StepState:
@@ -205,7 +212,8 @@ def with_params(
     layout = setup.layout
     if layout.control == "custom":
         return state
-    law, qpos = state.law, setup.pack.read_qpos()
+    law = state.law
+    qpos = setup.pack.read_qpos()
     if layout.control == "pid" and old.gain_units != new.gain_units:
         constants = setup.constants
         if uses_mass_matrix(before.layout, before.constants):

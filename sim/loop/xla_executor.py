@@ -18,7 +18,6 @@ from batchpid.arrays.array_types import Array, Float64, Pytree, Rows
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine.native import xla
-from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import sim_step, uses_mass_matrix
 from batchpid.sim.loop.custom import controller_errors
@@ -42,6 +41,7 @@ ROWS = 16
 def padded(rows: Any) -> Rows:
     """Return ``rows`` (envs, ...) followed by copies of the first row, up to a multiple of ROWS."""
     rows = np.asarray(rows)
+    # Copies of a robot stay finite, which rows of zeros need not.
     missing = -len(rows) % ROWS
     return np.concatenate([rows, np.repeat(rows[:1], missing, 0)])
 
@@ -75,13 +75,17 @@ class XLAExecutor:
         self.setup = setup
         self._engine = EngineSteps(setup)
         self.failed = False
-        pack, constants, layout = setup.pack, setup.constants, setup.layout
+        pack = setup.pack
+        constants = setup.constants
+        layout = setup.layout
         rows = (pack.size, pack.dof)
 
         def spread(part: Any) -> Any:
             return mapped(lambda array: padded(np.broadcast_to(array, rows)), part)
 
         uses_bodies = uses_mass_matrix(layout, constants) or constants.friction.coulomb is not None
+        # A program takes one row of constants for each robot, padded as the robots are.
+        # The law has the limits in its coefficients.
         arrays = constants._replace(
             timestep=np.float64(constants.timestep),
             k=spread(constants.k),
@@ -90,7 +94,10 @@ class XLAExecutor:
         )
         with own_settings("float64"):
             self._constants = put(arrays)
-            self._bodies = put(scene_tree(pack.spec).tables) if uses_bodies else None
+            if uses_bodies:
+                self._bodies = put(pack.rigid_tree.tables)
+            else:
+                self._bodies = None
         self.write_state(state)
         self.measure()
 
@@ -111,13 +118,19 @@ class XLAExecutor:
     def read_state(self) -> StepState:
         """Return the state of the control as new NumPy arrays."""
         state: StepState = self._numpy(self._state)
-        return state if state.age is None else state._replace(age=state.age.astype(np.int64))
+        if state.age is None:
+            return state
+        return state._replace(age=state.age.astype(np.int64))
 
     def write_state(self, state: StepState) -> None:
         """Replace the state of the control."""
         import jax
 
-        age = None if state.age is None else state.age.astype(np.int32)
+        if state.age is None:
+            age = None
+        else:
+            # The program's integers have 32 bits, as those of a tick's span.
+            age = state.age.astype(np.int32)
         with own_settings("float64"):
             self._state = put(jax.tree.map(padded, state._replace(age=age)))
 
@@ -128,8 +141,10 @@ class XLAExecutor:
 
     def run(self, command: Command, moves: bool, begin: int, end: int) -> int:
         """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
-        setup, step = self.setup, self._engine.compiled()
-        control, controller = setup.options.control, setup.controller
+        setup = self.setup
+        step = self._engine.compiled()
+        # The layout is a key of the cache of programs, so it has no functions of this group.
+        controller = setup.controller
         layout = setup.layout._replace(model=Model(), moves=moves)
         traced = None if controller is None else controller.traced
         with own_settings("float64"):
@@ -137,7 +152,7 @@ class XLAExecutor:
             steps = np.array([begin, end, 0, 0], np.int32)
             steps[2:].view(np.uint64)[0] = step.prepare()
             rows = put(mapped(padded, command))
-            with controller_errors(None if controller is None else control, begin + 1):
+            with controller_errors(controller, begin + 1):
                 carry = compiled(layout, traced)(
                     steps, self._constants, self._bodies, self._state, self._measured, rows
                 )
@@ -175,12 +190,14 @@ def tick(
     from jax import lax
 
     xp = jax.numpy
-    end, address = span[1], lax.bitcast_convert_type(span[2:], np.uint32)
+    end = span[1]
+    address = lax.bitcast_convert_type(span[2:], np.uint32)
 
     def mass_matrix(qpos: Array) -> Array:
         assert bodies is not None
         return xla.mass_matrix(*bodies, qpos)
 
+    # One branch for all rows: a choice for each row would compute both.
     def when(due: Any, function: Any, otherwise: Array) -> Any:
         return lax.cond(due.any(), function, lambda: otherwise)
 
@@ -188,7 +205,8 @@ def tick(
     with_model = layout._replace(model=model)
 
     def body(carry: Carry) -> Carry:
-        index, status = carry.progress[0], carry.progress[1]
+        index = carry.progress[0]
+        status = carry.progress[1]
 
         def engine(layout: Layout, constants: Constants, values: Values) -> Values:
             nonlocal status
@@ -203,7 +221,8 @@ def tick(
 
     # The loop may end before its first sim step, so its results have values before.
     qpos = measured.qpos
-    zero, none = xp.zeros_like(qpos), xp.zeros(qpos.shape, bool)
+    zero = xp.zeros_like(qpos)
+    none = xp.zeros(qpos.shape, bool)
     outputs = Outputs(zero, zero, none, returned=None if controller is None else zero)
     carry = Carry(xp.stack([span[0], xp.zeros_like(end)]), state, measured, outputs, qpos)
     return lax.while_loop(

@@ -83,7 +83,7 @@ def check_plain(record: object) -> None:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Group:
+class OptionGroup:
     """Base of the groups of options."""
 
     def __post_init__(self) -> None:
@@ -104,7 +104,7 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Scene(Group):
+class Scene(OptionGroup):
     """Engine, ground, contacts, and content of the scenes."""
 
     engine: Annotated[
@@ -112,7 +112,6 @@ class Scene(Group):
         option(
             "snapshot",
             "recording",
-            "scene",
             flag="Physics engine; mujoco is several times as fast, and its contacts differ.",
         ),
     ] = DEFAULT_ENGINE
@@ -204,7 +203,9 @@ class Scene(Group):
         """Return the MJCF file that the engine simulates as it is; None for others, and in
         SAPIEN.
         """
-        return robot.mjcf if self.engine == "mujoco" else None
+        if self.engine == "mujoco":
+            return robot.mjcf
+        return None
 
     def fit(self, robot: Robot) -> Self:
         engine = self.load_engine()
@@ -278,13 +279,14 @@ class Scene(Group):
         for link in links:
             choice(argument, link, [link.name for link in robot.links])
             if bodies[link].link == root and (argument == "wrenches" or robot.fixed_base):
-                problem, remedy = f"names {link!r}, which no joint moves", "name one further along"
+                problem = f"names {link!r}, which no joint moves"
+                remedy = "name one further along"
                 raise InvalidArgumentError(argument, problem, remedy=remedy)
         return links
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Timing(Group):
+class Timing(OptionGroup):
     """Time step and ticks."""
 
     timestep: Annotated[
@@ -344,7 +346,7 @@ class Controller(Protocol):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Control(Group):
+class Control(OptionGroup):
     """Law, gains, motors and guard."""
 
     params: Annotated[bp.PIDParams | None, option("restored")] = None
@@ -424,7 +426,9 @@ class Control(Group):
     @property
     def control_name(self) -> str:
         """Name of the control; of a :class:`Controller` its class."""
-        return self.control if isinstance(self.control, str) else type(self.control).__name__
+        if isinstance(self.control, str):
+            return self.control
+        return type(self.control).__name__
 
     @property
     def sets_positions(self) -> bool:
@@ -433,7 +437,7 @@ class Control(Group):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Faults(Group):
+class Faults(OptionGroup):
     """What makes an env fail, and what happens then."""
 
     on_fault: Annotated[FaultAction, option("snapshot")] = "hold"
@@ -486,13 +490,14 @@ class Ray:
     def __post_init__(self) -> None:
         check_plain(self)
         if "://" in instance("address", self.address or "", str, "pass HOST:PORT"):
-            problem, remedy = "must be HOST:PORT, 'auto' or 'local'", "leave out the protocol"
+            problem = "must be HOST:PORT, 'auto' or 'local'"
+            remedy = "leave out the protocol"
             raise InvalidArgumentError("address", problem, value=self.address, remedy=remedy)
         instance("runtime_env", self.runtime_env or {}, dict, "pass a dict as for ray.init")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Workers(Group):
+class Workers(OptionGroup):
     """Processes and machines that run the envs."""
 
     first_env: Annotated[int, Field(high=1e9), option("snapshot")] = 0
@@ -533,6 +538,7 @@ class Workers(Group):
             )
         cluster = Ray() if self.cluster == "ray" else self.cluster
         if self.workers is not None:
-            problem, remedy = "is not for a cluster", "pass cluster=Ray(cpus_per_node=...)"
+            problem = "is not for a cluster"
+            remedy = "pass cluster=Ray(cpus_per_node=...)"
             raise InvalidArgumentError("workers", problem, value=self.workers, remedy=remedy)
         return self.changed(cluster=instance("cluster", cluster, Ray, "pass 'ray' or Ray(...)"))

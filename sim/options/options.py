@@ -135,7 +135,8 @@ class RunnerOptions(RunnerKeywords):
         have.
         """
         require_jax()
-        engine, robot = self.load_engine(), self.robot
+        engine = self.load_engine()
+        robot = self.robot
         reads_force = robot.fixed_base or "base_state" in engine.capabilities
         if "coriolis" not in self.compensate and "partial_force" not in engine.capabilities:
             reads_force = False
@@ -176,7 +177,9 @@ class RunnerOptions(RunnerKeywords):
     @property
     def loops(self) -> tuple[str, ...]:
         """Equality constraints that close loops of the simulated robot's links."""
-        return () if self.mjcf is None else self.mjcf.loops
+        if self.mjcf is None:
+            return ()
+        return self.mjcf.loops
 
     @cached_property
     def observed(self) -> dict[str, Quantity]:
@@ -212,7 +215,9 @@ class RunnerOptions(RunnerKeywords):
     def command_coupling(self) -> Coupling | None:
         """Coupling of the joints that setpoints are for; None where there is none."""
         is_coupled = self.sets_positions and not self.robot.independent.all()
-        return self.robot.coupling if is_coupled else None
+        if is_coupled:
+            return self.robot.coupling
+        return None
 
     @cached_property
     def derived(self) -> dict[str, Callable[[Observation], Rows]]:
@@ -357,7 +362,9 @@ def default_params(
         return robot.params(
             kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None
         )
-    return robot.tuned() if robot.has_tuned else robot.designed("effort" if loops else None)
+    if robot.has_tuned:
+        return robot.tuned()
+    return robot.designed("effort" if loops else None)
 
 
 def checked_option(name: str, value: Any) -> Any:
@@ -390,7 +397,9 @@ def _plain(value: Any) -> object:
         return list(value)
     if value is None or isinstance(value, str | int | float):
         return value
-    return value.name if isinstance(value, Robot) else digest(value)
+    if isinstance(value, Robot):
+        return value.name
+    return digest(value)
 
 
 def _not_in_program(argument: str, problem: str) -> InvalidArgumentError:

@@ -82,8 +82,14 @@ def step_responses(
         The robot has no such joint.
     """
     run = _blank_failed(rollout)
-    command = None if run.info.sets_positions else run.info.own_command
-    labels = [] if command is None else [f"setpoint {label}" for label in command.labels]
+    if run.info.sets_positions:
+        command = None
+    else:
+        command = run.info.own_command
+    if command is None:
+        labels = []
+    else:
+        labels = [f"setpoint {label}" for label in command.labels]
     chosen, names = _chosen(run, joints)
     figure, blocks = _grid(names + labels, 2, title, run.time[-1])
     # Joints come first, entries of another command after them.
@@ -316,7 +322,8 @@ def _draw_setpoint(axes: Axes, run: Rollout, joint: int, band: float | None) -> 
     move = move[np.isfinite(move)]
     if band is not None and move.size and np.ptp(setpoint[-1]) == 0:
         half = band * float(np.median(move))
-        low, high = setpoint[-1, 0] - half, setpoint[-1, 0] + half
+        low = setpoint[-1, 0] - half
+        high = setpoint[-1, 0] + half
         label = f"settling band, {band:.0%} of the move"
         axes.axhspan(low, high, color=SETPOINT, alpha=0.2, lw=0, label=label)
 
@@ -342,7 +349,8 @@ def _draw_limits(axes: Axes, low: float, high: float) -> None:
 
 def _draw_efforts(axes: Axes, run: Rollout, joint: int, mark: int | None) -> None:
     """Draw the efforts against their limit, with their peak and the share of saturated samples."""
-    values, limit = run.effort[..., joint], float(run.info.effort_limit[joint])
+    values = run.effort[..., joint]
+    limit = float(run.info.effort_limit[joint])
     _draw_limits(axes, -limit, limit)
     _draw_fan(axes, run.time, values, mark)
     _show_efforts(axes, [run], joint)
@@ -355,7 +363,8 @@ def _draw_efforts(axes: Axes, run: Rollout, joint: int, mark: int | None) -> Non
 def _show_positions(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
     """Show all positions and the first run's setpoints, but no more than 15 % beyond the limits."""
     info = runs[0].info
-    low, high = info.lower[joint], info.upper[joint]
+    low = info.lower[joint]
+    high = info.upper[joint]
     margin = 0.15 * (high - low)
     setpoints = _finite(runs[:1], "setpoint", joint)
     # Setpoints outside the limits are worth seeing, a run that diverges is not.
@@ -379,7 +388,8 @@ def _show(axes: Axes, values: Rows, unit: str) -> None:
     """Set the range of the axes so that it holds ``values``, and their unit."""
     axes.set_ylabel(unit, fontsize=SMALL)
     if values.size:
-        low, high = float(values.min()), float(values.max())
+        low = float(values.min())
+        high = float(values.max())
         margin = 0.08 * (high - low) or 0.05 * max(abs(high), 1e-3)
         axes.set_ylim(low - margin, high + margin)
 
@@ -405,7 +415,8 @@ def _blank_failed(rollout: Rollout) -> Rollout:
     """Return the rollout with NaN where an env has failed, and for setpoints that are not
     positions.
     """
-    alive, seen = rollout.ok[..., None], rollout.observation
+    alive = rollout.ok[..., None]
+    seen = rollout.observation
     blank = seen._replace(
         qpos=np.where(alive, seen.qpos, np.nan),
         effort=np.where(alive, seen.effort, np.nan),
@@ -423,7 +434,10 @@ def _chosen(run: Rollout, joints: Joints) -> tuple[list[int], list[str]]:
     indices = {name: index for index, name in enumerate(names)}
     chosen = []
     for joint in joints or names:
-        index = indices.get(joint, joint) if isinstance(joint, str) else joint
+        if isinstance(joint, str):
+            index = indices.get(joint, joint)
+        else:
+            index = joint
         if index not in range(len(names)):
             remedy = f"use {', '.join(names)}"
             raise InvalidArgumentError("joints", "no such joint", value=joint, remedy=remedy)

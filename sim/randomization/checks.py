@@ -110,8 +110,14 @@ def prepared_actuators(
         problem = "has no effect on PhysX's drives"
         remedy = f"use control 'pid', or draw only {', '.join(DRIVEN)}"
         raise InvalidArgumentError(f"actuators.{bypassed[0]}", problem, remedy=remedy)
-    nominal = bp.Actuators() if actuators is None else actuators
-    delay = 0.0 if nominal.max_delay is None else float(nominal.max_delay[0, 0])
+    if actuators is None:
+        nominal = bp.Actuators()
+    else:
+        nominal = actuators
+    if nominal.max_delay is None:
+        delay = 0.0
+    else:
+        delay = float(nominal.max_delay[0, 0])
     values: Document = {}
     for name, field in randomization.actuators.items():
         values[name], most = _with_extremes(name, field, nominal, robot)
@@ -139,7 +145,10 @@ def _with_extremes(
         remedy = f"give the runner actuators with {name}"
         problem = "is off, and has no value to change"
         raise InvalidArgumentError(f"actuators.{name}", problem, remedy=remedy)
-    nominal = np.full((1, robot.dof), declared.neutral) if leaf is None else np.asarray(leaf)
+    if leaf is None:
+        nominal = np.full((1, robot.dof), declared.neutral)
+    else:
+        nominal = np.asarray(leaf)
     most = -np.inf
     for rows in _extremes(f"actuators.{name}", field, robot.joint_names, nominal):
         declared.checked(name, rows, robot.joint_names)

@@ -62,7 +62,9 @@ class Distribution(ABC):
         """Return the value that results from the nominal one and a draw."""
         if self.operation == "add":
             return nominal + drawn
-        return nominal * drawn if self.operation == "scale" else drawn + np.zeros_like(nominal)
+        if self.operation == "scale":
+            return nominal * drawn
+        return drawn + np.zeros_like(nominal)
 
     @classmethod
     def arguments(cls, keywords: bool) -> list[str]:

@@ -41,7 +41,9 @@ def elements(name: str, robot: Robot) -> Sequence[str]:
     links = [
         link.name for link in robot.links if link.mass or (link.mass is None and link.num_shapes)
     ]
-    return links if name == "link_mass" else [f"{link}.{axis}" for link in links for axis in "xyz"]
+    if name == "link_mass":
+        return links
+    return [f"{link}.{axis}" for link in links for axis in "xyz"]
 
 
 def parts(
@@ -66,7 +68,9 @@ def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None = None) -> Flo
     if name == "link_mass":
         return np.array([robot.link_masses[link].mass for link in elements(name, robot)])
     if name in ("friction", "damping"):
-        return robot.friction if name == "friction" else robot.damping
+        if name == "friction":
+            return robot.friction
+        return robot.damping
     if name == "gravity":
         return np.array([0.0, 0.0, -9.81])
     if name == "ground_friction":

@@ -260,7 +260,10 @@ class Randomization:
         drawn: Document = {}
         for name in self.actuators:
             rows = self.apply(f"actuators.{name}", getattr(actuators, name), draws, robot)
-            drawn[name] = rows * robot.independent if name in OF_JOINTS else rows
+            if name in OF_JOINTS:
+                drawn[name] = rows * robot.independent
+            else:
+                drawn[name] = rows
         return actuators._replace(**drawn)
 
     def start(
@@ -319,7 +322,9 @@ def _copied(value: object) -> object:
 def _plain(value: object) -> object:
     if isinstance(value, Mapping):
         return {name: _plain(part) for name, part in value.items()}
-    return value.to_dict() if isinstance(value, Distribution) else value
+    if isinstance(value, Distribution):
+        return value.to_dict()
+    return value
 
 
 FIELDS = declared(Randomization, Bounds)

@@ -81,7 +81,10 @@ class Recorder(SingleOwner):
             raise InvalidArgumentError("runner", problem, remedy="close that Recorder first")
         self._mode = "w" if flag("overwrite", overwrite) else "x"
         self.path: Path = files.check_path(path, overwrite=overwrite)
-        self._seed = None if seed is None else integer("seed", seed, 0, 2**63 - 1)
+        if seed is None:
+            self._seed = None
+        else:
+            self._seed = integer("seed", seed, 0, 2**63 - 1)
         self._runner = runner
         self._info: RunInfo | None = None  # at the first tick
         self._file: h5py.File | None = None
@@ -120,7 +123,10 @@ class Recorder(SingleOwner):
         self._episodes = episodes
         self._params_changed |= self._runner.params is not self._params
         self._rates |= command.setpoint_rate is not None
-        feedforward = None if command.feedforward is None else np.array(command.feedforward)
+        if command.feedforward is None:
+            feedforward = None
+        else:
+            feedforward = np.array(command.feedforward)
         inputs = {
             "time": np.array(time_),
             "setpoint": np.array(command.setpoint),
@@ -214,7 +220,10 @@ def _stacked(rows: list[dict[str, Rows | None]]) -> dict[str, Rows | None]:
         present = next((array for array in column if array is not None), None)
         if present is not None:
             column = [np.zeros_like(present) if array is None else array for array in column]
-        arrays[name] = None if present is None else np.array(column)
+        if present is None:
+            arrays[name] = None
+        else:
+            arrays[name] = np.array(column)
     return arrays
 
 

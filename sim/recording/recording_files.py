@@ -77,11 +77,10 @@ def write_recording(
     """
     instance("rollout", rollout, Rollout, "pass what runner.rollout() returned")
     path = check_path(path, overwrite=overwrite)
-    info = (
-        rollout.info
-        if seed is None
-        else replace(rollout.info, seed=integer("seed", seed, 0, 2**63 - 1))
-    )
+    if seed is None:
+        info = rollout.info
+    else:
+        info = replace(rollout.info, seed=integer("seed", seed, 0, 2**63 - 1))
     import h5py
 
     content = io.BytesIO()  # on a full disk HDF5 could not close its own file
@@ -115,7 +114,8 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
     """
     import h5py
 
-    path, every = file_path("path", path), integer("every", every, 1, 10**9)
+    path = file_path("path", path)
+    every = integer("every", every, 1, 10**9)
     try:
         if not path.is_file():
             raise FileNotFoundError("there is no such file")
@@ -123,10 +123,14 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
             if file.attrs.get("format") != FORMAT:
                 raise ValueError(f"its format is not {FORMAT}")
             info = read_info(file.attrs)
-            num_envs, tick = int(file.attrs["num_envs"]), float(file.attrs["tick"])
+            num_envs = int(file.attrs["num_envs"])
+            tick = float(file.attrs["tick"])
             time = file["time"][:]
             is_written = np.isfinite(time)
-            count = len(time) if is_written.all() else int(is_written.argmin())
+            if is_written.all():
+                count = len(time)
+            else:
+                count = int(is_written.argmin())
             rows = slice(0, count, every)
             arrays = {"time": time[rows]}
             for name, quantity in info.recorded.items():
@@ -180,7 +184,8 @@ def create_datasets(
     }
     datasets["time"].attrs["unit"] = ["s"]
     for name, quantity in info.recorded.items():
-        row, dtype = info.row_shape(name, num_envs), np.dtype(quantity.dtype)
+        row = info.row_shape(name, num_envs)
+        dtype = np.dtype(quantity.dtype)
         rows = max(1, CHUNK_BYTES // max(1, int(np.prod(row)) * dtype.itemsize))
         datasets[name] = file.create_dataset(
             name, (0, *row), dtype, maxshape=(None, *row), chunks=(rows, *row)
@@ -275,5 +280,8 @@ def read_info(values: Mapping[str, Any]) -> RunInfo:
             is_text = value.dtype.kind == "O" or not value.size
             read[name] = tuple(value) if is_text else value
         else:
-            read[name] = value.item() if isinstance(value, np.generic) else value
+            if isinstance(value, np.generic):
+                read[name] = value.item()
+            else:
+                read[name] = value
     return RunInfo(**read)

@@ -203,7 +203,8 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
         tables = {quantity: rows[1:] for quantity, rows in tables.items()}
     position, rate, acceleration = map(tables.get, QUANTITIES)
     assert position is not None
-    steps, has_rates = 0, rate is not None
+    steps = 0
+    has_rates = rate is not None
     if rate is None:
         rate, steps = _rates(robot, np.vstack([start, position]), substeps * timestep)
     first = start if at_zero else None
@@ -265,7 +266,8 @@ def _check_limits(robot: Robot, source: str, position: Float64, lines: list[int]
     beyond &= robot.independent
     if beyond.any():
         row, joint = np.argwhere(beyond)[0].tolist()
-        name, unit = robot.joint_names[joint], robot.units[joint]
+        name = robot.joint_names[joint]
+        unit = robot.units[joint]
         problem = f"line {lines[row]}, column 'setpoint:{name}' is outside the joint's limits"
         remedy = f"keep it within {robot.lower[joint]:g} to {robot.upper[joint]:g} {unit}"
         raise error(source, problem, remedy, float(position[row, joint]))
@@ -282,7 +284,10 @@ def _substeps(source: str, time: Float64, lines: list[int], timestep: float) -> 
     if abs(np.mean(periods) - period) < 0.01 * period:  # no row is missing
         period = float(np.mean(periods))
     if period <= tolerance:
-        problem = "time does not increase" if len(time) > 1 else f"the only row is at {time[0]:g} s"
+        if len(time) > 1:
+            problem = "time does not increase"
+        else:
+            problem = f"the only row is at {time[0]:g} s"
         remedy = "give a row for the end of each tick"
         raise error(source, f"line {lines[0]}: {problem}", remedy)
     if period > LONGEST:

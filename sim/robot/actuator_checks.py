@@ -43,10 +43,13 @@ def known_joints(robot: RobotDescription) -> KnownJoints:
     """Return friction, damping and armature of the robot's own actuators, which its controller
     knows.
     """
-    own = bp.Actuators() if robot.actuators is None else robot.actuators
+    if robot.actuators is None:
+        motors = bp.Actuators()
+    else:
+        motors = robot.actuators
     coulomb, viscous, armature = (
         np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
-        for leaf in (own.coulomb, own.viscous, own.armature)
+        for leaf in (motors.coulomb, motors.viscous, motors.armature)
     )
     return KnownJoints(FRICTION_SHARE * coulomb, viscous, armature)
 
@@ -87,8 +90,10 @@ def fit_actuators(
             " three",
             remedy=f"use control 'pid', or leave only {', '.join(DRIVEN)}",
         )
+    # Ideal ones have no leaf that a joint could change.
     if not actuators.num_joints:
         return actuators
-    own = {name: getattr(actuators, name) for name in ("bias", *JOINT_SIDE)}
-    own = {name: leaf * robot.independent for name, leaf in own.items() if leaf is not None}
-    return actuators.replace(**own, continuous=robot.continuous)
+    motors = {name: getattr(actuators, name) for name in ("bias", *JOINT_SIDE)}
+    # The leader carries friction and armature of its followers.
+    motors = {name: leaf * robot.independent for name, leaf in motors.items() if leaf is not None}
+    return actuators.replace(**motors, continuous=robot.continuous)

@@ -39,9 +39,11 @@ def collision_groups(
     others. The ground and the user's content, with the default words 1, 1, 0, 0, touch every body.
     """
     cliques = _cliques(bodies, ignored, free)
+    # The largest cliques first: what is left over is then the least.
     cliques = sorted(cliques, key=lambda clique: -len(_within(clique, ignored)))[:_MAX_CLIQUES]
     by_words_0_and_1 = set(ignored).difference(*(_within(clique, ignored) for clique in cliques))
-    left, stars = by_words_0_and_1, list[str]()
+    left = by_words_0_and_1
+    stars = list[str]()
     while left and len(stars) < _MAX_STARS:
         degree = Counter(body for pair in left for body in pair)
         centre = max(bodies, key=lambda body: degree[body])  # the first of the largest
@@ -52,12 +54,14 @@ def collision_groups(
     for body in bodies:
         zero = one = _CONTENT
         if stars:
+            # With stars the default bit would let every pair touch.
             one = 0
             for number, centre in enumerate(stars, start=1):
                 zero |= (centre == body) << number
                 one |= (frozenset((centre, body)) not in by_words_0_and_1) << number
             if body not in stars:
-                zero, one = zero | _OTHERS, one | _OTHERS
+                zero = zero | _OTHERS
+                one = one | _OTHERS
         two = sum(1 << number for number, clique in enumerate(cliques) if body in clique)
         words[body] = (zero, one, two, _ROBOT)
     return words, frozenset(left)
@@ -74,7 +78,8 @@ def link_groups(
     root of a fixed base.
     """
     simulated = merge_links(tables, separate)
-    placements, root = simulated.links, simulated.bodies[0].name
+    placements = simulated.links
+    root = simulated.bodies[0].name
     bodies = rigid_bodies(tables.joints)
     neighbours = {
         frozenset((joint.parent_link, joint.child_link))
@@ -82,7 +87,8 @@ def link_groups(
         if joint.moves and not (fixed_base and joint.parent_link == root)
     }
     links = list(dict.fromkeys(shape.owner for shape in simulated.shapes))
-    ignored, free = set(ignored), set[Pair]()
+    ignored = set(ignored)
+    free = set[Pair]()
     for first, second in combinations(links, 2):
         pair = frozenset((placements[first].link, placements[second].link))
         if len(pair) == 1 or pair in neighbours:

@@ -47,10 +47,12 @@ def mesh_file(shape: Shape) -> str:
     lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices.tolist()]
     lines += ["f {} {} {}".format(*face) for face in (faces + 1).tolist()]
     content = ("\n".join(lines) + "\n").encode()
+    # SAPIEN reads meshes from files alone, so a hull becomes one.
     cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     path = Path(cache, "batchpid", "meshes", f"{digest(content)[:32]}.obj")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        # Another process may have written the same hull.
         if not path.is_file() or path.read_bytes() != content:
             write_atomically(path, content)
     except OSError as error:
@@ -65,7 +67,8 @@ def half_extents(shape: Shape) -> tuple[Float64, Float64]:
     """Return center (3,) and half size (3,) [m] of the box around a shape, in its frame."""
     if shape.kind == "mesh":
         vertices = hull(shape)
-        low, high = vertices.min(0), vertices.max(0)
+        low = vertices.min(0)
+        high = vertices.max(0)
         return (high + low) / 2, (high - low) / 2
     if shape.kind == "box":
         return np.zeros(3), np.array(shape.size)
@@ -121,7 +124,8 @@ def vertices_in_file(model: MjModel, indices: Any) -> Float64:
     """
     import mujoco
 
-    turned, place = np.zeros(9), model.mesh_pos[0]
+    turned = np.zeros(9)
+    place = model.mesh_pos[0]
     mujoco.mju_quat2Mat(turned, model.mesh_quat[0])
     return model.mesh_vert[indices].astype(float) @ turned.reshape(3, 3).T + place
 

@@ -12,7 +12,6 @@ from lxml import etree
 from batchpid.checks.warn import warn
 from batchpid.errors import RobotError
 
-MOST_LISTED = 50  # repairs in an error
 SEVERITIES = ("warning", "note")  # probably an error; good to know
 
 
@@ -48,7 +47,10 @@ class Finding:
     @property
     def figures(self) -> str:
         """Detail, envs and time in words."""
-        more = f" and {len(self.envs) - 1} more" if len(self.envs) > 1 else ""
+        if len(self.envs) > 1:
+            more = f" and {len(self.envs) - 1} more"
+        else:
+            more = ""
         env = f"env {self.envs[0]}{more}" if self.envs else ""
         time = "" if self.time is None else f"{self.time:.3g} s"
         return ", ".join(
@@ -62,7 +64,9 @@ class Finding:
     @property
     def _name(self) -> str:
         name = self.link if self.joint is None else self.joint
-        return "" if name is None else repr(name)
+        if name is None:
+            return ""
+        return repr(name)
 
 
 class Findings(list[Finding]):
@@ -76,9 +80,12 @@ def summary(findings: Iterable[Finding]) -> list[str]:
     """Return one sentence for each cause, with all joints or links that have it, in the order of
     ``findings``.
     """
+    # A dict keeps the order in which causes appear.
     causes: dict[tuple[str, ...], list[Finding]] = defaultdict(list)
-    for each in findings:
-        causes[each.severity, each.code, each._kind, each.text, each.remedy].append(each)
+    for finding in findings:
+        causes[finding.severity, finding.code, finding._kind, finding.text, finding.remedy].append(
+            finding
+        )
     return [_sentence(same) for same in causes.values()]
 
 
@@ -87,7 +94,8 @@ def _sentence(same: Sequence[Finding]) -> str:
     first = same[0]
     names = list(
         dict.fromkeys(
-            f"{each._name} ({each.figures})" if each.figures else each._name for each in same
+            f"{finding._name} ({finding.figures})" if finding.figures else finding._name
+            for finding in same
         )
     )
     if len(names) == 1:
@@ -106,6 +114,7 @@ def finding_of(
     """Return a finding of the joint or link that an XML ``element`` is or belongs to, or of the
     robot.
     """
+    # An attribute's fault is told with the joint or link that a reader looks for.
     owner: etree._Element | None = element
     while owner is not None and owner.tag not in ("joint", "link"):
         owner = owner.getparent()
@@ -126,11 +135,13 @@ def report(path: Path, repairs: Sequence[Finding], strict: bool) -> None:
     """
     if not repairs:
         return
-    count = "1 repair" if len(repairs) == 1 else f"{len(repairs)} repairs"
+    if len(repairs) == 1:
+        count = "1 repair"
+    else:
+        count = f"{len(repairs)} repairs"
     if not strict:
         warn(f"{path}: {count}; robot.check() and batchpid inspect list them", RepairWarning)
         return
     sentences = [sentence.partition(": ")[2] for sentence in summary(repairs)]
-    listed = "".join(f"\n  {sentence}" for sentence in sentences[:MOST_LISTED])
-    listed += "\n  ..." if len(sentences) > MOST_LISTED else ""
+    listed = "".join(f"\n  {sentence}" for sentence in sentences)
     raise RobotError(f"{path}: needs {count}, which strict=True refuses:{listed}")

@@ -41,7 +41,9 @@ def nearest_physical(tensor: Float64) -> Float64:
     """
     (a, b, c), axes = np.linalg.eigh(tensor)
     excess = max(c - a - b, 0.0) / 3
-    a, b, c = a + excess, b + excess, c - excess
+    a = a + excess
+    b = b + excess
+    c = c - excess
     if a < 0:
         a, b, c = 0.0, (b + c) / 2, (b + c) / 2
     moments = np.maximum([a, b, c], 0.0)
@@ -56,7 +58,10 @@ def possible_inertia(mass: float, tensor: Float64) -> tuple[Float64, tuple[str, 
     moments = np.linalg.eigvalsh(tensor)
     if moments[0] >= max(SMALLEST, SMALLEST_RATIO * moments[2]):
         return tensor, None
-    changed = nearest_physical(tensor) if moments[2] >= SMALLEST else np.zeros((3, 3))
+    if moments[2] >= SMALLEST:
+        changed = nearest_physical(tensor)
+    else:
+        changed = np.zeros((3, 3))
     done = "the nearest that a body has is used"
     if changed.max() < SMALLEST:
         changed = ball(mass)
@@ -129,13 +134,16 @@ def _inertial(link: etree._Element) -> Iterator[Finding]:
     if not value or not value[0]:
         link.remove(inertial)  # SAPIEN does not use it
         return
+    # Every entry is named, since each may be wrong by itself.
     for problem in filter(None, (fault(inertia, key, "0") for key in MOMENTS)):
         text = f"{problem}: the inertia tensor counts as not given"
         yield finding_of(link, "warning", "inertia", text, "correct <inertia>")
+    # One unreadable entry makes the whole tensor unknown.
     parts = [readable(inertia, key, "0") for key in MOMENTS]
-    tensor = (
-        np.zeros((3, 3)) if None in parts else from_entries([part[0] for part in parts if part])
-    )
+    if None in parts:
+        tensor = np.zeros((3, 3))
+    else:
+        tensor = from_entries([part[0] for part in parts if part])
     changed, problem_and_detail = possible_inertia(value[0], tensor)
     if problem_and_detail is not None:
         text, detail = problem_and_detail
@@ -151,29 +159,22 @@ def _collisions(link: etree._Element) -> Iterator[Finding]:
     """Leave out collision shapes that PhysX cannot hold."""
     for collision in link.findall("collision"):
         shapes = collision.findall("geometry/*")
-        problem = f"it has none of {', '.join(SHAPES)}" if not shapes else None
-        problem = _misplaced(collision.find("origin")) or problem
+        problem = _misplaced(collision.find("origin"))
+        if not shapes:
+            problem = f"it has none of {', '.join(SHAPES)}"
         for shape in shapes:
             for key, default in SHAPES[shape.tag].items():
                 text = shape.get(key, default)
                 if key == "scale" and len(text.split()) == 1:
                     shape.set(key, " ".join([text] * 3))  # one factor for all axes
                 sizes = readable(shape, key, default)
-                if (
-                    sizes is None
-                    or min(map(abs, sizes)) < SMALLEST_SIZE
-                    or max(map(abs, sizes)) > LARGEST_SIZE
-                ):
+                # A negative scale mirrors the mesh.
+                smallest = min(abs(size) if key == "scale" else size for size in sizes or (0.0,))
+                if not sizes or smallest < SMALLEST_SIZE or max(sizes) > LARGEST_SIZE:
                     problem = (
                         f"<{shape.tag} {key}={text!r}> is not from {SMALLEST_SIZE:g} to"
                         f" {LARGEST_SIZE:g}"
                     )
-                elif min(sizes) < 0 and key != "scale":  # a negative scale mirrors the mesh
-                    shape.set(key, " ".join(repr(abs(size)) for size in sizes))
-                    problem_text = (
-                        f"<{shape.tag} {key}={text!r}> is negative: its magnitude is used"
-                    )
-                    yield finding_of(link, "warning", "collision", problem_text, "make it positive")
         if problem is not None:
             text = f"a collision shape is left out: {problem}"
             yield finding_of(link, "warning", "collision", text, "correct <collision>")

@@ -38,7 +38,8 @@ def merge_links(tables: Tables, separate: Separate = ()) -> Tables:
     Links ``separate`` begin a body. Raises RobotError if a mass comes from the volume of a mesh
     that cannot be read.
     """
-    links, inertias = place_links(tables, separate), link_inertias(tables)
+    links = place_links(tables, separate)
+    inertias = link_inertias(tables)
     parts: dict[str, list[SpatialInertia]] = defaultdict(list)
     members: dict[str, int] = defaultdict(int)
     for name, at in links.items():
@@ -64,6 +65,7 @@ def merge_links(tables: Tables, separate: Separate = ()) -> Tables:
         position, wxyz = _within(at, shape.position, shape.wxyz)
         shapes.append(shape._replace(body=at.link, position=position, wxyz=wxyz))
     row = {body.name: index for index, body in enumerate(bodies)}
+    # Engines number shapes by body, and SAPIEN builds mirrored ones last.
     shapes.sort(key=lambda shape: (row[shape.body], shape.is_mirrored))
     return Tables(tuple(bodies), tuple(shapes), links)
 
@@ -89,7 +91,10 @@ def rigid_bodies(joints: Iterable[Joint]) -> dict[str, str]:
     bodies: dict[str, str] = {}
     for joint in joints:
         body = bodies.setdefault(joint.parent_link, joint.parent_link)
-        bodies[joint.child_link] = joint.child_link if joint.moves else body
+        if joint.moves:
+            bodies[joint.child_link] = joint.child_link
+        else:
+            bodies[joint.child_link] = body
     return bodies
 
 
@@ -125,6 +130,7 @@ def _merged_joints(joints: Sequence[Joint], separate: Separate) -> set[str]:
     merge would change the order of joints below them.
     """
     order = [joint.name for joint in joints if joint.moves]
+    # From the leaves to the root, so that one pass is enough.
     carriers: set[str] = set()  # links with a joint that moves below them
     for joint in reversed(joints):
         if joint.moves or joint.child_link in carriers:
@@ -133,6 +139,7 @@ def _merged_joints(joints: Sequence[Joint], separate: Separate) -> set[str]:
     merged = {joint.name for joint in fixed}
     if _moving_order(joints, merged) == order:
         return merged
+    # Else joints without motion below them first, then one by one what keeps the order.
     merged = {joint.name for joint in fixed if joint.child_link not in carriers}
     for joint in fixed:
         if _moving_order(joints, merged | {joint.name}) == order:
@@ -146,7 +153,10 @@ def _moving_order(joints: Sequence[Joint], merged: Collection[str]) -> list[str]
     below: dict[str, list[Joint]] = defaultdict(list)
     for joint in joints:
         parent = body.setdefault(joint.parent_link, joint.parent_link)
-        body[joint.child_link] = parent if joint.name in merged else joint.child_link
+        if joint.name in merged:
+            body[joint.child_link] = parent
+        else:
+            body[joint.child_link] = joint.child_link
         if joint.name not in merged:
             below[parent].append(joint)
     ordered = below[joints[0].parent_link].copy()

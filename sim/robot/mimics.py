@@ -38,16 +38,19 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     limits = [(joint.lower, joint.upper) for joint in joints]
     for index in coupling.followers.tolist():
         leader, multiplier, offset = (
-            each[index] for each in (coupling.leader, coupling.multiplier, coupling.offset)
+            column[index] for column in (coupling.leader, coupling.multiplier, coupling.offset)
         )
+        # Such a follower holds nothing back.
         if multiplier == 0 or joints[index].continuous:
             continue
         ends = sorted(
             (end - offset) / multiplier for end in (joints[index].lower, joints[index].upper)
         )
-        low, high = max(limits[leader][0], ends[0]), min(limits[leader][1], ends[1])
+        low = max(limits[leader][0], ends[0])
+        high = min(limits[leader][1], ends[1])
         if low < high:
             limits[leader] = (float(low), float(high))
+    # After all leaders are narrowed, followers get the images of their limits.
     for index in coupling.followers.tolist():
         ends = [_image(coupling, index, end) for end in limits[coupling.leader[index]]]
         limits[index] = (min(ends), max(ends))
@@ -65,5 +68,8 @@ def _image(coupling: Coupling, index: int, end: float) -> float:
     """Return the position of follower ``index`` where its leader is at ``end``, which may be
     infinite.
     """
-    multiplier, offset = float(coupling.multiplier[index]), float(coupling.offset[index])
-    return offset if multiplier == 0 else multiplier * end + offset
+    multiplier = float(coupling.multiplier[index])
+    offset = float(coupling.offset[index])
+    if multiplier == 0:
+        return offset
+    return multiplier * end + offset

@@ -59,7 +59,9 @@ class Joint:
     @property
     def unit(self) -> str:
         """Unit of position: ``"m"`` for a prismatic joint, else ``"rad"``."""
-        return "m" if self.type == "prismatic" else "rad"
+        if self.type == "prismatic":
+            return "m"
+        return "rad"
 
     @property
     def effort_unit(self) -> str:
@@ -188,15 +190,15 @@ def joint_rows(joints: Iterable[Joint]) -> Iterator[list[str]]:
 
 def _range(joint: Joint) -> str:
     limits = joint.lower, joint.upper
-    return (
-        f"{_bound(limits[0])} to {_bound(limits[1])} {joint.unit}"
-        if any(map(math.isfinite, limits))
-        else "none"
-    )
+    if any(map(math.isfinite, limits)):
+        return f"{_bound(limits[0])} to {_bound(limits[1])} {joint.unit}"
+    return "none"
 
 
 def _bound(value: float, unit: str = "") -> str:
-    return f"{value:.5g}{unit}" if math.isfinite(value) else "none"
+    if math.isfinite(value):
+        return f"{value:.5g}{unit}"
+    return "none"
 
 
 CONTACT_FRICTION = 0.3

@@ -81,13 +81,15 @@ class RobotModel:
         result is the sum of the absolute values in each of its rows: diagonal gains for these sums
         are at least as stiff as gains for the matrix (Gershgorin's theorem).
         """
-        tree, joints = self.tree, np.asarray(qpos, np.float64)
+        tree = self.tree
+        joints = np.asarray(qpos, np.float64)
 
         def jacobians(link: str, point: Float64) -> tuple[Float64, Float64]:
             """Return the Jacobians of a point of the world in a link (6, dof), and with respect to
             the base (6, 6).
             """
             x, y, z = point
+            # A twist of the base moves each point of the world by v + w x p.
             crossed = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # -(p x)
             of_base = np.block([[np.eye(3), crossed], [np.zeros((3, 3)), np.eye(3)]])
             pose = ts.link_poses(tree, joints, (link,))[0]
@@ -100,6 +102,7 @@ class RobotModel:
             of_joints, of_base = (
                 np.concatenate([foot[:3] for foot in part]) for part in zip(*feet, strict=True)
             )
+            # Directions that the feet leave free are cut off, not followed.
             follow = -np.linalg.pinv(of_base, rcond=1e-3) @ of_joints
         matrix = np.zeros((tree.dof, tree.dof))
         for at, link in enumerate(tree.links):
@@ -107,7 +110,8 @@ class RobotModel:
             turn = matrix_of(pose[3:])
             of_joints, of_base = jacobians(link, pose[:3] + turn @ tree.center[at])
             moving = of_joints + of_base @ follow
-            linear, angular = moving[:3], moving[3:]
+            linear = moving[:3]
+            angular = moving[3:]
             matrix += (
                 tree.mass[at] * linear.T @ linear
                 + angular.T @ turn @ tree.inertia[at] @ turn.T @ angular
@@ -140,7 +144,9 @@ def base_start(robot: Any, qpos: Float64, ground: bool) -> Float64:
     If the file does not place the base, it is upright at the origin. On a ``ground`` at height 0
     the lowest point is then on the ground, and otherwise not below.
     """
-    pose, model = np.array(robot.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64), robot.dynamics()
+    pose = np.array(robot.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64)
+    model = robot.dynamics()
+    # The ground is met by any link, the base included.
     height = model.contacts.height(np.nan_to_num(qpos), base_too=True)
     if not np.isfinite(height):
         return pose

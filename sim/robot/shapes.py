@@ -82,6 +82,7 @@ def surfaces(
         solid = [(shape, None) for shape in robot.tables.shapes_of(name)]
         parts: dict[Rgba, list[Any]] = {}
         unreadable: list[_UnreadableMesh] = []
+        # Collision shapes are drawn where the visuals cannot be.
         for elements in (visuals.get(name, []), solid):
             try:
                 meshes = [_mesh(shape, robot, deviation) for shape, _ in elements]
@@ -93,7 +94,10 @@ def surfaces(
                     parts.setdefault(rgba or _default_colour(name), []).append(mesh)
                 break
         if findings is not None:
-            shown = "collision shapes are drawn instead" if parts else "it is not drawn"
+            if parts:
+                shown = "collision shapes are drawn instead"
+            else:
+                shown = "it is not drawn"
             for mesh, reason in (error.args for error in unreadable):
                 text = f"mesh cannot be read ({reason}): {shown}"
                 findings.append(
@@ -125,7 +129,8 @@ def _read_visuals(robot: RobotDescription) -> dict[str, list[tuple[Shape | None,
         where = f"{robot.path}: link {name!r}"
         rows = []
         for element in link.findall("visual"):
-            geometry, material = element.find("geometry/*"), element.find("material")
+            geometry = element.find("geometry/*")
+            material = element.find("material")
             shape, rgba = None, None
             if geometry is not None and geometry.tag in SHAPES:
                 shape = read_shape(geometry, name, read_origin(element, where), where)
@@ -216,7 +221,8 @@ def _mesh(shape: Shape | None, robot: RobotDescription, deviation: float) -> Any
         mesh = creation.box([2 * side for side in shape.size])
         mesh.unmerge_vertices()
     else:
-        radius, length = shape.size[0], 2 * sum(shape.size[1:])
+        radius = shape.size[0]
+        length = 2 * sum(shape.size[1:])
         segments = segments_of(radius, deviation)
         # Made with radius 1 and scaled: trimesh drops triangles smaller than 1e-8 m^2.
         if shape.kind == "cylinder":

@@ -50,7 +50,8 @@ def varied_bodies(
     """Return the simulated bodies with varying mass, by name: they contain ``links`` or
     ``carrier``.
     """
-    placements, inertias = place_links(tables, separate), link_inertias(tables)
+    placements = place_links(tables, separate)
+    inertias = link_inertias(tables)
     parts: dict[str, list[Part]] = defaultdict(list)
     for name, at in placements.items():
         if name in inertias:
@@ -64,6 +65,7 @@ def varied_bodies(
         place = inertias[carrier].moved(at.position, at.wxyz).center
     varied = {}
     for body in merge_links(tables, separate).bodies:
+        # A body without mass of its links varies as it is simulated.
         members = parts[body.name] or [Part(body.spatial_inertia, np.eye(3), None)]
         if body.name == at.link or any(part.column is not None for part in members):
             varied[body.name] = BodyParts(members, place if body.name == at.link else None)
@@ -88,12 +90,16 @@ def link_masses(tables: Tables, repairs: Iterable[Finding]) -> dict[str, LinkMas
             continue
         source = "shapes"
         if body.mass:
-            source = "repaired" if body.name in repaired else "inertial"
+            if body.name in repaired:
+                source = "repaired"
+            else:
+                source = "inertial"
         gyration = float(np.sqrt(np.linalg.eigvalsh(inertia.tensor)[-1] / inertia.mass))
         size = _size(tables.shapes_of(body.name))
-        center, tensor = read_only(inertia.center), read_only(inertia.tensor)
-        kept = SpatialInertia(inertia.mass, center, tensor)
-        masses[body.name] = LinkMass(inertia.mass, source, gyration, size, kept)
+        center = read_only(inertia.center)
+        tensor = read_only(inertia.tensor)
+        frozen_inertia = SpatialInertia(inertia.mass, center, tensor)
+        masses[body.name] = LinkMass(inertia.mass, source, gyration, size, frozen_inertia)
     return masses
 
 
@@ -103,7 +109,9 @@ def _size(shapes: Sequence[Shape]) -> float:
     for shape in shapes:
         center, half = half_extents(shape)
         corners.append(rotate(matrix_of(shape.wxyz), center + half * _CORNERS) + shape.position)
-    return float(np.linalg.norm(np.ptp(np.concatenate(corners), axis=0))) if corners else 0.0
+    if corners:
+        return float(np.linalg.norm(np.ptp(np.concatenate(corners), axis=0)))
+    return 0.0
 
 
 _EMPTY = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))

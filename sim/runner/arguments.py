@@ -100,7 +100,8 @@ def accelerated(command: Command, motion: Motion, seconds: float) -> Command:
 
 def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
     """Return the number of ticks of a rollout, from the shape of its setpoints."""
-    rows, num_envs = read_array("setpoints", setpoints), options.num_envs
+    rows = read_array("setpoints", setpoints)
+    num_envs = options.num_envs
     size = len(options.command_columns[0][1])
     if rows.ndim not in (2, 3) or len(rows) == 0:
         raise InvalidArgumentError(
@@ -127,7 +128,8 @@ def _check_acceleration(params: bp.PIDParams, given: Mapping[str, ArrayLike | No
 
 def joint_rows(options: RunnerOptions, name: str, value: ArrayLike) -> Float64:
     """Return positions or velocities (envs, dof) to reset to."""
-    robot, is_finite = options.robot, options.on_invalid_input == "raise"
+    robot = options.robot
+    is_finite = options.on_invalid_input == "raise"
     rows = array(
         name, value, (options.num_envs, robot.dof), robot.joint_names, finite=is_finite
     ).copy()

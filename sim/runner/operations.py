@@ -74,7 +74,10 @@ class Reset(Operation):
         draws = state.draws
         qpos = joint_rows(options, "qpos", robot.start if pose[0] is None else pose[0])
         qvel = joint_rows(options, "qvel", 0.0 if pose[1] is None else pose[1])
-        chosen = np.ones(num_envs, bool) if mask is None else env_mask("mask", mask, num_envs)
+        if mask is None:
+            chosen = np.ones(num_envs, bool)
+        else:
+            chosen = env_mask("mask", mask, num_envs)
         limits.check("qpos", robot.coupled(qpos), chosen)
         if randomization is not None:
             draws = randomization.redraw(robot, draws, chosen, seed, options.first_env)
@@ -83,14 +86,16 @@ class Reset(Operation):
             raise InvalidArgumentError(
                 "seed", "has no effect without a randomization", remedy="leave it out"
             )
-        qpos, qvel = robot.coupling.positions(qpos), robot.coupling.rates(qvel)
+        qpos = robot.coupling.positions(qpos)
+        qvel = robot.coupling.rates(qvel)
         return cls(chosen, qpos, qvel, draws, base_rows(options, *base, qpos, chosen))
 
     def apply(self, loop: Loop) -> None:
         loop.reset(self.mask, self.qpos, self.qvel, self.draws, self.base)
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        chosen, motion = self.mask[:, None], state.motion
+        chosen = self.mask[:, None]
+        motion = state.motion
         if motion is not None:
             setpoint, rate = motion
             rate = np.where(chosen, self.qvel, 0.0 if rate is None else rate)
@@ -140,11 +145,17 @@ class Run(Operation):
         if not are_ok or contacts is not None:
             for arrays in outcome.completed:
                 faults = faults.with_faults(arrays)
-                contacts = None if contacts is None else contacts.with_contacts(arrays)
+                if contacts is None:
+                    contacts = None
+                else:
+                    contacts = contacts.with_contacts(arrays)
         if motion is not None and count:
             motion = setpoint[count - 1], None if rate is None else rate[count - 1]
         steps = count * self.substeps
-        work = state.work if outcome.failure else (tuple(outcome.results), count)
+        if outcome.failure:
+            work = state.work
+        else:
+            work = (tuple(outcome.results), count)
         since = state.steps_since_checkpoint + steps
         values = faults, contacts, motion, state.steps + steps, since, work
         # Not _replace(), which is a call of Python in the path of a tick.
@@ -254,7 +265,10 @@ def snapshot_of(options: RunnerOptions, state: RunnerState, states: EnvStates) -
     if state.motion is not None:
         last, rate = state.motion
         motion = np.stack([last, np.zeros_like(last) if rate is None else rate], axis=1)
-    episodes = None if options.randomization is None else state.draws.episodes.copy()
+    if options.randomization is None:
+        episodes = None
+    else:
+        episodes = state.draws.episodes.copy()
     return Snapshot(
         options.described, state.steps, state.params, states, state.actuators, episodes, motion
     )
@@ -286,8 +300,8 @@ def restored(
         stiction=options.has_stiction(acting),
         guard=options.guard is not None,
         pushes=options.has_pushes,
-        controller=initial_state(options, params),
-        actuators=initial_actuators(acting, options.num_envs, robot.dof, options.timestep),
+        law=initial_state(options, params),
+        motors=initial_actuators(acting, options.num_envs, robot.dof, options.timestep),
         sensors=untouched(options.num_envs, options.observed),
     )
     snapshot.states.check(fresh, options.command.size, sizes)

@@ -106,7 +106,8 @@ class Runner(SingleOwner):
         self.robot = checked.robot
         self.num_envs = checked.num_envs
         self.control = checked.control
-        self.timestep, self.substeps = checked.timestep, checked.substeps
+        self.timestep = checked.timestep
+        self.substeps = checked.substeps
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call, self._warnings = OneCall(), RunWarnings(checked)
@@ -196,7 +197,8 @@ class Runner(SingleOwner):
             :meth:`rollout` and :meth:`restore`.
         """
         self._ready("reset")
-        limits, base = self._warnings.limits, (base_pose, base_twist)
+        limits = self._warnings.limits
+        base = (base_pose, base_twist)
         self._execute(Reset.read(self.options, self._state, limits, (qpos, qvel), mask, seed, base))
         return self._pool.present.observation.copied(self._derived)
 
@@ -276,7 +278,8 @@ class Runner(SingleOwner):
             No tick was sent since the last call.
         """
         self._ready()
-        observation, self._unreceived = self._unreceived, None
+        observation = self._unreceived
+        self._unreceived = None
         if observation is None:
             raise CallOrderError("recv: no tick was sent; call send(setpoint) first")
         return observation
@@ -309,7 +312,8 @@ class Runner(SingleOwner):
             "setpoint_accelerations": setpoint_accelerations,
             "feedforwards": feedforwards,
         }
-        options, ticks = self.options, count_ticks(self.options, setpoints)
+        options = self.options
+        ticks = count_ticks(self.options, setpoints)
         tick = options.substeps * options.timestep
         command = read_command(
             options, self._state, self._warnings.setpoint_limits, arrays, tick, ticks
@@ -375,10 +379,8 @@ class Runner(SingleOwner):
         """
         self._ready()
         if self.options.mjcf is None:
-            problem, remedy = (
-                "are those of an MJCF file in the engine 'mujoco'",
-                "use robot.kinematic_tree() for links",
-            )
+            problem = "are those of an MJCF file in the engine 'mujoco'"
+            remedy = "use robot.kinematic_tree() for links"
             raise InvalidArgumentError("names", problem, remedy=remedy)
         chosen = tuple([choice("names", name, self.options.mjcf.bodies) for name in names])
         return np.stack(self._read(ReadPoses(chosen)))
@@ -502,7 +504,9 @@ class Runner(SingleOwner):
         last.
         """
         contacts = self._settled().contacts
-        return () if contacts is None else tuple(contacts.contacts)
+        if contacts is None:
+            return ()
+        return tuple(contacts.contacts)
 
     @property
     def draws(self) -> dict[str, NDArray[np.float64]]:
@@ -620,12 +624,16 @@ class Runner(SingleOwner):
     def _tick(self, arrays: tuple[ArrayLike | None, ...], substeps: int | None) -> Run:
         """Return the operation for the arguments of :meth:`step`, checked."""
         inputs = dict(zip(Command._fields, arrays, strict=True))
-        count = self.substeps if substeps is None else checked_option("substeps", substeps)
+        if substeps is None:
+            count = self.substeps
+        else:
+            count = checked_option("substeps", substeps)
         if self.recorder is not None and count != self.substeps:
             problem = f"is not the runner's {self.substeps}"
             remedy = "all ticks of a recording have the same length"
             raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
-        limits, seconds = self._warnings.setpoint_limits, count * self.timestep
+        limits = self._warnings.setpoint_limits
+        seconds = count * self.timestep
         command = read_command(self.options, self._state, limits, inputs, seconds)
         return Run(1, count, command)
 
@@ -698,9 +706,11 @@ class Runner(SingleOwner):
         # Warnings come last: as errors they must leave a runner that can go on.
         moving = self._warnings.moving
         if run is not None and moving is not None:
-            rows, rates = run.command.setpoint[: outcome.num_ticks], run.command.setpoint_rate
+            rows = run.command.setpoint[: outcome.num_ticks]
+            rates = run.command.setpoint_rate
             moving.see(rows, rates is not None, run.substeps * self.timestep)
-        faults, contacts = self._state.faults, self._state.contacts
+        faults = self._state.faults
+        contacts = self._state.contacts
         if pool.warnings or faults.faults or contacts is not None:
             self._warnings.issue(faults, contacts, pool.warnings)
         return outcome

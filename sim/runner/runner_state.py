@@ -47,12 +47,13 @@ class RunnerState(NamedTuple):
         if options.randomization is not None:
             draws = options.randomization.first(robot, count, options.first_env)
         names = None if command is None else command.names
-        faults, contacts = (
-            FaultLog(count, robot.joint_names, options.timestep, options.on_fault, names),
-            None,
-        )
+        faults = FaultLog(count, robot.joint_names, options.timestep, options.on_fault, names)
+        contacts = None
         if options.misses_contacts:
             nearest = lambda qpos: robot.dynamics().contacts.nearest_links(qpos)  # noqa: E731
             contacts = MissedContactLog(count, options.timestep, nearest)
-        motion = (np.tile(robot.start, (count, 1)), None) if options.sets_positions else None
+        if options.sets_positions:
+            motion = (np.tile(robot.start, (count, 1)), None)
+        else:
+            motion = None
         return cls(options.params, options.actuators, draws, faults, contacts, motion)

@@ -68,7 +68,8 @@ class CommandSpec:
         def numbers(argument: str, value: ArrayLike, finite: bool = False) -> Any:
             return array(argument, value, (1, len(names)), names, finite=finite, kind="entry")[0]
 
-        lower, upper = numbers("lower", self.lower), numbers("upper", self.upper)
+        lower = numbers("lower", self.lower)
+        upper = numbers("upper", self.upper)
         entries("lower", lower, lower <= upper, "is not below the upper bound", names, kind="entry")
         inside = np.clip(0.0, lower, upper)
         neutral = numbers("neutral", inside if self.neutral is None else self.neutral, finite=True)

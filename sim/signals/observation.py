@@ -51,7 +51,9 @@ class Quantity(NamedTuple):
     def unit_for(self, position: str) -> str:
         """Return the unit for a joint whose position is in ``position``, "rad" or "m"."""
         rotational, _, linear = self.unit.partition("|")
-        return linear if linear and position == "m" else rotational
+        if linear and position == "m":
+            return linear
+        return rotational
 
 
 class Observation(NamedTuple):
@@ -177,5 +179,10 @@ def untouched(num_envs: int, observed: Mapping[str, Quantity]) -> dict[str, Rows
 
 def failed_envs(ok: Bool) -> str:
     """Return in words how many envs failed in ``ok`` (..., envs)."""
-    failed = int((~ok.reshape(-1, ok.shape[-1]).all(0)).sum()) if ok.size else 0
-    return f"{failed} failed" if failed else "all ok"
+    if ok.size:
+        failed = int((~ok.reshape(-1, ok.shape[-1]).all(0)).sum())
+    else:
+        failed = 0
+    if failed:
+        return f"{failed} failed"
+    return "all ok"

@@ -154,11 +154,9 @@ class RunInfo:
     def sets_positions(self) -> bool:
         """True if setpoints are joint positions."""
         own = self.own_command
-        return (
-            self.control != "effort"
-            if own is None
-            else (own.names, own.units) == (self.joint_names, self.units)
-        )
+        if own is None:
+            return self.control != "effort"
+        return (own.names, own.units) == (self.joint_names, self.units)
 
     @property
     def recorded(self) -> dict[str, Quantity]:
@@ -192,7 +190,9 @@ class RunInfo:
         def rows(value: Any) -> Any:
             if isinstance(value, PIDParams | Actuators):
                 return value.for_envs(envs)
-            return None if value is None else value[envs]
+            if value is None:
+                return None
+            return value[envs]
 
         def events(values: tuple[Any, ...]) -> tuple[Any, ...]:
             """Return the events of these envs, under their new numbers."""
@@ -206,7 +206,8 @@ class RunInfo:
         if draws is not None:
             draws = {name: rows(table) for name, table in draws.items()}
         tables = {name: rows(getattr(self, name)) for name in _OF_ENVS}
-        faults, redraws = events(self.faults), events(self.redraws)
+        faults = events(self.faults)
+        redraws = events(self.redraws)
         return replace(self, draws=draws, faults=faults, redraws=redraws, **tables)
 
     def for_ticks(self, start: Rows | None, begin: float, end: float) -> RunInfo:
@@ -229,7 +230,10 @@ class RunInfo:
         )
 
     def __repr__(self) -> str:
-        control = f", control {self.control!r}" if self.control else ""
+        if self.control:
+            control = f", control {self.control!r}"
+        else:
+            control = ""
         return f"RunInfo({self.robot}, {len(self.joint_names)} joints{control})"
 
 
@@ -293,13 +297,15 @@ class Rollout:
     def for_ticks(self, ticks: slice) -> Rollout:
         """Return the rollout of some ticks."""
         numbers = np.arange(len(self.time))[ticks]
-        time, info = self.time[ticks], self.info
+        time = self.time[ticks]
+        info = self.info
         if len(numbers):
             first = numbers[0]
             start, begin = info.start, -np.inf
             # A later part starts where the ticks before it ended.
             if first:
-                start, begin = self.qpos[first - 1], float(self.time[first - 1])
+                start = self.qpos[first - 1]
+                begin = float(self.time[first - 1])
             info = info.for_ticks(start, begin, float(time[-1]))
         tick = self.tick * (ticks.step or 1)
         return self._mapped(itemgetter(ticks), time=time, tick=tick, info=info)
@@ -308,8 +314,12 @@ class Rollout:
         """Return a rollout with ``function`` applied to each array but the times, and with other
         fields.
         """
-        feedforward = None if self.feedforward is None else function(self.feedforward)
-        setpoint, seen = function(self.setpoint), self.observation.map(function)
+        if self.feedforward is None:
+            feedforward = None
+        else:
+            feedforward = function(self.feedforward)
+        setpoint = function(self.setpoint)
+        seen = self.observation.map(function)
         return replace(self, setpoint=setpoint, observation=seen, feedforward=feedforward, **others)
 
     @staticmethod
@@ -317,7 +327,8 @@ class Rollout:
         """Return successive rollouts of one run as one, with the info of the first, and the faults
         of the last, which include the earlier ones.
         """
-        first, last = parts[0], parts[-1]
+        first = parts[0]
+        last = parts[-1]
         feedforward = None
         if first.feedforward is not None:
             feedforward = np.concatenate([part.feedforward for part in parts])
@@ -356,10 +367,8 @@ class Rollout:
 
         robot = self.info.description if robot is None else robot
         if robot is None:
-            problem, remedy = (
-                "of this run is not known",
-                "pass it: rollout.findings(Robot.load(...))",
-            )
+            problem = "of this run is not known"
+            remedy = "pass it: rollout.findings(Robot.load(...))"
             raise InvalidArgumentError("robot", problem, remedy=remedy)
         return unsettled_findings(self, robot)
 

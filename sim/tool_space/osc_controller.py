@@ -138,7 +138,8 @@ class OperationalSpace:
                 "params", problem, remedy="make them with robot.kinematic_tree()"
             )
         self._params = params
-        self._k, self._timestep = ts.discretise(params, 1 / 2000), 1 / 2000
+        self._k = ts.discretise(params, 1 / 2000)
+        self._timestep = 1 / 2000
         # Coulomb friction, and the band of errors in which it is reduced.
         self._friction: tuple[Array, Array] | None = None
         # Damping and friction that the robot is known to have: the law acts against them.
@@ -153,7 +154,8 @@ class OperationalSpace:
         # A setpoint has the pose (7), then the optional twist, acceleration and wrench (6 each),
         # then single joints.
         self._columns = np.zeros(tree.dof, np.intp)  # of the setpoint, for each joint; 0 for none
-        entries, self._parts = dict(POSE_UNITS), dict[str, slice]()
+        entries = dict(POSE_UNITS)
+        self._parts = dict[str, slice]()
         for name, is_part in {
             "twist": twist,
             "acceleration": acceleration,
@@ -231,7 +233,9 @@ class OperationalSpace:
 
         None in a subclass that defines ``__call__``.
         """
-        return self._advance if type(self).__call__ is OperationalSpace.__call__ else None
+        if type(self).__call__ is OperationalSpace.__call__:
+            return self._advance
+        return None
 
     def _advance(
         self, state: ts.OSCState, setpoint: Array, qpos: Array, qvel: Array, passive: Array
@@ -245,7 +249,8 @@ class OperationalSpace:
         dynamics = ts.task_dynamics(
             self.tree, qpos, qvel, self.link, point=self.point, bias=passive
         )
-        parts, feedforward = {name: setpoint[:, part] for name, part in self._parts.items()}, None
+        parts = {name: setpoint[:, part] for name, part in self._parts.items()}
+        feedforward = None
         if self._damping is not None:
             feedforward = self._damping * qvel
             added = self._timestep * (self._damping[:, None] * xp.eye(qpos.shape[1]))
@@ -308,7 +313,8 @@ class OperationalSpace:
         j = dynamics.jacobian
         others = posture - qpos
         ahead = error if twist is None else error + LOOKAHEAD * twist
-        rows, eye = namespace(j).swapaxes(j, -1, -2), 1e-4 * namespace(j).eye(6)
+        rows = namespace(j).swapaxes(j, -1, -2)
+        eye = 1e-4 * namespace(j).eye(6)
         moved = gram(j, solve(gram(rows, rows) + eye.astype(j.dtype), ahead[..., None]))[..., 0]
         chain = dynamics.chain
         return compensation(coulomb, chain * moved + (1 - chain) * others, None, band)
@@ -318,7 +324,8 @@ class OperationalSpace:
         runner.
         """
         other = copy(self)
-        other._k, other._timestep = ts.discretise(self._params, timestep), timestep
+        other._k = ts.discretise(self._params, timestep)
+        other._timestep = timestep
         other._friction = self._known_friction if "friction" in compensate.split("+") else None
         return other
 

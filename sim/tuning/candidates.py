@@ -204,7 +204,8 @@ class Candidates:
         """Run each of ``points`` (n, dimension) on its :meth:`runner`, and return the costs
         (n,).
         """
-        count, rows = len(points), len(self._rows)
+        count = len(points)
+        rows = len(self._rows)
         params = self.params(points)
         limits = {}
         for name in ("effort_min", "effort_max"):

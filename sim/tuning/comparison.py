@@ -104,7 +104,8 @@ class Comparison:
     def _row(self, evaluation: Evaluation) -> list[str]:
         """Return the row of an evaluation in the table."""
         arm = arm_joints(self.robot)
-        metrics, error = evaluation.metrics, evaluation.following_error
+        metrics = evaluation.metrics
+        error = evaluation.following_error
         settling = metrics.settling_time[:, arm]
         settled = np.isfinite(settling).all(1).sum()
         # A joint without a move has no settling time, and is in time.
@@ -213,7 +214,9 @@ def compare(
 
 def default_sets(robot: Robot) -> tuple[str, ...]:
     """Return the names of the sets that are compared by default."""
-    return ("tuned", "sapien-tutorial", "drive") if robot.settings else ("designed", "drive")
+    if robot.settings:
+        return ("tuned", "sapien-tutorial", "drive")
+    return ("designed", "drive")
 
 
 def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:

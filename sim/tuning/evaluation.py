@@ -71,7 +71,9 @@ def tuning_engine(build: Callable[..., Any] | None) -> EngineName:
     """Return the default engine of searches and comparisons: MuJoCo, which is several times as
     fast, unless scenes have content of the user's for SAPIEN.
     """
-    return "mujoco" if build is None else "sapien"
+    if build is None:
+        return "mujoco"
+    return "sapien"
 
 
 def step_response_metrics(
@@ -84,10 +86,8 @@ def step_response_metrics(
     undefined (NaN), as under control "drive".
     """
     if (command := rollout.info.own_command) is not None:
-        problem, remedy = (
-            f"has setpoints of {', '.join(command.names)}, not of joints",
-            "pass a run with joint setpoints",
-        )
+        problem = f"has setpoints of {', '.join(command.names)}, not of joints"
+        remedy = "pass a run with joint setpoints"
         raise InvalidArgumentError("rollout", problem, remedy=remedy)
     metrics = step_metrics(
         rollout.tick,
@@ -168,10 +168,14 @@ def run_moves(
         start = runner.reset(
             moves.start, seed=(0 if streams is None else streams) if randomized else None
         )
-        setpoints, further = np.broadcast_to(moves.target, (ticks, *moves.target.shape)), {}
+        setpoints = np.broadcast_to(moves.target, (ticks, *moves.target.shape))
+        further = {}
         if durations is not None:
             total = np.maximum(durations, tick)[:, None]
-            began = start.qpos.astype(np.float64) if randomized else moves.start
+            if randomized:
+                began = start.qpos.astype(np.float64)
+            else:
+                began = moves.start
             motion = minimum_jerk(began, moves.target, tick, duration=total)
             rows = np.minimum(
                 np.arange(ticks), motion.ticks - 1
@@ -180,7 +184,8 @@ def run_moves(
             setpoints = np.where(smooth, motion.position[rows], setpoints)
             further["setpoint_rates"] = np.where(smooth, motion.velocity[rows], 0.0)
         rollout = runner.rollout(setpoints, progress=progress, **further)
-    with_effort, began = runner.control != "drive", moves.start
+    with_effort = runner.control != "drive"
+    began = moves.start
     if randomized and rollout.info.start is not None:
         began = rollout.info.start.astype(np.float64)
     return rollout, step_response_metrics(runner.robot, rollout, began, with_effort=with_effort)

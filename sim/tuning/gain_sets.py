@@ -25,7 +25,9 @@ class GainSet(NamedTuple):
 
 def default_gains(robot: Robot) -> str:
     """Return the name of the gains that a robot has by default."""
-    return "tuned" if robot.has_tuned else "designed"
+    if robot.has_tuned:
+        return "tuned"
+    return "designed"
 
 
 def gain_set(robot: Robot, name: str | None = None) -> GainSet:
@@ -66,7 +68,10 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     path = Path(name)
     if not path.is_file():
         near = difflib.get_close_matches(name, NAMES, 1)
-        remedy = f"did you mean {near[0]!r}?" if near else f"use a file or {', '.join(NAMES)}"
+        if near:
+            remedy = f"did you mean {near[0]!r}?"
+        else:
+            remedy = f"use a file or {', '.join(NAMES)}"
         raise InvalidArgumentError(
             "gains", "is neither a name nor a file", value=name, remedy=remedy
         )

@@ -97,7 +97,8 @@ def search_moves(robot: Robot, seed: int = 0) -> Moves:
     it; a random move of each kind; and the hardest of 28 more. The hardest needs most time under
     the effort limits, so it limits how fast the gains may be.
     """
-    moves, drawn = tutorial_move(robot), random_moves(robot, 32, seed)
+    moves = tutorial_move(robot)
+    drawn = random_moves(robot, 32, seed)
     if robot.settings is not None:
         spread = np.minimum(_NEARBY, (robot.upper - robot.lower) / 4)
         shift = np.random.default_rng(seed).uniform(-spread, spread, (64, robot.dof))
@@ -134,17 +135,20 @@ def random_moves(
         ``count``, ``seed`` or ``size`` is out of range, or there are no such moves: the robot
         touches itself, or is too weak, in nearly every pose.
     """
-    count, size = integer("count", count, 0, 100_000), number("size", size, 1e-3, 10.0, "rad or m")
-    dynamics, rng = (
-        robot.dynamics(ground),
-        np.random.default_rng(integer("seed", seed, 0, 2**63 - 1)),
-    )
+    count = integer("count", count, 0, 100_000)
+    size = number("size", size, 1e-3, 10.0, "rad or m")
+    dynamics = robot.dynamics(ground)
+    rng = np.random.default_rng(integer("seed", seed, 0, 2**63 - 1))
     poses = robot.sample(1000, seed=0)
     reach = np.ptp(poses, axis=0)
-    low, high = robot.lower + _EDGE * reach, robot.upper - _EDGE * reach
+    low = robot.lower + _EDGE * reach
+    high = robot.upper - _EDGE * reach
     line = np.linspace(0, 1 + MAX_OVERSHOOT, _LINE)[:, None]
     center, movable = easy_pose(robot, dynamics, poses[:200])
-    clearance = 0.0 if dynamics.in_contact(center[None], _CLEARANCE)[0] else _CLEARANCE
+    if dynamics.in_contact(center[None], _CLEARANCE)[0]:
+        clearance = 0.0
+    else:
+        clearance = _CLEARANCE
     share, in_vain = 1.0, 0
     moves = list[tuple[Float64, Float64, str]]()
     for _ in range(200 * count + 200):
@@ -152,11 +156,13 @@ def random_moves(
             break
         # Where few poses are free of contact, moves get smaller.
         if in_vain == _PATIENCE:
-            share, in_vain = share / 2, 0
+            share = share / 2
+            in_vain = 0
         kind = KINDS[len(moves) % len(KINDS)]
         pose = robot.sample(1, seed=int(rng.integers(2**31)))[0]
         start = np.clip(pose if share == 1 else center + share * (pose - center), low, high)
-        joint, fraction = rng.integers(robot.dof), rng.uniform(-1, 1, robot.dof)
+        joint = rng.integers(robot.dof)
+        fraction = rng.uniform(-1, 1, robot.dof)
         if kind == "all alike":
             fraction[:] = fraction[0]
         if kind == "one joint":
@@ -230,7 +236,8 @@ def easy_pose(
         share = shares(tried).max(1)
         for index in np.argsort(share, kind="stable")[:_TRIED]:
             if (move_cost := cost(tried[index], float(share[index]))) < least:
-                center, least = tried[index], move_cost
+                center = tried[index]
+                least = move_cost
                 break
     return center, movable
 

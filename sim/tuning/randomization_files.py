@@ -35,7 +35,9 @@ def load_randomization(path: str | Path, robot: Robot, seed: int = 0) -> Randomi
 
 def reseeded(randomization: Randomization | None, seed: int) -> Randomization | None:
     """Return ``randomization`` with ``seed`` added to its seed, for other draws."""
-    return None if randomization is None else replace(randomization, seed=randomization.seed + seed)
+    if randomization is None:
+        return None
+    return replace(randomization, seed=randomization.seed + seed)
 
 
 def at_the_joints(randomization: Randomization | None) -> Randomization | None:

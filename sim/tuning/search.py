@@ -218,7 +218,8 @@ def tune(
     options: Document = {"substeps": SUBSTEPS, **scene}
 
     is_varied = randomization is not None or robot.actuators is not None or motors is not None
-    unseen, fast = None, Document()
+    unseen = None
+    fast = Document()
     if moves is None:
         unseen = random_moves(robot, FINAL_MOVES, seed + FINAL_SEED)
         moves = search_moves(robot, seed)
@@ -260,8 +261,12 @@ def tune(
     # Final round: the designed gains against the candidates that beat them.
     costs = np.concatenate(history)
     ranking = np.argsort(costs, kind="stable")[:FINALISTS].tolist()
-    finalists = ranking[: ranking.index(0)] if 0 in ranking else ranking
-    best, rejected = (finalists or [0])[0], None
+    if 0 in ranking:
+        finalists = ranking[: ranking.index(0)]
+    else:
+        finalists = ranking
+    best = (finalists or [0])[0]
+    rejected = None
     if not finalists:
         rejected = (
             f"cost in the search: best candidate {costs[1:].min():.4f}, designed {costs[0]:.4f}"
@@ -353,7 +358,10 @@ def _evolve(
 
 def _plain(value: Any) -> Any:
     """Return an option of the runner as a plain value, or as text."""
-    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, np.generic):
+        value = value.item()
+    else:
+        value = value
     if value is None or isinstance(value, bool | int | float | str):
         return value
     return getattr(value, "__qualname__", None) or repr(value)

@@ -60,7 +60,8 @@ class Gate:
 
     def start(self, make: Callable[[], Any]) -> Any:
         """Return the server of viser that ``make()`` starts, behind this gate."""
-        serve, handlers = websocket_server.serve, []
+        serve = websocket_server.serve
+        handlers = []
 
         def guarded(handler: Any, *_: Any, process_request: Any, **options: Any) -> Any:
             def process(connection: Any, request: Any) -> Any:

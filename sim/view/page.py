@@ -108,7 +108,8 @@ class View(AbstractContextManager["View"]):
 
     def _show(self, charts: bool) -> None:
         """Send the present frame to the pages, and with ``charts`` these and the status."""
-        panel, frame = self.panel, self.data.frame()
+        panel = self.panel
+        frame = self.data.frame()
         self._nodes.update(frame, panel.env)
         if charts:
             self._charts.update(panel.env, panel.joint)
@@ -181,7 +182,8 @@ class SceneNodes:
             node = self._add_surface(f"/robots/{index}", surface, count, colour, opacity=opacity)
             self._robots.append(node)
             if sets_positions:
-                path, options = f"/setpoint/{index}", {"opacity": 0.22, **_NO_SHADOW}
+                path = f"/setpoint/{index}"
+                options = {"opacity": 0.22, **_NO_SHADOW}
                 self._setpoints.append(
                     self._add_surface(path, surface, 1, _SETPOINT_COLOUR, **options)
                 )
@@ -195,7 +197,10 @@ class SceneNodes:
         """Place every robot, the ring under robot ``env``, and its setpoint."""
         scene = self._scene
         with self._server.atomic():
-            base = None if frame.base_pose is None else frame.base_pose[0]
+            if frame.base_pose is None:
+                base = None
+            else:
+                base = frame.base_pose[0]
             _place(self._robots, scene.place(frame.qpos[0], base))
             self._ring.position = (*scene.positions[env][:2], scene.floor + 0.004)
             if self._setpoints:
@@ -271,7 +276,10 @@ class Charts:
             return
         described = self._data.robot.joints[joint]
         positions = history.qpos[:, env, joint]
-        setpoints = history.setpoint[:, env, joint] if history.info.sets_positions else positions
+        if history.info.sets_positions:
+            setpoints = history.setpoint[:, env, joint]
+        else:
+            setpoints = positions
         self._draw(
             self._position, f"{described.name} [{described.unit}]", past, positions, setpoints
         )

@@ -89,7 +89,8 @@ class Panel:
 
     def update_status(self, frame: Rollout, factor: float, rate: float) -> None:
         """Show time, real-time factor, frame rate, and how many robots diverged or saturate."""
-        data, time = self._data, float(frame.time[0])
+        data = self._data
+        time = float(frame.time[0])
         lines = [
             f"**{data.num_envs} x {data.robot.name}**",
             (
@@ -120,7 +121,10 @@ class Panel:
         if button == "Reset":
             self._data.reset()
         elif button == "Step":
-            self.frames_left = 1 if math.isinf(self.frames_left) else self.frames_left + 1
+            if math.isinf(self.frames_left):
+                self.frames_left = 1
+            else:
+                self.frames_left = self.frames_left + 1
         else:
             self.frames_left = math.inf if button == "Run" else 0
 

@@ -43,7 +43,10 @@ class Playback:
             )
         self.robot = robot
         self.num_envs = integer("num_envs", rollout.num_envs, 1, MAX_ROBOTS)
-        self.ground = robot.has_ground if rollout.info.ground is None else rollout.info.ground
+        if rollout.info.ground is None:
+            self.ground = robot.has_ground
+        else:
+            self.ground = rollout.info.ground
         """True if the run had a ground at height 0."""
         self._rollout = replace(rollout, time=rollout.time - rollout.time[0])
         self.duration = float(self._rollout.time[-1])
@@ -61,9 +64,10 @@ class Playback:
 
     def advance(self) -> None:
         """Go to the next frame; after the last to the first."""
-        self._now = (
-            0.0 if self._now >= self.duration else min(self._now + self.period, self.duration)
-        )
+        if self._now >= self.duration:
+            self._now = 0.0
+        else:
+            self._now = min(self._now + self.period, self.duration)
 
     def seek(self, time: float) -> None:
         """Go to a time [s] since the first row."""

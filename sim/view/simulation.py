@@ -67,7 +67,7 @@ class LiveSimulation:
         """Joint positions at the beginning (envs, dof) [rad or m]."""
         self.setpoint: Float64 = np.tile(robot.start, (num_envs, 1))
         """Setpoints (envs, dof) [rad or m]."""
-        self._frames: deque[Rollout] = deque(maxlen=round(HISTORY_SECONDS / self.period))
+        self._frames: deque[Rollout] = deque()
         self._runner = Runner(robot, num_envs, substeps=substeps, **options)
         self.ground = self._runner.options.ground
         """True if the scenes have a ground at height 0."""
@@ -76,8 +76,9 @@ class LiveSimulation:
 
     def reset(self) -> None:
         """Put every robot back to its start pose, at rest, with a reset controller."""
-        self._frames.clear()
-        self._observe(self._runner.reset(self.start), 0.0)
+        first = self._frame(self._runner.reset(self.start), 0.0)
+        # The page's thread reads the frames at any time: there is no moment without one.
+        self._frames = deque([first], round(HISTORY_SECONDS / self.period))
 
     def set_setpoint(
         self, position: ArrayLike, *, joint: int | None = None, env: int | None = None
@@ -125,14 +126,12 @@ class LiveSimulation:
     def advance(self) -> None:
         """Run one frame."""
         time = float(self._frames[-1].time[0])
-        self._observe(self._runner.step(self.setpoint), time + self.period)
+        self._frames.append(self._frame(self._runner.step(self.setpoint), time + self.period))
 
     def close(self) -> None:
         """Close the runner."""
         self._runner.close()
 
-    def _observe(self, observation: Observation, time: float) -> None:
+    def _frame(self, observation: Observation, time: float) -> Rollout:
         row = observation.map(lambda array: array[None])
-        self._frames.append(
-            Rollout(np.array([time]), self.setpoint[None].copy(), row, self.period, self._info)
-        )
+        return Rollout(np.array([time]), self.setpoint[None].copy(), row, self.period, self._info)

@@ -26,7 +26,8 @@ class SharedArrays(SingleOwner):
 
     def __init__(self, layout: Layout, fd: int | None = None) -> None:
         self.layout = layout
-        offsets, size = {}, 0
+        offsets = {}
+        size = 0
         for name, (shape, dtype) in layout.items():
             offsets[name] = size
             nbytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
@@ -42,6 +43,8 @@ class SharedArrays(SingleOwner):
 
     def close(self) -> None:
         """Close the descriptor. The memory is freed when no array refers to it."""
-        fd, self.fd, self.arrays = self.fd, -1, {}
+        fd = self.fd
+        self.fd = -1
+        self.arrays = {}
         if fd >= 0:
             os.close(fd)

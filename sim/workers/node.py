@@ -95,7 +95,10 @@ class Node:
         def run() -> Answer:
             outcome = self._pool.run(request)
             self._pool.start_replay_from(None)
-            arrays = self._pool.arrays.at(slice(outcome.num_ticks)) if outcome.num_ticks else None
+            if outcome.num_ticks:
+                arrays = self._pool.arrays.at(slice(outcome.num_ticks))
+            else:
+                arrays = None
             if outcome.failure is not None:
                 return Answer(None, outcome.failure.portable(), arrays)
             return Answer(request.join(outcome.results), None, arrays)
@@ -164,7 +167,8 @@ class Cluster:
 
     def _machines(self) -> list[Machine]:
         """Return the machines, in descending order of CPUs."""
-        least, machines = self.options.cpus_per_node, []
+        least = self.options.cpus_per_node
+        machines = []
         for node in self.ray.nodes():
             cpus = int(node["Resources"].get("CPU", 0))
             if node["Alive"] and cpus >= (least or 1):
@@ -229,7 +233,8 @@ class NodeWorker(Worker):
             scheduling_strategy=NodeAffinitySchedulingStrategy(self._machine.node_id, soft=False),
             runtime_env=self._cluster.options.runtime_env,
         )
-        self._actor, self._cpus = actor_type.remote(), 0
+        self._actor = actor_type.remote()
+        self._cpus = 0
 
     def send(self, request: Request) -> None:
         limit = self._step_limit * (request.ticks or 1) * request.substeps

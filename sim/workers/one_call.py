@@ -45,7 +45,8 @@ class OneCall:
 
     def begin(self) -> None:
         """Begin a call. Raises as :meth:`check`."""
-        me, process = threading.get_ident(), os.getpid()
+        me = threading.get_ident()
+        process = os.getpid()
         if self._user or process != self._owner:
             raise self._refusal(me, process)
         # No function is called since the check, so no other thread and no signal handler can run in

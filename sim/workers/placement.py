@@ -21,4 +21,6 @@ def pinned_cores(workers: int) -> list[int]:
     to the same cores.
     """
     cores = sorted(os.sched_getaffinity(0))
-    return cores if workers == len(cores) else []
+    if workers == len(cores):
+        return cores
+    return []

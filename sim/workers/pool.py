@@ -80,7 +80,8 @@ class WorkerPool(SingleOwner):
         ticks: int | None = None,
     ) -> None:
         envs = slice(0, options.num_envs) if envs is None else envs
-        num_envs, count = envs.stop - envs.start, options.workers
+        num_envs = envs.stop - envs.start
+        count = options.workers
         self.is_local = count == 0
         """True if the loop runs in this process."""
         self.closed = False
@@ -97,7 +98,8 @@ class WorkerPool(SingleOwner):
             most_steps = NODE_STEPS
         else:
             slices = split_in_shares(num_envs, [1] * max(1, min(count or 0, num_envs)))
-            widest, most_steps = -(-num_envs // len(slices)), _MAX_STEPS
+            widest = -(-num_envs // len(slices))
+            most_steps = _MAX_STEPS
         steps = max(_LEAST_STEPS, most_steps // widest)
         ticks = ticks or max(1, steps // options.substeps)
         layout = Arrays.layout(
@@ -203,7 +205,10 @@ class WorkerPool(SingleOwner):
             self._replay.append(request)
         if count:
             views = self.ticks.made
-            self.present = views[count - 1] if count <= len(views) else self.ticks[count - 1]
+            if count <= len(views):
+                self.present = views[count - 1]
+            else:
+                self.present = self.ticks[count - 1]
         # No constructor of a named tuple, which is a call of Python in the path of a tick.
         return tuple.__new__(Outcome, (results, failure, count, self.ticks))
 
@@ -211,7 +216,10 @@ class WorkerPool(SingleOwner):
         """Drop the kept requests, because ``request``, whose arrays no one changes, brings a new
         worker to the present state.
         """
-        self._replay = [Build()] if request is None else [Build(), request]
+        if request is None:
+            self._replay = [Build()]
+        else:
+            self._replay = [Build(), request]
 
     def close(self) -> None:
         """End all workers at once. May be called again, as after an interrupt."""
@@ -237,7 +245,8 @@ class WorkerPool(SingleOwner):
 
     def _replace(self, worker: Worker, loss: WorkerLost) -> Any:
         """Replace a lost worker; return the result of the new one for the present request."""
-        cause, began = str(loss), time.monotonic()
+        cause = str(loss)
+        began = time.monotonic()
         for _ in range(1, self.max_losses):
             self._raise_if_closed(loss)
             try:

@@ -37,7 +37,9 @@ class Request(ABC):
         def part(value: Any) -> Any:
             if value is None:
                 return None
-            return value.for_envs(envs) if hasattr(value, "for_envs") else value[envs]
+            if hasattr(value, "for_envs"):
+                return value.for_envs(envs)
+            return value[envs]
 
         return type(self)(*map(part, vars(self).values()))
 

@@ -98,7 +98,8 @@ class Worker(SingleOwner, ABC):
     @property
     def label(self) -> str:
         """Number, process and envs, for messages."""
-        first, process = self._start.first_env, "" if self.pid is None else f"pid {self.pid}, "
+        first = self._start.first_env
+        process = "" if self.pid is None else f"pid {self.pid}, "
         return (
             f"{self._start.index} ({process}envs {first + self.envs.start} to"
             f" {first + self.envs.stop - 1})"
@@ -199,7 +200,9 @@ class ProcessWorker(Worker):
         except (EOFError, OSError, pickle.UnpicklingError) as error:
             self._raise_early(error)
             raise self._lost(error) from error
-        return result.of_worker(f"worker {self.label}") if isinstance(result, Failure) else result
+        if isinstance(result, Failure):
+            return result.of_worker(f"worker {self.label}")
+        return result
 
     def close(self) -> None:
         self._end.close()
@@ -219,7 +222,10 @@ class ProcessWorker(Worker):
         except subprocess.TimeoutExpired:
             code = 0
         if not isinstance(error, TimeoutError):
-            cause = f"died ({signal.strsignal(-code)})" if code < 0 else f"died (exit code {code})"
+            if code < 0:
+                cause = f"died ({signal.strsignal(-code)})"
+            else:
+                cause = f"died (exit code {code})"
         return WorkerLost(f"worker {self.label} {cause}")
 
 

@@ -94,7 +94,8 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
         body.sleep = mujoco.mjtSleepPolicy.mjSLEEP_AUTO  # no body sleeps
     for element in [part for kind in REMOVED for part in getattr(scene, kind)]:
         scene.delete(element)
-    root, start = "", _start(model)
+    root = ""
+    start = _start(model)
     for joint in scene.joints:
         if joint.type != mujoco.mjtJoint.mjJNT_FREE or joint.parent.id not in robot:
             continue
@@ -102,8 +103,10 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
         if spec.fixed_base:
             start["qpos"] = np.delete(start["qpos"], model.jnt_qposadr[joint.id] + np.arange(7))
             start["qvel"] = np.delete(start["qvel"], model.jnt_dofadr[joint.id] + np.arange(6))
-            scene.body(root).pos, root = np.zeros(3), ""
+            scene.body(root).pos = np.zeros(3)
+            root = ""
             scene.delete(joint)
+    # With it a reset puts the whole scene to its start, objects included.
     scene.add_key(name="start", **start)
     _set_pairs(scene, spec.ignored, {*robot.values()})
     number = {name: joint for joint, name in names.joints.items()}
@@ -141,10 +144,8 @@ def set_ground(scene: MjSpec, ground: bool) -> None:
         if plane_shape.type == plane and (plane_shape.contype or plane_shape.conaffinity)
     ]
     if ground and not planes:
-        added, plain = (
-            scene.worldbody.add_geom(type=plane, size=[0, 0, 1]),
-            mujoco.MjSpec().worldbody.add_geom(),
-        )
+        added = scene.worldbody.add_geom(type=plane, size=[0, 0, 1])
+        plain = mujoco.MjSpec().worldbody.add_geom()
         for name in _OF_CONTACTS:  # the file's default class would apply otherwise
             setattr(added, name, getattr(plain, name))
         added.contype = added.conaffinity = _EVERYTHING
@@ -164,6 +165,7 @@ def _start(model: MjModel) -> Document:
 
 def _set_pairs(scene: MjSpec, ignored: Iterable[tuple[str, str]], robot: set[str]) -> None:
     """Exclude exactly those pairs of the robot's bodies that do not collide."""
+    # The file's pairs may be others than those of the robot's options.
     for exclude in list(scene.excludes):
         if {exclude.bodyname1, exclude.bodyname2} <= robot:
             scene.delete(exclude)
@@ -180,7 +182,8 @@ def _frames(
 
     A body's link has the body's axes, and its origin at the anchor of the body's last hinge.
     """
-    placements, names = spec.simulated.links, dict[str, str]()
+    placements = spec.simulated.links
+    names = dict[str, str]()
     frames: dict[str, BodyFrame] = {}
     for body, name in robot.items():
         if name not in placements:  # the world, if the robot does not include it
@@ -191,7 +194,10 @@ def _frames(
             continue
         joints = np.flatnonzero(model.jnt_bodyid == body)
         hinges = joints[-1:][model.jnt_type[joints[-1:]] == mujoco.mjtJoint.mjJNT_HINGE]
-        anchor = model.jnt_pos[hinges[0]].copy() if len(hinges) else np.zeros(3)
+        if len(hinges):
+            anchor = model.jnt_pos[hinges[0]].copy()
+        else:
+            anchor = np.zeros(3)
         back = inverse(wxyz)
         names[link], frames[link] = (
             name,
@@ -204,7 +210,8 @@ def _of_followers(values: Float64, spec: SceneSpec) -> Float64:
     """Return the armature or damping (dof,) that moves from leaders to their followers: d_f and
     -m^2 d_f.
     """
-    coupling, terms = coupling_of(spec.joints), np.zeros(len(values))
+    coupling = coupling_of(spec.joints)
+    terms = np.zeros(len(values))
     follower = coupling.followers
     terms[follower] = values[follower]
     np.subtract.at(

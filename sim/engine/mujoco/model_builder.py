@@ -26,7 +26,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Document, MjModel, MjSpec
+from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
@@ -46,8 +46,10 @@ _HARD = (0.99, 0.999, 1e-4, 0.5, 2.0)
 """Impedance of joint limits (MuJoCo's solimp): nearly all of the acceleration that violates a limit
 is cancelled.
 """
-_NOT_KEPT = sum(
-    int(getattr(mujoco.mjtEnableBit, f"mjENBL_{name}", 0)) for name in ("SLEEP", "ENERGY", "FWDINV")
+_NOT_KEPT = (
+    mujoco.mjtEnableBit.mjENBL_SLEEP
+    | mujoco.mjtEnableBit.mjENBL_ENERGY
+    | mujoco.mjtEnableBit.mjENBL_FWDINV
 )
 """Parts that a file cannot enable: a snapshot does not hold what sleeps, and nobody reads the
 others.
@@ -71,11 +73,11 @@ class RobotMj:
     terms: Any = (0.0, 0.0)
     """Armature and damping (2, dof) of the joints in addition to the description and the motors."""
     frames: Mapping[str, BodyFrame] = field(default_factory=dict)
-    """Frames of simulated links in their bodies; of other links the frames are the same."""
+    """Frames of simulated links in their bodies, in an MJCF file; of other links the frames are
+    the same.
+    """
     base: tuple[int, int] | None = None
     """Index of a floating base in MuJoCo's qpos and qvel; None on a fixed one."""
-    is_file: bool = False
-    """Whether the model is an MJCF file's."""
 
 
 @lru_cache(maxsize=8)
@@ -141,7 +143,8 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         raise RobotError(f"{file.path}: {problem}; {remedy}") from error
     qpos, qvel = _places(model, spec)
     armature, damping = parts.terms
-    model.dof_armature[qvel], model.dof_frictionloss[qvel] = np.maximum(armature, 0.0), 0.0
+    model.dof_armature[qvel] = np.maximum(armature, 0.0)
+    model.dof_frictionloss[qvel] = 0.0
     model.dof_damping[qvel] = np.maximum(damping + [joint.damping for joint in spec.joints], 0.0)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     base = None
@@ -149,7 +152,7 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         joint = model.joint(model.body(parts.root).jntadr[0])
         base = int(joint.qposadr[0]), int(joint.dofadr[0])
     bodies = {link: model.body(name).id for link, name in parts.names.items()}
-    return RobotMj(model, qpos, qvel, bodies, parts.terms, parts.frames, base, is_file=True)
+    return RobotMj(model, qpos, qvel, bodies, parts.terms, parts.frames, base)
 
 
 def robot_spec(spec: SceneSpec) -> tuple[Any, dict[str, str]]:
@@ -159,10 +162,12 @@ def robot_spec(spec: SceneSpec) -> tuple[Any, dict[str, str]]:
 
     Raises RobotError if MuJoCo refuses a part of the robot.
     """
-    scene, off = mujoco.MjSpec(), mujoco.mjtDisableBit
+    scene = mujoco.MjSpec()
+    off = mujoco.mjtDisableBit
     _set_options(scene, spec)
     scene.option.disableflags |= off.mjDSBL_SPRING | off.mjDSBL_DAMPER
-    scene.compiler.fusestatic, scene.compiler.degree = False, False
+    scene.compiler.fusestatic = False
+    scene.compiler.degree = False
     try:
         names = _add_links(scene, spec)
         if spec.collisions:
@@ -184,14 +189,12 @@ def _unused(name: str, taken: Collection[str]) -> str:
     ``taken``.
     """
     numbered = (f"{name}_{number}" for number in count(2))
-    return (
-        name
-        if name not in taken
-        else next(candidate for candidate in numbered if candidate not in taken)
-    )
+    if name not in taken:
+        return name
+    return next(candidate for candidate in numbered if candidate not in taken)
 
 
-def principal_inertia(inertia: SpatialInertia) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def principal_inertia(inertia: SpatialInertia) -> tuple[Float64, Float64]:
     """Return principal moments (3,) [kg m^2] and the rotation of the principal axes (4,), in the
     axes of the body.
     """
@@ -204,12 +207,15 @@ def principal_inertia(inertia: SpatialInertia) -> tuple[NDArray[np.float64], NDA
 def _set_options(scene: MjSpec, spec: SceneSpec) -> None:
     solver: MujocoSolver = spec.physics
     option, off = scene.option, mujoco.mjtDisableBit
-    option.timestep, option.gravity = spec.timestep, spec.gravity
+    option.timestep = spec.timestep
+    option.gravity = spec.gravity
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    option.iterations, option.tolerance = solver.iterations, solver.tolerance
-    option.cone = (
-        mujoco.mjtCone.mjCONE_ELLIPTIC if solver.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
-    )
+    option.iterations = solver.iterations
+    option.tolerance = solver.tolerance
+    if solver.elliptic:
+        option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    else:
+        option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     # A diverged env must stay visible: the loop suspends or resets it, and reports it.
     option.disableflags |= off.mjDSBL_AUTORESET | off.mjDSBL_ACTUATION
 
@@ -266,10 +272,12 @@ def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
         if shape.owner not in owners[shape.body]:
             owners[shape.body].append(shape.owner)
     ignored = {frozenset(pair) for pair in spec.ignored}
-    solid, split = [*owners], set[str]()
+    solid = [*owners]
+    split = set[str]()
     for first, second in combinations(solid, 2):
         pairs = [frozenset(pair) in ignored for pair in product(owners[first], owners[second])]
         if any(pairs) and not all(pairs):
+            # MuJoCo excludes whole bodies, so these get one for each link with shapes.
             split |= {first, second}
     bodies = {owner: names[link] for link in solid for owner in owners[link]}
     taken = {"world", *names.values()}
@@ -300,7 +308,9 @@ def _add_drives(scene: MjSpec, spec: SceneSpec) -> None:
             name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-        actuator.forcelimited, actuator.forcerange = True, [-LARGEST_FORCE, LARGEST_FORCE]
+        # The limit of the drive replaces this one later.
+        actuator.forcelimited = True
+        actuator.forcerange = [-LARGEST_FORCE, LARGEST_FORCE]
 
 
 def _contact(spec: SceneSpec) -> Document:
@@ -314,15 +324,20 @@ def set_inertia(model: MjModel, robot: RobotMj, link: str, inertia: SpatialInert
     """Give a simulated link in a ``mujoco.MjModel`` this inertia, in the link's frame;
     ``mj_setConst`` comes next.
     """
-    body, welded = robot.bodies[link], tuple[int, ...]()
+    body = robot.bodies[link]
+    welded = tuple[int, ...]()
     if link in robot.frames:
         position, turn, welded = robot.frames[link]
         inertia = inertia.moved(position, turn)
     moments, wxyz = principal_inertia(inertia)
-    model.body_mass[body], model.body_ipos[body] = inertia.mass, inertia.center
-    model.body_iquat[body], model.body_inertia[body] = wxyz, moments
-    model.body_mass[[*welded]], model.body_inertia[[*welded]] = 0.0, 0.0
+    model.body_mass[body] = inertia.mass
+    model.body_ipos[body] = inertia.center
+    model.body_iquat[body] = wxyz
+    model.body_inertia[body] = moments
+    model.body_mass[[*welded]] = 0.0
+    model.body_inertia[[*welded]] = 0.0
     # Without the compiler's shortcuts for centers of mass at the body's origin, and bodies that are
     # moved by one joint.
-    model.body_sameframe[body], model.body_simple[body] = 0, 0
+    model.body_sameframe[body] = 0
+    model.body_simple[body] = 0
     model.dof_simplenum[:] = 0

@@ -25,7 +25,9 @@ def obstacle() -> str:
 
 def describe_calls(engine: str, obstacle: str) -> str:
     """Return the kind of the calls into ``engine``, with the ``obstacle`` to native ones."""
-    return f"Python calls into {engine} ({obstacle})" if obstacle else f"native calls into {engine}"
+    if obstacle:
+        return f"Python calls into {engine} ({obstacle})"
+    return f"native calls into {engine}"
 
 
 def extension(name: str) -> Any:

@@ -12,7 +12,6 @@ from threading import RLock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
@@ -59,11 +58,15 @@ def articulation_builder(spec: SceneSpec) -> ArticulationBuilder:
 
     Raises RobotError for a body whose moments of inertia are not positive.
     """
-    builder, tables = MirroringBuilder(), spec.simulated
+    builder = MirroringBuilder()
+    tables = spec.simulated
     links: dict[str, Any] = {}
     for body in tables.bodies:
         joint = body.joint
-        parent = None if joint is None else links[joint.parent_link]
+        if joint is None:
+            parent = None
+        else:
+            parent = links[joint.parent_link]
         links[body.name] = link = builder.create_link_builder(parent)
         link.set_name(body.name)
         moments, axes = _principal(body.inertia, body.name)
@@ -92,7 +95,8 @@ def articulation_builder(spec: SceneSpec) -> ArticulationBuilder:
 
 def _add_shape(link: Any, shape: Shape) -> None:
     material = physx.PhysxMaterial(CONTACT_FRICTION, CONTACT_FRICTION, RESTITUTION)
-    place, size = _pose(shape.position, matrix_of(shape.wxyz)), shape.size
+    place = _pose(shape.position, matrix_of(shape.wxyz))
+    size = shape.size
     if shape.kind == "box":
         link.add_box_collision(place, size, material)
     elif shape.kind == "sphere":
@@ -126,7 +130,8 @@ def _principal(inertia: Float64, name: str) -> tuple[Float64, Float64]:
     """Return the principal moments (3,) and axes (3, 3), those of the frame if they are
     principal.
     """
-    moments, axes = np.diag(inertia), np.eye(3)
+    moments = np.diag(inertia)
+    axes = np.eye(3)
     if not np.array_equal(np.diag(moments), inertia):
         moments, axes = np.linalg.eigh(inertia)
         axes[:, 2] *= np.sign(np.linalg.det(axes))
@@ -154,8 +159,10 @@ def engine_settings(spec: SceneSpec) -> Iterator[None]:
     Only one thread at a time enters the context.
     """
     with _building:
-        scene, body = physx.get_scene_config(), physx.get_body_config()
-        shape, material = physx.get_shape_config(), physx.get_default_material()
+        scene = physx.get_scene_config()
+        body = physx.get_body_config()
+        shape = physx.get_shape_config()
+        material = physx.get_default_material()
         solver = spec.physics
         # Settings that are not given get SAPIEN's defaults.
         gravity = np.array(spec.gravity, np.float32)
@@ -176,13 +183,9 @@ def engine_settings(spec: SceneSpec) -> Iterator[None]:
             )
 
 
-def new_system(spec: SceneSpec, gravity: NDArray[np.float64] | None = None) -> Any:
-    """Return a new PhysX system, which has the solver and time step of ``spec``, and its or another
-    gravity (3,).
-    """
-    with engine_settings(
-        spec if gravity is None else replace(spec, gravity=tuple(gravity.tolist()))
-    ):
+def new_system(spec: SceneSpec) -> Any:
+    """Return a new PhysX system with the solver, time step and gravity of ``spec``."""
+    with engine_settings(spec):
         system = physx.PhysxCpuSystem()
     system.timestep = spec.timestep
     return system
@@ -258,7 +261,7 @@ def link_frames(spec: SceneSpec, robot: Any) -> Frames:
 
 
 @lru_cache(maxsize=8)
-def scene_tree(spec: SceneSpec) -> RigidTree:
+def rounded_tree(spec: SceneSpec) -> RigidTree:
     """Return the tree of the robot of ``spec`` as PhysX rounds it, all joints independent, the same
     object for equal specs.
 
@@ -276,6 +279,7 @@ def scene_tree(spec: SceneSpec) -> RigidTree:
         row = Body(body.name, None, mass=link.mass, center=np.asarray(place.p, float))
         row = row._replace(inertia=axes @ moments @ axes.T)
         if body.joint is not None:
+            # SAPIEN's joint has a frame in the parent and one in the child: the link between has the first.
             above = f"{body.name} (joint)"
             moving = replace(body.joint, axis=(1.0, 0.0, 0.0))
             rows.append(_placed(Body(above, moving), link.joint.pose_in_parent))

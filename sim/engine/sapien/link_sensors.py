@@ -18,7 +18,7 @@ from batchpid.arrays.array_types import Float32, Float64
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 
-class LinkSensors:
+class SapienLinkSensors:
     """Sums of the sensors of ``spec`` over sim steps. ``robots`` and ``systems`` are a pack's own
     lists.
     """
@@ -49,7 +49,8 @@ class LinkSensors:
 
     def take(self) -> dict[str, Float64]:
         """Return the sums since the last call, and set them to 0."""
-        before, (size, contacts, _) = self._sums, self._velocities.shape
+        before = self._sums
+        (size, contacts, _) = self._velocities.shape
         shapes = {
             "contact_force": (contacts, 3),
             "touching": (contacts,),
@@ -82,17 +83,20 @@ class LinkSensors:
     def _add(self, row: int) -> None:
         links, joints, _, gravity = self._parts[row]
         forces = self._robots[row].get_link_incoming_joint_forces()
+        # The force of the joint is the wrench; it needs no difference of velocities.
         if self._wrenches:
             self._sums["wrench"][row] += [_in_link(joints[at], forces[at]) for at in self._wrenches]
         if not self._contacts:
             return
-        velocities, touched = self._read_velocities(row), self._touched(row)
+        velocities = self._read_velocities(row)
+        touched = self._touched(row)
         for number, at in enumerate(self._contacts):
             if at not in touched:
                 continue
             rate = (velocities[number] - self._velocities[row, number]) / self._spec.timestep
             force = links[at].mass * (rate - gravity)
             if at not in self._roots:
+                # What the joints transmit is not contact: of the parent on the link, and of it on its children.
                 force -= _in_world(links[at], joints[at], forces[at])
             for child in self._children[at]:
                 force += _in_world(links[child], joints[child], forces[child])
@@ -117,7 +121,8 @@ def _in_link(joint: Any, force: Float32) -> Float64:
     the link's origin.
     """
     placed = joint.pose_in_child.to_transformation_matrix().astype(np.float64)
-    axes, linear = placed[:3, :3], placed[:3, :3] @ force[:3]
+    axes = placed[:3, :3]
+    linear = placed[:3, :3] @ force[:3]
     return np.concatenate([linear, axes @ force[3:] + np.cross(placed[:3, 3], linear)])
 
 

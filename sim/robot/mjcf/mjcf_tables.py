@@ -70,6 +70,7 @@ def find_base(model: MjModel, names: Names, path: Path, findings: list[Finding])
     left_out = {body for body in tops if model.body_mocapid[body] >= 0} | (free - moving) | soft
     if moving:
         left_out |= balls - moving
+    # A robot on a free joint is one object; all others are scenery.
     if floating:
         left_out |= tops - floating
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_BALL):
@@ -81,7 +82,8 @@ def find_base(model: MjModel, names: Names, path: Path, findings: list[Finding])
                 f"{path}: body {names.bodies[body]!r}: {problem}; replace it by three hinges"
             )
     for body in sorted(left_out - soft):
-        text, remedy = f"is apart from the robot: {ALONE} it", "in SAPIEN add it with build="
+        text = f"is apart from the robot: {ALONE} it"
+        remedy = "in SAPIEN add it with build="
         findings.append(Finding("note", "loose-link", text, remedy, link=names.bodies[body]))
     names.leave_out(left_out)
     if floating:
@@ -95,7 +97,9 @@ def find_base(model: MjModel, names: Names, path: Path, findings: list[Finding])
     ]
     # The only body, if it is held at the origin, is the root in place of the world.
     is_root = not (others or scenery or model.body_jntnum[only])
-    return only if is_root and pose == [0, 0, 0, 1, 0, 0, 0] else 0
+    if is_root and pose == [0, 0, 0, 1, 0, 0, 0]:
+        return only
+    return 0
 
 
 def _roots_of_actuators(model: MjModel) -> set[int]:
@@ -127,11 +131,14 @@ class TableReader:
 
     def read(self, couplings: Couplings, is_held: bool) -> Tables:
         """Return the tables; ``is_held`` says whether a base on a free joint is fixed."""
-        model, base, names = self._model, self._base, self._names.bodies
+        model = self._model
+        base = self._base
+        names = self._names.bodies
         if base == 0:
             self._add(0, Body(names[0], None), ORIGIN)
         else:
             self._report_world()
+        # A free joint that is held keeps its turn: a row above the base has it.
         root = None
         if base != 0 and is_held and model.body_quat[base][0] != 1:
             root = Body(self._names.new_link(f"{names[base]}_frame"), None)
@@ -150,10 +157,12 @@ class TableReader:
 
     def _read_body(self, body: int, parent: str | None, couplings: Couplings) -> None:
         """Read a body, and the joints between it and the row ``parent``; None for the root."""
-        model, name = self._model, self._names.bodies[body]
+        model = self._model
+        name = self._names.bodies[body]
         joints = [joint for joint in self._names.joints if model.jnt_bodyid[joint] == body]
         place = model.body_pos[body] - self._anchors[int(model.body_parentid[body])]
-        turn, anchor = model.body_quat[body].copy(), ORIGIN
+        turn = model.body_quat[body].copy()
+        anchor = ORIGIN
         if model.body_jntnum[body] > len(joints):  # on a free joint, which has the position
             place = ORIGIN
         row = Body(name, None)
@@ -185,8 +194,12 @@ class TableReader:
 
     def _read_joint(self, number: int, parent: str, link: str, couplings: Couplings) -> Joint:
         model = self._model
-        name, dof = self._names.joints[number], model.jnt_dofadr[number]
-        kind = "prismatic" if self._names.is_slide(number) else "continuous"
+        name = self._names.joints[number]
+        dof = model.jnt_dofadr[number]
+        if self._names.is_slide(number):
+            kind = "prismatic"
+        else:
+            kind = "continuous"
         lower, upper = -np.inf, np.inf
         if model.jnt_limited[number]:
             lower, upper = model.jnt_range[number].tolist()
@@ -213,10 +226,15 @@ class TableReader:
         self._read_shapes(body, row.name, anchor)
         if len(self._shapes) > before:
             self.solid[body] = row.name
-        mass, axes = float(model.body_mass[body]), model.body_iquat[body]
-        center, inertia = model.body_ipos[body] - anchor, np.diag(model.body_inertia[body])
+        mass = float(model.body_mass[body])
+        axes = model.body_iquat[body]
+        center = model.body_ipos[body] - anchor
+        inertia = np.diag(model.body_inertia[body])
+        # Else the row would get the mass of its shapes.
         if mass == 0 and body in self.solid:
-            mass, center, inertia = NO_MASS, ORIGIN, 1e-3 * NO_MASS * np.eye(3)
+            mass = NO_MASS
+            center = ORIGIN
+            inertia = 1e-3 * NO_MASS * np.eye(3)
         if mass > 0:
             inertia, repair = possible_inertia(mass, inertia)
             if repair is not None:
@@ -240,6 +258,7 @@ class TableReader:
                 size = tuple(sizes[:count].tolist())
             elif shape_type in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF):
                 vertices = _hull(self._model, int(self._model.geom_dataid[geom]))
+            # PhysX has no ellipsoids.
             elif shape_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
                 vertices = _ellipsoid(sizes)
                 text = "an ellipsoid collides in SAPIEN as a polyhedron inscribed in it"
@@ -274,20 +293,20 @@ class TableReader:
     def _report_shape(self, geom: int, body: int) -> None:
         """Report a plane or a height field. A plane of the world is replaced by a ground."""
         named = label(self._model.geom(geom))
-        kind = "plane" if self._model.geom_type[geom] == PLANE else "height field"
+        if self._model.geom_type[geom] == PLANE:
+            kind = "plane"
+        else:
+            kind = "height field"
         text = f"{ALONE} the {kind} {named} of the file"
-        height, (_, x, y, _) = float(self._model.geom_pos[geom, 2]), self._model.geom_quat[geom]
+        # A ground at another height, or not level, changes the run.
+        is_ground = not np.any([*self._model.geom_pos[geom, 2:], *self._model.geom_quat[geom, 1:3]])
         if body != 0 or kind != "plane":
             self._report("warning", body, text, "in SAPIEN add it with build=")
-        elif height == x == y == 0:
+        elif is_ground:
             self._report("note", None, text, "SAPIEN has a ground at height 0")
         else:
-            where = f"at height {height:g} m" if x == y == 0 else "which is not level"
-            remedy = (
-                "SAPIEN has a ground at height 0 instead: add the plane with build= of Runner, or"
-                " pass ground=False"
-            )
-            self._report("warning", None, f"{text}, {where}", remedy)
+            remedy = "SAPIEN has a level ground at height 0: add the plane with build="
+            self._report("warning", None, text, remedy)
 
     def _report(self, severity: str, body: int | None, text: str, remedy: str) -> None:
         link = None if body is None else self._names.bodies[body]
@@ -341,7 +360,8 @@ def _hull(model: MjModel, mesh: int) -> Float64:
     The hull's graph has the layout of ``mesh_graph`` in MuJoCo's mjmodel.h: two counts, an address
     for each vertex, and the numbers of the vertices.
     """
-    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    first = int(model.mesh_vertadr[mesh])
+    count = int(model.mesh_vertnum[mesh])
     vertices = model.mesh_vert[first : first + count].astype(np.float64)
     begin = int(model.mesh_graphadr[mesh])
     if begin >= 0:
