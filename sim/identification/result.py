@@ -339,7 +339,7 @@ def advice(problem: Problem, solution: Solution) -> str:
     weight = (1 + residual**2 / 4) ** -0.25
     weight[len(residual) - len(further) :] = 0.0
     residual = weight * residual
-    triangle = np.linalg.qr(np.column_stack([weight[:, None] * matrix, residual]), mode="r")
+    triangle: Any = np.linalg.qr(np.column_stack([weight[:, None] * matrix, residual]), mode="r")
     gains = dict[str, float]()
     column = count
     for name, new in effects.items():
