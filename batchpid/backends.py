@@ -129,14 +129,14 @@ class JAXBackend:
 
     def _compile(self, function: Any, **options: Any) -> Any:
         """Return a function of params and more, compiled as one of packed params: layout, shared,
-        own.
+        separate.
         """
 
-        def packed(layout: Any, shared: Any, own: Any, *inputs: Array, **named: Any) -> Any:
+        def packed(layout: Any, shared: Any, separate: Any, *inputs: Array, **named: Any) -> Any:
             tree, is_shared = layout
             shared = iter(shared)
-            own = iter(own)
-            leaves = [next(shared if one else own) for one in is_shared]
+            separate = iter(separate)
+            leaves = [next(shared if one else separate) for one in is_shared]
             return function(self.jax.tree.unflatten(tree, leaves), *inputs, **named)
 
         return self.jax.jit(
@@ -150,11 +150,11 @@ class JAXBackend:
         is_shared = tuple(leaf.shape[0] == 1 for leaf in leaves)
         with own_settings(self.dtype):
             shared = [np.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if one]
-            own = [
+            separate = [
                 jnp.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if not one
             ]
             stacked = np.stack(shared) if shared else np.empty((0, 1, shape[1]), params.dtype)
-            self.packed = ((tree, is_shared), jnp.asarray(stacked), own)
+            self.packed = ((tree, is_shared), jnp.asarray(stacked), separate)
         # Buffers of other params have another shape or dtype, and are of no use.
         self.dtype = self.packed[1].dtype
         self._spare = None

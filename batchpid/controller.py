@@ -14,6 +14,7 @@ from batchpid.backends import JAXBackend, NumPyBackend, declined
 from batchpid.checks.validate import (
     choice,
     env_mask,
+    flag,
     instance,
     integer,
     names,
@@ -76,15 +77,13 @@ class BatchPID:
         joint_names: Sequence[str] | None = None,
         threads: int | None = None,
     ) -> None:
+        # Sizes first: the params, the names and the engine are checked against them.
         self._backend, self._dt = choice("backend", backend, BACKENDS), time_step("dt", dt)
         self._shape = (integer("num_envs", num_envs, 1, MOST_ENVS), _checked(params).num_joints)
-        if joint_names is None:
-            self._names = None
-        else:
+        self._names: list[str] | None = None
+        if joint_names is not None:
             self._names = names("joint_names", joint_names, self.num_joints)
-        if threads is None:
-            threads = None
-        else:
+        if threads is not None:
             threads = integer("threads", threads, 1, MOST_THREADS)
         self._engine = BACKENDS[self._backend](self._dt, terms, threads)
         self._state: PIDState | None = None
@@ -157,6 +156,7 @@ class BatchPID:
             raise InvalidArgumentError(
                 "params", problem, remedy="build them with that dtype, or a new BatchPID"
             )
+        # A later write by the caller would reach compiled constants, or not.
         params = frozen(params)
         self._engine.prepare(params, self._shape)
         self._params = params
@@ -208,6 +208,7 @@ class BatchPID:
         )
         if effort is not NotImplemented:
             return effort
+        # All arguments are read before the state changes.
         r = self._array("setpoint", setpoint)
         y = self._array("measurement", measurement, exact=True)
         rest = self._optional(
@@ -234,10 +235,9 @@ class BatchPID:
             mask = np.ones(self.num_envs, bool)
         else:
             mask = env_mask("mask", mask, self.num_envs)
+        is_kept = flag("keep_integral", keep_integral)
         self._fast = declined
-        self._state = self._engine.call(
-            pid.reset, self._started(y), y, mask, keep_integral=bool(keep_integral)
-        )
+        self._state = self._engine.call(pid.reset, self._started(y), y, mask, keep_integral=is_kept)
 
     def track(
         self,
@@ -315,6 +315,7 @@ class BatchPID:
             problem = f"has shape {array.shape}, not {self._shape}"
             raise InvalidArgumentError(name, problem, remedy="give (num_envs, joints)")
         envs, joints = self._shape
+        # A view with two axes: the law takes (1 | envs, 1 | joints).
         if array.ndim <= 2 and all(
             n in (1, m) for n, m in zip(array.shape[::-1], (joints, envs), strict=False)
         ):

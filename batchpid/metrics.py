@@ -72,6 +72,7 @@ class StepMetrics(NamedTuple):
         """
 
         def reduce(figure: Float64) -> Float64:
+            # Joints may lack different envs, so each column is reduced by itself.
             columns = (column[~np.isnan(column)] for column in figure.T)
             return np.array([statistic(column) if column.size else np.nan for column in columns])
 
@@ -138,6 +139,7 @@ def step_metrics(
         raise InvalidArgumentError("measurement", problem, remedy="pass a rollout's qpos")
     number("band", band, 1e-9, 1.0, "fraction of the move")
     number("tail", tail, 1e-9, 1.0, "share of the record")
+    # Everything takes the shape of the measurement.
     r = broadcast("setpoint", setpoint, y.shape)
     floor = broadcast("absolute_band", absolute_band, y.shape[1:])
     if effort is None:
@@ -160,6 +162,7 @@ def step_metrics(
     if continuous is not None:
         y, r = _unwrap(y, r, read_array("continuous", continuous, "b"))
 
+    # Figures of a move refer to where it ends, integrals to each row's own setpoint.
     move = r[-1] - y[0]
     size = np.abs(move)
     direction = np.where(move < 0, -1.0, 1.0)

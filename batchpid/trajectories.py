@@ -60,6 +60,7 @@ class Trajectory(NamedTuple):
         InvalidArgumentError
             The tick or the shape differs.
         """
+        # The ticks are counted anew: sums of times would collect rounding.
         dt = self.time[0]
         if other.position.shape[1:] != self.position.shape[1:]:
             problem = (
@@ -80,6 +81,7 @@ class Trajectory(NamedTuple):
         """Return this trajectory with its last position held for ``duration`` [s], rounded up to
         whole ticks.
         """
+        # Rest has the last position, and no rate.
         ticks = _count(positive("duration", duration, "s"), self.time[0])
         still = np.broadcast_to(self.position[-1], (ticks, *self.position.shape[1:]))
         rest = np.zeros_like(still)
@@ -117,20 +119,21 @@ def minimum_jerk(
         Naming the argument and joint; also where neither a duration nor a finite limit is given, or
         both are.
     """
-    x0, way = _move(start, target)
+    # Each env takes the longest time that any of its joints needs.
+    x0, move = _move(start, target)
     if (duration is None) == (max_velocity is None and max_acceleration is None):
         remedy = "give duration=, or max_velocity= and max_acceleration="
         raise InvalidArgumentError("duration", "or limits are needed, and not both", remedy=remedy)
     if duration is not None:
-        total = _limits("duration", duration, way)
+        total = _limits("duration", duration, move)
     else:
         v = _limits(
-            "max_velocity", math.inf if max_velocity is None else max_velocity, way, finite=False
+            "max_velocity", math.inf if max_velocity is None else max_velocity, move, finite=False
         )
         a = _limits(
             "max_acceleration",
             math.inf if max_acceleration is None else max_acceleration,
-            way,
+            move,
             finite=False,
         )
         limited = np.isfinite(np.minimum(v, a))
@@ -141,18 +144,18 @@ def minimum_jerk(
             "and max_acceleration are both infinite",
             remedy="limit one of them",
         )
-        distance = np.abs(way)
+        distance = np.abs(move)
         needed = np.maximum(
             _PEAK_VELOCITY * distance / v, np.sqrt(_PEAK_ACCELERATION * distance / a)
         )
-        total = np.broadcast_to(needed.max(-1, keepdims=True), way.shape)
+        total = np.broadcast_to(needed.max(-1, keepdims=True), move.shape)
     time = _ticks(dt, total)
     safe = np.maximum(total, dt)  # a move within one tick is done at its end
-    tau = np.minimum(time[(...,) + (None,) * way.ndim] / safe, 1.0)
+    tau = np.minimum(time[(...,) + (None,) * move.ndim] / safe, 1.0)
     s = tau**3 * (10 + tau * (6 * tau - 15))
     rate = 30 * tau**2 * (1 - tau) ** 2 / safe
     acceleration = 60 * tau * (1 - tau) * (1 - 2 * tau) / safe**2
-    return _trajectory(time, x0, way, s, rate, acceleration, done=tau >= 1 - _ROUNDING)
+    return _trajectory(time, x0, move, s, rate, acceleration, done=tau >= 1 - _ROUNDING)
 
 
 def straight_line(start: ArrayLike, target: ArrayLike, dt: float, *, duration: float) -> Trajectory:
@@ -177,16 +180,17 @@ def straight_line(start: ArrayLike, target: ArrayLike, dt: float, *, duration: f
     first, last = (broadcast(name, x, (7,)) for name, x in (("start", start), ("target", target)))
     q0, q1 = (pose[3:] / np.linalg.norm(pose[3:]) for pose in (first, last))
     turn = compose(q1, q0 * np.array([1, -1, -1, -1]))
+    # q and -q are the same rotation; the one with w >= 0 turns less.
     turn = turn if turn[0] >= 0 else -turn
     sine = np.linalg.norm(turn[1:])
     angle = 2 * np.arctan2(sine, turn[0])
     axis = turn[1:] / max(sine, 1e-300)  # a turn by 0 needs none
-    way = np.concatenate([last[:3] - first[:3], angle * axis])
+    move = np.concatenate([last[:3] - first[:3], angle * axis])
     s = minimum_jerk([0.0], [1.0], dt, duration=duration)
     half = s.position * angle / 2
     q = compose(np.concatenate([np.cos(half), np.sin(half) * axis], 1), q0)
-    position = np.concatenate([first[:3] + s.position * way[:3], q], 1)
-    return Trajectory(s.time, position, s.velocity * way, s.acceleration * way)
+    position = np.concatenate([first[:3] + s.position * move[:3], q], 1)
+    return Trajectory(s.time, position, s.velocity * move, s.acceleration * move)
 
 
 def sine(
@@ -212,7 +216,7 @@ def sine(
     frequency
         f [Hz].
     """
-    low, way = _move(center, np.add(center, amplitude))
+    low, move = _move(center, np.add(center, amplitude))
     time = _ticks(dt, np.array(positive("duration", duration, "s")))
     growth = minimum_jerk([0.0], [1.0], dt, duration=positive("fade", fade, "s"))
     growth = growth.hold(duration)
@@ -222,8 +226,9 @@ def sine(
     cos = np.cos(w * time)
     # Products of the growth and the wave, and their derivatives.
     rows = (a * sin, rate * sin + w * a * cos, (change - w**2 * a) * sin + 2 * w * rate * cos)
-    shares = [row[(...,) + (None,) * way.ndim] for row in rows]
-    return Trajectory(time, low + shares[0] * way, shares[1] * way, shares[2] * way)
+    # One wave for all joints, scaled by the amplitude of each.
+    shares = [row[(...,) + (None,) * move.ndim] for row in rows]
+    return Trajectory(time, low + shares[0] * move, shares[1] * move, shares[2] * move)
 
 
 def trapezoidal(
@@ -233,9 +238,10 @@ def trapezoidal(
     *,
     max_velocity: ArrayLike,
     max_acceleration: ArrayLike,
-    synchronise: bool = True,
 ) -> Trajectory:
-    """Return the fastest move from rest to rest within limits of velocity and acceleration.
+    """Return the fastest straight move from rest to rest within limits of velocity and acceleration.
+
+    All joints of an env start and arrive together.
 
     Parameters
     ----------
@@ -244,21 +250,19 @@ def trapezoidal(
     max_velocity, max_acceleration
         Limits > 0, a number, (joints,) or (envs, joints) [rad/s, rad/s^2 or m/s, m/s^2]. Infinite:
         no velocity limit.
-    synchronise
-        All joints of an env start and arrive together, on a straight line; else each goes as fast
-        as it may.
     """
-    x0, way = _move(start, target)
-    v = _limits("max_velocity", max_velocity, way, finite=False)
-    a = _limits("max_acceleration", max_acceleration, way)
-    distance = np.abs(way)
+    x0, move = _move(start, target)
+    v = _limits("max_velocity", max_velocity, move, finite=False)
+    a = _limits("max_acceleration", max_acceleration, move)
+    distance = np.abs(move)
     moves = distance > _NO_WAY
-    # Limits of s itself: the joints' limits, per metre or radian of the way.
-    vs = np.divide(v, distance, out=np.full(way.shape, np.inf), where=moves)
-    as_ = np.divide(a, distance, out=np.full(way.shape, np.inf), where=moves)
-    if synchronise:
-        vs, as_ = (np.broadcast_to(limit.min(-1, keepdims=True), way.shape) for limit in (vs, as_))
-        moves = np.broadcast_to(moves.any(-1, keepdims=True), way.shape)
+    # Limits of s itself: the joints' limits, per metre or radian of the move.
+    vs = np.divide(v, distance, out=np.full(move.shape, np.inf), where=moves)
+    as_ = np.divide(a, distance, out=np.full(move.shape, np.inf), where=moves)
+    # The slowest joint sets the pace of all.
+    vs, as_ = (np.broadcast_to(limit.min(-1, keepdims=True), move.shape) for limit in (vs, as_))
+    moves = np.broadcast_to(moves.any(-1, keepdims=True), move.shape)
+    # An env that does not move gets any number, and a duration of 0.
     as_ = np.where(moves, as_, 1.0)
     peak = np.minimum(
         np.where(moves, vs, 1.0), np.sqrt(as_)
@@ -266,7 +270,7 @@ def trapezoidal(
     ramp = peak / as_
     total = np.where(moves, 1 / peak + ramp, 0.0)
     time = _ticks(dt, total)
-    t = np.minimum(time[(...,) + (None,) * way.ndim], total)
+    t = np.minimum(time[(...,) + (None,) * move.ndim], total)
     left = total - t
     s = np.where(
         t < ramp,
@@ -275,28 +279,28 @@ def trapezoidal(
     )
     rate = np.minimum(np.minimum(as_ * t, as_ * left), peak)
     acceleration = np.where(t < ramp, as_, np.where(left < ramp, -as_, 0.0))
-    return _trajectory(time, x0, way, s, rate, acceleration, done=left <= _ROUNDING * total)
+    return _trajectory(time, x0, move, s, rate, acceleration, done=left <= _ROUNDING * total)
 
 
 def _trajectory(
     time: Float64,
     x0: Float64,
-    way: Float64,
+    move: Float64,
     s: Float64,
     rate: Float64,
     acceleration: Float64,
     done: Any,
 ) -> Trajectory:
-    """Return x0 + way s and its derivatives; exactly the target, at rest, where the move is
+    """Return x0 + move s and its derivatives; exactly the target, at rest, where the move is
     done.
     """
-    position = np.where(done, x0 + way, x0 + way * s)
-    velocity = np.where(done, 0.0, way * rate)
-    return Trajectory(time, position, velocity, np.where(done, 0.0, way * acceleration))
+    position = np.where(done, x0 + move, x0 + move * s)
+    velocity = np.where(done, 0.0, move * rate)
+    return Trajectory(time, position, velocity, np.where(done, 0.0, move * acceleration))
 
 
 def _move(start: ArrayLike, target: ArrayLike) -> tuple[Float64, Float64]:
-    """Return the start and the way (..., joints) of a move."""
+    """Return the start and the move (..., joints) of a move."""
     shapes = [
         read_array(name, value).shape for name, value in (("start", start), ("target", target))
     ]
@@ -316,10 +320,10 @@ def _move(start: ArrayLike, target: ArrayLike) -> tuple[Float64, Float64]:
 
 
 def _limits(
-    name: str, value: ArrayLike, way: Float64, finite: bool = True, low: float = 0.0
+    name: str, value: ArrayLike, move: Float64, finite: bool = True, low: float = 0.0
 ) -> Float64:
-    """Return ``value`` > ``low``, shaped as ``way``."""
-    return at_least(name, broadcast(name, value, way.shape), low, above=True, infinite=not finite)
+    """Return ``value`` > ``low``, shaped as ``move``."""
+    return at_least(name, broadcast(name, value, move.shape), low, above=True, infinite=not finite)
 
 
 def _ticks(dt: float, total: Float64) -> Float64:

@@ -1,23 +1,15 @@
-"""Cost of the effects of motors and sensors: of all together, and of those that are off, for the 16
-envs of a group.
-"""
+"""Cost of all the effects of motors and sensors together, for the 16 envs of a group."""
 
 from __future__ import annotations
 
-import statistics
-import time
-from contextlib import ExitStack
-
 import numpy as np
 import pytest
-from workload import Workload
 
 import batchpid as bp
 from batchpid.motors import advance_effort, advance_measurement, command_limits, discretise
-from batchpid.sim import Robot
 from batchpid.sim.loop.model_functions import NoiseBlocks
 
-ENVS, JOINTS, STEPS, TICKS = 16, 9, 512, 10
+ENVS, JOINTS, STEPS = 16, 9, 512
 EFFECTS = {
     "command_delay": 0.005,
     "sensor_delay": 0.003,
@@ -33,48 +25,6 @@ EFFECTS = {
     "position_noise": 1e-5,
     "velocity_noise": 1e-3,
 }
-
-
-CASES = {
-    "all off": {},
-    "armature": {"armature": 1e-4},
-    "strength": {"strength": 0.95},
-    "effort limit": {"effort_limit": 60.0},
-}
-"""Options of actuators whose runners are compared with one of ideal ones."""
-
-
-def speeds_over_ideal(physics, most, rounds):
-    """Return the speed of each case relative to actuators=None: the median of rounds in which all
-    take turns.
-
-    Processor time of this process, in which the robots are: another program disturbs it less.
-    """
-    num_envs, rounds = min(ENVS, most.envs), min(rounds, most.rounds)
-    workload = Workload(Robot.load("panda"), num_envs, workers=0, physics=physics, ticks=TICKS)
-    setpoints = np.broadcast_to(workload.target, (workload.ticks, num_envs, len(workload.target)))
-    rng, seconds = np.random.default_rng(0), []
-    with ExitStack() as stack:
-        chosen = {name: bp.make_actuators(JOINTS, **options) for name, options in CASES.items()}
-        runners = {
-            name: stack.enter_context(workload.runner(actuators=each))
-            for name, each in {"ideal": None, **chosen}.items()
-        }
-        for _ in range(rounds + 1):
-            took = {}
-            for name in rng.permutation(list(runners)):
-                runners[name].reset(workload.start)
-                began = time.process_time()
-                qpos = runners[name].rollout(setpoints).qpos[-1]
-                took[name] = time.process_time() - began
-                assert np.abs(qpos - workload.start)[:, workload.moving].max(1).min() > 0.02, (
-                    "the robots did not move"
-                )
-            seconds.append(took)
-    return {
-        name: statistics.median(took["ideal"] / took[name] for took in seconds[1:])
-        for name in CASES
-    }
 
 
 @pytest.mark.benchmark(group="actuators")

@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import pytest
 from measure import BY_TICKS, OURS, PYTHON, measure_rates
-from test_actuator_cost import speeds_over_ideal
-from test_few_robots import COUNTS, few_robots
+from shared_ratios import COUNTS, few_robots, speeds_over_ideal
 from workload import Workload
 
 from batchpid.sim import Robot

@@ -1,56 +1,11 @@
 """Few robots in the caller's process, compared with the tutorial's loop: time of an env step,
 measured in turn.
-
-Processor time: another program disturbs it less.
 """
 
 import statistics
-import time
 
-import numpy as np
 import pytest
-from tutorial import TutorialLoop
-from workload import Workload
-
-from batchpid.sim import Robot
-
-TICKS, ROUNDS = 50, 3
-COUNTS = (1, 4, 16)
-
-
-def few_robots(name, num_envs, physics, most, rounds=ROUNDS):
-    """Return the seconds per env step of our loop and of the tutorial's in each round (rounds,
-    2).
-    """
-    num_envs, ticks, rounds = (
-        min(num_envs, most.envs),
-        min(TICKS, most.ticks),
-        min(rounds, most.rounds),
-    )
-    workload = Workload(Robot.load(name), num_envs, workers=0, physics=physics, ticks=ticks)
-    tutorial = TutorialLoop(workload.robot, workload.target, start=workload.start)
-    setpoints = np.broadcast_to(workload.target, (ticks, *workload.target.shape))
-    seconds = []
-    with workload.runner() as runner:
-        for _ in range(rounds + 1):
-            tutorial.reset()
-            runner.reset(workload.start)
-            began = time.process_time()
-            qpos = runner.rollout(setpoints).qpos[-1]
-            between = time.process_time()
-            final = tutorial.run(workload.steps)
-            ended = time.process_time()
-            seconds.append(
-                (
-                    (between - began) / (workload.steps * num_envs),
-                    (ended - between) / workload.steps,
-                )
-            )
-    for place in (*qpos, final):
-        assert np.abs(place - workload.start)[workload.moving].max() > 0.05, (
-            "the robots did not move"
-        )
-    return seconds[1:]
+from shared_ratios import COUNTS, few_robots
 
 
 @pytest.mark.parametrize("num_envs", COUNTS)

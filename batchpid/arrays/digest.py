@@ -39,6 +39,7 @@ def digest(*values: Array) -> str:
 
 
 def _digest(value: Any, where: str) -> bytes:
+    # Exact types: a bool is an int, and must not have the digest of 1.
     kind = type(value)
     if value is None or kind in (bool, int, complex):
         return _of_bytes(kind.__name__, repr(value).encode())
@@ -63,6 +64,7 @@ def _digest(value: Any, where: str) -> bytes:
     if kind in (set, frozenset):
         return _of_parts("set", sorted(_digest(part, where) for part in value))
     if isinstance(value, Mapping):
+        # Sorted by digest, since keys of different types have no order.
         pairs = [
             (_digest(key, where), _digest(part, f"{where}[{key!r}]")) for key, part in value.items()
         ]

@@ -119,6 +119,7 @@ def plain(name: str, kind: Kind, value: Any) -> Any:
     bounds = next((one for one in metadata if isinstance(one, Field)), Field(low=-math.inf))
     if get_origin(kind) is Literal:
         return choice(name, value, get_args(kind))
+    # None is allowed where the type says so; a union of more is checked elsewhere.
     if NoneType in get_args(kind):
         kinds = [one for one in get_args(kind) if one is not NoneType]
         if value is None or len(kinds) > 1:

@@ -47,6 +47,7 @@ def own_settings(dtype: DType = None) -> Iterator[None]:
     """
     import jax
 
+    # Only settings that differ are entered.
     config: Any = jax.config
     others = []
     for name, values in NEEDED.items():

@@ -139,6 +139,7 @@ def with_fields(
     defaults = {name: field.default for name, field in fields.items()} | choices
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        # The declared fields take the place of **options.
         declared_signature = inspect.signature(function)
         shown = [
             one for one in declared_signature.parameters.values() if one.kind is not one.VAR_KEYWORD
@@ -203,6 +204,7 @@ class LeafBuilder:
         """
         if value is None:
             return None
+        # A number beyond float32 becomes infinite, and is judged by the bounds.
         with np.errstate(over="ignore"):
             array = read_array(name, value, traced=True).astype(self.dtype)
         return field.checked(name, self.rows(name, array), self.names)
@@ -224,6 +226,7 @@ class LeafBuilder:
 
         ``size``, ``low`` and ``high`` name the options of both ends, the lower and the upper one.
         """
+        # Either the size or its ends: the check of both together follows.
         end = Field(neutral=math.inf, low=-math.inf)
         fields = {size: end._replace(low=0.0), low: end, high: end}
         read = {name: self.array(name, values.get(name), field) for name, field in fields.items()}
@@ -248,6 +251,7 @@ class LeafBuilder:
 
     def rows(self, name: str, array: Array) -> Array:
         """Return a scalar, (joints,) or (envs, joints) as (1 | envs, joints)."""
+        # The first option with several envs sets their number for the others.
         expected = f"(), ({self.joints},) or (envs, {self.joints})"
         rows = array[None] if array.ndim == 1 else array
         fits = array.ndim == 0 or rows.shape[1:] in ((1,), (self.joints,))
@@ -291,6 +295,7 @@ def frozen(record: R) -> R:
     Writeable arrays and views are copied. If all arrays are read-only, ``record`` itself is
     returned.
     """
+    # Most records are frozen already, and cost one look.
     exposed = [leaf for leaf in record if isinstance(leaf, np.ndarray) and _can_be_written(leaf)]
     if not exposed:
         return record

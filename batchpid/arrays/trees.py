@@ -66,6 +66,7 @@ def flatten(
         return {}
     if not isinstance(tree, Mapping | tuple | list):
         return {name or "state": read(tree)}
+    # Keys on the way become the name.
     named: Document = {}
     for key, part in parts(tree).items():
         named |= flatten(part, separator, read, f"{name}{separator}{key}" if name else key)

@@ -121,6 +121,7 @@ def instance(argument: str, value: object, kind: type[T], remedy: str) -> T:
 
 def names(argument: str, value: Any, count: int | None = None) -> list[str]:
     """Return ``value`` as a list of different names, ``count`` of them if given."""
+    # A string is a sequence of names, too, and never meant.
     sequence = isinstance(value, Sequence) and not isinstance(value, str)
     if not sequence or not all(isinstance(name, str) for name in value):
         raise InvalidArgumentError(
@@ -146,6 +147,7 @@ def file_path(argument: str, value: object, suffixes: Collection[str] = ()) -> P
         raise InvalidArgumentError(
             argument, "must be a path", value=value, remedy="pass the file's name"
         )
+    # Whether the file is there is for the operating system to say.
     path = Path(value)
     if suffixes and path.suffix.lower() not in suffixes:
         raise InvalidArgumentError(
@@ -244,11 +246,11 @@ def array(
         raise InvalidArgumentError(
             argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy
         )
-    given = result.reshape(-1)
+    flat = result.reshape(-1)
     if not is_read or result.shape != shape:
         result = _broadcast(argument, result, shape, remedy)
     # The sum of squares costs a third, and is finite for most; BLAS uses threads for a longer one.
-    is_sound = given.size < 10_000 and math.isfinite(given.dot(given))
+    is_sound = flat.size < 10_000 and math.isfinite(flat.dot(flat))
     if finite and not is_sound and not (good := np.isfinite(result)).all():
         entries(
             argument, result, good, "is not finite", names, kind=kind, remedy="pass finite numbers"
@@ -274,6 +276,7 @@ def entries(
     """
     if np.all(good):
         return
+    # The first bad entry is enough to find the cause.
     index = tuple(int(n) for n in np.argwhere(~np.asarray(good))[0])
     place = index[-1] if index else None
     value = values[index]

@@ -159,6 +159,7 @@ class Header:
 
     def text(self) -> str:
         """Return the header."""
+        # The step is traced once, with placeholders for everything that is not a constant.
         constants = discretise(self.params, self.dt), self.guard or Guard()
         trees = constants, self.state, (...,) * len(self.inputs)
         traced = trace_trees(self._step, *map(structure, trees), dtype=self.params.dtype)
@@ -199,6 +200,7 @@ class Header:
         named = dict(zip(self.inputs, inputs, strict=True))
         setpoint = named["setpoint"]
         rate = named.get("setpoint_rate")
+        # The guard comes before the law, as in a Runner.
         if held is not None:
             held, changed = guard_model.advance(limits, held, setpoint, self.dt)
             setpoint = held.setpoint
@@ -251,6 +253,7 @@ class Header:
         fields = "".join(f"  {t} {name}[{n}];\n" for name in state) or "  char unused;\n"
         every = self._started(state)
         lasting = self._started({name: leaf for name, leaf in state.items() if name != "integral"})
+        # An input without effect would be a warning of the compiler.
         unused = "".join(
             f"  (void){name};\n"
             for name in ("state", *self.inputs)
@@ -318,6 +321,7 @@ class {p}_controller {{
         unused = "  (void)state;\n  (void)measurement;\n"
         lines = []
         for name, leaf in leaves.items():
+            # NaN marks what starts at the measurement; equal numbers need no table.
             numbers = [
                 "measurement[j]" if math.isnan(number) else self.names.number(number)
                 for number in leaf[0].tolist()

@@ -122,6 +122,7 @@ def statements(
             return names[value]
         return f"t{value}[j]"
 
+    # Loops are as long as they can be: a joint's values then stay in registers.
     in_loop = False
     for name, out, operands in operations:
         texts = [text(operand) for operand in operands]
@@ -190,6 +191,7 @@ def helpers(c: Dialect, body: str) -> Iterator[str]:
     p = c.prefix
     t = c.type
     n = c.size
+    # Only what is called is written, or a compiler would warn of unused functions.
     across = f"{p}_row_minimum(" in body
     for name, sign in (("max", ">"), ("min", "<")):
         if f"{p}_{name}(" in body or (across and name == "min"):

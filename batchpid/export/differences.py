@@ -59,6 +59,7 @@ class Differences(list[str]):
 
     def _explicit(self, params: PIDParams) -> PIDParams:
         """Return the params of the explicit law at this time step."""
+        # No target has the implicit law, but all can have its gains at one time step.
         explicit = as_explicit(params, self.dt)
         if explicit is not params:
             share = explicit.kp[0] / np.where(params.kp[0] > 0, params.kp[0], np.inf)
@@ -82,6 +83,7 @@ class Differences(list[str]):
             problem = "is missing for gains per mass_matrix"
             remedy = "pass inertia=, the diagonal of the mass matrix, or gains in effort units"
             raise InvalidArgumentError("inertia", problem, remedy=remedy)
+        # The gains fit the first pose; the others show how far they are off elsewhere.
         ratio = poses / poses[0]
         text = f"gains per mass_matrix are efforts at one inertia: {self.listed(poses[0])} kg m^2"
         text += " or kg"

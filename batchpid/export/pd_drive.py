@@ -72,6 +72,7 @@ class Drive(Differences):
 
         The target passes the limit by up to one step, except at the joints of the mask ``clamps``.
         """
+        # A joint without ki has no integral that could differ.
         integrates = self.value("ki") > 0
         limits = self.integral_limit
         low, high = self.ends("integral")
@@ -88,6 +89,7 @@ class Drive(Differences):
             self.add(option, text, integrates & where, limits, "N m or N")
 
     def _compare(self) -> None:
+        # Options of the derivative matter where there is one, and come last.
         params = self.params
         low, high = self.ends("integral")
         excluded = ((low > 0) | (high < 0)) & (params.ki is not None)

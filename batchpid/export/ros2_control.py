@@ -76,6 +76,7 @@ def to_ros2_control(
     """
     law = Differences(params, joint_names, dt, inertia)
     gains = {joint: _gains(law, at) for at, joint in enumerate(law.joints)}
+    # The manager counts in whole hertz; a difference is reported below.
     rate = round(1 / law.dt)
     is_narrow = params.dtype != np.float64
     text = f"the target computes in float64, these params are {params.dtype}"
@@ -114,6 +115,7 @@ def _gains(law: Differences, at: int) -> Document:
         raise InvalidArgumentError(
             "effort_min", problem, joint=law.joints[at], value=value, remedy="widen the limits"
         )
+    # control_toolbox refuses limits that exclude 0.
     gains["i_clamp_min"] = min(gains["i_clamp_min"], 0.0)
     gains["i_clamp_max"] = max(gains["i_clamp_max"], 0.0)
     strategy = strategies(params)[at]
@@ -136,6 +138,7 @@ def _gains(law: Differences, at: int) -> Document:
 
 def _compare(law: Differences) -> None:
     """Add the differences between the law and control_toolbox's, but for anti-windup."""
+    # A joint without kd does not show how its derivative is taken.
     acts = law.value("kd") > 0
     text = "u_clamp limits the PID alone, not its sum with a feedforward such as gravity"
     law.add("effort_limit", f"{text} compensation", law.limited)

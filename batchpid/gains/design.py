@@ -91,6 +91,7 @@ def pid_from_inertia(
     damping
         Viscous damping of the joints (joints,) [N m s/rad or N s/m].
     """
+    # Gains of three equal poles, with the joint's own damping as a part of kd.
     w = 2 * np.pi * np.asarray(bandwidth_hz, np.float64)
     load = np.asarray(damping, np.float64)
     # A joint whose own damping exceeds zeta needs the stiffness of a heavier one to be as fast.
@@ -174,6 +175,7 @@ def design_gains(
         raise InvalidArgumentError(
             "load", f"has no effect with gain_units {gain_units!r}", remedy=remedy
         )
+    # A leader carries its followers, so gains are designed for the reduced inertias.
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
     coupling = getattr(robot, "coupling", Coupling.of(mass.shape[-1]))
     mass = coupling.reduced(mass)
@@ -206,6 +208,7 @@ def design_gains(
         "gain_units": gain_units,
         "discretization": discretization,
     }
+    # A limit that the caller names replaces the robot's.
     limit = getattr(robot, "design_effort_limit", None)
     if limit is not None and not {"effort_limit", "effort_min", "effort_max"} & set(options):
         designed["effort_limit"] = limit
@@ -247,6 +250,7 @@ def _filter_time(
         high *= 2
         if high > 1e3:
             return math.inf
+    # Bisection in the logarithm: 40 halvings exceed the precision of a float.
     for _ in range(40):
         middle = math.sqrt(low * high)
         if ratios(middle).max() > margin:

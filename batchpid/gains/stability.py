@@ -128,10 +128,9 @@ def stability_bound(
         lag=lag,
     )
     if model is not None or late.any() or slow.any():
-        one = np.eye(m.shape[-1])
-        unit = broadcast(
-            "model", one if model is None else model, m.shape, "give it the shape of mass_matrix"
-        )
+        matrix = np.eye(m.shape[-1]) if model is None else model
+        unit = broadcast("model", matrix, m.shape, "give it the shape of mass_matrix")
+        at_least("model", unit, -np.inf)
         return _late_bound(m, unit, [p, c, tau, b, late, slow], dt)
     passed = dt / (dt + 2 * tau)
     weight = np.sqrt(passed * dt * c + 0.5 * dt**2 * p)

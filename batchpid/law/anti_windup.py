@@ -34,12 +34,14 @@ def masks(build: LeafBuilder, names: str | Sequence[object]) -> list[Bool | None
     good = np.array([isinstance(name, str) and name in ANTI_WINDUP for name in array.flat], bool)
     good = good.reshape(array.shape)
     entries("anti_windup", array, good, "unknown option", build.names, remedy=remedy)
+    # "none" needs no mask: it is where the others are not.
     joints = [array == strategy for strategy in ANTI_WINDUP[1:]]
     return [mask if mask.any() else None for mask in joints]
 
 
 def named(joints: int, tracking_time: Array, conditional: Array | NamedChoice | None) -> Rows:
     """Return the strategies (1 | envs, joints) by name, from the leaves of params."""
+    # A joint has one strategy, so later marks cannot meet earlier ones.
     names: Rows = np.full((1, joints), "none", dtype=object)
     if tracking_time is not None:
         names = np.where(np.isfinite(tracking_time), "back_calculation", names)
@@ -91,6 +93,7 @@ def _rule_of_thumb(kp: Array, ki: Array, kd: Array) -> Array:
     if ki is None:
         return xp.full_like(kp, math.inf)
     kp, ki, kd = xp.broadcast_arrays(kp, ki, xp.zeros_like(kp) if kd is None else kd)
+    # Where ki is 0 the quotient is not used, but must be finite.
     safe = xp.where(ki > 0, ki, 1.0)
     # The inner where keeps the gradient of the square root finite where kd is 0.
     times = xp.where(kd > 0, xp.sqrt(xp.where(kd > 0, kd, 1.0) / safe), kp / safe)

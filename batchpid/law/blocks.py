@@ -44,6 +44,7 @@ def advance_in_blocks(
         return state, terms.effort
     if out is None:
         out = (jax.tree.map(jnp.zeros_like, state), jnp.zeros_like(measurement))
+    # All arrays are flat from here on; shared rows fill a block.
     block = rows * joints
     total = envs * joints
 

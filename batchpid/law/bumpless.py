@@ -78,15 +78,12 @@ def track(
     # The law solved for its integral: I = u - P - D - feedforward, with the derivative filter
     # settled on its input.
     integral = effort - proportional(k, error, measurement, origin)
-    if k.kd is None:
-        integral = integral
-    else:
+    if k.kd is not None:
         integral = integral - k.kd * rate
-    if feedforward is None:
-        integral = integral
-    else:
+    if feedforward is not None:
         integral = integral - feedforward
     return PIDState(
+        # What the next step compares with is set as if this sample had been the last.
         integral=clip(integral, k.integral_min, k.integral_max, xp),
         measurement=None if state.measurement is None else measurement.copy(),
         derivative=None if state.derivative is None else rate,

@@ -69,6 +69,7 @@ def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coe
     of another type, and unless dt is positive and finite; an array of JAX is not checked.
     """
     dt = checked_dt(dt, instance("params", params, PIDParams, "build them with make_params").dtype)
+    # The implicit law is the explicit one with other gains; what it adds is kept beside them.
     c = params.setpoint_weight_derivative
     c_given = None
     share = None
@@ -79,6 +80,7 @@ def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coe
     tau = params.derivative_filter_time
     tracking = params.tracking_time
     same = {name: leaf for name, leaf in params._asdict().items() if name in Coefficients._fields}
+    # Leaves that time does not scale keep their names.
     k = Coefficients(
         **same,
         ki_dt=None if params.ki is None else params.ki * dt,
@@ -105,6 +107,7 @@ def spread(k: Coefficients, num_envs: int) -> Coefficients:
     """Return ``k`` with arrays of shape (num_envs, joints): NumPy then steps small batches twice as
     fast.
     """
+    # Masks and options that are off have no rows.
     xp = namespace(*k)
     dtype = k.kp.dtype
     zeros = xp.zeros((num_envs, k.kp.shape[-1]), dtype)

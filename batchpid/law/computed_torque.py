@@ -75,9 +75,7 @@ def advance_with_mass_matrix(
     p, i, d, arguments = (
         x if isinstance(x, float) else matrix_vector(mass_matrix, x) for x in terms[:4]
     )
-    if feedforward is None:
-        arguments = arguments
-    else:
+    if feedforward is not None:
         arguments = arguments + feedforward
     return new, Terms(p, i, d, arguments, unsaturated, effort)
 
@@ -147,16 +145,16 @@ def _to_effort(
     xp = namespace(*k, a, mass_matrix)
     low = k.effort_min
     high = k.effort_max
-    wanted = matrix_vector(mass_matrix, a)
+    demand = matrix_vector(mass_matrix, a)
     passive = 0.0 if feedforward is None else feedforward
-    effort = unsaturated = wanted + passive
+    effort = unsaturated = demand + passive
     stops = k.ki_dt is not None and k.conditional is not None
     change = new.integral - old.integral if stops else None
     deeper = None
     if low is not None or high is not None:
         # The acceleration is scaled as a whole, so that its direction stays.
-        share = _share(wanted, passive, low, high, xp)
-        effort = clip(share * wanted + passive, low, high, xp)
+        share = _share(demand, passive, low, high, xp)
+        effort = clip(share * demand + passive, low, high, xp)
         if change is None:
             deeper = None
         else:
@@ -190,11 +188,11 @@ def _towards(effort: Array, last: Array, step: Any, xp: ArrayModule) -> Array:
     return clip(xp.where(part < 1, last + part * change, effort), last - step, last + step, xp)
 
 
-def _share(wanted: Array, passive: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
-    """Return s (envs, 1): the share of ``wanted`` that fits between ``passive`` and the limits."""
+def _share(demand: Array, passive: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
+    """Return s (envs, 1): the share of ``demand`` that fits between ``passive`` and the limits."""
     above = xp.inf if high is None else high - passive
     below = xp.inf if low is None else passive - low
-    room = xp.where(wanted > 0, above, below)
-    size = xp.abs(wanted)
+    room = xp.where(demand > 0, above, below)
+    size = xp.abs(demand)
     limited = (size > room) & (room > 0)
     return row_minimum(xp.where(limited, room / xp.where(limited, size, 1.0), 1.0))

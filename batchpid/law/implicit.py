@@ -80,12 +80,14 @@ def implicit_gains(params: PIDParams, dt: Array) -> ImplicitGains:
     c = params.setpoint_weight_derivative
     xp = namespace(kp, ki, kd, b, c, dt)
     ki_dt = 0.0 if ki is None else ki * dt
+    # The symbols of the equations above: numerators first, then 1 / D.
     stiffness = kp + 2 * ki_dt
     damping = kd + dt * (kp + ki_dt)
     per_step = 1 / (1 + dt * damping)
     on_rate = kd if c is None else c * kd
 
     def share(part: Array, whole: Array, otherwise: Array) -> Array:
+        # A joint without gain has no share; the inner where keeps gradients finite.
         has = whole > 0
         return xp.where(has, part / xp.where(has, whole, 1), otherwise)
 

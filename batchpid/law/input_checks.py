@@ -45,14 +45,15 @@ def checked_inputs(
     arrays |= {
         name: None if value is None else _as_array(name, value) for name, value in inputs.items()
     }
+    # Shapes are compared as sets: one look suffices where all are (envs, joints).
     of_params = {leaf.shape for leaf in params if leaf is not None and not isinstance(leaf, tuple)}
-    known = {"state": [leaf.shape for leaf in state if leaf is not None]}
-    known |= {name: [array.shape] for name, array in arrays.items() if array is not None}
-    (whole,) = known["measurement"]
+    shapes = {"state": [leaf.shape for leaf in state if leaf is not None]}
+    shapes |= {name: [array.shape] for name, array in arrays.items() if array is not None}
+    (whole,) = shapes["measurement"]
     joints = params.num_joints
     usual = {whole, (1, joints)}  # a look saves most of the time
-    if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*known.values())):
-        _check_shapes(np.broadcast_shapes(*of_params), joints, known)
+    if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*shapes.values())):
+        _check_shapes(np.broadcast_shapes(*of_params), joints, shapes)
     return in_dtype_of(params, *arrays.values())
 
 
@@ -171,6 +172,7 @@ def checked_dt(dt: Array, dtype: DType) -> Array:
 
     A number of NumPy would give its own dtype to the efforts. Values of JAX's arrays are not read.
     """
+    # One step for each env is checked entry by entry.
     if isinstance(dt, np.ndarray) and dt.ndim:
         if dt.dtype.kind not in "iuf" or not ((dt > 0) & (dt < np.inf)).all():
             raise InvalidArgumentError(

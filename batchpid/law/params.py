@@ -111,6 +111,7 @@ class PIDParams(Record, _ParamsFields):
     def replace(self, **options: object) -> PIDParams:
         """Return params with some options of :func:`make_params` changed, checked as there."""
         present = self.options()
+        # A limit that is given replaces both ends that stand.
         for end in ("effort", "integral"):
             if f"{end}_limit" in options:
                 present.pop(f"{end}_min", None)
@@ -227,6 +228,7 @@ def make_params(
     InvalidArgumentError
         Naming the option, joint, env and value.
     """
+    # The dtype may come from any option that is traced, so all are looked at.
     options |= {"kp": kp, "ki": ki, "kd": kd}
     options |= {"effort_limit": effort_limit, "integral_limit": integral_limit}
     build = LeafBuilder(joints, joint_names, dtype, options.values())

@@ -61,6 +61,7 @@ def init(params: PIDParams, measurement: Array) -> PIDState:
 
     Raises InvalidArgumentError if the measurement has another number of joints than the params.
     """
+    # A state holds what the options need, and nothing else.
     (measurement,) = checked_inputs(params, PIDState(), measurement)
     xp = namespace(*params, measurement)
     y = xp.zeros_like(measurement) + measurement
@@ -195,9 +196,7 @@ def advance(
     if k.non_finite is not None:
         finite = xp.isfinite(r) & xp.isfinite(y)
         for optional in (r_rate, y_rate, ff):
-            if optional is None:
-                finite = finite
-            else:
+            if optional is not None:
                 finite = finite & xp.isfinite(optional)
         r, y, r_rate, y_rate, ff = (
             None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff)
@@ -299,6 +298,7 @@ def reset(
     """
     (measurement,) = checked_inputs(params, state, measurement)
     mask = checked_mask(mask, state)
+    # Every env is started, and those of the mask are taken.
     fresh = init(params, measurement)
     if keep_integral:
         fresh = fresh._replace(integral=state.integral)
@@ -386,6 +386,7 @@ def advance_drive(
     """
     state, terms = advance(k, state, setpoint, measurement, **inputs)
     xp = namespace(*k, terms.i, setpoint)
+    # I / kp moves the target; a joint without kp has nothing to move it by.
     driven = k.kp > 0
     target = nearest_turn(setpoint, measurement, k.turns, xp)
     return state, target + xp.where(driven, terms.filled().i, 0) / xp.where(driven, k.kp, 1)

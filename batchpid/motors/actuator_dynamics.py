@@ -123,6 +123,7 @@ def init(
     position = zeros + qpos
     velocity = zeros if qvel is None else zeros + qvel
     requested = zeros if effort is None else zeros + effort
+    # What no effect needs is None, and costs nothing.
     command = sensor = encoder = key = step = None
     # Histories are as long as the longest delay may become, so that delays can grow in flight.
     if actuators.max_delay is not None:
@@ -164,6 +165,7 @@ def discretise(
     xp = namespace(*actuators)
     position = velocity = None
     if a.sensor_delay is not None:
+        # One history for both: positions side by side with velocities.
         begins = 0, a.sensor_delay.shape[1]
         position, velocity = (
             delay.discretise(a.sensor_delay, dt, state.sensor, begin) for begin in begins
@@ -197,6 +199,7 @@ def discretise(
             return leaf
         return xp.broadcast_to(leaf, (*leaf.shape[:-2], num_envs, leaf.shape[-1])).copy()
 
+    # The envelopes are tuples of their own.
     flat = {name: spread(leaf) for name, leaf in k._asdict().items() if not isinstance(leaf, tuple)}
     ends, commands = (Envelope(*map(spread, item)) for item in (k.envelope, k.commands))
     return k._replace(**flat, envelope=ends, commands=commands)
@@ -230,9 +233,7 @@ def measure(
 
 def _motor(k: MotorCoefficients, effort: Array) -> Array:
     """Return s u + b."""
-    if k.strength is None:
-        effort = effort
-    else:
+    if k.strength is not None:
         effort = k.strength * effort
     if k.bias is None:
         return effort
@@ -246,6 +247,7 @@ def _delivered(
     before, None without.
     """
     xp = namespace(effort, qpos, qvel)
+    # The lag is within the envelope, too: it cannot deliver what the motor does not have.
     low, high = limits(k.envelope, qvel)
     motor = clip(_motor(k, effort), low, high, xp)
     if k.intake is not None:
@@ -269,6 +271,7 @@ def _play(k: MotorCoefficients, encoder: Array, qpos: Array, qvel: Array) -> tup
     before.
     """
     xp = namespace(qpos, qvel)
+    # The encoder moves once the play is used up, and not before.
     behind = wrap(encoder - qpos, k.turns, xp)
     offset = clip(behind, -k.play, k.play, xp)
     return qpos + offset, qvel * (offset != behind).astype(qvel.dtype)
@@ -282,12 +285,11 @@ def _encode(
     ``position`` and ``velocity`` are the noise, or None.
     """
     xp = namespace(qpos, qvel)
-    if k.position_offset is None:
-        qpos = qpos
-    else:
+    if k.position_offset is not None:
         qpos = qpos + k.position_offset
     qpos = qpos if position is None else qpos + position
     qvel = qvel if velocity is None else qvel + velocity
+    # Resolution comes last: noise and offset are rounded, as in an encoder.
     if k.position_resolution is not None:
         qpos = xp.rint(qpos / k.position_resolution) * k.position_resolution
     if k.velocity_resolution is not None:

@@ -83,13 +83,15 @@ class ArrayProgram:
         self.shape = shape
         self.dtype = np.dtype(dtype)
         self.masks = trace.masks
-        given = [np.ascontiguousarray(entry, dtype) for entry in (*constants, *trace.literals)]
+        prepared = [np.ascontiguousarray(entry, dtype) for entry in (*constants, *trace.literals)]
         if trace.prelude is not None:
-            rows = max((entry.shape[0] for entry in given if entry.ndim == 2), default=1)
-            result = ArrayProgram(trace.prelude, (), len(given), (rows, shape[1]), dtype)(*given)
-            given += [entry.astype(dtype) for entry in result]
+            rows = max((entry.shape[0] for entry in prepared if entry.ndim == 2), default=1)
+            result = ArrayProgram(trace.prelude, (), len(prepared), (rows, shape[1]), dtype)(
+                *prepared
+            )
+            prepared += [entry.astype(dtype) for entry in result]
         tables = trace.operations, trace.results, trace.registers
-        self.arguments = (*tables, inputs, tuple(given), *shape, self.dtype == np.float32)
+        self.arguments = (*tables, inputs, tuple(prepared), *shape, self.dtype == np.float32)
         """Arguments of ``make_program`` in make_program.h."""
         self._program = interpreter().program(*self.arguments)
         self._run = interpreter().run

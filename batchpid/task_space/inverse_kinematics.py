@@ -118,6 +118,7 @@ def inverse_kinematics(
         An argument has a wrong shape or range, a quaternion is not of unit length, or, with
         "raise", a pose was not reached.
     """
+    # Every argument is checked before the first search.
     index = instance("tree", tree, RigidTree, MAKE_TREE).index(link)
     choice("on_failure", on_failure, ON_FAILURE)
     integer("starts", starts, 1, 10_000)
@@ -129,6 +130,7 @@ def inverse_kinematics(
     if point is not None:
         point = array("point", read_point(goal[0], point), (3,), "xyz", kind="entry")
     search = _Search(tree, index, point, np.array([position, rotation]), iterations)
+    # The draws are shares of the range, the same for every env, whatever the others do.
     shares = np.random.default_rng(seed).uniform(size=(starts - 1, tree.dof))
     number = np.zeros(len(goal), np.intp)
     with quiet():
@@ -192,13 +194,13 @@ class _Search(NamedTuple):
         """Position limits of the joints (dof,)."""
         return np.asarray(self.tree.lower), np.asarray(self.tree.upper)
 
-    def size(self, found: _Found) -> Float64:
+    def size(self, nearest: _Found) -> Float64:
         """Return the larger of position and rotation error over its tolerance (n,)."""
-        return (found.errors / self.tolerance).max(-1)
+        return (nearest.errors / self.tolerance).max(-1)
 
-    def reached(self, found: _Found) -> Bool:
+    def reached(self, nearest: _Found) -> Bool:
         """Return the rows (n,) with both errors within the tolerances."""
-        within: Bool = found.errors <= self.tolerance
+        within: Bool = nearest.errors <= self.tolerance
         return within[:, 0] & within[:, 1]
 
     def drawn(self, rows: Float64, share: Float64) -> Float64:
@@ -208,6 +210,7 @@ class _Search(NamedTuple):
         low, high = self.limits
         low = np.where(np.isfinite(low), low, rows - np.pi)
         high = np.where(np.isfinite(high), high, rows + np.pi)
+        # Joints outside of the chain stay where they are.
         chain = self.tree.chain(self.tree.links[self.link])
         return self.tree.positions(np.where(chain, low + share * (high - low), rows))
 
@@ -221,17 +224,17 @@ class _Search(NamedTuple):
         full &= np.isfinite(high - low)
         free = np.where(full, -np.inf, low), np.where(full, np.inf, high)
         # Without limits a search passes a full turn, and is turned back afterwards.
-        found = self.solve(goal, qpos, free)
-        over = np.where(full, np.maximum(found.qpos - high, 0), 0.0)
-        under = np.where(full, np.maximum(low - found.qpos, 0), 0.0)
+        nearest = self.solve(goal, qpos, free)
+        over = np.where(full, np.maximum(nearest.qpos - high, 0), 0.0)
+        under = np.where(full, np.maximum(low - nearest.qpos, 0), 0.0)
         back = 2 * np.pi * (np.ceil(under / (2 * np.pi)) - np.ceil(over / (2 * np.pi)))
         past = np.flatnonzero(back.any(axis=1))
         if len(past):
             # A joint between two turns is clipped to its limits, so search again from there.
-            turned = np.clip(found.qpos[past] + back[past], low, high)
+            turned = np.clip(nearest.qpos[past] + back[past], low, high)
             within = self.solve(goal[past], turned, self.limits)
-            found.write(past, within._replace(steps=within.steps + found.steps[past]))
-        return found
+            nearest.write(past, within._replace(steps=within.steps + nearest.steps[past]))
+        return nearest
 
     def solve(self, goal: Float64, qpos: Float64, limits: tuple[Float64, Float64]) -> _Found:
         """Return the results of searches that begin at ``qpos`` (n, dof), within ``limits``."""
@@ -239,18 +242,20 @@ class _Search(NamedTuple):
         native = native_rows.search(*tool, limits, goal, qpos, self.tolerance, self.iterations)
         if native is not None:
             return _Found(*native)
+        # The same search in NumPy: the definition of the native one.
         count = len(goal)
         best = _Found(qpos.copy(), np.full((count, 2), np.inf), np.zeros((count, 1)))
+        # Rows that have arrived leave, so the others pay for themselves alone.
         going = np.arange(count)
         q = qpos
         for step in range(self.iterations + 1):
             at = _At(*tool, q)
             error = pose_error(goal[going], at.pose)
             lengths = np.sqrt((error * error).reshape(-1, 2, 3).sum(-1))
-            found = _Found(q, lengths, np.full((len(q), 1), float(step)))
-            better = self.size(found) < self.size(best.rows(going))
-            best.write(going[better], found.rows(better))
-            stay = ~self.reached(found)
+            nearest = _Found(q, lengths, np.full((len(q), 1), float(step)))
+            better = self.size(nearest) < self.size(best.rows(going))
+            best.write(going[better], nearest.rows(better))
+            stay = ~self.reached(nearest)
             going = going[stay]
             q = self.tree.positions(_stepped(limits, at, q, error))[stay]
             if not len(going):
@@ -278,6 +283,7 @@ class _At:
 
 def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Float64) -> Float64:
     """Return the positions (n, dof) after a step within the limits."""
+    # Damping grows with the error: far away the steps are short and safe, near by quadratic.
     damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
     # Joints that would pass a limit stop there, and the others take over their share.
     free = np.ones(qpos.shape, bool)
@@ -304,6 +310,7 @@ def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Flo
 def _damped(part: Float64, damping: Float64, vector: Float64) -> Float64:
     """Return J^T (J J^T + damping 1)^-1 v (n, dof) of the columns ``part`` (n, 6, dof) of J."""
     rows = part.swapaxes(-1, -2)
+    # One Cholesky factor serves both J and the error: J^T (L L^T)^-1 v.
     factor = whitened(
         gram(rows, rows) + damping * np.eye(6), np.concatenate([part, vector[..., None]], axis=-1)
     )
@@ -314,6 +321,7 @@ def _goals_and_starts(
     tree: RigidTree, pose: ArrayLike, start: ArrayLike
 ) -> tuple[Float64, Float64]:
     """Return checked poses (envs, 7) and starts (envs, dof)."""
+    # Either argument may be one row for all envs.
     columns = ("x", "y", "z", "qw", "qx", "qy", "qz")
     counts = [np.shape(arguments)[0] for arguments in (pose, start) if np.ndim(arguments) == 2]
     envs = max([1, *counts])

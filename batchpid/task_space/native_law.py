@@ -49,6 +49,7 @@ def law(
 
     Raises ValueError if an array has a wrong shape.
     """
+    # With a tool the extension computes the dynamics itself, from the tree's tables.
     tool: Tool | None = None
     dynamics_arrays: tuple[Any, ...] = dynamics
     if isinstance(dynamics, Tool):
@@ -60,12 +61,12 @@ def law(
     if (native := native_rows.for_rows(inputs.qpos, *dynamics_arrays, *arrays)) is None:
         return None
     rows, dof = inputs.qpos.shape
-    if state.integral is None:
-        wanted = wanted
-    else:
-        wanted = (*wanted, "integral")
+    # The new integral is a result like the terms, though no caller names it.
+    needed = wanted
+    if state.integral is not None:
+        needed = (*wanted, "integral")
     results = [
-        np.empty((rows, size or dof)) if name in wanted else None for name, size in _RESULTS.items()
+        np.empty((rows, size or dof)) if name in needed else None for name, size in _RESULTS.items()
     ]
     fixed: tuple[Any, ...] = (k.frame is not None, *_WITHOUT_TREE)
     if tool is not None:
@@ -73,6 +74,7 @@ def law(
         dynamics_arrays = (*[None] * 5, chain)
     native_rows.call(native.law, rows, dof, *fixed, *dynamics_arrays, *arrays, *results)
     effort, integral, _, *parts, s1, s2, near = results
+    # The extension writes columns; the terms are one number for each env.
     shares = [None if entry is None else entry[:, 0] for entry in (s1, s2)]
     terms = OSCTerms._make((*parts, effort, *shares, None if near is None else near[:, 0] > 0))
     return (state if integral is None else state._replace(integral=integral)), terms
@@ -86,6 +88,7 @@ def friction(arrays: Mapping[str, Any], coulomb: Array, band: Array) -> Float64 
     qpos = arrays["qpos"]
     if (native := native_rows.for_rows(qpos, *arrays.values(), coulomb, band)) is None:
         return None
+    # Arrays that friction does not read have no entry, and go as None.
     rubbing_effort = np.empty(qpos.shape)
     dynamics_arrays = map({**arrays, "effort": rubbing_effort}.get, LAW)
     native_rows.call(
@@ -142,6 +145,7 @@ class BoundOSC:
             name: np.zeros((rows, part.stop - part.start)) for name, part in self._parts.items()
         }
         self._posture = np.zeros_like(qpos)
+        # The call keeps the addresses of these arrays: they are written in place from now on.
         self.state = {"posture": np.zeros_like(qpos)}
         if k.ki_dt is not None:
             self.state["integral"] = np.zeros((rows, 6))
@@ -162,6 +166,7 @@ class BoundOSC:
             "effort": self.effort,
             "limited": self.limited,
         }
+        # Implicit damping appears to the law as an inertia of dt times it.
         if damping is not None:
             arrays |= {"damping": damping, "added_inertia": timestep * damping}
         rubbing: list[Float64 | None] = [None, None, None]

@@ -78,15 +78,17 @@ def kinematics(
         native = in_use()
     else:
         native = None
+    # The mass matrix of a floating base is a Schur complement, which NumPy computes.
     if native is None or not (tree.fixed_base or _DYNAMICS.isdisjoint(wanted)):
         return None
     dof = tree.dof
     leading = qpos.shape[:-1]
     rows = math.prod(qpos.shape[:-1])
-    found = empty(wanted, leading, dof)
+    # The extension writes into arrays that it is given, by rows.
+    outputs = empty(wanted, leading, dof)
     inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
-    call(native.kinematics, *_arguments(native, tree, found, inputs, index, point))
-    return found
+    call(native.kinematics, *_arguments(native, tree, outputs, inputs, index, point))
+    return outputs
 
 
 def bound(
@@ -99,20 +101,27 @@ def bound(
     """
     if (native := in_use()) is None:
         return None
-    found = empty(wanted, qpos.shape[:1], tree.dof)
+    outputs = empty(wanted, qpos.shape[:1], tree.dof)
     return partial(
-        native.kinematics, *_arguments(native, tree, found, [qpos, qvel], index, None)
-    ), tuple(found.values())
+        native.kinematics, *_arguments(native, tree, outputs, [qpos, qvel], index, None)
+    ), tuple(outputs.values())
 
 
 def _arguments(
-    native: Any, tree: RigidTree, found: dict[str, Float64], inputs: Any, index: int, point: Array
+    native: Any, tree: RigidTree, outputs: dict[str, Float64], inputs: Any, index: int, point: Array
 ) -> list[Any]:
     """Return the arguments of ``kinematics`` in task_space.cpp."""
-    own = native_tree(native, tree)
+    constants = native_tree(native, tree)
     rows = len(inputs[0])
-    results = [found.get(name) for name in KINEMATICS[3:]]
-    return [own.tree, tree.link_bodies[index], rows, *inputs, tool(own, index, point), *results]
+    results = [outputs.get(name) for name in KINEMATICS[3:]]
+    return [
+        constants.tree,
+        tree.link_bodies[index],
+        rows,
+        *inputs,
+        tool(constants, index, point),
+        *results,
+    ]
 
 
 def empty(wanted: tuple[str, ...], leading: tuple[int, ...], dof: int) -> dict[str, Float64]:
@@ -139,20 +148,28 @@ def search(
     """
     if (native := in_use()) is None:
         return None
-    own = native_tree(native, tree)
+    constants = native_tree(native, tree)
     rows = len(start)
-    found = [start.copy(), np.full((rows, 2), np.inf), np.zeros((rows, 1))]
-    arrays = goal, tool(own, index, point), *(limit[None] for limit in limits), tolerance[None]
-    call(native.search, own.tree, tree.link_bodies[index], rows, iterations, *arrays, *found)
-    found[0] = tree.positions(found[0])
-    return found
+    outputs = [start.copy(), np.full((rows, 2), np.inf), np.zeros((rows, 1))]
+    arrays = (
+        goal,
+        tool(constants, index, point),
+        *(limit[None] for limit in limits),
+        tolerance[None],
+    )
+    call(
+        native.search, constants.tree, tree.link_bodies[index], rows, iterations, *arrays, *outputs
+    )
+    # A search moves leaders alone; their followers are set at the end.
+    outputs[0] = tree.positions(outputs[0])
+    return outputs
 
 
-def tool(own: _NativeTree, index: int, point: Array) -> Float64:
+def tool(constants: _NativeTree, index: int, point: Array) -> Float64:
     """Return the frames (1 | rows, 12) of a link in its body, with the origin at a ``point`` (3,)
     or (..., 3).
     """
-    tool = own.tools[index]
+    tool = constants.tools[index]
     if point is not None:
         tool = np.broadcast_to(tool, (*point.shape[:-1], 3, 4)).copy()
         tool[..., 3] += (tool[..., :3] * point[..., None, :]).sum(-1)
@@ -161,14 +178,17 @@ def tool(own: _NativeTree, index: int, point: Array) -> Float64:
 
 def native_tree(native: Any, tree: RigidTree) -> _NativeTree:
     """Return the constants of a tree for the extension."""
-    if (own := _trees.get(tree)) is not None:
-        return own
+    # Tables of a tree are built once, and go when the tree goes.
+    if (constants := _trees.get(tree)) is not None:
+        return constants
     bodies, (kinds, rows) = tree.bodies, tree.tables
     arguments = kinds, rows, np.array(bodies.armature), tuple(bodies.gravity.tolist())
     coupling = tree.coupling
     laws = coupling.leader.astype(np.int32), coupling.multiplier, coupling.offset
-    _trees[tree] = own = _NativeTree(native.tree(tree.dof, *arguments, *laws), bodies.link_frames)
-    return own
+    _trees[tree] = constants = _NativeTree(
+        native.tree(tree.dof, *arguments, *laws), bodies.link_frames
+    )
+    return constants
 
 
 def for_rows(like: Array, *arrays: Array) -> Array:
@@ -186,6 +206,7 @@ def call(function: Callable[..., None], *arguments: Any) -> None:
     converted.
     """
     try:
+        # Nearly all arrays fit as they are: the refusal is cheaper than a look at each.
         function(*arguments)
     except (ValueError, BufferError):
         function(*[_contiguous(one) if isinstance(one, np.ndarray) else one for one in arguments])

@@ -78,6 +78,7 @@ def init(params: OSCParams, qpos: Array) -> OSCState:
     Raises InvalidArgumentError for params of another type.
     """
     instance("params", params, OSCParams, MAKE_PARAMS)
+    # The posture begins where the robot is, so that nothing pulls at first.
     (qpos,) = in_dtype_of(params, qpos)
     xp = namespace(*params, qpos)
     posture = xp.zeros_like(qpos) + qpos
@@ -137,6 +138,7 @@ def osc(
     if isinstance(dynamics, Tool):
         dynamics = task_dynamics(dynamics.tree, *inputs[1:3], dynamics.link, point=dynamics.point)
     with quiet():
+        # All that follows is in the axes in which the gains are given.
         task = in_frame(k, dynamics, inputs)
         # Accelerations of task and posture first, then their efforts, then the limits.
         a = task_acceleration(k, task)
@@ -187,6 +189,7 @@ class Task(NamedTuple):
 def in_frame(k: OSCCoefficients, d: TaskDynamics, inputs: OSCInputs) -> Task:
     """Return the dynamics, error and motion in the axes of the params' frame."""
     xp = namespace(*k, *d, *inputs)
+    # Position and rotation have limits of their own: a far target does not drown a turn.
     error = pose_error(inputs.setpoint, d.pose)
     limits = (k.position_error_limit, k.rotation_error_limit)
     near = [
@@ -242,6 +245,7 @@ def posture_acceleration(
     a = springs - k.posture_kd * v
     if k.limit_kp is None:
         return a, springs
+    # Positive below the lower margin, negative above the upper one.
     depth = xp.maximum(k.limit_low - q, 0.0) - xp.maximum(q - k.limit_high, 0.0)
     pushed = k.limit_kp * depth
     return (
@@ -323,11 +327,13 @@ def track(
             available = bias
         else:
             available = bias + feedforward
+        # The acceleration that the model expects of the effort.
         qacc = solve(mass, (effort - available)[..., None])[..., 0]
+        # A joint without stiffness cannot ask for anything by its posture.
         stiff = k.posture_kp > 0
         rest = qacc - posture_acceleration(k, dynamics, qpos, qpos, qvel)[0]
         posture = qpos + xp.where(stiff, rest / xp.where(stiff, k.posture_kp, 1.0), 0.0)
         task = in_frame(k, dynamics, inputs)
-        wanted = product(task.dynamics.jacobian, qacc) + task.dynamics.jacobian_rate
-        integral = wanted - task_acceleration(k, task)
+        demand = product(task.dynamics.jacobian, qacc) + task.dynamics.jacobian_rate
+        integral = demand - task_acceleration(k, task)
         return OSCState(posture, clip(integral, -k.integral_limit, k.integral_limit, xp))

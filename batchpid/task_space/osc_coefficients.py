@@ -72,6 +72,7 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
     """
     instance("params", params, OSCParams, MAKE_PARAMS)
     check_time_step("dt", dt)
+    # Explicit gains first; the implicit law then replaces those that it changes.
     xp = namespace(*params, dt)
     kp = params.stiffness
     kd = params.damping
@@ -96,12 +97,14 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
         if ki is not None:
             ki = ki * share
             ki_dt2 = ki * dt * dt
+        # Posture and limits have no integral, and a simpler denominator.
         posture_kp, posture_kd = _implicit(posture_kp, posture_kd, dt)
         if limit_kp is not None:
             limit_kp, limit_kd = _implicit(limit_kp, limit_kd, dt)
     same = {
         name: leaf for name, leaf in params._asdict().items() if name in OSCCoefficients._fields
     }
+    # A joint with a margin of 0 is pushed from nowhere: its ends lie at infinity.
     part = {
         "limit_margin": None if margin is None else xp.where(margin > 0, margin, 1.0),
         "limit_low": (

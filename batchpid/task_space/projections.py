@@ -62,6 +62,7 @@ def projections(
     task_inertia, null_inertia, spring_inertia, singular = _inertias(
         k, gram(y[..., :6], y[..., :6]), xp
     )
+    # The wrench that accelerates the tool's inertia, less what the motion does by itself.
     f = product(task_inertia, a - d.jacobian_rate)
     f = f if wrench is None else f + wrench
     task = gram(j, f[..., None])[..., 0]
@@ -81,6 +82,7 @@ def projections(
     base = d.bias + product(m, a_o)
     base = base if feedforward is None else base + feedforward
 
+    # L^-1 of M_cc, from the same factor: two products replace a solution.
     inverse_root = y[..., 6:]
 
     def of_others(effort: Array) -> Array:
@@ -94,6 +96,7 @@ def _inertias(
     k: OSCCoefficients, mobility: Array, xp: ArrayModule
 ) -> tuple[Array, Array, Array, Array]:
     """Return L, L_n and L_s of the mobility A (envs, 6, 6), and where any is bounded."""
+    # Without axes of force, task and null space need the same inverse, computed once.
     s0 = k.smallest_eigenvalue[..., 0]
     both = k.axes
     if k.axes is not None and k.force_axes is not None:

@@ -136,6 +136,7 @@ class RigidTree:
     """
 
     def __post_init__(self) -> None:
+        # Names and types come first: they give the sizes of all other arrays.
         links = tuple(names("links", list(self.links)))
         count = len(links)
         types = tuple(choice("joint_types", one, JOINT_TYPES) for one in self.joint_types)
@@ -150,9 +151,11 @@ class RigidTree:
         moving = tuple(
             names("joint_names", list(self.joint_names), sum(one != "fixed" for one in types))
         )
+        # Parents first, so that one pass from the base outwards serves every recursion.
         parent = np.array(_array("parent", self.parent, (count,)), np.intp)
         first = (parent < np.arange(count)) & (parent >= np.minimum(np.arange(count), 1) - 1)
         entries("parent", parent, first, "does not come before its child", links, kind="entry")
+        # One copy of each table, in float64: later writes by the caller change nothing.
         shapes = {
             "position": (3,),
             "wxyz": (4,),
@@ -166,12 +169,14 @@ class RigidTree:
             for name, shape in shapes.items()
         }
         for name in ("armature", "lower", "upper"):
-            given: Any = np.asarray(getattr(self, name))
+            row: Any = np.asarray(getattr(self, name))
             tables[name] = _array(
-                name, given if given.shape else np.full(len(moving), given), (len(moving),)
+                name, row if row.shape else np.full(len(moving), row), (len(moving),)
             )
+        # Gravity belongs to the world, and to no link or joint.
         tables["gravity"] = _array("gravity", self.gravity, (3,))
         for name, table in tables.items():
+            # An infinite limit of position is none.
             finite = np.isfinite(table).reshape(len(table), -1).all(1) | (
                 name in ("lower", "upper")
             )
@@ -179,6 +184,7 @@ class RigidTree:
             entries(name, np.where(finite, 0.0, np.nan), finite, "is not finite", of, kind="entry")
         entries("mass", tables["mass"], tables["mass"] >= 0, "must be >= 0", links, kind="entry")
         entries("armature", tables["armature"], tables["armature"] >= 0, "must be >= 0", moving)
+        # A quaternion must be a unit one; an axis only needs a direction.
         lengths = {name: np.linalg.norm(tables[name], axis=1) for name in ("wxyz", "axis")}
         unit = np.abs(lengths["wxyz"] - 1) < 1e-6
         entries("wxyz", lengths["wxyz"], unit, "is not a unit quaternion", links, kind="entry")
@@ -186,6 +192,7 @@ class RigidTree:
         entries("axis", lengths["axis"], pointing, "has no direction", links, kind="entry")
         tables["wxyz"] /= lengths["wxyz"][:, None]
         tables["axis"] /= np.where(lengths["axis"] > 0, lengths["axis"], 1.0)[:, None]
+        # Followers are known by the coupling, which must count the same joints.
         coupling = Coupling.of(len(moving)) if self.coupling is None else self.coupling
         if len(coupling.leader) != len(moving):
             problem = f"couples {len(coupling.leader)} joints, but {len(moving)} move"
@@ -194,6 +201,7 @@ class RigidTree:
             )
         for table in (parent, *tables.values()):
             table.setflags(write=False)
+        # The class is frozen, so the checked tables go past its setter.
         vars(self).update(
             tables,
             links=links,
@@ -231,6 +239,7 @@ class RigidTree:
         """Name of the link at the end of the longest chain of joints, or of the hand if that chain
         ends in fingers.
         """
+        # Depth counts the joints that move; a branch is a subtree with at least one.
         moves = [kind != "fixed" for kind in self.joint_types]
         depth = [0] * len(self.links)
         branches = [0] * len(self.links)
@@ -239,6 +248,7 @@ class RigidTree:
         for child, above in reversed(list(enumerate(self.parent.tolist()))[1:]):
             branches[above] += moves[child] or branches[child] > 0
         link = tip = int(np.argmax(depth))
+        # Fingers are short: a branching at most two joints below the tip is a hand.
         while link > 0 and depth[tip] - depth[link] <= 2:
             if branches[link] > 1:
                 return self.links[link]
@@ -266,6 +276,7 @@ class RigidTree:
         wxyz = self.wxyz.copy()
         types = np.array(self.joint_types, object)
         above = np.flatnonzero(types != "fixed")
+        # A fixed joint is the same joint with its motion multiplied into its place.
         for link, q in zip(above[~moves], np.asarray(qpos)[~moves], strict=True):
             turn = matrix_of(wxyz[link])
             if types[link] == "revolute":
@@ -274,7 +285,7 @@ class RigidTree:
             else:
                 position[link] += q * turn @ self.axis[link]
             types[link] = "fixed"
-        names = tuple(name for name, kept in zip(self.joint_names, moves, strict=True) if kept)
+        names = tuple(name for name, stays in zip(self.joint_names, moves, strict=True) if stays)
         rows = {name: getattr(self, name)[moves] for name in ("armature", "lower", "upper")}
         places: Document = {"position": position, "wxyz": wxyz, "joint_types": tuple(types)}
         return replace(self, **places, **rows, joint_names=names, coupling=Coupling.of(len(names)))
@@ -309,6 +320,7 @@ class RigidTree:
 
         The last row, body -1, is the base.
         """
+        # A joint that is coupled to one of the chain moves the tool, too.
         rows = np.concatenate([self.bodies.moves, np.zeros((1, self.dof))])
         rows = (rows @ (self.coupling.leader[:, None] == self.coupling.leader) > 0).astype(
             np.float64
@@ -340,6 +352,7 @@ class RigidTree:
         local = np.zeros((4, self.dof, 3, 4))  # at_zero, sine, cosine, slide
         moves = np.zeros((self.dof, self.dof))
         slides = np.zeros((self.dof, 1))
+        # From the base outwards: the frame of each link in its body, and each body's placement.
         for link, above in enumerate(self.parent):
             frames[link] = np.column_stack([matrix_of(self.wxyz[link]), self.position[link]])
             if link:
@@ -365,14 +378,15 @@ class RigidTree:
                 moves[joint] += moves[parents[-1]]
             body.append(joint)
             links_of.append([link])
+            # The body's frame has the axis along x; its link is turned back from that.
             frames[link] = np.column_stack([turn.T, np.zeros(3)])
         on_base = [link for link, of in enumerate(body) if of < 0]
         mass, center, tensor = self._inertias([*links_of, on_base], frames)
-        own = mass[:-1], center[:-1], tensor[:-1]
+        of_joints = mass[:-1], center[:-1], tensor[:-1]
         leaves = (
             *local,
             slides,
-            *own,
+            *of_joints,
             moves,
             frames,
             self.armature,
@@ -421,22 +435,17 @@ class RigidTree:
         """Return the bodies of n robots with spatial inertias (n, 6, 6) added to links, in the axes
         of the links.
         """
+        # Links that fixed joints connect add up in one body.
         of_bodies = dict[int, Float64]()
         for name, matrices in added.items():
             link = self.index(name)
             moved = moved_matrix(matrices, self.bodies.link_frames[link])
             of_bodies[self.link_bodies[link]] = of_bodies.get(self.link_bodies[link], 0.0) + moved
-        return self.with_added(of_bodies)
-
-    def with_added(self, added: Mapping[int, Float64]) -> Bodies:
-        """Return the bodies of n robots with spatial inertias (n, 6, 6) added, by index, in the
-        axes of the bodies.
-        """
         rows = np.tile(self.inertias(), (len(next(iter(added.values()))), 1, 1))
-        for body, matrices in added.items():
+        for body, matrices in of_bodies.items():
             mass, center, tensor = np.split(rows[0, body], [1, 4])
-            own = SpatialInertia(float(mass[0]), center, tensor.reshape(3, 3))
-            rows[:, body] = inertia_rows(spatial_matrix(own) + matrices)
+            nominal = SpatialInertia(float(mass[0]), center, tensor.reshape(3, 3))
+            rows[:, body] = inertia_rows(spatial_matrix(nominal) + matrices)
         mass = rows[..., :1]
         center = rows[..., 1:4]
         tensor = rows[..., 4:].reshape(*rows.shape[:-1], 3, 3)
@@ -459,6 +468,7 @@ class RigidTree:
         masses = np.zeros((count, 1))
         centers = np.zeros((count, 3))
         tensors = np.zeros((count, 3, 3))
+        # Huygens and Steiner about the common center of mass; a body without mass keeps a place.
         for joint, links in enumerate(links_of):
             turn = frames[links, :, :3]
             shift = frames[links, :, 3]
@@ -468,8 +478,8 @@ class RigidTree:
             centers[joint] = mass @ at / mass.sum() if mass.sum() else at[0]
             d = at - centers[joint]
             spread = (d * d).sum(1)[:, None, None] * np.eye(3) - d[:, :, None] * d[:, None, :]
-            own = turn @ self.inertia[links] @ turn.transpose(0, 2, 1)
-            tensors[joint] = (own + mass[:, None, None] * spread).sum(0)
+            tensor = turn @ self.inertia[links] @ turn.transpose(0, 2, 1)
+            tensors[joint] = (tensor + mass[:, None, None] * spread).sum(0)
         return masses, centers, tensors
 
 
@@ -479,6 +489,7 @@ _ABOUT_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 def _along_x(axis: Float64) -> Float64:
     """Return a rotation matrix (3, 3) whose first column is the unit vector ``axis``."""
+    # The coordinate axis farthest from it keeps the cross product well conditioned.
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     across /= np.linalg.norm(across)
     return np.column_stack([axis, across, np.cross(axis, across)])

@@ -43,6 +43,7 @@ def spatial_matrix(inertia: SpatialInertia) -> Float64:
     S = [[m 1, -m C], [m C, I - m C C]] with C a = c x a.
     """
     mass = inertia.mass
+    # The origin moves with v; the center of mass with v + w x c.
     cross = _cross_matrix(inertia.center)
     matrix = np.zeros((6, 6))
     matrix[:3, :3] = mass * np.eye(3)
@@ -67,6 +68,7 @@ def moved_matrix(matrix: Float64, place: Float64) -> Float64:
 def inertia_rows(matrices: Float64) -> Float64:
     """Return mass, center and inertia tensor, a row for each spatial matrix (n, 6, 6): (n, 13)."""
     mass = matrices[:, 0, 0, None]
+    # The block m C holds the center of mass thrice; one entry of each is read.
     center = matrices[:, [5, 3, 4], [1, 2, 0]] / mass
     cross = _cross_matrix(center)
     tensor = matrices[:, 3:, 3:] + mass[:, :, None] * cross @ cross

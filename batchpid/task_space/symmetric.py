@@ -28,6 +28,7 @@ def whitened(matrix: Array, right: Array) -> Array:
     A matrix that is not positive definite gives NaN.
     """
     xp = namespace(matrix, right)
+    # JAX returns NaN by itself; NumPy would raise for the whole batch.
     if xp is not np:
         return xp.linalg.solve(xp.linalg.cholesky(matrix), right)
     matrix, sound = _sound(matrix)
@@ -60,6 +61,7 @@ def _sound(matrix: Array) -> tuple[Array, Array]:
 
 def gram(factor: Array, other: Array) -> Array:
     """Return the products Y^T Z (..., m, k) of (..., n, m) and (..., n, k)."""
+    # A sum in a fixed order: a row does not depend on the size of the batch.
     total = factor[..., 0, :, None] * other[..., 0, None, :]
     for row in range(1, factor.shape[-2]):
         total = total + factor[..., row, :, None] * other[..., row, None, :]
@@ -94,6 +96,7 @@ def bounded_inverse(matrix: Array, smallest: Array, *smooth: Array) -> tuple[Arr
     ]
     with quiet():
         values, vectors = eigen(matrix)
+        # Rounding may leave eigenvalues a little below 0.
         positive = xp.maximum(values, 0.0)
         rows = xp.swapaxes(vectors, -1, -2)
 

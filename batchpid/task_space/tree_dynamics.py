@@ -47,6 +47,7 @@ def check_masses(tree: RigidTree) -> None:
     """Raise InvalidArgumentError for a joint that moves no mass and has no armature: its mass
     matrix is singular.
     """
+    # A leader moves the masses of its followers, too.
     moved = tree.bodies.moves.T @ tree.bodies.mass[:, 0] + tree.bodies.armature
     moved = tree.coupling.of_all(tree.coupling.reduced_damping(moved))
     for joint, kg in zip(tree.joint_names, moved, strict=True):
@@ -77,6 +78,7 @@ def _composite(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayModul
     center = rotate(turn, bodies.center) + motions.frames[..., 3]
     moment = bodies.mass * center
     tensor = _in_world(turn, bodies.tensor, xp) + _about_origin(moment, center, xp)
+    # One pass from the tips for both: sums over everything that a joint moves.
     packed = xp.concatenate([moment, tensor.reshape(*tensor.shape[:-2], 9)], axis=-1)
     composite = from_tips(tree, packed, xp)
     mass = from_tips(tree, bodies.mass, xp)
@@ -100,6 +102,7 @@ def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: ArrayModule)
     """Return M_bb (..., 6, 6), linear parts first: the momenta of the whole robot under the motions
     of its base.
     """
+    # Composites of the joints on the base contain all bodies but the base itself.
     roots = [joint for joint, above in enumerate(tree.body_parents) if above < 0]
     part = bodies.base_mass * bodies.base_center
     mass = all_.mass[..., roots, :].sum(-2) + bodies.base_mass
@@ -128,6 +131,7 @@ def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayM
     rest = xp.where(bodies.moves > 0, xp.swapaxes(table, -1, -2), xp.zeros_like(table))
     matrix = xp.where(above, table, rest)
     if not tree.fixed_base:
+        # The free base yields to each joint's momentum.
         falls = solve(_of_base(tree, bodies, all_, xp), xp.swapaxes(all_.momenta, -1, -2))
         matrix = matrix - (
             all_.momenta[..., :, None, :] * xp.swapaxes(falls, -1, -2)[..., None, :, :]
@@ -156,6 +160,7 @@ def effort_of(
     acceleration = (
         rates.linear_rate + cross(rates.angular_rate, center) + cross(w, v + cross(w, center))
     )
+    # A free base falls with its joints: gravity cancels there.
     force = bodies.mass * (acceleration - bodies.gravity if tree.fixed_base else acceleration)
     spin = rotate(tensor, rates.angular_rate) + cross(w, rotate(tensor, w))
     wrench = from_tips(tree, xp.concatenate([force, spin + cross(center, force)], axis=-1), xp)

@@ -97,6 +97,7 @@ def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Any], Bodies, Any]:
 def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModule) -> Array:
     """Return the frames (..., dof, 3, 4) of the bodies in the world."""
     with quiet():
+        # Rodrigues' formula with the placement multiplied in: four constant matrices a joint.
         q = qpos[..., None, None]
         local = (
             bodies.at_zero
@@ -127,6 +128,7 @@ def velocities_of(
     """
     linear = motions.linear * qvel[..., None]
     angular = motions.angular * qvel[..., None]
+    # Velocities about the world's origin add up along the chain without a shift.
     v = from_base(tree, linear, xp)
     w = from_base(tree, angular, xp)
     if turning is not None:

@@ -11,7 +11,7 @@ armature and viscous friction of the motors are counted, each where it is known.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -163,12 +163,7 @@ class StabilityWarning(UserWarning):
 
 
 MOST = 64
-"""Largest number of envs with late motors that are checked one by one; of more, the ends of their
-ranges are.
-"""
-_LARGEST = "kp", "kd", "command_delay", "sensor_delay", "lag", "strength"
-_SMALLEST = "derivative_filter_time", "armature", "viscous"
-"""Columns of which the largest or smallest value of all envs makes a loop the least stable."""
+"""Largest number of envs that are checked: a draw of that many motors shows the range of all."""
 
 
 class StabilityCheck:
@@ -190,20 +185,18 @@ class StabilityCheck:
         """Warn if ``params`` pass the bound."""
         if not DISSIPATION[self._robot.dissipation].modelled:
             return
-        if actuators is None or actuators.is_ideal:
-            motors = None
-        else:
-            motors = actuators
+        motors = None
+        if actuators is not None and not actuators.is_ideal:
+            motors = actuators.for_envs(slice(0, MOST))
+        if params.num_envs > 1 and motors is not None:
+            params = params.for_envs(slice(0, MOST))
         rows = max(params.num_envs, 1 if motors is None else motors.num_envs)
-        if motors is not None and rows > MOST:
-            params = _extreme(params)
-            motors = _extreme(motors)
-            rows = 1
         start = self._robot.start
         try:
             report = stability_report(self._robot, params, start, self._timestep, motors)
         except InvalidArgumentError:  # the robot's mass matrix is not positive definite
             return
+        # A caller who changes gains in a loop is told once.
         is_beyond = report.robot_ratio >= 1
         if is_beyond and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
@@ -215,16 +208,3 @@ class StabilityCheck:
                 StabilityWarning,
             )
         self._has_warned = is_beyond
-
-
-def _extreme(record: Any) -> Any:
-    """Return params or actuators of one env with the end of the range of all envs that is the least
-    stable.
-    """
-    ends = {}
-    for names, reduce in ((_LARGEST, np.max), (_SMALLEST, np.min)):
-        for name in names:
-            leaf = getattr(record, name, None)
-            if leaf is not None:
-                ends[name] = reduce(leaf, 0, keepdims=True)
-    return record.for_envs(slice(0, 1))._replace(**ends)

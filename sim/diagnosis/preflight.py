@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import batchpid as bp
-from batchpid.arrays.array_types import Array, Bool, Float64
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import slow_oscillation, stability_report
@@ -50,6 +50,7 @@ def check(
     start = robot.start
     if qpos is not None:
         start = within("qpos", array("qpos", qpos, (1, robot.dof), names), 1e6, names)[0]
+    # The robot first, then what this run adds to it.
     preflight = _Preflight(robot)
     preflight.check_robot(start)
     if setpoint is not None:
@@ -116,10 +117,7 @@ class _Preflight:
                 loaded.add(bodies[joint.parent_link])
         for link in robot.links:
             body = bodies[link.name]
-            if link.mass:
-                excess = triangle_excess(link.inertia)
-            else:
-                excess = 0.0
+            excess = triangle_excess(link.inertia) if link.mass else 0.0
             if excess > EXCESS:
                 self._note(
                     "inertia",
@@ -136,16 +134,16 @@ class _Preflight:
 
     def _report_mass(self, link: str, is_body: bool, is_loaded: bool) -> None:
         """Report a link without ``<inertial>``."""
+        mass = self.robot.link_masses[link]
         report = self._warn if is_body else self._note
+        effect = "it becomes a link of 1e-6 kg, without load: no gains per effort control it"
         detail = ""
-        if self.robot.link_masses[link].source == "shapes":
+        if mass.source == "shapes":
             effect = f"mass and inertia are those of the collision shapes, at {DENSITY:g} kg/m^3"
-            detail = f"{self.robot.link_masses[link].mass:.3g} kg"
+            detail = f"{mass.mass:.3g} kg"
         elif is_loaded:
             report = self._note
             effect = "it becomes a link of 1e-6 kg; only the links that it carries have mass"
-        else:
-            effect = "it becomes a link of 1e-6 kg, without load: no gains per effort control it"
         remedy = "add <inertial> with mass and inertia"
         report("no-inertia", f"no <inertial>: {effect}", remedy, link=link, detail=detail)
 
@@ -163,6 +161,7 @@ class _Preflight:
                 remedy = "move their shapes 1 mm apart, or enable the pair in an .srdf"
                 other = f"with {pair.second!r}"
                 self._note("pairs-left-out", text, remedy, link=pair.first, detail=other)
+        # A floating base starts on its ground, which is no fault.
         model = robot.dynamics(ground=robot.fixed_base and robot.has_ground)
         if model.in_contact(start[None])[0]:
             self._warn(
@@ -265,14 +264,9 @@ class _Preflight:
 
     def check_params(self, params: bp.PIDParams, control: str) -> None:
         """Report params that disagree with the joints, or have no effect under ``control``."""
-        dof = self.robot.dof
-
-        def in_any_env(leaf: Array) -> Bool:
-            rows = np.broadcast_to(leaf, (params.num_envs, dof))
-            return np.logical_or.reduce(rows, axis=0)
-
-        wraps = in_any_env(0 if params.continuous is None else params.continuous)
-        dead = in_any_env(0 if params.ki is None else params.ki * (params.kp == 0))
+        wraps = np.zeros(self.robot.dof, bool)
+        if params.continuous is not None:
+            wraps |= np.asarray(params.continuous).any(axis=0)
         for index, joint in enumerate(self.robot.joints):
             if joint.continuous and not wraps[index] and control == "pid":
                 text = "continuous in the URDF, not in params: the error jumps where qpos wraps"
@@ -282,7 +276,3 @@ class _Preflight:
                 text = "continuous in params, not in the URDF: the short way round may lie beyond"
                 remedy = "leave it out of continuous="
                 self._warn("continuous", f"{text} the limits", remedy, joint.name)
-            if dead[index] and control == "drive":
-                text = "ki has no effect under control 'drive' where kp is 0"
-                remedy = "give a kp > 0, or use control='pid'"
-                self._warn("drive-integral", text, remedy, joint.name)

@@ -12,8 +12,6 @@ from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.warn import warn
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 
-LISTED = 4
-"""Envs that a warning lists for each joint."""
 LAG, MOVING = 0.05, 0.5
 """Lag above which a moving setpoint needs its rate, and how long it moves until a warning [s]."""
 
@@ -73,12 +71,8 @@ class SetpointCheck:
         size = outside.shape[-1]
         if size == 1:
             return f"{place}, not in {limits}"
-        envs = np.flatnonzero(outside.reshape(-1, size).any(0)).tolist()
-        numbers = ", ".join(map(str, envs[:LISTED]))
-        if len(envs) > LISTED:
-            numbers += f" and {len(envs) - LISTED} more"
-        plural = "s" * (len(envs) > 1)
-        return f"{place}, not in {limits} (env{plural} {numbers})"
+        env = int(outside.reshape(-1, size).any(0).argmax())
+        return f"{place}, not in {limits} (env {env} first)"
 
 
 class MovingSetpointCheck:
@@ -114,6 +108,7 @@ class MovingSetpointCheck:
         """
         if not self.is_watching:
             return
+        # Rates tell the law where the setpoint goes.
         if rated:
             self._last, self._moved = None, 0.0
             return

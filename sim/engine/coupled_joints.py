@@ -29,7 +29,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.arrays.elementwise import TURN, matrix_vector
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.engine import native
@@ -66,9 +66,9 @@ class ConstraintEfforts:
         self,
         robots: int,
         coupling: Coupling,
-        wraps: NDArray[np.bool_],
+        wraps: Bool,
         timestep: float,
-        asked: NDArray[np.float32] | None = None,
+        asked: Float32 | None = None,
     ) -> None:
         joints = len(coupling.leader)
         followers = coupling.followers
@@ -134,6 +134,7 @@ class ConstraintEfforts:
 
         ``mass_matrix`` is a function of positions; native code does not need it.
         """
+        # Native code has the mass matrices of its own model.
         if self._model is not None:
             mask = np.zeros(len(qpos), bool)
             mask[rows] = True
@@ -150,6 +151,7 @@ class ConstraintEfforts:
             response,
             np.where(sound[:, 0], passive[rows], 0.0),
         )
+        # Once for all sim steps until the next update: each then takes two small products.
         self._push[rows] = jacobian.T @ np.linalg.inv(response @ jacobian.T)
 
     def place(self, rows: Sequence[int], qpos: Rows) -> None:
@@ -160,6 +162,7 @@ class ConstraintEfforts:
         """Return ``effort`` with the constraint efforts added."""
         coupling = self._coupling
         followers = self._followers
+        # Of all positions that differ by whole jumps, that nearest to the last one.
         self.unwrapped[...] = np.where(
             self.wraps, qpos + WRAP * np.rint((self.unwrapped - qpos) / WRAP), qpos
         )

@@ -4,13 +4,11 @@ ends of ticks.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Bool, Rows
-from batchpid.sim.engine.robot_model import contacts_of, description_tree
+from batchpid.arrays.array_types import Rows
+from batchpid.sim.engine.robot_model import contacts_of
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 DEPTH = 1e-3
@@ -25,19 +23,18 @@ class MissedContacts:
     """Contacts that ``size`` robots of ``spec`` would have had, with a ground at height 0 or
     without.
 
-    Distances take as long to compute as the sim steps of a tick. They are computed where joint
-    motion since the last time can have closed one of them: unit speed of a joint brings two links
-    together at most at the speed ``arms``.
+    Distances take as long to compute as many sim steps. They are computed where joint motion since
+    the last time can have closed them: unit speed of a joint brings two links together at most at
+    the speed ``arms``.
     """
 
     def __init__(self, spec: SceneSpec, size: int, ground: bool) -> None:
-        self._contacts, tree = contacts_of(spec, ground), description_tree(spec).held
+        self._contacts, tree = contacts_of(spec, ground), spec.rigid_tree.held
         slides = tree.bodies.slides.ravel() > 0
         parents = tree.body_parents
         body, balls = self._contacts.balls
-        farthest = np.zeros(
-            tree.dof + 1
-        )  # from the origin of each body to the end of its last child; the base is last
+        # From the origin of each body to the end of its last child; the base is last.
+        farthest = np.zeros(tree.dof + 1)
         np.maximum.at(farthest, body, np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3])
         for joint in reversed(range(tree.dof)):
             limits = spec.joints[joint].lower, spec.joints[joint].upper
@@ -50,15 +47,12 @@ class MissedContacts:
                 farthest[parents[joint]], offset + travel + farthest[joint]
             )
         moves = np.vstack([tree.bodies.moves, np.zeros(tree.dof)])
-        self._pairs = list(self._contacts.least_distances(np.zeros(tree.dof)))
-        first, second = np.array(self._pairs, np.intp).reshape(-1, 2).T
-        self._arms = np.where(
-            moves[first] != moves[second], np.where(slides, 1.0, farthest[:-1]), 0.0
-        )
-        self._centers, self._margins = (
-            np.zeros((size, tree.dof)),
-            np.zeros((size, len(self._pairs))),
-        )
+        first, second = self._contacts.body_pairs.T
+        # A joint that moves both bodies of a pair, or none, leaves their distance.
+        moves_one = moves[first] != moves[second]
+        self._arms = np.where(moves_one, np.where(slides, 1.0, farthest[:-1]), 0.0)
+        self._centers = np.zeros((size, tree.dof))
+        self._margins = np.zeros((size, len(first)))
 
     def place(self, mask: NDArray[np.bool_]) -> None:
         """Forget the distances of the robots of ``mask`` (size,), which are now in other states."""
@@ -76,23 +70,29 @@ class MissedContacts:
         The step of the first one of a robot is written into ``first`` (size,), where that is 0,
         and into the rows of ``tables`` (ticks, size) from there on.
         """
-        for row in np.flatnonzero(self._closes(qpos, slice(None)).any(axis=0) & (first == 0)):
-            tick = 0
-            while first[row] == 0:
-                closes = np.flatnonzero(self._closes(qpos[tick:, row], row))
-                if not closes.size:
-                    break
-                tick += int(closes[0])
-                distances = self._contacts.least_distances(qpos[tick, row])
-                margins = np.array([distances[pair] for pair in self._pairs]) + DEPTH
-                self._centers[row] = qpos[tick, row]
-                self._margins[row] = margins
-                if (margins < 0).any():
-                    first[row] = tables[tick:, row] = steps[tick]
-                tick += 1
+        rows = np.flatnonzero(first == 0)
+        ticks = np.zeros(len(rows), np.intp)
+        while rows.size:
+            # Most robots move too little in all ticks together, which is seen at once.
+            moved = np.abs(qpos[:, rows] - self._centers[rows])
+            may_close = (moved.max(axis=0) @ self._arms.T >= self._margins[rows]).any(axis=1)
+            rows, ticks = rows[may_close], ticks[may_close]
+            closes = (moved[:, may_close] @ self._arms.T >= self._margins[rows]).any(axis=2)
+            closes &= np.arange(len(qpos))[:, None] >= ticks
+            may_close = closes.any(axis=0)
+            rows, ticks = rows[may_close], closes.argmax(axis=0)[may_close]
+            if rows.size:
+                self._search(qpos[ticks, rows], rows)
+            missed = (self._margins[rows] < 0).any(axis=1)
+            for row, tick in zip(rows[missed].tolist(), ticks[missed].tolist(), strict=True):
+                first[row] = tables[tick:, row] = steps[tick]
+            rows, ticks = rows[~missed], ticks[~missed] + 1
 
-    def _closes(self, qpos: Rows, rows: Any) -> Bool:
-        """Return whether motion to ``qpos`` (..., dof) can have closed a distance of ``rows``."""
-        moved = np.abs(qpos - self._centers[rows]) @ self._arms.T
-        closes: Bool = (moved >= self._margins[rows]).any(axis=-1)
-        return closes
+    def _search(self, qpos: Rows, rows: NDArray[np.intp]) -> None:
+        """Compute the distances that motion of robots ``rows`` to ``qpos`` (rows, dof) can have
+        closed; the others have decreased by that motion at most.
+        """
+        rest = self._margins[rows] - np.abs(qpos - self._centers[rows]) @ self._arms.T
+        distances = self._contacts.least_distances(qpos, rest <= 0)
+        self._margins[rows] = np.maximum(rest, distances + DEPTH)
+        self._centers[rows] = qpos

@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
@@ -34,8 +33,10 @@ class ModelPack(SingleOwner):
     selects native code.
     """
 
-    _tree: RigidTree
-    """Rigid tree of the model, with a fixed or floating base."""
+    @property
+    def rigid_tree(self) -> RigidTree:
+        """Tree of the model; SAPIEN's own is another."""
+        return self.spec.rigid_tree
 
     def __init__(
         self,
@@ -51,7 +52,7 @@ class ModelPack(SingleOwner):
         self.steps_natively = natively
         self.dof, self._variation = len(spec.joints), variation or Variation()
         self._masses = VariedMasses(spec, size, self._variation)
-        self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
+        self._suspended: Bool = np.zeros(size, bool)
         self.friction = own_friction(spec, self._variation)
         armature = self._variation.armature  # vary() changes its rows
         self.armature = self._motors = np.zeros((1, self.dof)) if armature is None else armature
@@ -62,39 +63,35 @@ class ModelPack(SingleOwner):
         """Whether the robots have the masses and the gravity of the model."""
         return not self._masses.added and self._variation.gravity is None
 
-    def joint_model(self) -> NativeModel:
-        """Return the native code's model for :meth:`joint_mass_matrix`."""
-        return self._joint_model
-
     @cached_property
-    def _joint_model(self) -> NativeModel:
-        model = NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
+    def joint_model(self) -> NativeModel:
+        """Native model of :meth:`joint_mass_matrix`."""
+        model = NativeModel(self, "fixed" if self.spec.fixed_base else "free")
         if self._masses.added:
             model.vary(range(self.size), self.size, self._masses.added)
         return model
 
-    def force_model(self) -> NativeModel:
-        """Return the native code's model of the passive force, for compiled steps that do not read
-        it in the engine.
-        """
-        return self._force_model
-
     @cached_property
-    def _force_model(self) -> NativeModel:
-        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "held")
+    def force_model(self) -> NativeModel:
+        """Native model of the passive force, for compiled steps that do not read it in the
+        engine.
+        """
+        return NativeModel(self, "fixed" if self.spec.fixed_base else "held")
 
     def joint_mass_matrix(self, qpos: Rows) -> Float64:
         """Return the mass matrices of the joints at ``qpos`` (M, dof, dof) [kg m^2 or kg]; a
         floating base yields.
         """
         if self.steps_natively:
-            return self._joint_model.mass_matrix(qpos)
+            return self.joint_model.mass_matrix(qpos)
         added = self._masses.added
-        return ts.mass_matrix(self._tree, qpos, self._tree.varied(added) if added else None)
+        return ts.mass_matrix(
+            self.rigid_tree, qpos, self.rigid_tree.varied(added) if added else None
+        )
 
     @cached_property
     def _passive_force(self) -> Callable[..., Float64]:
-        return passive_force_of(self.spec, self.steps_natively)
+        return passive_force_of(self, self.steps_natively)
 
     def _change(self, rows: Sequence[int], variation: Variation) -> None:
         """Set the differences of the robots ``rows`` from the model, in the fields that vary."""
@@ -104,8 +101,8 @@ class ModelPack(SingleOwner):
 
     def _change_model(self, rows: Sequence[int]) -> None:
         """Update the masses of the robots ``rows`` in the native code's model."""
-        if self._masses.added and "_joint_model" in self.__dict__:
-            self._joint_model.vary(rows, self.size, self._masses.added)
+        if self._masses.added and "joint_model" in self.__dict__:
+            self.joint_model.vary(rows, self.size, self._masses.added)
 
     def _add_joints(self, actuators: Actuators | None) -> Float64:
         """Set friction and armature of ``actuators``; return the inertia that the engine has to add

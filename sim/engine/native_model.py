@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, cached_property
-from typing import Any
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -21,29 +21,38 @@ from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import BASES, STATUS, Group, ModelStruct, Refresh
 from batchpid.sim.engine.protocol import CompiledModel
-from batchpid.sim.engine.robot_model import passive_force, scene_tree
+from batchpid.sim.engine.robot_model import passive_force
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.task_space.rigid_tree import RigidTree
 
 
-class NativeModel:
-    """Model of the robots of ``spec``, on a base of this kind of :data:`BASES`."""
+class Described(Protocol):
+    """Pack, as far as a model of its robots needs it."""
 
-    def __init__(self, spec: SceneSpec, base: str = "fixed") -> None:
-        self._spec = spec
+    spec: SceneSpec
+
+    @property
+    def rigid_tree(self) -> RigidTree:
+        """As :attr:`batchpid.sim.engine.protocol.EnginePack.rigid_tree`."""
+
+
+class NativeModel:
+    """Model of the robots of ``pack``, without their variation, on a base of this kind of
+    :data:`BASES`.
+    """
+
+    def __init__(self, pack: Described, base: str = "fixed") -> None:
+        # The pack's tree is read at the first use: SAPIEN has to build a robot for it.
+        self._pack = pack
         self._base = base
         self._native = native.extension("_gateway")
         self._inertias: Float64 | None = None
 
     @cached_property
-    def _tree(self) -> RigidTree:
-        return scene_tree(self._spec)
-
-    @cached_property
     def _structure(self) -> tuple[ModelStruct, Any]:
-        tree, rows = self._tree.tables
+        tree, rows = self._pack.rigid_tree.tables
         if self._inertias is None:
-            inertias = self._tree.inertias()[None]
+            inertias = self._pack.rigid_tree.inertias()[None]
         else:
             inertias = self._inertias
         arrays: dict[str, Rows] = {"tree": tree, "rows": rows, "inertias": inertias}
@@ -53,7 +62,7 @@ class NativeModel:
             "varies": self._inertias is not None,
             "base": BASES.index(self._base),
         }
-        return ModelStruct(gravity=self._spec.gravity, **numbers, **addresses), arrays
+        return ModelStruct(gravity=self._pack.spec.gravity, **numbers, **addresses), arrays
 
     @property
     def address(self) -> int:
@@ -67,12 +76,14 @@ class NativeModel:
         They are :func:`batchpid.task_space.spatial_inertia.spatial_matrix`, in the axes of the
         links.
         """
+        tree = self._pack.rigid_tree
         if self._inertias is None:
+            # From now on each robot has inertias of its own.
             self.__dict__.pop("_structure", None)
-            self._inertias = np.tile(self._tree.inertias(), (size, 1, 1))
+            self._inertias = np.tile(tree.inertias(), (size, 1, 1))
         picked = np.asarray(rows, np.intp)
-        varied = self._tree.varied({name: rows[picked] for name, rows in added.items()})
-        self._inertias[picked] = self._tree.inertias(varied)
+        varied = tree.varied({name: rows[picked] for name, rows in added.items()})
+        self._inertias[picked] = tree.inertias(varied)
 
     def mass_matrix(self, qpos: Rows) -> Float64:
         """Return the mass matrices (n, dof, dof) [kg m^2 or kg] that the joints show at ``qpos``
@@ -217,29 +228,25 @@ class NativeStep:
         return bool(status)
 
 
-def mass_matrix_of(spec: SceneSpec, natively: bool) -> Callable[[Float64], Float64]:
-    """Return the function of positions that computes the mass matrices of a robot's description, on
-    a fixed base.
+def mass_matrix_of(pack: Described, natively: bool) -> Callable[[Float64], Float64]:
+    """Return the function of positions that computes the mass matrices of a pack's model, on a
+    fixed base.
 
     ``natively`` says whether the extension is used; then every executor takes them from it, since
     NumPy's differ in the last bits.
     """
     if natively:
-        return NativeModel(spec).mass_matrix
-    tree = cache(
-        lambda: scene_tree(spec).held
-    )  # looked up once: the hash of a spec takes many calls
-    return lambda qpos: ts.mass_matrix(tree(), qpos)
+        return NativeModel(pack).mass_matrix
+    return lambda qpos: ts.mass_matrix(pack.rigid_tree.held, qpos)
 
 
-def passive_force_of(spec: SceneSpec, natively: bool) -> Callable[..., Float64]:
-    """Return the function of positions, velocities, gravity, coriolis and base that computes a
-    robot's passive forces.
+def passive_force_of(pack: Described, natively: bool) -> Callable[..., Float64]:
+    """Return the function of positions, velocities, gravity, coriolis and base that computes the
+    passive forces of a pack's model.
 
     The base is fixed, or held where it is. ``natively`` says whether the extension is used; then
     every executor takes them from it, since the engines' and NumPy's differ in the last bits.
     """
     if natively:
-        return NativeModel(spec, "fixed" if spec.fixed_base else "held").passive_force
-    tree = cache(lambda: scene_tree(spec).held)
-    return lambda *state: passive_force(tree(), *state)
+        return NativeModel(pack, "fixed" if pack.spec.fixed_base else "held").passive_force
+    return lambda *state: passive_force(pack.rigid_tree.held, *state)

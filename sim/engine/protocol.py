@@ -77,6 +77,10 @@ class EnginePack(Protocol):
     friction: Friction
     armature: Float64
 
+    @property
+    def rigid_tree(self) -> RigidTree:
+        """Tree of the robots of ``spec`` as the engine has them, all joints independent."""
+
     def read_qpos(self, dtype: DType = np.float64) -> Rows:
         """Return the joint positions [rad or m]."""
 
@@ -284,20 +288,22 @@ class CompiledPack(EnginePack, Protocol):
         within a tick.
         """
 
+    @property
     def joint_model(self) -> CompiledModel:
-        """Return the native model of :meth:`joint_mass_matrix`, the same object for the life of the
+        """Native model of :meth:`joint_mass_matrix`, the same object for the life of the
         pack.
         """
 
+    @property
     def force_model(self) -> CompiledModel:
-        """Return the native model of :meth:`passive_force`, for compiled steps that do not read
+        """Native model of :meth:`passive_force`, for compiled steps that do not read
         this force.
         """
 
 
 @dataclass
 class Engine:
-    """Physics engine: it makes packs, and the rigid trees of its robots."""
+    """Physics engine: it makes packs of robots."""
 
     name: str
     """Value of the option ``engine``."""
@@ -321,8 +327,6 @@ class Engine:
     allocates its memory. Raises RobotError if the engine cannot build the robot, and
     InvalidArgumentError if the function ``build`` of the spec is wrong.
     """
-    scene_tree: Callable[[SceneSpec], RigidTree]
-    """Rigid tree of the robot of a spec as the engine has it: the same object for equal specs."""
     native_obstacle: Callable[[], str]
     """Reason for which native code cannot call the engine, in a sentence; "" if it can."""
 
@@ -360,6 +364,7 @@ def load_engine(name: str = "sapien") -> Engine:
     MissingDependencyError
         MuJoCo is too old.
     """
+    # Engines are imported at their first use: one of them need not be installed.
     module = MODULES[choice("engine", name, MODULES)]
     if name == "mujoco" and module not in modules:
         _require_mujoco()
@@ -372,6 +377,7 @@ def load_engine(name: str = "sapien") -> Engine:
 
 def _require_mujoco() -> None:
     try:
+        # A module that came with the oldest version that has all that is used here.
         import_module("mujoco.batch")
     except ImportError as error:
         raise MissingDependencyError("mujoco>=3.17", "the engine 'mujoco'") from error

@@ -4,18 +4,12 @@ gravity.
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Any
-
 import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.contacts import Contacts
-from batchpid.sim.robot.simulated_links import rigid_tree
-from batchpid.task_space.frames import matrix_of, unrotate
 from batchpid.task_space.rigid_tree import RigidTree
 
 
@@ -41,30 +35,13 @@ def passive_force(
         turning = base[:, 3:]
         bodies = tree.bodies._replace(gravity=base[:, None, :3])
     force = zero
-    if coriolis or (gravity and tree.fixed_base):
+    if coriolis or gravity:
         force = ts.bias(
             tree, qpos, qvel if coriolis else zero, turning if coriolis else None, bodies=bodies
         )
-    if coriolis and not gravity and tree.fixed_base:
+    if coriolis and not gravity:
         force = force - ts.bias(tree, qpos, zero, bodies=bodies)
     return np.asarray(force, np.float64)
-
-
-def turned_back(wxyz: Float64, vectors: Any) -> Float64:
-    """Return vectors of the world, (3,) or (n, 3), in the axes of bases with these quaternions (n,
-    4).
-
-    Rounded as by ``turn_back`` in ``sim_step.h``.
-    """
-    return np.asarray(unrotate(matrix_of(wxyz), vectors))
-
-
-@lru_cache(maxsize=16)
-def description_tree(spec: SceneSpec) -> RigidTree:
-    """Return the rigid tree of the simulated bodies of ``spec``, not coupled; the same object for
-    equal specs.
-    """
-    return rigid_tree(spec.simulated, gravity=spec.gravity, fixed_base=spec.fixed_base)
 
 
 def contacts_of(spec: SceneSpec, ground: bool) -> Contacts:
@@ -72,11 +49,4 @@ def contacts_of(spec: SceneSpec, ground: bool) -> Contacts:
     at height 0.
     """
     ignored = {frozenset(pair) for pair in spec.ignored}
-    return Contacts(description_tree(spec), spec.simulated.shapes, ignored, ground)
-
-
-def scene_tree(spec: SceneSpec) -> RigidTree:
-    """Return the rigid tree of the robot of ``spec`` as its engine simulates it, the same object
-    for equal specs.
-    """
-    return load_engine(spec.engine).scene_tree(spec)
+    return Contacts(spec.rigid_tree, spec.simulated.shapes, ignored, ground)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,9 +19,9 @@ from batchpid.motors.friction import Friction
 from batchpid.sim.robot.merging import merge_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
-from batchpid.sim.robot.simulated_links import BodyParts, varied_bodies
+from batchpid.sim.robot.simulated_links import BodyParts, rigid_tree, varied_bodies
 from batchpid.sim.robot.tables import Tables
-from batchpid.task_space.rigid_tree import GRAVITY
+from batchpid.task_space.rigid_tree import GRAVITY, RigidTree
 from batchpid.task_space.spatial_inertia import SpatialInertia, spatial_matrix, total
 
 Build = Callable[[Any, int], Any]
@@ -37,7 +38,7 @@ class SceneSpec:
 
     ``tables`` are the rows of the robot's file; ``ignored`` are pairs of its links that do not
     collide; ``joints`` are the degrees of freedom, in the order of all arrays.
-    ``physics`` are the solver settings of ``engine``, in the engine's type. Without ``collisions``
+    ``physics`` are the solver settings, in the engine's type. Without ``collisions``
     scenes have no collision shapes and no ground, but the same masses and inertias. ``mjcf`` is the
     file that MuJoCo compiles in place of ``tables``. ``contacts`` and ``wrenches`` are links with
     sensors. ``carrier`` is the link that carries payloads, and ``varied_links`` are those whose mass
@@ -55,7 +56,6 @@ class SceneSpec:
     collisions: bool = True
     build: Build | None = field(default=None, compare=False)
     gravity: tuple[float, float, float] = GRAVITY
-    engine: str = "sapien"
     contacts: tuple[str, ...] | None = None
     wrenches: tuple[str, ...] | None = None
     mjcf: MjcfFile | None = None
@@ -66,6 +66,11 @@ class SceneSpec:
     def simulated(self) -> Tables:
         """Tables of the simulated bodies."""
         return merge_links(self.tables, self.separate)
+
+    @cached_property
+    def rigid_tree(self) -> RigidTree:
+        """Rigid tree of the simulated bodies, all joints independent."""
+        return rigid_tree(self.simulated, gravity=self.gravity, fixed_base=self.fixed_base)
 
     @property
     def separate(self) -> tuple[str, ...]:
@@ -145,6 +150,7 @@ class VariedMasses:
             column = part.column
             share = 1.0
             if variation.link_mass is not None and column is not None:
+                # The inertia tensor grows with the mass, as of the same body of another density.
                 share = float(np.nan_to_num(variation.link_mass[row, column], nan=1.0))
             if variation.center_of_mass is not None and column is not None:
                 displacement = variation.center_of_mass[row, 3 * column : 3 * column + 3]
@@ -173,9 +179,10 @@ def own_friction(spec: SceneSpec, variation: Variation | None = None) -> Frictio
         model = model._replace(coulomb=coupling_of(spec.joints).of_independent(variation.friction))
     if variation is not None and variation.damping is not None:
         model = model._replace(viscous=variation.damping.copy())
-    return (
-        model if spec.mjcf is None else model._replace(viscous=None)
-    )  # there MuJoCo computes the damping
+    if spec.mjcf is not None:
+        # MuJoCo computes the damping of a file.
+        return model._replace(viscous=None)
+    return model
 
 
 def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
@@ -186,11 +193,9 @@ def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
     coulomb, viscous = (
         one if more is None else more if one is None else one + more for one, more in both
     )
-    if static is not None:
-        if own.coulomb is None:
-            static = static
-        else:
-            static = static + own.coulomb
+    if static is not None and own.coulomb is not None:
+        static = static + own.coulomb
     if coulomb is None and (rubs := Friction(None, None, static, load=load).most) is not None:
+        # Friction of the other kinds alone still needs an array of Coulomb friction.
         coulomb = np.zeros_like(rubs)
     return Friction(coulomb, viscous, static, added.stribeck, load)

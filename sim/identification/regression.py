@@ -25,11 +25,11 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.sim.identification.log import Log, interpolated
 from batchpid.sim.identification.simulator import (
-    Control,
     Dynamics,
     LogControl,
     Plant,
     PlantCandidates,
+    SimulatedControl,
 )
 
 CUTOFF = 15.0
@@ -219,7 +219,7 @@ def _commanded(part: LogData, has_slew: bool) -> Float64:
     ideal = PlantCandidates(Actuators(), law, SETPOINT_DELAYS, [()] * count)
     q, v = (np.repeat(table[:, None], count, axis=1) for table in motion[:2])
     dynamics = Dynamics(part.plant, ideal.masses, q[0], v[0])
-    control = Control(drive, ideal, dynamics, q[0], v[0])
+    control = SimulatedControl(drive, ideal, dynamics, q[0], v[0])
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)
     efforts = np.empty(q.shape)
     zero = np.zeros(q.shape[1:])

@@ -216,7 +216,7 @@ class Dynamics:
             self.force[rows] = force
 
 
-class Control:
+class SimulatedControl:
     """Control, motors and friction of n robots; a native program where programs are used, with the
     same bits.
     """
@@ -406,7 +406,7 @@ def simulate(
         efforts = np.tile(commands[past - 1 :: -1][:past], (1, count, 1))
         if described is not None and drive.through:
             efforts = efforts + described.force
-    control = Control(drive, rows, dynamics, q, v, efforts)
+    control = SimulatedControl(drive, rows, dynamics, q, v, efforts)
     forwards = None
     if any(stretch.feedforward is not None for stretch in stretches):
         tables = []

@@ -176,6 +176,7 @@ def _mass_matrix(layout: Layout, constants: Constants, values: Values) -> Values
     assert law is not None
 
     def fresh() -> Any:
+        # Half way through the steps for which it serves, where its error is least on average.
         xp = namespace(qpos)
         steps = xp.minimum(law.matrix_steps, step.end - step.index).astype(qpos.dtype)
         return mass_matrix(layout, constants, half_way(qpos, qvel, steps, constants.timestep))
@@ -200,6 +201,7 @@ def _guard(layout: Layout, constants: Constants, values: Values) -> Values:
     state, changed = guard_model.advance(
         constants.guard, values.state.guard, setpoint, constants.timestep
     )
+    # The guard limits leaders; a follower's setpoint comes from its leader's.
     command = values.command._replace(setpoint=coupling.positions(state.setpoint))
     if layout.moves:
         command = command._replace(

@@ -33,6 +33,7 @@ class OwnController:
         assert not isinstance(options.control, str)
         self._options = options
         self._controller = options.control
+        self.name = type(options.control).__name__
         if isinstance(options.control, OperationalSpace):
             self._reporting = options.control.reporting
         else:
@@ -45,6 +46,7 @@ class OwnController:
         Raises InvalidArgumentError if an array of the state does not have the envs as its first
         axis.
         """
+        # The structure stays the same; between sim steps only its arrays are kept, by name.
         state = self._structure = _begin(self._options, envs)
         leaves = {name: np.array(leaf) for name, leaf in flatten(state).items()}
         for name, leaf in leaves.items():
@@ -60,7 +62,7 @@ class OwnController:
     def reset(self, state: Mapping[str, Any], mask: NDArray[np.bool_]) -> dict[str, Rows]:
         """Return ``state`` with the envs of ``mask`` (M,) at their start."""
         rows = {name: np.array(leaf) for name, leaf in state.items()}
-        with controller_errors(self._controller):
+        with controller_errors(self):
             fresh = _like(rows, self.init(len(mask)))
         for name, leaf in rows.items():
             leaf[mask] = fresh[name][mask]
@@ -80,6 +82,7 @@ class OwnController:
             read_only(np.array(rows)) for rows in inputs
         )  # the controller may keep them, but not write to them
         new, returned, *limited = self._called(unflatten(self._structure, state), *copies)
+        # Copies again: the controller may change its own arrays at any time.
         leaves = _like(state, flatten(new, read=np.array))
         effort = np.array(returned, np.float64)
         _check_effort(effort, inputs[1])
@@ -122,7 +125,7 @@ def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, Row
 
 
 @contextmanager
-def controller_errors(controller: object, step: int = 0) -> Iterator[None]:
+def controller_errors(controller: OwnController | None, step: int = 0) -> Iterator[None]:
     """Convert errors in sim step ``step`` of a tick to ControllerErrors, unless ``controller`` is
     None.
     """
@@ -131,7 +134,7 @@ def controller_errors(controller: object, step: int = 0) -> Iterator[None]:
     except Exception as error:
         if controller is None:
             raise
-        raise ControllerError(type(controller).__name__, error, step) from error
+        raise ControllerError(controller.name, error, step) from error
 
 
 def _begin(options: RunnerOptions, envs: int) -> Any:

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import clip
+from batchpid.arrays.trees import flatten, leaves, structure
 from batchpid.motors import ActuatorState, advance_measurement
-from batchpid.motors.friction import FrictionState
-from batchpid.motors.guard import GuardState
 from batchpid.sim.engine.missed_contacts import MissedContacts
-from batchpid.sim.engine.protocol import DrivenPack, EnginePack
+from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.acting_draws import ActingDraws, variation
 from batchpid.sim.loop.arrays import Arrays, Command, Ticks
 from batchpid.sim.loop.custom import OwnController
@@ -29,7 +28,7 @@ from batchpid.sim.loop.native_program import Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
 from batchpid.sim.loop.pushes import Pushes
 from batchpid.sim.loop.sensed import LinkSensors
-from batchpid.sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
+from batchpid.sim.loop.snapshot import EnvStates
 from batchpid.sim.loop.step_setup import (
     Setup,
     init_motors,
@@ -40,10 +39,13 @@ from batchpid.sim.loop.step_setup import (
     with_matrix,
     with_params,
 )
-from batchpid.sim.loop.step_values import StepState
+from batchpid.sim.loop.step_values import StepState, state_of
 from batchpid.sim.loop.xla_executor import XLAExecutor
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
+
+_RESULTS = ("effort", "saturated", "guarded")
+"""Results of a sim step that are observed, by name."""
 
 
 class EnvGroup:
@@ -115,7 +117,7 @@ class EnvGroup:
             self._executor = NativeExecutor(setup, state, self._last)
         else:
             self._executor = NumPyExecutor(setup, state)
-        if self._options.control == "drive" and isinstance(self.pack, DrivenPack):
+        if self._options.control == "drive" and hasattr(self.pack, "write_drive"):
             damping, stiffness = setup.constants.drive
             limit = self.acting.acting_params.effort_max
             if limit is None:
@@ -152,6 +154,7 @@ class EnvGroup:
         for them.
         """
         old, motors = state.motors, None
+        # Friction and armature behind the gear belong to the engine's joints.
         self.pack.write_joints(self.acting.set_actuators(actuators), rows)
         if self.acting.motors is not None:
             # New motors begin the streams of their noise again.
@@ -291,10 +294,9 @@ class EnvGroup:
 
     def _take_results(self) -> None:
         outputs = self._executor.results()
-        last = self._last
-        last.effort[...] = outputs.motor
-        last.saturated[...] = False if outputs.saturated is None else outputs.saturated
-        last.guarded[...] = False if outputs.guarded is None else outputs.guarded
+        results = outputs.motor, outputs.saturated, outputs.guarded
+        for name, rows in zip(_RESULTS, results, strict=True):
+            getattr(self._last, name)[...] = False if rows is None else rows
 
     def _push(self, substeps: int) -> None:
         """Push the bases that are due before a tick of ``substeps`` sim steps."""
@@ -325,9 +327,8 @@ class EnvGroup:
         observation, last = rows.observation, self._last
         observation.qpos[...] = self._executor.qpos()
         observation.qvel[...] = self.pack.read_qvel(np.float32)
-        observation.effort[...] = last.effort
-        observation.saturated[...] = last.saturated
-        observation.guarded[...] = last.guarded
+        for name in _RESULTS:
+            getattr(observation, name)[...] = getattr(last, name)
         if observation.base_pose is not None and observation.base_twist is not None:
             pose, twist = np.split(self.pack.read_base(), [7], axis=1)
             observation.base_pose[...] = pose
@@ -344,26 +345,14 @@ class EnvGroup:
 
     def read(self) -> EnvStates:
         """Return the state of these envs, physics and controller."""
-        state = self._executor.read_state()
         last = self._last
-        law = state.law
-        motors = state.motors
-        friction = {}
-        guard = {}
-        if state.age is not None:
-            friction = {**state.friction._asdict(), AGE: state.age}
-        if state.guard is not None:
-            guard = {**state.guard._asdict(), CHANGED: last.guarded.copy()}
+        # Each tick begins with a new mass matrix.
+        control = self._executor.read_state()._replace(matrix=None)
         return EnvStates(
             engine=self.pack.read_state(),
-            effort=last.effort.copy(),
-            saturated=last.saturated.copy(),
-            controller=law.leaves() if isinstance(law, bp.PIDState) else dict(law),
-            friction=friction,
-            actuators=(
-                {} if motors is None else {**motors.leaves(), EPISODE: self._episode.copy()}
-            ),
-            guard=guard,
+            **{name: getattr(last, name).copy() for name in _RESULTS},
+            episode=self._episode.copy(),
+            control=flatten(control),
             containment=self._faults.read(),
             sensors=self._sensors.read(),
             pushes=self._pushes.read(),
@@ -381,38 +370,36 @@ class EnvGroup:
         snapshot.
         """
         acting, last = self.acting, self._last
+        # The control step stays where nothing of it can have changed, since a new one takes time.
+        stays = pack is self.pack and self._controller is None
+        stays = stays and self._options.randomization is None
+        stays = stays and _are_equal((params, actuators), (acting.params, acting.actuators))
         self.pack = pack
-        # Params and actuators come before the state: they say which arrays it has.
         acting.draws = draws
-        acting.set_params(params)
-        state = self._executor.read_state()
-        if actuators is not None or acting.actuators is not None:
-            self._with_actuators(state, actuators)
+        # Params and actuators come before the state: they say which arrays it has.
+        if not stays:
+            acting.set_params(params)
+            if actuators is not None or acting.actuators is not None:
+                self._with_actuators(self._executor.read_state(), actuators)
         # Placing robots clears efforts and suspension, so these follow.
         pack.write_state_rows(states.engine)
         self._faults.write(states.containment)
         pack.suspend(self._faults.suspended)
         pack.write_qf(states.effort)
-        last.effort[...] = states.effort
-        last.saturated[...] = states.saturated
+        for name in _RESULTS:
+            getattr(last, name)[...] = getattr(states, name)
+        self._episode[...] = states.episode
         self._sensors.write(states.sensors)
         self._pushes.write(states.pushes)
-        law: Any = states.controller
-        friction = dict(states.friction)
-        motors = dict(states.actuators)
-        guard = dict(states.guard)
-        state = StepState(
-            law=law if self._controller else bp.PIDState(**law),
-            age=friction.pop(AGE, None),
-            friction=FrictionState(**friction),
-        )
-        if motors:
-            self._episode = motors.pop(EPISODE).copy()
-            state = state._replace(motors=ActuatorState(**motors))
-        if guard:
-            last.guarded[...] = guard.pop(CHANGED)
-            state = state._replace(guard=GuardState(**guard))
-        self._prepare(self._setup(state.motors), state)
+        is_custom = self._controller is not None
+        state = state_of(states.control, is_custom, acting.motors is not None)
+        executor = self._executor
+        if stays:
+            executor.failed = False
+            executor.measure()
+            executor.write_state(with_matrix(executor.setup, state))
+        else:
+            self._prepare(self._setup(state.motors), state)
         if self._contacts is not None:
             self._contacts.place(np.ones(pack.size, bool))
 
@@ -424,6 +411,7 @@ class EnvGroup:
 
         ``returned`` is the effort of the caller's own controller, or None.
         """
+        # The fault is handled here, and the tick goes on.
         self._executor.failed = False
         if returned is not None:
             returned = clip(returned, *self._executor.setup.constants.limits, np)
@@ -499,3 +487,10 @@ class EnvGroup:
         else:
             state = state._replace(law=self._controller.reset(state.law, mask))
         executor.write_state(reset_friction(setup, state, mask))
+
+
+def _are_equal(one: Any, other: Any) -> bool:
+    """Return whether two trees have the same parts, and arrays with the same values."""
+    if structure(one) != structure(other):
+        return False
+    return all(map(np.array_equal, leaves(one), leaves(other)))

@@ -118,6 +118,7 @@ class FaultLog:
         if np.logical_and.reduce(arrays.observation.ok):  # ok.all() takes a call of Python
             return self
         fault = arrays.fault
+        # A fault is new if its step differs from that of the env's last one.
         log = self.restored(fault.step)
         new = list[Fault]()
         for env in np.flatnonzero((log._steps >= 0) & (log._steps != self._steps)).tolist():
@@ -203,6 +204,7 @@ class FaultContainment(StateRows):
 
         ``returned`` is the effort of the caller's own controller, within the limits; or None.
         """
+        # The comparison is also false for NaN.
         qpos = pack.read_qpos()
         qvel = pack.read_qvel()
         bad = ~(np.abs(qpos) <= FARTHEST) | ~np.isfinite(qvel) | pack.strays()[:, None]
@@ -222,6 +224,7 @@ class FaultContainment(StateRows):
     def pop_unplaced(self) -> Bool:
         """Return the envs that failed since the last call (M,), which are to be placed."""
         unplaced = self._unplaced
+        # A new array, since the caller keeps the old one.
         self._unplaced = np.zeros_like(self._unplaced)
         return unplaced
 

@@ -27,13 +27,13 @@ def model_functions(
     """Return the functions for NumPy arrays of the robots of ``pack``."""
     native = steps_natively(pack)
     model = Model(
-        mass_matrix=mass_matrix_of(pack.spec, native),
+        mass_matrix=mass_matrix_of(pack, native),
         joint_mass_matrix=partial(_joint_mass_matrix, pack),
         controller=controller,
         noise=NoiseBlocks(),
     )
     if layout.gravity:
-        force = passive_force_of(pack.spec, native)
+        force = passive_force_of(pack, native)
         parts = layout.gravity, layout.coriolis
         model = model._replace(
             passive_force=lambda qpos, qvel: force(qpos, qvel, *parts, pack.read_base_motion())
@@ -42,9 +42,7 @@ def model_functions(
         return model
     if constants.friction.coulomb is not None:
         inputs = constants.friction, constants.drive, constants.coupling, constants.timestep
-        refresh = NativeRefresh(
-            pack.joint_model(), pack.size, pack.armature, *inputs, REFRESH_STEPS
-        )
+        refresh = NativeRefresh(pack.joint_model, pack.size, pack.armature, *inputs, REFRESH_STEPS)
         model = model._replace(refresh=refresh)
     return model
 

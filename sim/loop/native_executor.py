@@ -91,6 +91,7 @@ class NativeExecutor:
     def run(self, command: Command, moves: bool, begin: int, end: int) -> int:
         """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
         # The tables of ticks are not used here, since the command may differ from theirs.
+        # A program for each kind of tick is made once, at the first such tick.
         program = self.start(moves, begin)
         if program.control is not None:
             program.control.load(command.setpoint)

@@ -21,10 +21,9 @@ from batchpid.native.symbols import Symbol
 from batchpid.native.tracing import Trace, trace
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
-from batchpid.sim.engine.protocol import CompiledPack
-from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
 from batchpid.sim.loop.control_step import COUPLING_STEPS, STAGES, SimStage
+from batchpid.sim.loop.model_functions import steps_natively
 from batchpid.sim.loop.step_setup import Setup, moves_drives
 from batchpid.sim.loop.step_values import (
     Layout,
@@ -82,7 +81,7 @@ class TickProgram:
         self, setup: Setup, buffers: Buffers, table: Table, noise: Any, reads_force: bool
     ) -> None:
         _, pack, layout, constants, _ = setup
-        assert isinstance(pack, CompiledPack)
+        assert steps_natively(pack)
         self._setup, self._buffers = setup, buffers
         self._native = native.extension("_gateway")
         self._programs, self._stages = list[Any](), list[interface.Stage]()
@@ -105,7 +104,7 @@ class TickProgram:
                 field = "measured_force"
             else:
                 field = "read_force"
-            setattr(self.tick, field, pack.force_model().address)
+            setattr(self.tick, field, pack.force_model.address)
         # Programs have no key of the noise, counts, or state of a controller.
         state, motors = buffers.state, buffers.state.motors
         if motors is not None:
@@ -150,14 +149,6 @@ class TickProgram:
         outputs = self.outputs
         measured = self._buffers.measured
         none = np.zeros(measured.qpos.shape, bool)
-        if outputs.saturated is None:
-            saturated = none
-        else:
-            saturated = outputs.saturated
-        if outputs.guarded is None:
-            guarded = none
-        else:
-            guarded = outputs.guarded
         copies: list[tuple[str, Rows, Rows]] = [
             *[
                 ("read", rows, row)
@@ -166,15 +157,17 @@ class TickProgram:
             ("write_floats", seen.qpos, measured.qpos),
             ("write_floats", seen.qvel, measured.qvel),
             ("write_floats", seen.effort, outputs.motor),
-            ("write_bytes", seen.saturated, saturated),
-            ("write_bytes", seen.guarded, guarded),
             ("write_bytes", seen.ok, np.ones(len(none), bool)),
             # One row, which each tick overwrites.
             ("write_floats", table.effort[None], outputs.motor),
-            ("write_bytes", table.saturated[None], saturated),
-            ("write_bytes", table.guarded[None], guarded),
             *[("write_bytes", rows, row) for rows, row in zip(fault, table.fault, strict=True)],
         ]
+        for name in ("saturated", "guarded"):
+            mask = getattr(outputs, name)
+            if mask is None:
+                mask = none
+            copies.append(("write_bytes", getattr(seen, name), mask))
+            copies.append(("write_bytes", getattr(table, name)[None], mask))
         if seen.base_pose is not None and seen.base_twist is not None:
             pose = np.zeros((len(none), 7))
             twist = np.zeros((len(none), 6))
@@ -269,7 +262,7 @@ class TickProgram:
 
     def _add_mass_matrix(self, values: Values) -> Values:
         _, pack, _, constants, _ = self._setup
-        tree, bodies = scene_tree(pack.spec).tables
+        tree, bodies = pack.rigid_tree.tables
         self._place(pose=values.seen.qpos, rate=values.seen.qvel, tree=tree, bodies=bodies)
         self._place(matrix=self._buffers.state.matrix, armature=constants.armature)
         self._place(damping=constants.damping, **constants.coupling.native())

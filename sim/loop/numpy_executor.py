@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.sim.engine.protocol import CompiledPack, CompiledStep, EnginePack
+from batchpid.sim.engine.protocol import CompiledStep, EnginePack
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import COUPLING_STEPS, sim_step
 from batchpid.sim.loop.custom import controller_errors
@@ -86,10 +86,6 @@ class NumPyExecutor:
         setup = self.setup
         constants = setup.constants
         layout = setup.layout._replace(moves=moves)
-        if isinstance(setup.options.control, str):
-            controller = None
-        else:
-            controller = setup.options.control
         self._first = begin
         engine = {
             "targets": self._write_targets,
@@ -100,7 +96,7 @@ class NumPyExecutor:
             step = Step(index, end, layout.left(index, end, constants.timestep))
             self.before = self.measured.qpos  # where a robot that fails now is suspended
             values = Values(self._state, command, self.measured, step, self.measured)
-            with controller_errors(controller, index + 1):
+            with controller_errors(setup.controller, index + 1):
                 values = sim_step(layout, constants, values, engine)
             self._state = values.state
             self.outputs = values.outputs
@@ -141,7 +137,8 @@ class EngineSteps:
         self._is_native = steps_natively(setup.pack)
         self.native_force = False
         """Whether the native sim step reads the passive force."""
-        if isinstance(setup.pack, CompiledPack):
+        # Not isinstance, which would make the pack's native models.
+        if hasattr(setup.pack, "steps_read_force"):
             self.native_force = self.reads_force and setup.pack.steps_read_force(*self._parts)
         self._step: CompiledStep | None = None
         self._bound: object = None

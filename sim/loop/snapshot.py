@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.trees import flatten
 from batchpid.checks.validate import file_path, integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
@@ -31,17 +32,12 @@ from batchpid.motors.friction import FrictionState
 from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, FaultContainment
 from batchpid.sim.loop.pushes import COUNTS
+from batchpid.sim.loop.step_values import StepState
 
-EPISODE = "episode"
-"""Name of the resets of each env with actuators (envs,)."""
-CHANGED = "changed"
-"""Name of the setpoints that the guard changed in the last sim step."""
-AGE = "age"
-"""Name of the sim steps since the friction model of an env took its inertia (envs,)."""
-_FORMAT = 14
+_FORMAT = 15
 _DIGITS = 64
 """Length of a digest."""
-_TABLES = ("controller", "friction", "actuators", "guard", "containment", "sensors", "pushes")
+_TABLES = ("control", "containment", "sensors", "pushes")
 """Parts of :class:`EnvStates` that are arrays by name."""
 
 
@@ -56,19 +52,13 @@ class EnvStates:
     """
     effort: NDArray[np.float32]
     saturated: NDArray[np.bool_]
-    controller: dict[str, Rows]
-    """Leaves of :class:`batchpid.PIDState`."""
-    friction: dict[str, Rows]
-    """Leaves of :class:`batchpid.motors.friction.FrictionState`, and :data:`AGE`; none without
-    Coulomb friction.
-    """
-    actuators: dict[str, Rows]
-    """Leaves of :class:`batchpid.motors.ActuatorState`, and :data:`EPISODE`; none without effects
-    on efforts or measurements.
-    """
-    guard: dict[str, Rows]
-    """Leaves of :class:`batchpid.motors.guard.GuardState`, and :data:`CHANGED`; none without
-    guard.
+    guarded: NDArray[np.bool_]
+    """Setpoints that the guard changed in the last sim step."""
+    episode: NDArray[np.int64]
+    """Resets of each env with actuators (envs,)."""
+    control: dict[str, Rows]
+    """Arrays of :class:`batchpid.sim.loop.step_values.StepState` by name, such as
+    "friction/gain".
     """
     containment: dict[str, Rows]
     """See :class:`batchpid.sim.loop.faults.FaultContainment`."""
@@ -85,29 +75,36 @@ class EnvStates:
         num_envs: int,
         dof: int,
         *,
+        law: dict[str, Rows],
+        motors: dict[str, Rows],
+        sensors: dict[str, Rows],
         stiction: bool,
         guard: bool,
         pushes: bool,
-        **parts: dict[str, Rows],
     ) -> EnvStates:
         """Return states of zeros, in the shapes and dtypes of ``num_envs`` envs of ``dof`` joints.
 
         ``stiction``, ``guard`` and ``pushes`` tell whether the envs have Coulomb friction, a guard
-        and pushes; ``parts`` are the states of controller, actuators and sensors.
+        and pushes; ``law``, ``motors`` and ``sensors`` are the states of these parts by name.
         """
         counts = np.zeros(num_envs, np.int64)
         rows = np.zeros((num_envs, dof))
+        state = StepState(law, motors=motors)
+        if stiction:
+            friction = FrictionState(*[rows] * len(FrictionState._fields))
+            state = state._replace(friction=friction, age=counts)
+        if guard:
+            state = state._replace(guard=GuardState(*[rows] * len(GuardState._fields)))
         return cls(
             engine=np.zeros((num_envs, 0)),
             effort=rows.astype(np.float32),
             saturated=rows > 0,
-            friction=(
-                {**dict.fromkeys(FrictionState._fields, rows), AGE: counts} if stiction else {}
-            ),
-            guard={**dict.fromkeys(GuardState._fields, rows), CHANGED: rows > 0} if guard else {},
+            guarded=rows > 0,
+            episode=counts,
+            control=flatten(state),
             containment=FaultContainment(num_envs, dof, "hold").read(),
+            sensors=sensors,
             pushes=dict.fromkeys(COUNTS, counts) if pushes else {},
-            **parts,
         )
 
     def for_envs(self, envs: slice | NDArray[np.intp]) -> EnvStates:
@@ -148,7 +145,7 @@ class EnvStates:
         return EnvStates(**parts)
 
     def tables(self) -> dict[str, Rows]:
-        """Return all arrays by name, such as "friction.age"."""
+        """Return all arrays by name, such as "control.age"."""
         tables: dict[str, Rows] = {}
         for name, part in vars(self).items():
             if isinstance(part, dict):
@@ -358,7 +355,6 @@ def initial_actuators(
         *(None if leaf is None else leaf.max(0, keepdims=True) for leaf in actuators)
     )
     state = bp.motors.init(longest, np.zeros((1, dof)), timestep).leaves()
-    state[EPISODE] = np.zeros(1, np.int64)
     return {
         name: np.broadcast_to(leaf, (num_envs, *leaf.shape[1:])) for name, leaf in state.items()
     }

@@ -4,15 +4,18 @@ of an executor.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array
+from batchpid.arrays.array_types import Array, Rows
 from batchpid.law.coefficients import Coefficients
+from batchpid.law.state import PIDState
+from batchpid.motors.actuator_state import ActuatorState
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction, FrictionState
+from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.pid_law import PIDLaw
 
@@ -35,6 +38,37 @@ class StepState(NamedTuple):
     """:class:`batchpid.motors.guard.GuardState`; None without guard."""
     matrix: Array = None
     """Mass matrix of the law (M, dof, dof). Each tick begins with a new one."""
+
+
+_RECORDS: dict[str, Any] = {
+    "law": PIDState,
+    "friction": FrictionState,
+    "motors": ActuatorState,
+    "guard": GuardState,
+}
+"""Records of the parts of a :class:`StepState`."""
+
+
+def state_of(arrays: Mapping[str, Rows], is_custom: bool, has_motors: bool) -> StepState:
+    """Return the state with these arrays by name, as :func:`batchpid.arrays.trees.flatten` names
+    them.
+
+    ``is_custom`` and ``has_motors`` say whether the law is the caller's own, and whether there are
+    motors, which may be without arrays.
+    """
+    parts: dict[str, Any] = {"law": {}}  # of efforts it has no arrays
+    if has_motors:
+        parts["motors"] = {}
+    for name, rows in arrays.items():
+        part, _, leaf = name.partition("/")
+        if leaf:
+            parts.setdefault(part, {})[leaf] = rows
+        else:
+            parts[part] = rows
+    for part, record in _RECORDS.items():
+        if part in parts and not (is_custom and part == "law"):
+            parts[part] = record(**parts[part])
+    return StepState(**parts)
 
 
 class Measured(NamedTuple):

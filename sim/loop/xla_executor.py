@@ -18,7 +18,6 @@ from batchpid.arrays.array_types import Array, Float64, Pytree, Rows
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine.native import xla
-from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import sim_step, uses_mass_matrix
 from batchpid.sim.loop.custom import controller_errors
@@ -42,6 +41,7 @@ ROWS = 16
 def padded(rows: Any) -> Rows:
     """Return ``rows`` (envs, ...) followed by copies of the first row, up to a multiple of ROWS."""
     rows = np.asarray(rows)
+    # Copies of a robot stay finite, which rows of zeros need not.
     missing = -len(rows) % ROWS
     return np.concatenate([rows, np.repeat(rows[:1], missing, 0)])
 
@@ -84,6 +84,8 @@ class XLAExecutor:
             return mapped(lambda array: padded(np.broadcast_to(array, rows)), part)
 
         uses_bodies = uses_mass_matrix(layout, constants) or constants.friction.coulomb is not None
+        # A program takes one row of constants for each robot, padded as the robots are.
+        # The law has the limits in its coefficients.
         arrays = constants._replace(
             timestep=np.float64(constants.timestep),
             k=spread(constants.k),
@@ -93,7 +95,7 @@ class XLAExecutor:
         with own_settings("float64"):
             self._constants = put(arrays)
             if uses_bodies:
-                self._bodies = put(scene_tree(pack.spec).tables)
+                self._bodies = put(pack.rigid_tree.tables)
             else:
                 self._bodies = None
         self.write_state(state)
@@ -127,6 +129,7 @@ class XLAExecutor:
         if state.age is None:
             age = None
         else:
+            # The program's integers have 32 bits, as those of a tick's span.
             age = state.age.astype(np.int32)
         with own_settings("float64"):
             self._state = put(jax.tree.map(padded, state._replace(age=age)))
@@ -140,7 +143,7 @@ class XLAExecutor:
         """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
         setup = self.setup
         step = self._engine.compiled()
-        control = setup.options.control
+        # The layout is a key of the cache of programs, so it has no functions of this group.
         controller = setup.controller
         layout = setup.layout._replace(model=Model(), moves=moves)
         traced = None if controller is None else controller.traced
@@ -149,7 +152,7 @@ class XLAExecutor:
             steps = np.array([begin, end, 0, 0], np.int32)
             steps[2:].view(np.uint64)[0] = step.prepare()
             rows = put(mapped(padded, command))
-            with controller_errors(None if controller is None else control, begin + 1):
+            with controller_errors(controller, begin + 1):
                 carry = compiled(layout, traced)(
                     steps, self._constants, self._bodies, self._state, self._measured, rows
                 )
@@ -194,6 +197,7 @@ def tick(
         assert bodies is not None
         return xla.mass_matrix(*bodies, qpos)
 
+    # One branch for all rows: a choice for each row would compute both.
     def when(due: Any, function: Any, otherwise: Array) -> Any:
         return lax.cond(due.any(), function, lambda: otherwise)
 

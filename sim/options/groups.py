@@ -83,7 +83,7 @@ def check_plain(record: object) -> None:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Group:
+class OptionGroup:
     """Base of the groups of options."""
 
     def __post_init__(self) -> None:
@@ -104,7 +104,7 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Scene(Group):
+class Scene(OptionGroup):
     """Engine, ground, contacts, and content of the scenes."""
 
     engine: Annotated[
@@ -112,7 +112,6 @@ class Scene(Group):
         option(
             "snapshot",
             "recording",
-            "scene",
             flag="Physics engine; mujoco is several times as fast, and its contacts differ.",
         ),
     ] = DEFAULT_ENGINE
@@ -287,7 +286,7 @@ class Scene(Group):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Timing(Group):
+class Timing(OptionGroup):
     """Time step and ticks."""
 
     timestep: Annotated[
@@ -347,7 +346,7 @@ class Controller(Protocol):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Control(Group):
+class Control(OptionGroup):
     """Law, gains, motors and guard."""
 
     params: Annotated[bp.PIDParams | None, option("restored")] = None
@@ -438,7 +437,7 @@ class Control(Group):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Faults(Group):
+class Faults(OptionGroup):
     """What makes an env fail, and what happens then."""
 
     on_fault: Annotated[FaultAction, option("snapshot")] = "hold"
@@ -498,7 +497,7 @@ class Ray:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Workers(Group):
+class Workers(OptionGroup):
     """Processes and machines that run the envs."""
 
     first_env: Annotated[int, Field(high=1e9), option("snapshot")] = 0

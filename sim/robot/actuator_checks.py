@@ -44,12 +44,12 @@ def known_joints(robot: RobotDescription) -> KnownJoints:
     knows.
     """
     if robot.actuators is None:
-        own = bp.Actuators()
+        motors = bp.Actuators()
     else:
-        own = robot.actuators
+        motors = robot.actuators
     coulomb, viscous, armature = (
         np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
-        for leaf in (own.coulomb, own.viscous, own.armature)
+        for leaf in (motors.coulomb, motors.viscous, motors.armature)
     )
     return KnownJoints(FRICTION_SHARE * coulomb, viscous, armature)
 
@@ -90,8 +90,10 @@ def fit_actuators(
             " three",
             remedy=f"use control 'pid', or leave only {', '.join(DRIVEN)}",
         )
+    # Ideal ones have no leaf that a joint could change.
     if not actuators.num_joints:
         return actuators
-    own = {name: getattr(actuators, name) for name in ("bias", *JOINT_SIDE)}
-    own = {name: leaf * robot.independent for name, leaf in own.items() if leaf is not None}
-    return actuators.replace(**own, continuous=robot.continuous)
+    motors = {name: getattr(actuators, name) for name in ("bias", *JOINT_SIDE)}
+    # The leader carries friction and armature of its followers.
+    motors = {name: leaf * robot.independent for name, leaf in motors.items() if leaf is not None}
+    return actuators.replace(**motors, continuous=robot.continuous)

@@ -39,6 +39,7 @@ def collision_groups(
     others. The ground and the user's content, with the default words 1, 1, 0, 0, touch every body.
     """
     cliques = _cliques(bodies, ignored, free)
+    # The largest cliques first: what is left over is then the least.
     cliques = sorted(cliques, key=lambda clique: -len(_within(clique, ignored)))[:_MAX_CLIQUES]
     by_words_0_and_1 = set(ignored).difference(*(_within(clique, ignored) for clique in cliques))
     left = by_words_0_and_1
@@ -53,6 +54,7 @@ def collision_groups(
     for body in bodies:
         zero = one = _CONTENT
         if stars:
+            # With stars the default bit would let every pair touch.
             one = 0
             for number, centre in enumerate(stars, start=1):
                 zero |= (centre == body) << number

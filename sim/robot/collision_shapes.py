@@ -47,10 +47,12 @@ def mesh_file(shape: Shape) -> str:
     lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices.tolist()]
     lines += ["f {} {} {}".format(*face) for face in (faces + 1).tolist()]
     content = ("\n".join(lines) + "\n").encode()
+    # SAPIEN reads meshes from files alone, so a hull becomes one.
     cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     path = Path(cache, "batchpid", "meshes", f"{digest(content)[:32]}.obj")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        # Another process may have written the same hull.
         if not path.is_file() or path.read_bytes() != content:
             write_atomically(path, content)
     except OSError as error:

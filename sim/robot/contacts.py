@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.sim.robot.collision_shapes import add_geom
 from batchpid.sim.robot.tables import Shape
 from batchpid.task_space.frames import matrix_of
@@ -26,6 +26,10 @@ NEAR = 0.02
 """Distance [m] below which two shapes are near each other."""
 GROUND = ""
 """Name of the ground."""
+_EXACT = 0.1
+"""Distance [m] of balls around shapes below which least distances are exact."""
+_FARTHEST = 1.0
+"""Largest distance [m] between shapes that is computed."""
 
 
 class Near(NamedTuple):
@@ -66,6 +70,7 @@ class Contacts:
         self._link = np.array([self.links.index(shape.body) for shape in shapes], np.intp)
         bodies = [tree.link_bodies[tree.index(link)] for link in self.links]
         self._body = np.array([bodies[link] for link in self._link], np.intp)
+        # One flat model of all shapes: poses are written into its data, without joints.
         spec = mujoco.MjSpec()
         for shape in self._shapes:
             add_geom(spec, spec.worldbody, shape)
@@ -76,6 +81,7 @@ class Contacts:
         )  # on the world, shapes are where they are in their links
         self._place = self._data.geom_xpos.copy()
         self._turn = self._data.geom_xmat.reshape(-1, 3, 3).copy()
+        # PhysX lets the children of a fixed root collide with it.
         first = 1 if tree.fixed_base else 0
         above = zip(tree.links[1:], tree.parent[1:].tolist(), strict=True)
         free = {frozenset((link, tree.links[parent])) for link, parent in above if parent >= first}
@@ -88,16 +94,20 @@ class Contacts:
         ]
         self._pairs = np.array(pairs, np.intp).reshape(-1, 2)
         self._grounded = np.flatnonzero(self._body >= 0) if ground else np.empty(0, np.intp)
+        owners = [shape.owner for shape in self._shapes]
+        self._owners = [(owners[a], owners[b]) for a, b in pairs]
+        self._owners += [(owners[index], GROUND) for index in self._grounded.tolist()]
+        on_ground = np.column_stack([np.full(len(self._grounded), -1), self._body[self._grounded]])
+        touching = np.vstack([np.sort(self._body[self._pairs], axis=1), on_ground])
+        self.body_pairs, numbers = np.unique(touching, axis=0, return_inverse=True)
+        """Pairs of bodies that may touch (pairs, 2); the ground counts as the base, body -1."""
+        self._body_pair = numbers.ravel()
 
     def near(self, qpos: Rows, within: float = NEAR) -> Iterator[Near]:
         """Yield the pairs of shapes that are closer than ``within`` [m], at one pose (dof,)."""
-        apart, heights = self._apart(qpos, max(within, NEAR))
-        owners = [shape.owner for shape in self._shapes]
-        for row in np.flatnonzero(apart < within).tolist():
-            first, second = self._pairs[row].tolist()
-            yield Near(owners[first], owners[second], float(apart[row]))
-        for row in np.flatnonzero(heights < within).tolist():
-            yield Near(owners[self._grounded[row]], GROUND, float(heights[row]))
+        gaps = self._gaps(np.asarray(qpos)[None], max(within, NEAR))[0]
+        for row in np.flatnonzero(gaps < within).tolist():
+            yield Near(*self._owners[row], float(gaps[row]))
 
     @property
     def balls(self) -> tuple[NDArray[np.intp], Float64]:
@@ -110,47 +120,55 @@ class Contacts:
         centers = np.einsum("sij,sj->si", frames[:, :, :3], self._place) + frames[:, :, 3]
         return self._body, np.column_stack([centers, self._model.geom_rbound[: len(centers)]])
 
-    def least_distances(self, qpos: Rows) -> dict[tuple[int, int], float]:
-        """Return a lower bound of the distance [m] of each pair of bodies that may touch, at one
-        pose (dof,).
+    def least_distances(self, qpos: Rows, needed: Bool) -> Float64:
+        """Return lower bounds of the distances [m] of :attr:`body_pairs`, at poses qpos (n, dof),
+        as (n, pairs).
 
-        It is exact where the bodies are near each other. The ground counts as the base, body -1.
+        Those ``needed`` (n, pairs) are exact where the bodies are near each other, up to 1 m.
         """
-        apart, heights = self._apart(qpos, NEAR)
-        bodies = [
-            *np.sort(self._body[self._pairs], axis=1).tolist(),
-            *([-1, body] for body in self._body[self._grounded]),
-        ]
-        least: dict[tuple[int, int], float] = {}
-        for distance, (first, second) in zip(
-            [*apart.tolist(), *heights.tolist()], bodies, strict=True
-        ):
-            least[first, second] = min(distance, least.get((first, second), np.inf))
+        gaps = self._gaps(qpos, _EXACT, needed[:, self._body_pair])
+        order = np.argsort(self._body_pair, kind="stable")
+        starts = np.searchsorted(self._body_pair[order], np.arange(len(self.body_pairs)))
+        least: Float64 = np.minimum.reduceat(gaps[:, order], starts, axis=1)
         return least
 
-    def _apart(self, qpos: Rows, within: float) -> tuple[Float64, Float64]:
-        """Return lower bounds of the distances of the pairs (pairs,) [m], exact below ``within``,
-        and the heights of the lowest points of the shapes that may touch the ground.
+    def _gaps(self, qpos: Rows, within: float, needed: Bool | None = None) -> Float64:
+        """Return lower bounds of the distances [m] of the pairs of shapes, and then of shapes and
+        the ground, at poses qpos (n, dof), as (n, pairs).
+
+        Those ``needed`` (n, pairs), by default all, are exact below ``within``.
         """
+        centers, turns = self._frames(qpos)
+        radii = self._model.geom_rbound[: len(self._shapes)]
+        first, second = self._pairs.T
+        # Distances between balls around the shapes cost little, so they come first.
+        apart = np.linalg.norm(centers[:, first] - centers[:, second], axis=-1)
+        apart -= radii[first] + radii[second]
+        heights = centers[:, self._grounded, 2] - radii[self._grounded]
+        gaps = np.hstack([apart, heights])
+        exact = gaps < within
+        if needed is not None:
+            exact &= needed
         with self._lock:
-            centers = self._move(qpos)
-            radii = self._model.geom_rbound[: len(centers)]
-            (first, second) = self._pairs.T
-            apart = (
-                np.linalg.norm(centers[first] - centers[second], axis=1)
-                - radii[first]
-                - radii[second]
-            )
-            for row in np.flatnonzero(apart < within).tolist():
-                a, b = self._pairs[row].tolist()
-                apart[row] = mujoco.mj_geomDistance(self._model, self._data, a, b, within, None)
-            return apart, np.array([self._lowest(index) for index in self._grounded.tolist()])
+            for row in np.flatnonzero(exact.any(axis=1)).tolist():
+                self._put(centers[row], turns[row])
+                for pair in np.flatnonzero(exact[row]).tolist():
+                    gaps[row, pair] = self._distance(pair)
+        return gaps
+
+    def _distance(self, pair: int) -> float:
+        """Return the distance [m] of two shapes, or of a shape and the ground, as placed."""
+        if pair >= len(self._pairs):
+            return self._lowest(self._grounded[pair - len(self._pairs)])
+        first, second = self._pairs[pair].tolist()
+        return mujoco.mj_geomDistance(self._model, self._data, first, second, _FARTHEST, None)
 
     def in_contact(self, qpos: Rows, clearance: float = 0.0) -> NDArray[np.bool_]:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground
         (n,).
         """
-        return np.array([any(True for _ in self.near(row, clearance)) for row in np.asarray(qpos)])
+        gaps = self._gaps(np.asarray(qpos), max(clearance, NEAR))
+        return np.asarray((gaps < clearance).any(axis=1))
 
     def nearest_links(self, qpos: Rows) -> tuple[str, ...]:
         """Return the two links nearest to each other; one if the other is the ground, none if none
@@ -184,15 +202,27 @@ class Contacts:
             ]
 
     def _move(self, qpos: Rows) -> Float64:
-        """Place the shapes; return their centers (shapes, 3)."""
+        """Place the shapes at one pose; return their centers (shapes, 3)."""
+        centers, turns = self._frames(qpos)
+        self._put(centers, turns)
+        return centers
+
+    def _frames(self, qpos: Rows) -> tuple[Float64, Float64]:
+        """Return centers (..., shapes, 3) and rotation matrices (..., shapes, 3, 3) of the shapes
+        at poses qpos (..., dof).
+        """
+        qpos = np.asarray(qpos, np.float64)
         if not self._shapes:
-            return np.zeros((0, 3))
-        poses = ts.link_poses(self._tree, np.asarray(qpos, np.float64), self.links)[self._link]
-        turns = matrix_of(poses[:, 3:])
-        centers = poses[:, :3] + np.einsum("sij,sj->si", turns, self._place)
+            return np.zeros((*qpos.shape[:-1], 0, 3)), np.zeros((*qpos.shape[:-1], 0, 3, 3))
+        poses = ts.link_poses(self._tree, qpos, self.links)
+        turns = matrix_of(poses[..., 3:])[..., self._link, :, :]
+        centers = poses[..., self._link, :3] + np.einsum("...sij,sj->...si", turns, self._place)
+        return centers, turns @ self._turn
+
+    def _put(self, centers: Float64, turns: Float64) -> None:
+        """Place the shapes for MuJoCo."""
         self._data.geom_xpos[:] = centers
-        self._data.geom_xmat[:] = (turns @ self._turn).reshape(-1, 9)
-        return np.asarray(centers)
+        self._data.geom_xmat[:] = turns.reshape(-1, 9)
 
     def _lowest(self, index: int) -> float:
         """Return the height [m] of the lowest point of a shape, as placed."""
@@ -203,6 +233,7 @@ class Contacts:
         ]  # the shape's axes along the vertical
         if shape.kind == "mesh":
             mesh = self._model.geom_dataid[index]
+            # The lowest vertex of a hull; other shapes have a formula.
             start = self._model.mesh_vertadr[mesh]
             vertices = self._model.mesh_vert[start : start + self._model.mesh_vertnum[mesh]]
             return float(place[2] + (vertices @ np.array([x, y, z])).min())

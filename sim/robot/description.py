@@ -66,18 +66,16 @@ LIMIT_TOLERANCE = 1e-6  # rad or m
 class RobotDescription:
     """Robot as its file describes it; every array is in the order of ``joint_names``.
 
-    ``tables`` are its bodies and shapes as in the file, after ``repairs``; ``oddities`` are
-    findings about content that was read as it stands. ``joints`` are the degrees of freedom, the
-    moving joints of ``all_joints``. ``settings`` come from a bundled robot, ``defaults`` and ``mjcf`` from an MJCF
-    file, else None. ``package_dirs`` are the folders in which meshes are looked up first.
-    ``actuators`` are its motors and sensors, None for ideal ones. ``base_start`` is the pose (7,)
-    at which the file places a floating base, None if it does not.
+    ``tables`` are its bodies and shapes as in the file, after ``repairs``. ``joints`` are the
+    degrees of freedom, the moving joints of ``all_joints``. ``settings`` come from a bundled robot,
+    ``defaults`` and ``mjcf`` from an MJCF file, else None. ``package_dirs`` are the folders in
+    which meshes are looked up first. ``actuators`` are its motors and sensors, None for ideal ones.
+    ``base_start`` is the pose (7,) at which the file places a floating base, None if it does not.
     """
 
     name: str
     tables: Tables
     repairs: tuple[Finding, ...]
-    oddities: tuple[Finding, ...]
     path: Path
     srdf: Srdf
     self_collision: str
@@ -162,6 +160,7 @@ class RobotDescription:
         it gives none.
         """
         limits = self.effort_limit
+        # The dynamics of 50 poses take time that most robots need not spend.
         if np.isfinite(limits).all():
             return read_only(limits)
         qpos = self.sample(POSES)
@@ -254,6 +253,7 @@ class RobotDescription:
         """
         if self.settings is not None:
             return self.settings.target.copy()
+        # Toward the farther limit, so that the move is inside.
         above = self.upper - self.start
         below = self.lower - self.start
         distance = np.where(above >= -below, above, below)
@@ -272,22 +272,23 @@ class RobotDescription:
         InvalidArgumentError
             The robot has no gains and ``options`` has no ``kp``.
         """
-        known: Document = {"joint_names": self.joint_names, "anti_windup": "conditional"}
+        defaults: Document = {"joint_names": self.joint_names, "anti_windup": "conditional"}
         if self.continuous.any():
-            known["continuous"] = self.continuous
+            defaults["continuous"] = self.continuous
         if not {"effort_min", "effort_max"} & set(options):
-            known["effort_limit"] = self.effort_limit
+            defaults["effort_limit"] = self.effort_limit
         if self.settings is not None:
-            known |= {gain: getattr(self.settings, gain) for gain in ("kp", "ki", "kd")}
+            defaults |= {gain: getattr(self.settings, gain) for gain in ("kp", "ki", "kd")}
         elif "kp" not in options:
             remedy = "pass kp=, ki=, kd= (scalar or per joint), or use robot.designed()"
             raise InvalidArgumentError("kp", f"robot {self.name!r} has no gains", remedy=remedy)
-        return bp.make_params(joints=self.dof, **(known | options))
+        return bp.make_params(joints=self.dof, **(defaults | options))
 
     def sample(self, count: int, seed: int = 0) -> Float64:
         """Return seeded poses (count, dof), uniform within the limits and half a turn of the start;
         followers match.
         """
+        # A joint without limits would have no range to draw from.
         low = np.maximum(self.lower, self.start - np.pi)
         high = np.minimum(self.upper, self.start + np.pi)
         return self.coupled(np.random.default_rng(seed).uniform(low, high, (count, self.dof)))
@@ -388,5 +389,6 @@ class RobotDescription:
 @lru_cache(maxsize=8)
 def _model(robot: RobotDescription, ground: bool) -> RobotModel:
     ignored = frozenset(map(frozenset, robot.ignored_pairs))
+    # Merged, since the engines simulate merged links, too.
     simulated = merge_links(robot.tables)
     return RobotModel(rigid_tree(simulated), robot.coupling, simulated, ignored, ground)

@@ -12,7 +12,6 @@ from lxml import etree
 from batchpid.checks.warn import warn
 from batchpid.errors import RobotError
 
-MOST_LISTED = 50  # repairs in an error
 SEVERITIES = ("warning", "note")  # probably an error; good to know
 
 
@@ -81,9 +80,12 @@ def summary(findings: Iterable[Finding]) -> list[str]:
     """Return one sentence for each cause, with all joints or links that have it, in the order of
     ``findings``.
     """
+    # A dict keeps the order in which causes appear.
     causes: dict[tuple[str, ...], list[Finding]] = defaultdict(list)
-    for each in findings:
-        causes[each.severity, each.code, each._kind, each.text, each.remedy].append(each)
+    for finding in findings:
+        causes[finding.severity, finding.code, finding._kind, finding.text, finding.remedy].append(
+            finding
+        )
     return [_sentence(same) for same in causes.values()]
 
 
@@ -92,7 +94,8 @@ def _sentence(same: Sequence[Finding]) -> str:
     first = same[0]
     names = list(
         dict.fromkeys(
-            f"{each._name} ({each.figures})" if each.figures else each._name for each in same
+            f"{finding._name} ({finding.figures})" if finding.figures else finding._name
+            for finding in same
         )
     )
     if len(names) == 1:
@@ -111,6 +114,7 @@ def finding_of(
     """Return a finding of the joint or link that an XML ``element`` is or belongs to, or of the
     robot.
     """
+    # An attribute's fault is told with the joint or link that a reader looks for.
     owner: etree._Element | None = element
     while owner is not None and owner.tag not in ("joint", "link"):
         owner = owner.getparent()
@@ -139,6 +143,5 @@ def report(path: Path, repairs: Sequence[Finding], strict: bool) -> None:
         warn(f"{path}: {count}; robot.check() and batchpid inspect list them", RepairWarning)
         return
     sentences = [sentence.partition(": ")[2] for sentence in summary(repairs)]
-    listed = "".join(f"\n  {sentence}" for sentence in sentences[:MOST_LISTED])
-    listed += "\n  ..." if len(sentences) > MOST_LISTED else ""
+    listed = "".join(f"\n  {sentence}" for sentence in sentences)
     raise RobotError(f"{path}: needs {count}, which strict=True refuses:{listed}")

@@ -134,9 +134,11 @@ def _inertial(link: etree._Element) -> Iterator[Finding]:
     if not value or not value[0]:
         link.remove(inertial)  # SAPIEN does not use it
         return
+    # Every entry is named, since each may be wrong by itself.
     for problem in filter(None, (fault(inertia, key, "0") for key in MOMENTS)):
         text = f"{problem}: the inertia tensor counts as not given"
         yield finding_of(link, "warning", "inertia", text, "correct <inertia>")
+    # One unreadable entry makes the whole tensor unknown.
     parts = [readable(inertia, key, "0") for key in MOMENTS]
     if None in parts:
         tensor = np.zeros((3, 3))
@@ -157,32 +159,22 @@ def _collisions(link: etree._Element) -> Iterator[Finding]:
     """Leave out collision shapes that PhysX cannot hold."""
     for collision in link.findall("collision"):
         shapes = collision.findall("geometry/*")
+        problem = _misplaced(collision.find("origin"))
         if not shapes:
             problem = f"it has none of {', '.join(SHAPES)}"
-        else:
-            problem = None
-        problem = _misplaced(collision.find("origin")) or problem
         for shape in shapes:
             for key, default in SHAPES[shape.tag].items():
                 text = shape.get(key, default)
                 if key == "scale" and len(text.split()) == 1:
                     shape.set(key, " ".join([text] * 3))  # one factor for all axes
                 sizes = readable(shape, key, default)
-                if (
-                    sizes is None
-                    or min(map(abs, sizes)) < SMALLEST_SIZE
-                    or max(map(abs, sizes)) > LARGEST_SIZE
-                ):
+                # A negative scale mirrors the mesh.
+                smallest = min(abs(size) if key == "scale" else size for size in sizes or (0.0,))
+                if not sizes or smallest < SMALLEST_SIZE or max(sizes) > LARGEST_SIZE:
                     problem = (
                         f"<{shape.tag} {key}={text!r}> is not from {SMALLEST_SIZE:g} to"
                         f" {LARGEST_SIZE:g}"
                     )
-                elif min(sizes) < 0 and key != "scale":  # a negative scale mirrors the mesh
-                    shape.set(key, " ".join(repr(abs(size)) for size in sizes))
-                    problem_text = (
-                        f"<{shape.tag} {key}={text!r}> is negative: its magnitude is used"
-                    )
-                    yield finding_of(link, "warning", "collision", problem_text, "make it positive")
         if problem is not None:
             text = f"a collision shape is left out: {problem}"
             yield finding_of(link, "warning", "collision", text, "correct <collision>")

@@ -65,6 +65,7 @@ def merge_links(tables: Tables, separate: Separate = ()) -> Tables:
         position, wxyz = _within(at, shape.position, shape.wxyz)
         shapes.append(shape._replace(body=at.link, position=position, wxyz=wxyz))
     row = {body.name: index for index, body in enumerate(bodies)}
+    # Engines number shapes by body, and SAPIEN builds mirrored ones last.
     shapes.sort(key=lambda shape: (row[shape.body], shape.is_mirrored))
     return Tables(tuple(bodies), tuple(shapes), links)
 
@@ -129,6 +130,7 @@ def _merged_joints(joints: Sequence[Joint], separate: Separate) -> set[str]:
     merge would change the order of joints below them.
     """
     order = [joint.name for joint in joints if joint.moves]
+    # From the leaves to the root, so that one pass is enough.
     carriers: set[str] = set()  # links with a joint that moves below them
     for joint in reversed(joints):
         if joint.moves or joint.child_link in carriers:
@@ -137,6 +139,7 @@ def _merged_joints(joints: Sequence[Joint], separate: Separate) -> set[str]:
     merged = {joint.name for joint in fixed}
     if _moving_order(joints, merged) == order:
         return merged
+    # Else joints without motion below them first, then one by one what keeps the order.
     merged = {joint.name for joint in fixed if joint.child_link not in carriers}
     for joint in fixed:
         if _moving_order(joints, merged | {joint.name}) == order:

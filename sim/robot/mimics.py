@@ -38,8 +38,9 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     limits = [(joint.lower, joint.upper) for joint in joints]
     for index in coupling.followers.tolist():
         leader, multiplier, offset = (
-            each[index] for each in (coupling.leader, coupling.multiplier, coupling.offset)
+            column[index] for column in (coupling.leader, coupling.multiplier, coupling.offset)
         )
+        # Such a follower holds nothing back.
         if multiplier == 0 or joints[index].continuous:
             continue
         ends = sorted(
@@ -49,6 +50,7 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
         high = min(limits[leader][1], ends[1])
         if low < high:
             limits[leader] = (float(low), float(high))
+    # After all leaders are narrowed, followers get the images of their limits.
     for index in coupling.followers.tolist():
         ends = [_image(coupling, index, end) for end in limits[coupling.leader[index]]]
         limits[index] = (min(ends), max(ends))

@@ -13,8 +13,8 @@ example-robot-data 6.0.0 and of the bundled ones:
 - its radius of gyration exceeds twice L and twice its size (0.6);
 - a joint bears more than a mass of 1000 L^3 kg at the distance L (10 L^3), by gravity or by
   inertia;
-- a limit or mimic offset of a hinge is from 4 pi to 1000 rad (10 rad), or an angle of an <origin>
-  is beyond 2 pi (4.7 rad), as if degrees were read as radians.
+- a limit or mimic offset of a hinge is from 4 pi to 1000 rad (10 rad), as if degrees were read as
+  radians.
 
 Mass and inertia are not checked for a fixed base and for links with less than a hundredth of the
 total mass: sensors, frames and stands often have arbitrary figures.
@@ -22,6 +22,7 @@ total mass: sensors, frames and stands often have arbitrary figures.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterator
 
@@ -64,32 +65,25 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
         if size > LARGEST * length:
             text = f"no robot has such large collision shapes: {of_reach}"
             yield Finding("warning", "scale", text, _UNITS, link=name, detail=f"{size:.3g} m")
-    if sizes and max(sizes.values()) < SMALLEST * reach:
-        text = (
-            f"no robot has such small collision shapes, at most {max(sizes.values()):.2g} m:"
-            f" {of_reach}"
-        )
-        yield Finding(
-            "warning", "scale", text, "correct <mesh scale=>; the meshes may be in metres already"
-        )
+    # A single small link is common, such as a sensor.
+    largest = max(sizes.values(), default=math.inf)
+    if largest < SMALLEST * reach:
+        text = f"no robot has such small collision shapes, at most {largest:.2g} m: {of_reach}"
+        remedy = "correct <mesh scale=>; the meshes may be in metres already"
+        yield Finding("warning", "scale", text, remedy)
     root = robot.bodies[robot.all_joints[0].parent_link].link
     for name, mass in masses.items():
         at_rest = robot.fixed_base and robot.bodies[name].link == root
         if mass.source in ("shapes", "none") or mass.mass < JUDGED * total or at_rest:
             continue
+        # A link may be longer than its shapes.
         size = max(mass.size, next_joint[name])
         if mass.size > 0 and not SPARSEST <= mass.mass / size**3 <= DENSEST:
             kind = "light" if mass.mass < SPARSEST * size**3 else "heavy"
             text = f"no link of such a size is so {kind}"
             remedy = "give <mass> in kg and <collision> in metres"
-            yield Finding(
-                "warning",
-                "mass",
-                text,
-                remedy,
-                link=name,
-                detail=f"{mass.mass:.3g} kg over {size:.3g} m",
-            )
+            detail = f"{mass.mass:.3g} kg over {size:.3g} m"
+            yield Finding("warning", "mass", text, remedy, link=name, detail=detail)
         if mass.gyration > GYRATION * max(length, size):
             text = (
                 "no link has so much inertia for its mass: its radius of gyration exceeds the"
@@ -109,10 +103,10 @@ def _loads(robot: RobotDescription, length: float) -> Iterator[Finding]:
     poses = robot.sample(POSES, seed=0)
     gravity = np.abs(robot.holding_efforts(poses)).max(0)
     inertia = np.diagonal(robot.mass_matrix(poses), axis1=1, axis2=2).max(0)
+    # A slide bears the mass itself, whatever its distance.
     arms = np.where([joint.type == "prismatic" for joint in robot.joints], 1.0, length)
-    for at in np.flatnonzero(
-        np.maximum(gravity / (-GRAVITY[2] * arms), inertia / arms**2) > LOAD * length**3
-    ):
+    masses = np.maximum(gravity / (-GRAVITY[2] * arms), inertia / arms**2)
+    for at in np.flatnonzero(masses > LOAD * length**3):
         text = f"no robot whose chain of joints is up to {length:.3g} m long has such a load"
         remedy = f"correct <mass> and <inertia>; for links without, {_UNITS}"
         detail = (
@@ -122,14 +116,10 @@ def _loads(robot: RobotDescription, length: float) -> Iterator[Finding]:
 
 
 def _degrees(robot: RobotDescription) -> Iterator[Finding]:
-    """Yield a finding for limits and mimic offsets of a hinge, and for angles of an origin, that
-    look like degrees.
-    """
+    """Yield a finding for limits and mimic offsets of a hinge that look like degrees."""
     for joint in robot.all_joints:
-        angles = {
-            name: getattr(joint, name) for name in ("lower", "upper", "soft_lower", "soft_upper")
-        }
-        angles["mimic offset"] = 0.0 if joint.mimic is None else joint.mimic.offset
+        offset = 0.0 if joint.mimic is None else joint.mimic.offset
+        angles = {"lower": joint.lower, "upper": joint.upper, "mimic offset": offset}
         large = [
             f"{name} {angle:g} rad"
             for name, angle in angles.items()
@@ -139,7 +129,6 @@ def _degrees(robot: RobotDescription) -> Iterator[Finding]:
             text = "angles of many turns, as if degrees were read as radians"
             remedy = "give radians, and velocities in rad/s"
             yield Finding("warning", "degrees", text, remedy, joint.name, detail=", ".join(large))
-    yield from robot.oddities
 
 
 def _distances(robot: RobotDescription) -> tuple[float, dict[str, float]]:

@@ -8,9 +8,8 @@ which is an error there.
 
 from __future__ import annotations
 
-import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from lxml import etree
@@ -19,7 +18,7 @@ from batchpid.errors import RobotError
 from batchpid.sim.robot import joint_repair, link_repair
 from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.joint_repair import ends_of
-from batchpid.sim.robot.link_repair import MOMENTS, SHAPES
+from batchpid.sim.robot.link_repair import SHAPES
 
 _READ = {  # elements to keep, by parent: SAPIEN may fail to parse elements that it does not use
     "robot": {"link", "joint"},
@@ -41,16 +40,8 @@ _READ = {  # elements to keep, by parent: SAPIEN may fail to parse elements that
 _MANY = {"link", "joint", "collision", *SHAPES}  # elements that a parent may have several of
 UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
 """Elements of a URDF that have no effect here."""
-_SCALARS = (
-    "value lower upper effort velocity damping friction multiplier offset soft_lower_limit"
-    " soft_upper_limit"
-)
-_NUMBERS: dict[str, tuple[int, ...]] = dict.fromkeys(
-    [*_SCALARS.split(), *MOMENTS, "radius", "length"], (1,)
-)
-_NUMBERS |= {"xyz": (3,), "rpy": (3,), "size": (3,), "scale": (3, 1)}
-"""Attributes that hold numbers, and how many."""
-_DECIMAL_COMMA = re.compile(r"[+-]?(\d+,?\d*|,\d+)([eE][+-]?\d+)?")
+_VECTORS = {"xyz", "rpy", "size", "scale"}
+"""Attributes that hold three numbers."""
 
 
 def repair(root: etree._Element, path: Path) -> list[Finding]:
@@ -59,17 +50,16 @@ def repair(root: etree._Element, path: Path) -> list[Finding]:
     Raises RobotError if the file is a xacro that was not expanded, or has no joint.
     """
     findings = [*_elements(root), *_attributes(root)]
+    # After the removal of elements without effect, where an expression does no harm.
     _refuse_xacro(root, path)
     if root.find("joint") is None:
         remedy = "a xacro has to be expanded first: xacro FILE.xacro > FILE.urdf"
         raise RobotError(f"{path}: a robot without joints cannot be controlled; {remedy}")
     if root.get("name") is None:
         root.set("name", path.stem)
-        text = f"<robot> has no name: called {path.stem!r}, after the file"
-        findings.append(Finding("note", "repeated-name", text, "give <robot name=>"))
     findings += [*_links(root), *_joints(root), *_tree(root)]
     for joint in root.findall("joint"):
-        findings += joint_repair.repair(joint, root)
+        findings += joint_repair.repair(joint)
     findings += joint_repair.mimics(root)
     for link in root.findall("link"):
         findings += link_repair.repair(link)
@@ -86,6 +76,7 @@ def _elements(root: etree._Element) -> Iterator[Finding]:
         seen = set()
         for child in list(parent):
             tag = etree.QName(child).localname
+            # Elements within those that are kept are looked at in turn.
             if child.tag in _READ[parent.tag] and (child.tag in _MANY or child.tag not in seen):
                 seen.add(child.tag)
                 stack += [child] if child.tag in _READ else []
@@ -114,7 +105,7 @@ def _list(tags: Counter[str]) -> str:
 
 
 def _attributes(root: etree._Element) -> Iterator[Finding]:
-    """Strip the attributes, remove empty ones, and read commas between and in numbers."""
+    """Strip the attributes, remove empty ones, and read commas between numbers."""
     for element in root.iter():
         for key, value in element.items():
             if not (text := value.strip()):
@@ -124,32 +115,13 @@ def _attributes(root: etree._Element) -> Iterator[Finding]:
                     yield finding_of(
                         element, "note", "empty-attribute", problem, "give a value, or remove it"
                     )
-            elif "," in text and (read := _without_commas(text, _NUMBERS.get(key, ()))) is not None:
-                element.set(key, read)
-                done = "points in place of decimal commas"
-                remedy = "write decimal points"
-                if read == text.replace(",", " "):
-                    done = "blanks in place of the commas"
-                    remedy = "separate the numbers by blanks"
-                problem = f"<{element.tag} {key}={text!r}> is read with {done}"
+            elif key in _VECTORS and len(text.split(",")) == 3:
+                element.set(key, text.replace(",", " "))
+                problem = f"<{element.tag} {key}={text!r}> is read with blanks in place of commas"
+                remedy = "separate the numbers by blanks"
                 yield finding_of(element, "warning", "number", problem, remedy)
             elif text != value:
                 element.set(key, text)
-
-
-def _without_commas(text: str, counts: Sequence[int]) -> str | None:
-    """Return one of ``counts`` numbers with blanks between them and decimal points; None if the
-    commas are neither.
-    """
-    if len((separated := text.replace(",", " ")).split()) in counts:
-        return separated
-    words = text.split()
-    decimal = len(words) in counts and all(
-        "," not in word or _DECIMAL_COMMA.fullmatch(word) for word in words
-    )
-    if decimal:
-        return text.replace(",", ".")
-    return None
 
 
 def _refuse_xacro(root: etree._Element, path: Path) -> None:
@@ -171,22 +143,11 @@ def _links(root: etree._Element) -> Iterator[Finding]:
     """Remove links without a name and with a name that is taken."""
     seen: set[str | None] = {None}
     for link in root.findall("link"):
-        if (name := link.get("name")) in seen:
-            if name is None:
-                text = "no joint can refer to a link without name"
-            else:
-                text = "this name is used twice"
-            if name is None:
-                effect = "left out"
-            else:
-                effect = "the first link is kept, the other left out"
-            yield finding_of(
-                link,
-                "warning",
-                "repeated-name",
-                f"{text}: {effect}",
-                "give every link a name to itself",
-            )
+        name = link.get("name")
+        if name in seen:
+            text = "has no name, or one that is used twice: left out"
+            remedy = "give every link a name to itself"
+            yield finding_of(link, "warning", "repeated-name", text, remedy)
             root.remove(link)
         seen.add(name)
 
@@ -199,33 +160,20 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
         name = joint.get("name")
         ends = ends_of(joint)
         if name is not None and seen.get(name) == ends:
-            yield finding_of(
-                joint,
-                "warning",
-                "repeated-name",
-                "given twice: the first is kept",
-                "remove the copy",
-            )
+            text = "given twice: the first is kept"
+            yield finding_of(joint, "warning", "repeated-name", text, "remove the copy")
             root.remove(joint)
             continue
+        # The number that makes a new name is the first that nobody has.
         base = new = name or "{}_to_{}".format(*ends)
         number = 2
         while new in seen or (new != name and new in names):
             new = f"{base}_{number}"
-            number = number + 1
+            number += 1
         if new != name:
             joint.set("name", new)
-            if name is None:
-                problem = "no name"
-            else:
-                problem = f"the name {name!r} is used twice"
-            yield finding_of(
-                joint,
-                "warning",
-                "repeated-name",
-                f"{problem}: called {new!r}",
-                "name it in the URDF",
-            )
+            text = f"no name, or one that is used twice: called {new!r}"
+            yield finding_of(joint, "warning", "repeated-name", text, "name it in the URDF")
         seen[new] = ends
 
 
@@ -242,6 +190,7 @@ def _tree(root: etree._Element) -> Iterator[Finding]:
             yield Finding(
                 "warning", "missing-link", text, "correct the name, or add the link", link=name
             )
+    # A robot of one link has no joints that could name it.
     joined = {end for pair in ends for end in pair}
     for name, link in links.items():
         if joined and name not in joined:

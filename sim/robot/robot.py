@@ -71,7 +71,7 @@ class Robot(RobotDescription):
         fixed_base
             True to fix the root link to the world. Default True, unless the file has a floating
             base: the root of an MJCF file has a free joint, or the root of a URDF is a link without
-            mass and shapes and its only joint is floating or planar: then the root is that joint's
+            mass and shapes and its only joint is floating: then the root is that joint's
             child.
         self_collision
             ``"auto"``: links that are neighbours, or touch or overlap at the start pose or in
@@ -111,7 +111,7 @@ class Robot(RobotDescription):
         # Options are checked before a file is read, so that a wrong one is not hidden by a fault of
         # the file.
         path = _find(name_or_path)
-        folders = tuple(file_path("package_dirs", each) for each in package_dirs)
+        folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
         source = read_robot(path, fixed_base, folders, missing_meshes)
         report(path, source.repairs, strict)
         joints = couple([joint for joint in source.tables.joints if joint.moves])
@@ -249,9 +249,9 @@ class Robot(RobotDescription):
             An option is not one of those above, or has a wrong shape or sign.
         """
         check_keywords("kinematic_tree", options, ("armature", "gravity"))
-        known = {}
+        own_options = {}
         if self.actuators is not None and self.actuators.armature is not None:
-            known["armature"] = np.asarray(self.actuators.armature, float)[0]
+            own_options["armature"] = np.asarray(self.actuators.armature, float)[0]
         if not self.fixed_base:
             problem = (
                 "operational space and inverse kinematics need a kinematic tree, which has a fixed"
@@ -261,7 +261,7 @@ class Robot(RobotDescription):
                 f"{self.path}: {problem}; load the robot with fixed_base=True, or control its"
                 " joints"
             )
-        return replace(self.rigid_tree, **(known | options))
+        return replace(self.rigid_tree, **(own_options | options))
 
     @property
     def has_tuned(self) -> bool:

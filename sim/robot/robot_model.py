@@ -89,6 +89,7 @@ class RobotModel:
             the base (6, 6).
             """
             x, y, z = point
+            # A twist of the base moves each point of the world by v + w x p.
             crossed = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # -(p x)
             of_base = np.block([[np.eye(3), crossed], [np.zeros((3, 3)), np.eye(3)]])
             pose = ts.link_poses(tree, joints, (link,))[0]
@@ -101,6 +102,7 @@ class RobotModel:
             of_joints, of_base = (
                 np.concatenate([foot[:3] for foot in part]) for part in zip(*feet, strict=True)
             )
+            # Directions that the feet leave free are cut off, not followed.
             follow = -np.linalg.pinv(of_base, rcond=1e-3) @ of_joints
         matrix = np.zeros((tree.dof, tree.dof))
         for at, link in enumerate(tree.links):
@@ -144,6 +146,7 @@ def base_start(robot: Any, qpos: Float64, ground: bool) -> Float64:
     """
     pose = np.array(robot.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64)
     model = robot.dynamics()
+    # The ground is met by any link, the base included.
     height = model.contacts.height(np.nan_to_num(qpos), base_too=True)
     if not np.isfinite(height):
         return pose

@@ -14,9 +14,6 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from batchpid.arrays.array_types import Float64
 from batchpid.sim.robot.collision_groups import link_groups
 from batchpid.sim.robot.contacts import Contacts
 from batchpid.sim.robot.findings import Finding
@@ -82,13 +79,13 @@ def read_srdf(path: Path, links: Iterable[str]) -> Srdf:
     Pairs that name a link twice or an unknown link are left out, as in MoveIt, with a finding.
     Raises RobotError for what :func:`batchpid.sim.robot.xml.parse_xml` refuses.
     """
-    known = set(links)
+    names = set(links)
     disabled = list[DisabledPair]()
     enabled = set[frozenset[str]]()
     findings = list[Finding]()
     for element in parse_xml(path).iterchildren("disable_collisions", "enable_collisions"):
         pair = element.get("link1", ""), element.get("link2", "")
-        if len(known.intersection(pair)) != 2:
+        if len(names.intersection(pair)) != 2:
             text = (
                 f"{path.name}: <{element.tag} link1={pair[0]!r} link2={pair[1]!r}> does not name"
                 " two of its links"
@@ -105,7 +102,7 @@ def disabled_pairs(
     order: Sequence[str],
     adjacent: Iterable[frozenset[str]],
     rest: Iterable[frozenset[str]],
-    samples: Sequence[Iterable[frozenset[str]]],
+    samples: Sequence[Collection[frozenset[str]]],
 ) -> tuple[DisabledPair, ...]:
     """Return the pairs that do not collide, each with the first of its reasons, in ``order`` of the
     links.
@@ -113,17 +110,15 @@ def disabled_pairs(
     ``adjacent`` are neighbours, ``rest`` the pairs in contact at rest, ``samples`` those in contact
     at each pose.
     """
-    touches = Counter(pair for sample in samples for pair in set(sample))
+    touches = Counter(pair for sample in samples for pair in sample)
     always = (pair for pair, count in touches.items() if count > ALWAYS * len(samples))
     reasons: dict[frozenset[str], str] = {}
     for reason, pairs in (("Adjacent", adjacent), ("Default", rest), ("Always", always)):
         for pair in pairs:
             reasons.setdefault(pair, reason)
     number = {link: index for index, link in enumerate(order)}
-    ordered = {
-        tuple(sorted(pair, key=number.__getitem__)): reason for pair, reason in reasons.items()
-    }
-    listed = [DisabledPair(first, second, reason) for (first, second), reason in ordered.items()]
+    ordered = ((sorted(pair, key=number.__getitem__), reason) for pair, reason in reasons.items())
+    listed = [DisabledPair(first, second, reason) for (first, second), reason in ordered]
     return tuple(sorted(listed, key=lambda pair: (number[pair.first], number[pair.second])))
 
 
@@ -142,14 +137,13 @@ def self_contact(robot: Any) -> SelfContact:
     if robot.self_collision == "none":
         computed = tuple(DisabledPair(*pair, "User") for pair in combinations(solid, 2))
     elif robot.self_collision == "auto" and len({bodies[link] for link in solid}) > 1:
-        at_rest, *samples = [
-            _distances(contacts, qpos) for qpos in (robot.start, *robot.sample(SAMPLES, seed=0))
-        ]
+        # The first pose is the start; the others judge how often a pair touches.
         rest, *close = [
-            [pair for pair, distance in near.items() if distance < GAP]
-            for near in (at_rest, *samples)
+            {frozenset(near[:2]) for near in contacts.near(qpos, GAP)}
+            for qpos in (robot.start, *robot.sample(SAMPLES, seed=0))
         ]
         computed = disabled_pairs(solid, _adjacent_links(robot.all_joints, solid), rest, close)
+    # The .srdf comes last, so that its reason holds.
     listed = {pair.links: pair for pair in (*computed, *robot.srdf.disabled)}
     pairs = [
         pair
@@ -163,17 +157,6 @@ def self_contact(robot: Any) -> SelfContact:
         left_over=tuple(pair for pair in pairs if pair.links in left_over),
         reaches_ground=robot.fixed_base and contacts.height(robot.start) < GAP,
     )
-
-
-def _distances(contacts: Contacts, qpos: Float64) -> dict[frozenset[str], float]:
-    """Return the distances [m] of the pairs of links that are near each other, at one pose
-    (dof,).
-    """
-    distances: dict[frozenset[str], float] = {}
-    for near in contacts.near(qpos):
-        pair = frozenset(near[:2])
-        distances[pair] = min(near.distance, distances.get(pair, np.inf))
-    return distances
 
 
 def _adjacent_links(joints: Iterable[Joint], solid: Collection[str]) -> list[frozenset[str]]:

@@ -64,19 +64,21 @@ def _of_leaders(guard: bp.Guard, joints: Sequence[Joint]) -> bp.Guard:
         ends = np.sort(
             [(end[:, index] - coupling.offset[index]) / multiplier for end in (low, high)], axis=0
         )
+        # A leader that turns without end takes its follower anywhere.
         if joints[leader].continuous:
             _check_turning(joints[index].name, joints[leader].name, ends)
             continue
         ends = np.stack([np.maximum(low[:, leader], ends[0]), np.minimum(high[:, leader], ends[1])])
+        # Limits that exclude each other would leave no setpoint.
         narrower = ends[0] < ends[1]
         low[:, leader], high[:, leader] = np.where(
             narrower, ends, (low[:, leader], high[:, leader])
         )
     for limits, none in zip((low, high, rate, acceleration), free, strict=False):
         limits[:, coupling.followers] = none
-    found = dict(zip(guard._fields, (low, high, rate, acceleration), strict=False))
+    leaves = dict(zip(guard._fields, (low, high, rate, acceleration), strict=False))
     return guard._replace(
-        **{name: None if np.isinf(limits).all() else limits for name, limits in found.items()}
+        **{name: None if np.isinf(limits).all() else limits for name, limits in leaves.items()}
     )
 
 

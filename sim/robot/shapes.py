@@ -82,6 +82,7 @@ def surfaces(
         solid = [(shape, None) for shape in robot.tables.shapes_of(name)]
         parts: dict[Rgba, list[Any]] = {}
         unreadable: list[_UnreadableMesh] = []
+        # Collision shapes are drawn where the visuals cannot be.
         for elements in (visuals.get(name, []), solid):
             try:
                 meshes = [_mesh(shape, robot, deviation) for shape, _ in elements]

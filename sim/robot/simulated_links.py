@@ -65,6 +65,7 @@ def varied_bodies(
         place = inertias[carrier].moved(at.position, at.wxyz).center
     varied = {}
     for body in merge_links(tables, separate).bodies:
+        # A body without mass of its links varies as it is simulated.
         members = parts[body.name] or [Part(body.spatial_inertia, np.eye(3), None)]
         if body.name == at.link or any(part.column is not None for part in members):
             varied[body.name] = BodyParts(members, place if body.name == at.link else None)
@@ -97,8 +98,8 @@ def link_masses(tables: Tables, repairs: Iterable[Finding]) -> dict[str, LinkMas
         size = _size(tables.shapes_of(body.name))
         center = read_only(inertia.center)
         tensor = read_only(inertia.tensor)
-        kept = SpatialInertia(inertia.mass, center, tensor)
-        masses[body.name] = LinkMass(inertia.mass, source, gyration, size, kept)
+        frozen_inertia = SpatialInertia(inertia.mass, center, tensor)
+        masses[body.name] = LinkMass(inertia.mass, source, gyration, size, frozen_inertia)
     return masses
 
 

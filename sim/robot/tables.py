@@ -110,6 +110,7 @@ class Tables:
     """Body and place in it of each link of the file, in the order of the file's rows."""
 
     def __post_init__(self) -> None:
+        # Frozen, so that caches and processes can share them.
         vars(self).update(
             bodies=tuple(Body._make(map(read_only, body)) for body in self.bodies),
             shapes=tuple(Shape._make(map(read_only, shape)) for shape in self.shapes),
@@ -145,6 +146,7 @@ def breadth_first(bodies: Iterable[Body], shapes: Iterable[Shape]) -> Tables:
             ordered.append(body)
         else:
             below[body.joint.parent_link].append(body)
+    # The list grows while it is read, which is breadth first.
     for body in ordered:
         ordered += below[body.name]
     row = {body.name: index for index, body in enumerate(ordered)}

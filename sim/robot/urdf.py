@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +12,7 @@ from lxml import etree
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.errors import RobotError
 from batchpid.motors import Actuators
-from batchpid.sim.robot.findings import Finding, finding_of
+from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.joint_repair import ends_of, free_base, free_joint_of
 from batchpid.sim.robot.link_repair import MOMENTS, from_entries
 from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
@@ -26,16 +24,13 @@ from batchpid.sim.robot.xml import number, numbers
 from batchpid.task_space.frames import from_rpy
 
 MOST_READ = 4096  # links and joints of a file
-TURN = 2 * np.pi + 0.01
-"""Largest plausible angle of an origin [rad]."""
 
 
 class Source(NamedTuple):
     """Robot as its file gives it.
 
-    ``repairs`` are findings, one for each change that the simulation needs; ``oddities`` are
-    findings about content that was read as it stands. ``base_start`` is the pose (7,) at which the
-    file places a floating base.
+    ``repairs`` are findings, one for each change that the simulation needs. ``base_start`` is the
+    pose (7,) at which the file places a floating base.
     """
 
     name: str
@@ -43,7 +38,6 @@ class Source(NamedTuple):
     repairs: tuple[Finding, ...]
     fixed_base: bool
     base_start: tuple[float, ...] | None
-    oddities: tuple[Finding, ...] = ()
     mjcf: MjcfFile | None = None
     pairs: tuple[DisabledPair, ...] = ()
     """Pairs of links that do not collide."""
@@ -68,16 +62,13 @@ def read_urdf(
     base = None
     if fixed_base is None:
         fixed_base = free_joint is None
-    else:
-        fixed_base = fixed_base
     if free_joint is not None and not fixed_base:
-        base = free_base(root, free_joint, findings)
+        base = free_base(root, free_joint)
     _repair(root, path, findings, package_dirs, missing_meshes)
     added = [str(finding.link) for finding in findings if finding.code == "missing-link"]
     tables = _read_tables(root, path, added)
     name = root.get("name", path.stem)
-    oddities = tuple(_degrees(root))
-    return Source(name, tables, tuple(findings), fixed_base, base, oddities)
+    return Source(name, tables, tuple(findings), fixed_base, base)
 
 
 def _repair(
@@ -93,6 +84,7 @@ def _repair(
         raise RobotError(
             f"{path}: {problem}; is this a robot's file (not SDF, xacro, a part of an MJCF)?"
         )
+    # Before the repairs and the check of the tree, whose time is the square of the number.
     if max(len(root.findall(tag)) for tag in ("link", "joint")) > MOST_READ:
         raise RobotError(
             f"{path}: has more than {MOST_READ} links or joints; remove what the robot does not"
@@ -122,20 +114,20 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
     names and why.
     """
     missing = []
-    check = cache(mesh_problem)
     for collision in root.findall("link/collision"):
         mesh = collision.find("geometry/mesh")
         if mesh is None:
             continue
         name = mesh.get("filename", "")
-        found = find_mesh(name, path, package_dirs)
-        problem = None if found is None else check(found)
-        if found is None or problem is not None:
+        file = find_mesh(name, path, package_dirs)
+        problem = None if file is None else mesh_problem(file)
+        if file is None or problem is not None:
             missing.append(name if problem is None else f"{name} ({problem})")
             collision.getparent().remove(collision)
         else:
-            check_unchanged(found)
-            mesh.set("filename", str(found))
+            # SAPIEN would simulate the file that it read before.
+            check_unchanged(file)
+            mesh.set("filename", str(file))
     return missing
 
 
@@ -206,6 +198,7 @@ def _read_tables(root: etree._Element, path: Path, added: list[str]) -> Tables:
                 read_shape(geometry, name, place, where)
                 for geometry in collision.iterfind("geometry/*")
             ]
+    # Links of a loop are below no root, and so left behind.
     tables = breadth_first(bodies, shapes)
     if len(tables.bodies) != len(bodies):
         root_link = tables.bodies[0].name
@@ -214,16 +207,6 @@ def _read_tables(root: etree._Element, path: Path, added: list[str]) -> Tables:
             " one tree"
         )
     return tables
-
-
-def _degrees(root: etree._Element) -> Iterator[Finding]:
-    """Yield a finding for each origin with an angle of more than a turn, in degrees probably."""
-    for origin in root.iterfind(".//origin[@rpy]"):
-        if max(map(abs, numbers(origin, "rpy", "0 0 0", "origin"))) > TURN:
-            text = "roll, pitch or yaw of more than a turn, as if degrees were read as radians"
-            detail = f"<{origin.getparent().tag}> rpy {origin.get('rpy')}"
-            remedy = "give <origin rpy=> in radians"
-            yield finding_of(origin, "warning", "degrees", text, remedy, detail)
 
 
 def read_shape(

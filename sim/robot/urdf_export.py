@@ -82,6 +82,7 @@ def _write(robot: RobotDescription, mass_factors: Mapping[str, float]) -> etree.
     for body in robot.links:
         link = etree.SubElement(root, "link", name=body.name)
         factor = factors.get(tree.link_bodies[tree.index(body.name)])
+        # A factor of the rigid body holds for each of its links.
         if factor is not None and body.name in inertias:
             # A mass of shapes becomes a number.
             mass, center, inertia = inertias[body.name]
@@ -155,7 +156,9 @@ def _copy_unused(
     found.
     """
     owners = {
-        (tag, each.get("name")): each for tag in ("link", "joint") for each in root.findall(tag)
+        (tag, element.get("name")): element
+        for tag in ("link", "joint")
+        for element in root.findall(tag)
     }
     copied = set()
     missing = []
@@ -166,11 +169,12 @@ def _copy_unused(
             continue  # left out, or the second of its name
         copied.add(owner)
         target.extend(deepcopy([child for child in parent if child.tag in COPIED]))
+    # Paths were relative to the source, which the new file may not be near.
     for mesh in root.iterfind("link/visual/geometry/mesh"):
-        if (found := find_mesh(mesh.get("filename", ""), path, packages)) is None:
+        if (file := find_mesh(mesh.get("filename", ""), path, packages)) is None:
             missing.append(mesh.get("filename", ""))
         else:
-            mesh.set("filename", str(found))
+            mesh.set("filename", str(file))
     if missing:
         return [f"visual meshes not found, written as they were: {', '.join(sorted({*missing}))}"]
     return []
@@ -180,25 +184,14 @@ def _lacking(robot: RobotDescription) -> Iterator[str]:
     """Yield sentences about infinite limits, for which a URDF has no number, and about
     actuators.
     """
-    for what, names in (
-        ("effort limit", [joint.name for joint in robot.joints if math.isinf(joint.effort_limit)]),
-        (
-            "velocity limit",
-            [joint.name for joint in robot.joints if math.isinf(joint.velocity_limit)],
-        ),
-    ):
+    endless = {
+        "effort limit": robot.effort_limit,
+        "velocity limit": robot.velocity_limit,
+        "position limit": np.where(robot.continuous, 0.0, robot.upper - robot.lower),
+    }
+    for kind, limits in endless.items():
+        names = [robot.joint_names[joint] for joint in np.flatnonzero(np.isinf(limits))]
         if names:
-            yield f"no {what}, which other programs may require: {', '.join(names)}"
-    endless = [
-        joint
-        for joint in robot.joints
-        if not joint.continuous and math.isinf(joint.upper - joint.lower)
-    ]
-    if endless:
-        names = [joint.name for joint in endless]
-        yield (
-            "no position limit, written as inf, which other programs may refuse:"
-            f" {', '.join(names)}"
-        )
+            yield f"no {kind}, which other programs may require: {', '.join(names)}"
     if robot.actuators is not None:
         yield "motors and sensors (actuators) are not in a URDF"

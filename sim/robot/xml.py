@@ -37,6 +37,7 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
     try:
         with open(path, "rb") as file:
             data = file.read(SIZE_LIMIT + 1)
+        # One byte more than allowed is read, and no more.
         if len(data) > SIZE_LIMIT:
             raise RobotError(
                 f"{path}: larger than {SIZE_LIMIT >> 20} MiB; remove what the robot does not need"
@@ -69,16 +70,25 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
 
 def _drop_default_namespace(root: etree._Element) -> None:
     """Take elements out of a default namespace, which readers of robots ignore."""
-    found = [each for each in root.iter("{*}*") if each.prefix is None and each.tag.startswith("{")]
-    for element in found:
+    elements = [
+        element
+        for element in root.iter("{*}*")
+        if element.prefix is None and element.tag.startswith("{")
+    ]
+    for element in elements:
         element.tag = etree.QName(element).localname
-    if found:
+    if elements:
         etree.cleanup_namespaces(root)
 
 
+def parse_bytes(data: bytes, **options: bool) -> etree._Element:
+    """Return the root element of untrusted XML; ``options`` are more of those of lxml's parser."""
+    safe = {"resolve_entities": False, "no_network": True, "load_dtd": False}
+    return etree.fromstring(data, etree.XMLParser(**safe, **options))
+
+
 def _parse(data: bytes) -> etree._Element:
-    options = {"resolve_entities": False, "no_network": True, "load_dtd": False}
-    return etree.fromstring(data, etree.XMLParser(**options, remove_comments=True, remove_pis=True))
+    return parse_bytes(data, remove_comments=True, remove_pis=True)
 
 
 def _lenient(data: bytes) -> etree._Element:
@@ -99,6 +109,7 @@ def _lenient(data: bytes) -> etree._Element:
     ):  # comments and processing instructions, in linear time
         first, *rest = text.split(start)
         text = first + "".join(part.partition(end)[2] for part in rest)
+    # An ampersand that begins no entity.
     text = re.sub(r"&(?!\w+;|#)", "&amp;", text)
     prefixes = sorted(set(re.findall(r"[<\s]([A-Za-z_]\w{0,40}):", text)) - {"xml", "xmlns"})[
         :MOST_PREFIXES
@@ -108,8 +119,6 @@ def _lenient(data: bytes) -> etree._Element:
     root = wrapper.find("{*}robot")
     if root is None and len(wrapper):
         root = wrapper[0]
-    else:
-        root = root
     if root is None:
         raise etree.XMLSyntaxError("no element", 0, 0, 0)
     wrapper.remove(root)
@@ -144,10 +153,10 @@ def readable(
 ) -> tuple[float, ...] | None:
     """Return the numbers in an attribute, or None where :func:`numbers` raises."""
     if element is None:
-        given = default
+        text = default
     else:
-        given = element.get(key, default)
-    words = (given if given.strip() else default).split()
+        text = element.get(key, default)
+    words = (text if text.strip() else default).split()
     largest = LARGEST_LIMIT if limit else LARGEST
     try:
         values = tuple(float(word) for word in words if word.isascii() and "_" not in word)

@@ -300,8 +300,8 @@ def restored(
         stiction=options.has_stiction(acting),
         guard=options.guard is not None,
         pushes=options.has_pushes,
-        controller=initial_state(options, params),
-        actuators=initial_actuators(acting, options.num_envs, robot.dof, options.timestep),
+        law=initial_state(options, params),
+        motors=initial_actuators(acting, options.num_envs, robot.dof, options.timestep),
         sensors=untouched(options.num_envs, options.observed),
     )
     snapshot.states.check(fresh, options.command.size, sizes)

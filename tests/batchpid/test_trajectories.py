@@ -24,7 +24,6 @@ MOVES = {
     "minimum_jerk": lambda a, b: minimum_jerk(a, b, DT, **LIMITS),
     "minimum_jerk_timed": lambda a, b: minimum_jerk(a, b, DT, duration=0.77),
     "trapezoidal": lambda a, b: trapezoidal(a, b, DT, **LIMITS),
-    "trapezoidal_each": lambda a, b: trapezoidal(a, b, DT, **LIMITS, synchronise=False),
 }
 
 
@@ -67,7 +66,7 @@ def test_positions_are_the_integral_of_velocities(move, start, target):
 
 @settings(deadline=None, max_examples=15)
 @given(start=poses, target=poses)
-@pytest.mark.parametrize("name", ["minimum_jerk", "trapezoidal", "trapezoidal_each"])
+@pytest.mark.parametrize("name", ["minimum_jerk", "trapezoidal"])
 def test_limits_are_kept_at_every_tick(name, start, target):
     t = MOVES[name](start, target[0])
     assert (np.abs(t.velocity) <= np.array(LIMITS["max_velocity"]) * (1 + 1e-9)).all()

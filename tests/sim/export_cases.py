@@ -16,8 +16,8 @@ number = st.just(0.0) | st.floats(1e-30, 1e3)  # a normal float32, in units of a
 OPTION = {
     "ki": number,
     "kd": number,
-    "effort_limit": st.floats(0.1, 1e3),
-    "effort_max": st.floats(-5.0, -0.1) | st.floats(0.1, 1e3),
+    "effort_limit": st.floats(1e-30, 1e3),
+    "effort_max": st.floats(-5.0, 1e3),
     "effort_rate_limit": st.floats(1.0, 1e3),
     "integral_min": st.floats(-10.0, 0.5, allow_subnormal=False),
     "integral_max": st.floats(0.6, 10.0),

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import MjModel
+from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import Clearance
 
@@ -44,12 +44,13 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
     """Return the tables of shapes and pairs for ``Clearance`` in ``clearance.h``, the same for
     every robot.
 
-    None if there are no proofs: no shapes can touch, or the fields to change are not found in this
-    version of MuJoCo.
+    None if there are no proofs: the model is a file's, no shapes can touch, or the fields to change
+    are not found in this version of MuJoCo.
     """
     model = robot.model
     pairs = touching_pairs(model)
-    if not len(pairs) or places() is None:
+    # Models of files, which have frames, can hold any element.
+    if robot.frames or not len(pairs) or places() is None:
         return None
     bodies = model.geom_bodyid[pairs]
     arms, travel = _arms(robot, bodies)
@@ -85,14 +86,13 @@ def touching_pairs(model: MjModel) -> NDArray[np.int32]:
     bodies = model.geom_bodyid[pairs]
     welded = model.body_weldid[bodies]
     parents = model.body_weldid[model.body_parentid[welded]]
+    # A body and its parent touch at their joint; the world is no such parent.
     related = (welded != 0).all(axis=1) & (welded == parents[:, ::-1]).any(axis=1)
     excluded = np.isin((bodies[:, 0] << 16) + bodies[:, 1], model.exclude_signature)
     return pairs[(welded[:, 0] != welded[:, 1]) & ~related & ~excluded].astype(np.int32)
 
 
-def _arms(
-    robot: RobotMj, pairs: NDArray[np.intp]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:
     """Return bounds of the closing speed of pairs of bodies per unit speed of each way (pairs,
     ways) [m or 1].
 
@@ -106,6 +106,7 @@ def _arms(
     travel = np.tile([[-np.inf], [np.inf]], (1, dof))
     arms = np.ones(dof + 2 * (robot.base is not None))
     moved = np.zeros((model.nbody, len(arms)), bool)
+    # Points and radii that a body carries; its children add theirs, from the last body to the root.
     balls: list[list[tuple[Any, float]]] = [[] for _ in range(model.nbody)]
     for shape, body in enumerate(model.geom_bodyid):
         balls[body].append((model.geom_pos[shape], model.geom_rbound[shape]))
@@ -122,6 +123,7 @@ def _arms(
             column = int(np.flatnonzero(robot.qvel == model.jnt_dofadr[joint])[0])
             moved[body, column] = True
             if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+                # A hinge moves a point at its distance from the axis, not from the origin.
                 across = np.cross(points, model.jnt_axis[joint])
                 arms[column] = (np.linalg.norm(across, axis=1) + radii).max(initial=0.0)
             else:
@@ -130,6 +132,7 @@ def _arms(
                 slide = float(np.abs(travel[:, column]).max())
         balls[model.body_parentid[body]].append((model.body_pos[body], slide + farthest))
     for body in range(1, model.nbody):
+        # What moves a body moves its children.
         moved[body] |= moved[model.body_parentid[body]]
     return np.where(moved[pairs[:, 0]] != moved[pairs[:, 1]], arms, 0.0), travel
 
@@ -144,6 +147,7 @@ def places() -> tuple[int, ...] | None:
     """
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     before = ctypes.string_at(model._address, _BEGINNING)
+    # One bit differs between the two copies of the model's beginning.
     model.opt.disableflags ^= _NO_CONTACT
     after = ctypes.string_at(model._address, _BEGINNING)
     flags = [place for place in range(_BEGINNING) if before[place] != after[place]]
@@ -176,23 +180,26 @@ class GroupClearance:
         bodies = models[0].nbody
         floats = bool((models[0].jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
         ways = dof + 2 * floats
-        addresses = {
-            "models": [model._address for model in models],
-            "places": [scene.geom_xpos.ctypes.data for scene in data],
-            "turns": [scene.geom_xmat.ctypes.data for scene in data],
-        }
-        arrays: Arrays = {name: np.array(rows, np.uint64) for name, rows in addresses.items()}
-        arrays |= tables | {name: np.zeros((robots, ways)) for name in ("moved", "rate")}
-        arrays |= {
+        arrays = tables | {
+            # Native code reads the places of shapes where MuJoCo writes them.
+            "models": np.array([model._address for model in models], np.uint64),
+            "places": np.array([scene.geom_xpos.ctypes.data for scene in data], np.uint64),
+            "turns": np.array([scene.geom_xmat.ctypes.data for scene in data], np.uint64),
+            "moved": np.zeros((robots, ways)),
+            "rate": np.zeros((robots, ways)),
             "last": np.zeros((robots, dof + 7 * floats)),
             "open": np.zeros((robots, bodies), np.int8),
+            "left": np.zeros((robots, pairs), np.uint16),
+            "wait": np.ones(robots, np.int32),
+            "no_shapes": np.zeros(bodies, np.int32),
+            "some_types": np.zeros(bodies, np.int32),
+            "brief": np.zeros(robots, np.int8),
+            # No pair is near, and no proof is young enough: the first step checks all pairs.
+            "near": np.full((robots, _MOST_NEAR), -1, np.int32),
+            "age": np.full(robots, _NEVER, np.int32),
         }
-        arrays |= {"left": np.zeros((robots, pairs), np.uint16), "wait": np.ones(robots, np.int32)}
-        arrays |= {name: np.zeros(bodies, np.int32) for name in ("no_shapes", "some_types")}
-        arrays["brief"] = np.zeros(robots, np.int8)
-        arrays["near"] = np.full((robots, _MOST_NEAR), -1, np.int32)
-        arrays["age"] = np.full(robots, _NEVER, np.int32)
         self.arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        # Native code has their addresses.
         self._kept = models, data
         fields = zip(("flags", "counts", "types_at", "affinities_at"), places() or (), strict=True)
         self._fields = Clearance(

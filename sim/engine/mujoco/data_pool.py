@@ -13,9 +13,8 @@ from typing import Any, Protocol
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import MjModel
+from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import FARTHEST
 
@@ -29,7 +28,7 @@ class User(Protocol):
     """Pack that uses a :class:`DataPool`: a model and a row of the state for each robot."""
 
     models: list[Any]
-    rows: NDArray[np.float64]
+    rows: Float64
 
     @property
     def data(self) -> list[Any]:
@@ -62,7 +61,7 @@ class DataPool:
         rest(robot.model, data)
         mujoco.mj_getState(robot.model, data, self._initial, STATE)
 
-    def initial(self, size: int) -> NDArray[np.float64]:
+    def initial(self, size: int) -> Float64:
         """Return the rows of ``size`` robots at rest."""
         return np.tile(self._initial, (size, 1))
 
@@ -71,12 +70,14 @@ class DataPool:
         kept in its rows.
         """
         if self._user is not user:
+            # The states of the pack that used the memory before are read out first.
             if self._user is not None:
                 for model, data, row in zip(
                     self._user.models, self._taken, self._user.rows, strict=True
                 ):
                     mujoco.mj_getState(model, data, row, STATE)
             self._user, self._taken = user, self._new(len(user.rows))
+            # MuJoCo warns of states that are not finite, and the loop finds them by itself.
             sound = np.all(
                 np.abs(user.rows[:, POSITIONS : POSITIONS + self.robot.model.nq]) <= FARTHEST,
                 axis=1,

@@ -106,6 +106,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
             scene.body(root).pos = np.zeros(3)
             root = ""
             scene.delete(joint)
+    # With it a reset puts the whole scene to its start, objects included.
     scene.add_key(name="start", **start)
     _set_pairs(scene, spec.ignored, {*robot.values()})
     number = {name: joint for joint, name in names.joints.items()}
@@ -164,6 +165,7 @@ def _start(model: MjModel) -> Document:
 
 def _set_pairs(scene: MjSpec, ignored: Iterable[tuple[str, str]], robot: set[str]) -> None:
     """Exclude exactly those pairs of the robot's bodies that do not collide."""
+    # The file's pairs may be others than those of the robot's options.
     for exclude in list(scene.excludes):
         if {exclude.bodyname1, exclude.bodyname2} <= robot:
             scene.delete(exclude)

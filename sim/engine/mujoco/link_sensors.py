@@ -7,9 +7,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import MjModel, MjSpec
+from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 _FOUND_AND_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND) | 1 << int(
@@ -39,6 +38,7 @@ def add_link_sensors(
     frames of their bodies.
     """
     kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
+    # Links that are merged into one body share its sensor.
     for link in dict.fromkeys(contact_bodies(spec)):
         for part in _parts(scene.body(names[link]), {*names.values()}):
             sensor = scene.add_sensor(
@@ -74,6 +74,7 @@ class MujocoLinkSensors:
     def __init__(self, spec: SceneSpec, model: MjModel, bodies: dict[str, int]) -> None:
         ids = model.sensor_objid[model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT]
         owners = ids.copy()
+        # A body without a link of its own belongs to the nearest one above it that has one.
         while (lower := ~np.isin(owners, [*bodies.values()])).any():
             owners[lower] = model.body_parentid[owners[lower]]
         self._rows: Sequence[Any] = [
@@ -83,7 +84,7 @@ class MujocoLinkSensors:
         self._wrenches = len(spec.wrenches or ())
         self.size = int(model.nsensordata)
 
-    def quantities(self, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    def quantities(self, values: Float64) -> dict[str, Float64]:
         """Return the quantities of :meth:`batchpid.sim.engine.protocol.EnginePack.take_sensed` for
         values (M, size).
         """
@@ -92,6 +93,7 @@ class MujocoLinkSensors:
         if self._rows:
             parts = of_contacts.reshape(-1, self._contacts, _CONTACT)
             rows = np.stack([parts[:, row].sum(1) for row in self._rows], axis=1)
+            # The sensor has the force on the other body. From 0, so that there is no negative zero.
             quantities = {"contact_force": 0.0 - rows[..., 1:], "touching": rows[..., 0]}
         if self._wrenches:
             quantities["wrench"] = of_wrenches.reshape(-1, self._wrenches, _WRENCH).copy()

@@ -30,10 +30,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.errors import InvalidArgumentError
+from batchpid.export.differences import joint_values
 from batchpid.export.pd_drive import Drive
 from batchpid.motors.guard import Guard
 
@@ -56,9 +56,7 @@ class MjcfActuators:
         Mask (joints,) of the joints with a rate-limited setpoint.
     """
 
-    def __init__(
-        self, drive: Drive, independent: NDArray[np.bool_], is_law: bool, guard: Guard | None
-    ) -> None:
+    def __init__(self, drive: Drive, independent: Bool, is_law: bool, guard: Guard | None) -> None:
         self._drive = drive
         self._independent = independent
         self.is_law = is_law
@@ -66,29 +64,26 @@ class MjcfActuators:
         low = drive.value("effort_min", -math.inf)
         high = drive.value("effort_max", math.inf)
         self.effort_range = np.array([np.maximum(low, -limit), np.minimum(high, limit)]).T
-        self._stall, self._speed = (
-            drive.motor("saturation_effort", math.inf),
-            drive.motor("no_load_speed", math.inf),
-        )
-        self._lag, self._strength = drive.motor("lag"), drive.motor("strength", 1.0)
+        self._stall = drive.motor("saturation_effort", math.inf)
+        self._speed = drive.motor("no_load_speed", math.inf)
+        self._lag = drive.motor("lag")
+        self._strength = drive.motor("strength", 1.0)
+        # Without strength a motor has no effort that a line could limit.
         self._has_line = np.isfinite(self._stall) & (self._strength > 0)
+        # MuJoCo's PID has neither a line nor a lag.
         self._is_dcmotor = self._has_line | (is_law & (self._lag > 0))
         guard = Guard() if guard is None else guard
-        self._rate, self._lower, self._upper, self._acceleration = (
-            np.broadcast_to(off if leaf is None else np.asarray(leaf[0], float), limit.shape)
-            for leaf, off in (
-                (guard.rate, math.inf),
-                (guard.lower, -math.inf),
-                (guard.upper, math.inf),
-                (guard.acceleration, math.inf),
-            )
-        )
+        joints = len(drive.joints)
+        self._rate = joint_values(guard.rate, joints, math.inf)
+        self._lower = joint_values(guard.lower, joints, -math.inf)
+        self._upper = joint_values(guard.upper, joints, math.inf)
+        self._acceleration = joint_values(guard.acceleration, joints, math.inf)
         self.has_rate = independent & np.isfinite(self._rate)
         self.elements = [self._element(int(joint)) for joint in np.flatnonzero(independent)]
 
     def _element(self, joint: int) -> tuple[str, dict[str, str]]:
         drive = self._drive
-        name = self._drive.joints[joint]
+        name = drive.joints[joint]
         low, high = self.effort_range[joint].tolist()
         if low >= high:
             problem = "must be below effort_max for MuJoCo"
@@ -97,20 +92,21 @@ class MjcfActuators:
             )
         element = {"name": name, "joint": name}
         if delay := drive.motor("command_delay")[joint]:
+            # MuJoCo interpolates between samples of the inputs: one more at either end.
             samples = math.ceil(delay / drive.dt) + 2
-            element |= {"delay": _text(delay), "nsample": str(samples), "interp": "linear"}
+            element |= {"delay": numbers_text(delay), "nsample": str(samples), "interp": "linear"}
         if self._is_dcmotor[joint]:
             return "dcmotor", element | self._dcmotor(joint)
         if self.is_law:
             return "pid", element | self._pid(joint)
         bias = drive.motor("bias")[joint]
         element |= {
-            "gainprm": _text(self._strength[joint]),
+            "gainprm": numbers_text(self._strength[joint]),
             "biastype": "affine",
-            "biasprm": _text(bias),
+            "biasprm": numbers_text(bias),
         }
         if lag := self._lag[joint]:
-            element |= {"dyntype": "filterexact", "dynprm": _text(lag), "actearly": "true"}
+            element |= {"dyntype": "filterexact", "dynprm": numbers_text(lag), "actearly": "true"}
         return "general", element
 
     def _gains(self, joint: int) -> dict[str, float]:
@@ -118,9 +114,10 @@ class MjcfActuators:
         none.
         """
         drive = self._drive
-        limit = self._drive.integral_limit[joint]
+        limit = drive.integral_limit[joint]
         rate = self._rate[joint]
         kp, ki, kv = (float(drive.value(name)[joint]) for name in ("kp", "ki", "kd"))
+        # MuJoCo limits the integral of the error, not its effort, and takes a limit of 0 for none.
         ki = ki if limit > 0 else 0.0
         imax = limit / ki if ki and math.isfinite(limit) else 0.0
         return {
@@ -133,33 +130,32 @@ class MjcfActuators:
 
     def _pid(self, joint: int) -> dict[str, str]:
         element = {
-            key: _text(value) for key, value in self._gains(joint).items() if value or key == "kp"
+            key: numbers_text(value)
+            for key, value in self._gains(joint).items()
+            if value or key == "kp"
         } | _INPUTS
         lower = self._lower[joint]
-        ends = (
-            lower,
-            max(self._upper[joint], np.nextafter(lower, math.inf)),
-        )  # MuJoCo: lower < upper
+        # MuJoCo needs a range of some width, also of a joint that is locked.
+        ends = lower, max(self._upper[joint], np.nextafter(lower, math.inf))
         if np.isfinite(ends).any():
-            element["posrange"] = _text(*np.clip(ends, -FAR, FAR))
+            element["posrange"] = numbers_text(*np.clip(ends, -FAR, FAR))
         return element
 
     def _dcmotor(self, joint: int) -> dict[str, str]:
-        arm = (
-            1.0 if self.is_law else float(self._strength[joint])
-        )  # the gear, by which the motor's efforts are divided
+        # The gear, by which the motor's efforts are divided: the strength of motors alone.
+        arm = 1.0 if self.is_law else float(self._strength[joint])
         element = {"motorconst": "1 1", "resistance": "1"}
         voltage = 0.0
         if self._has_line[joint]:
             voltage = 1.0
             element = {
-                "nominal": _text(voltage, self._stall[joint] / arm, self._speed[joint] * arm)
+                "nominal": numbers_text(voltage, self._stall[joint] / arm, self._speed[joint] * arm)
             }
         gains = self._gains(joint).values() if self.is_law else [0.0] * 5
-        element |= _INPUTS if self.is_law else {"input": "ff", "gear": _text(arm)}
-        element["controller"] = _text(*gains, voltage)
+        element |= _INPUTS if self.is_law else {"input": "ff", "gear": numbers_text(arm)}
+        element["controller"] = numbers_text(*gains, voltage)
         if lag := self._lag[joint]:
-            element["inductance"] = _text(0, lag)
+            element["inductance"] = numbers_text(0, lag)
         return element
 
     def compare(self, continuous: Bool) -> None:
@@ -223,6 +219,6 @@ class MjcfActuators:
                 drive.append(f"{text}: {drive.listed_names(joints)}")
 
 
-def _text(*numbers: Float64 | float) -> str:
+def numbers_text(*numbers: Float64 | float) -> str:
     """Return numbers with all digits."""
     return " ".join(repr(float(number)) for number in numbers)

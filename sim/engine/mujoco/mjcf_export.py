@@ -13,15 +13,15 @@ import numpy as np
 from lxml import etree
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
+from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.errors import InvalidArgumentError, RobotError
-from batchpid.export.differences import Exported
+from batchpid.export.differences import Exported, joint_values
 from batchpid.export.pd_drive import Drive
 from batchpid.law.params import PIDParams, make_params
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.motors.guard import Guard
-from batchpid.sim.engine.mujoco.mjcf_actuators import FAR, MjcfActuators
+from batchpid.sim.engine.mujoco.mjcf_actuators import FAR, MjcfActuators, numbers_text
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
@@ -92,12 +92,12 @@ def to_mjcf(
         dissipation=robot.dissipation,
         ground=robot.has_ground,
         fixed_base=robot.fixed_base,
-        engine="mujoco",
     )
     # The bodies are those that the engine simulates; inertias and efforts are then written with all
     # their digits.
     scene, names = robot_spec(spec)
     scene.modelname = robot.name
+    # The engine switches off what the loop computes for it; other programs need it all.
     scene.option.disableflags = 0
     for row in spec.simulated.bodies:
         _set_inertia(scene.body(names[row.name]), row.spatial_inertia, row.name, drive)
@@ -111,6 +111,7 @@ def to_mjcf(
         motors.effort_range,
     )
     try:
+        # Actuators are added to the text, which then has all their digits.
         scene.compile()
         root = _exact(scene)
         section = etree.SubElement(root, "actuator")
@@ -119,8 +120,10 @@ def to_mjcf(
         model = mujoco.MjModel.from_xml_string(etree.tostring(root, encoding="unicode"))
     except ValueError as error:
         raise RobotError(f"MuJoCo cannot build the robot: {error}; correct the URDF") from error
+    # The model gives the sizes and places of the keyframe's rows.
     etree.SubElement(etree.SubElement(root, "keyframe"), "key", _start(model, robot, motors))
     etree.indent(root)
+    # The tables of an MJCF robot hold the robot alone.
     if robot.mjcf is not None:
         drive.append(
             "scene: the robot alone, without objects, tendons, springs and equalities of its MJCF"
@@ -145,29 +148,27 @@ def _set_joints(
     scene: MjSpec, robot: RobotDescription, drive: Drive, friction: Friction, effort_range: Float64
 ) -> None:
     """Set damping, friction, armature and effort limits of the joints, and tie the followers."""
-    rows = {"damping": friction.viscous, "frictionloss": friction.coulomb}
-    tables = {
-        field: np.broadcast_to(leaf, (1, robot.dof))[0]
-        for field, leaf in rows.items()
-        if leaf is not None
-    }
+    rubs = joint_values(friction.coulomb, robot.dof, 0.0)
+    damping = joint_values(friction.viscous, robot.dof, 0.0)
+    armature = drive.motor("armature")
     for at, name in enumerate(robot.joint_names):
         joint = scene.joint(name)
-        joint.armature = drive.motor("armature")[at]
-        for field, values in tables.items():
-            value = float(values[at])
-            setattr(joint, field, [value, 0, 0] if np.ndim(getattr(joint, field)) else value)
+        joint.armature = armature[at]
+        joint.frictionloss = rubs[at]
+        # Damping is a polynomial of the speed in MuJoCo.
+        joint.damping = [damping[at], 0, 0]
         if robot.independent[at] and np.isfinite(effort_range[at]).any():
             joint.actfrclimited, joint.actfrcrange = True, np.clip(effort_range[at], -FAR, FAR)
     coupling = robot.coupling
     for follower in coupling.followers:
+        # MuJoCo's polynomial of the leader's position; the higher coefficients are 0.
         tie = scene.add_equality(type=mujoco.mjtEq.mjEQ_JOINT)
         tie.objtype = mujoco.mjtObj.mjOBJ_JOINT
         tie.name1 = robot.joint_names[follower]
         tie.name2 = robot.joint_names[coupling.leader[follower]]
         figures = [coupling.offset[follower], coupling.multiplier[follower]]
         tie.data = np.pad(figures, (0, len(tie.data) - 2))
-    if np.any(tables.get("frictionloss", 0)):
+    if rubs.any():
         drive.append(
             "friction: a soft constraint in MuJoCo, in which a joint creeps below its friction"
         )
@@ -184,16 +185,13 @@ def _start(model: MjModel, robot: RobotDescription, motors: MjcfActuators) -> di
         qpos[:7] = base_start(robot, robot.start, robot.has_ground)
     for at, name in enumerate(robot.joint_names):
         qpos[model.joint(name).qposadr] = robot.start[at]
-    for actuator in range(model.nactuator):
-        at = robot.joint_names.index(model.actuator(actuator).name)
+    for actuator, joint in enumerate(np.flatnonzero(robot.independent)):
         if motors.is_law:
-            ctrl[model.actuator_ctrladr[actuator]] = robot.start[at]
-        if motors.has_rate[at]:  # the setpoint is the first of the states
-            act[model.actuator_actadr[actuator]] = robot.start[at]
+            ctrl[model.actuator_ctrladr[actuator]] = robot.start[joint]
+        if motors.has_rate[joint]:  # the setpoint is the first of the states
+            act[model.actuator_actadr[actuator]] = robot.start[joint]
     columns = {"qpos": qpos, "ctrl": ctrl, "act": act}
-    return {"name": "home"} | {
-        key: " ".join(map(repr, row.tolist())) for key, row in columns.items() if row.any()
-    }
+    return {"name": "home"} | {key: numbers_text(*row) for key, row in columns.items() if row.any()}
 
 
 def _exact(scene: MjSpec) -> Any:
@@ -201,34 +199,30 @@ def _exact(scene: MjSpec) -> Any:
     six.
     """
     root = etree.fromstring(scene.to_xml().encode())
-    _write(
-        root.find("option"), {"timestep": scene.option.timestep, "gravity": scene.option.gravity}
-    )
+    _write(root.find("option"), scene.option, timestep="timestep", gravity="gravity")
     for element in root.iterfind("worldbody//body"):
         body = scene.body(element.get("name"))
-        _write(element, {"pos": body.pos, "quat": body.quat})
-        figures = {
-            "pos": body.ipos,
-            "quat": body.iquat,
-            "mass": body.mass,
-            "diaginertia": body.inertia,
-        }
-        _write(element.find("inertial"), figures)
+        _write(element, body, pos="pos", quat="quat")
+        inertial = element.find("inertial")
+        _write(inertial, body, pos="ipos", quat="iquat", mass="mass", diaginertia="inertia")
     for element in root.iterfind("worldbody//joint[@name]"):
         joint = scene.joint(element.get("name"))
-        fields = ("axis", "range", "actuatorfrcrange", "armature", "damping", "frictionloss")
-        _write(
-            element,
-            {field: getattr(joint, field.replace("actuatorfrc", "actfrc")) for field in fields},
-        )
+        if joint.actfrclimited:
+            # MuJoCo leaves out a range that is nearly 0, and then refuses to read the joint.
+            element.set("actuatorfrcrange", "0 0")
+        _write(element, joint, axis="axis", range="range", actuatorfrcrange="actfrcrange")
+        _write(element, joint, armature="armature", damping="damping", frictionloss="frictionloss")
     for element, tie in zip(root.findall("equality/joint"), scene.equalities, strict=True):
-        _write(element, {"polycoef": tie.data})
+        _write(element, tie, polycoef="data")
     return root
 
 
-def _write(element: Any, figures: Document) -> None:
-    """Replace the numbers of the attributes that an element has."""
-    for key, values in figures.items():
+def _write(element: Any, source: Any, **fields: str) -> None:
+    """Replace the numbers of the attributes that an element has by those of the fields of
+    ``source``.
+    """
+    for key, field in fields.items():
         if element is not None and key in element.attrib:
-            numbers = np.atleast_1d(values)[: len(element.get(key).split())]
-            element.set(key, " ".join(repr(float(value)) for value in numbers))
+            # MuJoCo leaves out zeros at the end.
+            count = len(element.get(key).split())
+            element.set(key, numbers_text(*np.atleast_1d(getattr(source, field))[:count]))

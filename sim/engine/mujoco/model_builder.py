@@ -26,7 +26,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Document, MjModel, MjSpec
+from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
@@ -46,8 +46,10 @@ _HARD = (0.99, 0.999, 1e-4, 0.5, 2.0)
 """Impedance of joint limits (MuJoCo's solimp): nearly all of the acceleration that violates a limit
 is cancelled.
 """
-_NOT_KEPT = sum(
-    int(getattr(mujoco.mjtEnableBit, f"mjENBL_{name}", 0)) for name in ("SLEEP", "ENERGY", "FWDINV")
+_NOT_KEPT = (
+    mujoco.mjtEnableBit.mjENBL_SLEEP
+    | mujoco.mjtEnableBit.mjENBL_ENERGY
+    | mujoco.mjtEnableBit.mjENBL_FWDINV
 )
 """Parts that a file cannot enable: a snapshot does not hold what sleeps, and nobody reads the
 others.
@@ -71,11 +73,11 @@ class RobotMj:
     terms: Any = (0.0, 0.0)
     """Armature and damping (2, dof) of the joints in addition to the description and the motors."""
     frames: Mapping[str, BodyFrame] = field(default_factory=dict)
-    """Frames of simulated links in their bodies; of other links the frames are the same."""
+    """Frames of simulated links in their bodies, in an MJCF file; of other links the frames are
+    the same.
+    """
     base: tuple[int, int] | None = None
     """Index of a floating base in MuJoCo's qpos and qvel; None on a fixed one."""
-    is_file: bool = False
-    """Whether the model is an MJCF file's."""
 
 
 @lru_cache(maxsize=8)
@@ -150,7 +152,7 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         joint = model.joint(model.body(parts.root).jntadr[0])
         base = int(joint.qposadr[0]), int(joint.dofadr[0])
     bodies = {link: model.body(name).id for link, name in parts.names.items()}
-    return RobotMj(model, qpos, qvel, bodies, parts.terms, parts.frames, base, is_file=True)
+    return RobotMj(model, qpos, qvel, bodies, parts.terms, parts.frames, base)
 
 
 def robot_spec(spec: SceneSpec) -> tuple[Any, dict[str, str]]:
@@ -192,7 +194,7 @@ def _unused(name: str, taken: Collection[str]) -> str:
     return next(candidate for candidate in numbered if candidate not in taken)
 
 
-def principal_inertia(inertia: SpatialInertia) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def principal_inertia(inertia: SpatialInertia) -> tuple[Float64, Float64]:
     """Return principal moments (3,) [kg m^2] and the rotation of the principal axes (4,), in the
     axes of the body.
     """
@@ -275,6 +277,7 @@ def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
     for first, second in combinations(solid, 2):
         pairs = [frozenset(pair) in ignored for pair in product(owners[first], owners[second])]
         if any(pairs) and not all(pairs):
+            # MuJoCo excludes whole bodies, so these get one for each link with shapes.
             split |= {first, second}
     bodies = {owner: names[link] for link in solid for owner in owners[link]}
     taken = {"world", *names.values()}
@@ -305,6 +308,7 @@ def _add_drives(scene: MjSpec, spec: SceneSpec) -> None:
             name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        # The limit of the drive replaces this one later.
         actuator.forcelimited = True
         actuator.forcerange = [-LARGEST_FORCE, LARGEST_FORCE]
 

@@ -6,7 +6,6 @@ from batchpid.sim.engine.mujoco.mujoco_pack import MujocoPack
 from batchpid.sim.engine.mujoco.mujoco_step import obstacle
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.protocol import Engine
-from batchpid.sim.engine.robot_model import description_tree
 
 ENGINE = Engine(
     name="mujoco",
@@ -15,6 +14,5 @@ ENGINE = Engine(
     physics=SOLVERS,
     group_size=64,
     make_pack=MujocoPack,
-    scene_tree=description_tree,
     native_obstacle=obstacle,
 )

@@ -12,9 +12,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import DType, Float64, Rows
+from batchpid.arrays.array_types import Bool, DType, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ModelPack
@@ -31,12 +30,11 @@ from batchpid.sim.engine.mujoco.model_builder import (
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_back
+from batchpid.sim.engine.robot_model import passive_force
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import CONTACT_FRICTION
-from batchpid.task_space.frames import inverse, matrix_of
-from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.frames import matrix_of, rotate, unrotate
 
 _KEPT = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
 """Parts of the state in snapshots: all but the targets of drives, which every tick writes."""
@@ -77,7 +75,7 @@ class MujocoPack(ModelPack):
             self._constraint.implicit[...] = spec.timestep * (0.0 if viscous is None else viscous)
             if self.steps_natively:
                 reads = spec.fixed_base and self.steps_read_force(True, True)
-                self._constraint.use(self._joint_model, None if reads else self._bias_model)
+                self._constraint.use(self.joint_model, None if reads else self._bias_model)
         if spec.mjcf is not None:
             links = *(spec.contacts or ()), *(spec.wrenches or ()), spec.carrier
             check_links(spec, spec.mjcf, filter(None, links))
@@ -94,7 +92,7 @@ class MujocoPack(ModelPack):
         self._sensors = MujocoLinkSensors(self.spec, robot.model, robot.bodies)
         self._sensed = np.zeros((self.size, self._sensors.size))
         self.models, self.rows = [self._pool.model] * self.size, self._pool.initial(self.size)
-        self._at, self._moves = _columns(robot.qpos), _columns(robot.qvel)
+        self._at, self._moves = robot.qpos, robot.qvel
         self._change_world(range(self.size))
         self._change_masses(range(self.size))
         self._update(range(self.size))
@@ -139,13 +137,9 @@ class MujocoPack(ModelPack):
         return self._passive_force(*state).astype(dtype)
 
     @cached_property
-    def _tree(self) -> RigidTree:  # type: ignore[override]
-        return scene_tree(self.spec)
-
-    @cached_property
     def _bias_model(self) -> NativeModel:
         """Model of the forces in the equations of motion of the joints, for constraint efforts."""
-        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
+        return NativeModel(self, "fixed" if self.spec.fixed_base else "free")
 
     # -- stepping
     # ----------------------------------------------------------------------------------------------
@@ -157,7 +151,7 @@ class MujocoPack(ModelPack):
         """Do one sim step of every robot, with constraint efforts on coupled joints."""
         if self.steps_natively:
             if self._own_step is None:
-                self._own_step = self._make_step(False, None)
+                self._own_step = self.compiled_step(False, False, True, None)
             self._own_step.may_have_failed(self._own_step(self.qf, *np.empty((3, *self.qf.shape))))
             return
         effort = self.qf
@@ -192,49 +186,39 @@ class MujocoPack(ModelPack):
         gravity: bool,
         coriolis: bool,
         velocities: bool,
-        speed_limit: NDArray[np.float64] | None,
+        speed_limit: Float64 | None,
         drives: bool = False,
-    ) -> MujocoStep:
-        return self._make_step(gravity and coriolis, speed_limit, drives)
-
-    def _make_step(
-        self, reads_force: bool, speed_limit: NDArray[np.float64] | None, drives: bool = False
     ) -> MujocoStep:
         arrays = {"qf": self.qf, "sensed": self._sensed}
         if drives:
             arrays |= {"stiffness": self._stiffness, "rate_gain": self._rate_gain}
-        if self._constraint is None:
-            constraint = None
-        else:
-            constraint = self._constraint.address
+        constraint = None if self._constraint is None else self._constraint.address
+        reads_force = gravity and coriolis
         return MujocoStep(
             self, self._robot, reads_force, speed_limit, arrays, self._suspended, constraint
         )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
-        if self._constraint is not None:
-            if (
-                self.spec.fixed_base
-            ):  # the bias is the passive force, with the bits that native steps read
-                bias = self.passive_force(True, True)
+        if self._constraint is None:
+            return
+        if self.spec.fixed_base:
+            # The bias is the passive force, with the bits that native steps read.
+            bias = self.passive_force(True, True)
+        else:
+            state = self.read_qpos(), self.read_qvel(), True, True, self.read_base_motion()
+            if self.steps_natively:
+                bias = self._bias_model.passive_force(*state)
             else:
-                state = self.read_qpos(), self.read_qvel(), True, True, self.read_base_motion()
-                natively = self.steps_natively
-                model = self._bias_model
-                if natively:
-                    bias = model.passive_force(*state)
-                else:
-                    bias = passive_force(self._tree, *state)
-            self._constraint.update(self.joint_mass_matrix, self.read_qpos(), bias, rows)
+                bias = passive_force(self.rigid_tree, *state)
+        self._constraint.update(self.joint_mass_matrix, self.read_qpos(), bias, rows)
 
     # -- changes
     # ----------------------------------------------------------------------------------------------
 
     def read_base(self) -> Float64:
         rows = self._bases()
-        rows[:, 10:] = turned_back(
-            inverse(rows[:, 3:7]), rows[:, 10:]
-        )  # MuJoCo's are in the body's axes
+        # MuJoCo's angular velocities are in the body's axes.
+        rows[:, 10:] = rotate(matrix_of(rows[:, 3:7]), rows[:, 10:])
         return rows
 
     def _bases(self) -> Float64:
@@ -247,7 +231,7 @@ class MujocoPack(ModelPack):
             [np.concatenate([data.qpos[parts[0]], data.qvel[parts[1]]]) for data in self.data]
         )
 
-    def strays(self) -> NDArray[np.bool_]:
+    def strays(self) -> Bool:
         """Return the robots (M,) whose base, or an object of the file, is beyond FARTHEST or not
         finite.
         """
@@ -256,10 +240,7 @@ class MujocoPack(ModelPack):
         return ~np.array([np.abs(data.qpos).max() <= FARTHEST for data in self.data])
 
     def take_sensed(self) -> dict[str, Float64]:
-        if self._sensors.size:
-            sums = self._sensors.quantities(self._sensed)
-        else:
-            sums = {}
+        sums = self._sensors.quantities(self._sensed)
         self._sensed[...] = 0.0
         return sums
 
@@ -267,7 +248,8 @@ class MujocoPack(ModelPack):
         if self.spec.fixed_base:
             return None
         rows = self._bases()
-        return np.hstack([turned_back(rows[:, 3:7], np.array(self.spec.gravity)), rows[:, 10:]])
+        gravity = unrotate(matrix_of(rows[:, 3:7]), np.array(self.spec.gravity))
+        return np.hstack([gravity, rows[:, 10:]])
 
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         data = self.data
@@ -275,6 +257,7 @@ class MujocoPack(ModelPack):
         _, at = self._robot.base or (0, 0)
         for row, twist, turn in zip(rows, twists, turns, strict=True):
             data[row].qvel[at : at + 3] += twist[:3]
+            # MuJoCo's angular velocities are in the body's axes.
             data[row].qvel[at + 3 : at + FLOATING] += turn.T @ twist[3:]
         self._evaluate(rows)
 
@@ -286,14 +269,13 @@ class MujocoPack(ModelPack):
         """
         everyone = self.data
         floats = self._robot.base is not None
-        if base is None:
-            bases = np.tile(_ORIGIN, (len(rows), 1))
-        else:
-            bases = base.copy()
+        bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else base.copy()
         at, moves = self._robot.base or (0, 0)
+        # MuJoCo's angular velocities are in the body's axes.
         bases[:, 10:] = np.einsum("eji,ej->ei", matrix_of(bases[:, 3:7]), bases[:, 10:])
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
             data = everyone[row]
+            # Everything else of the scene returns to its start, but drives keep their targets.
             ctrl = data.ctrl.copy()
             rest(self.models[row], data)
             if floats:
@@ -308,7 +290,7 @@ class MujocoPack(ModelPack):
         self._evaluate(rows)
         self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
-    def suspend(self, mask: NDArray[np.bool_]) -> None:
+    def suspend(self, mask: Bool) -> None:
         """Leave the robots of ``mask`` (M,) where they are, and step the others."""
         self._suspended[...] = mask
 
@@ -324,6 +306,7 @@ class MujocoPack(ModelPack):
                 if not np.array_equal(
                     getattr(self.models[row], name)[self._robot.qvel], table[row]
                 ):
+                    # A copy only where it differs: a model takes much memory.
                     model = self._own_model(row)
                     getattr(model, name)[self._robot.qvel] = table[row]
                     mujoco.mj_setConst(model, self._scratch)
@@ -477,10 +460,3 @@ class MujocoPack(ModelPack):
 
 
 _ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
-
-
-def _columns(indices: NDArray[np.intp]) -> Any:
-    """Return ``indices`` as a slice where they are consecutive, which NumPy reads faster."""
-    if (np.diff(indices) == 1).all():
-        return slice(int(indices[0]), int(indices[-1]) + 1)
-    return indices

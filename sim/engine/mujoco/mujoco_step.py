@@ -14,9 +14,8 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
 from batchpid.sim.engine.mujoco.data_pool import User
@@ -67,17 +66,16 @@ def functions() -> dict[str, int] | None:
     try:
         library = ctypes.CDLL(str(mujoco_library()))
         addresses = {
-            field: ctypes.cast(getattr(library, name), ctypes.c_void_p).value
+            field: ctypes.cast(getattr(library, name), ctypes.c_void_p).value or 0
             for field, name in FUNCTIONS.items()
         }
         addresses["clock"] = ctypes.addressof(ctypes.c_void_p.in_dll(library, CLOCK))
+        # Attributes of the Python package that are not documented: a version may lack them.
         data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
-        has_addresses = bool(data._address and data.model._address)
+        _ = data._address, data.model._address
     except (ValueError, OSError, AttributeError):
         return None
-    if has_addresses:
-        return {field: address or 0 for field, address in addresses.items()}
-    return None
+    return addresses
 
 
 class MujocoStep(NativeStep):
@@ -105,9 +103,9 @@ class MujocoStep(NativeStep):
         pack: User,
         robot: RobotMj,
         reads_force: bool,
-        speed_limit: NDArray[np.float64] | None,
+        speed_limit: Float64 | None,
         arrays: dict[str, Rows],
-        skip: NDArray[np.bool_],
+        skip: Bool,
         constraint: int | None,
     ) -> None:
         data = pack.data
@@ -123,7 +121,7 @@ class MujocoStep(NativeStep):
         robots.sensor_size = arrays["sensed"].shape[1]
         robots.base_qpos, robots.base_qvel = robot.base or (0, 0)
         clearance = None
-        shapes = None if robot.is_file else shape_tables(robot)
+        shapes = shape_tables(robot)
         if shapes is not None:
             clearance = GroupClearance(shapes, kinematics, pack.models, data, dof)
             robots.clearance = clearance.address

@@ -12,7 +12,6 @@ from threading import RLock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
@@ -184,13 +183,9 @@ def engine_settings(spec: SceneSpec) -> Iterator[None]:
             )
 
 
-def new_system(spec: SceneSpec, gravity: NDArray[np.float64] | None = None) -> Any:
-    """Return a new PhysX system, which has the solver and time step of ``spec``, and its or another
-    gravity (3,).
-    """
-    with engine_settings(
-        spec if gravity is None else replace(spec, gravity=tuple(gravity.tolist()))
-    ):
+def new_system(spec: SceneSpec) -> Any:
+    """Return a new PhysX system with the solver, time step and gravity of ``spec``."""
+    with engine_settings(spec):
         system = physx.PhysxCpuSystem()
     system.timestep = spec.timestep
     return system
@@ -266,7 +261,7 @@ def link_frames(spec: SceneSpec, robot: Any) -> Frames:
 
 
 @lru_cache(maxsize=8)
-def scene_tree(spec: SceneSpec) -> RigidTree:
+def rounded_tree(spec: SceneSpec) -> RigidTree:
     """Return the tree of the robot of ``spec`` as PhysX rounds it, all joints independent, the same
     object for equal specs.
 
@@ -284,6 +279,7 @@ def scene_tree(spec: SceneSpec) -> RigidTree:
         row = Body(body.name, None, mass=link.mass, center=np.asarray(place.p, float))
         row = row._replace(inertia=axes @ moments @ axes.T)
         if body.joint is not None:
+            # SAPIEN's joint has a frame in the parent and one in the child: the link between has the first.
             above = f"{body.name} (joint)"
             moving = replace(body.joint, axis=(1.0, 0.0, 0.0))
             rows.append(_placed(Body(above, moving), link.joint.pose_in_parent))

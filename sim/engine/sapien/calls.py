@@ -13,9 +13,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import DType, Rows
+from batchpid.arrays.array_types import Bool, DType, Float32, Float64, Rows
 from batchpid.sim.engine.native import SWITCH, extension
 from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.native.library import functions
@@ -33,8 +32,8 @@ class PythonCalls:
         self,
         robots: Sequence[Any],
         systems: Sequence[Any],
-        qf: NDArray[np.float32],
-        skip: NDArray[np.bool_],
+        qf: Float32,
+        skip: Bool,
     ) -> None:
         # Bound methods and kept row views: looking them up, or slicing, costs as much as the calls.
         self._shape = qf.shape
@@ -95,8 +94,8 @@ class NativeCalls:
         self,
         robots: Sequence[Any],
         systems: Sequence[Any],
-        qf: NDArray[np.float32],
-        skip: NDArray[np.bool_],
+        qf: Float32,
+        skip: Bool,
     ) -> None:
         self._objects = [*robots], [*systems]  # kept alive, since the gateway has their pointers
         pointers = [
@@ -105,6 +104,7 @@ class NativeCalls:
         ]
         self._native = extension("_gateway")
         self.gateway = self._native.gateway(functions(), *pointers, qf.shape[1])
+        # The pack's own arrays, which native code reads at each call.
         self.qf, self.skip = qf, skip
 
     def qpos(self, dtype: DType) -> Rows:
@@ -141,18 +141,6 @@ class NativeCalls:
 
 
 EngineCalls = PythonCalls | NativeCalls
-
-
-def engine_calls(
-    robots: Sequence[Any],
-    systems: Sequence[Any],
-    qf: NDArray[np.float32],
-    skip: NDArray[np.bool_],
-    native: bool,
-) -> EngineCalls:
-    """Return native calls, or Python's; both take the arguments before ``native``."""
-    make = NativeCalls if robots and native else PythonCalls
-    return make(robots, systems, qf, skip)
 
 
 def pointer(wrapper: Any, kind: str) -> int:
@@ -203,11 +191,11 @@ class SapienStep(NativeStep):
     def __init__(
         self,
         calls: EngineCalls,
-        stepped: NDArray[np.bool_],
+        stepped: Bool,
         gravity: bool,
         coriolis: bool,
         velocities: bool,
-        speed_limit: NDArray[np.float64] | None,
+        speed_limit: Float64 | None,
         constraint: int | None = None,
         joints: Sequence[Any] | None = None,
         sense: Callable[[], None] | None = None,
@@ -241,6 +229,7 @@ class SapienStep(NativeStep):
         return super().prepare()
 
     def may_have_failed(self, status: int) -> bool:
+        # A return to Python for the sensors is no failure.
         failed = super().may_have_failed(status & ~_SENSE)
         if self._sense is not None:
             self._sense()

@@ -18,7 +18,7 @@ from batchpid.arrays.array_types import Float32, Float64
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 
-class LinkSensors:
+class SapienLinkSensors:
     """Sums of the sensors of ``spec`` over sim steps. ``robots`` and ``systems`` are a pack's own
     lists.
     """
@@ -83,6 +83,7 @@ class LinkSensors:
     def _add(self, row: int) -> None:
         links, joints, _, gravity = self._parts[row]
         forces = self._robots[row].get_link_incoming_joint_forces()
+        # The force of the joint is the wrench; it needs no difference of velocities.
         if self._wrenches:
             self._sums["wrench"][row] += [_in_link(joints[at], forces[at]) for at in self._wrenches]
         if not self._contacts:
@@ -95,6 +96,7 @@ class LinkSensors:
             rate = (velocities[number] - self._velocities[row, number]) / self._spec.timestep
             force = links[at].mass * (rate - gravity)
             if at not in self._roots:
+                # What the joints transmit is not contact: of the parent on the link, and of it on its children.
                 force -= _in_world(links[at], joints[at], forces[at])
             for child in self._children[at]:
                 force += _in_world(links[child], joints[child], forces[child])

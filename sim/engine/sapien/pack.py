@@ -13,35 +13,34 @@ that is the whole interface between loop and engine.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sapien import Pose, physx
 
-from batchpid.arrays.array_types import DType, Float32, Float64, Rows
+from batchpid.arrays.array_types import Bool, DType, Float32, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ModelPack
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native.library import obstacle
-from batchpid.sim.engine.robot_model import turned_back
 from batchpid.sim.engine.sapien.building import (
     RESTITUTION,
     build_scene,
     engine_settings,
     link_frames,
     new_system,
-    scene_tree,
+    rounded_tree,
     set_inertia,
 )
-from batchpid.sim.engine.sapien.calls import EngineCalls, SapienStep, engine_calls
-from batchpid.sim.engine.sapien.link_sensors import LinkSensors
+from batchpid.sim.engine.sapien.calls import EngineCalls, NativeCalls, PythonCalls, SapienStep
+from batchpid.sim.engine.sapien.link_sensors import SapienLinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.task_space.frames import matrix_of
+from batchpid.task_space.frames import matrix_of, unrotate
 from batchpid.task_space.rigid_tree import RigidTree
 
 _ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
@@ -107,9 +106,11 @@ class Pack(ModelPack):
                 [joint.armature[0] for joint in self.robots[0].active_joints]
             ]
             if self.steps_natively:
-                self._constraint.use(self._joint_model, None)
+                self._constraint.use(self.joint_model, None)
         self._sensors = (
-            LinkSensors(spec, self.robots, self.systems) if spec.contacts or spec.wrenches else None
+            SapienLinkSensors(spec, self.robots, self.systems)
+            if spec.contacts or spec.wrenches
+            else None
         )
         self._bind()
         if variation is not None:
@@ -117,8 +118,11 @@ class Pack(ModelPack):
 
     def _system(self, row: int) -> Any:
         """Return a new system for ``row``."""
+        spec = self.spec
         gravity = self._variation.gravity
-        return new_system(self.spec, None if gravity is None else gravity[row])
+        if gravity is not None:
+            spec = replace(spec, gravity=tuple(gravity[row].tolist()))
+        return new_system(spec)
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
         """Return a new scene in ``system`` and the robot in it, for ``row``, with its masses and
@@ -136,12 +140,11 @@ class Pack(ModelPack):
         """Prepare the calls of every sim step, for the present robots and systems."""
         robots = self.robots
         self._joints = [joint for robot in robots for joint in robot.active_joints]
-        self._calls = engine_calls(
-            robots,
-            self.systems,
-            self._joint_qf[: len(robots)],
-            self._suspended[: len(robots)],
-            self.steps_natively,
+        make = NativeCalls if robots and self.steps_natively else PythonCalls
+        # After close() there are no robots, and the arrays are empty.
+        size = len(robots)
+        self._calls: EngineCalls = make(
+            robots, self.systems, self._joint_qf[:size], self._suspended[:size]
         )
 
     def step(self) -> None:
@@ -170,7 +173,7 @@ class Pack(ModelPack):
         gravity: bool,
         coriolis: bool,
         velocities: bool,
-        speed_limit: NDArray[np.float64] | None,
+        speed_limit: Float64 | None,
         drives: bool = False,
     ) -> SapienStep:
         constraint = None if self._constraint is None else self._constraint.address
@@ -187,8 +190,8 @@ class Pack(ModelPack):
             )
 
     @cached_property
-    def _tree(self) -> RigidTree:  # type: ignore[override]
-        return scene_tree(self.spec)
+    def rigid_tree(self) -> RigidTree:
+        return rounded_tree(self.spec)
 
     def _renew(self, rows: Sequence[int]) -> None:
         """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence
@@ -245,10 +248,8 @@ class Pack(ModelPack):
         if self._constraint is None:
             self._calls.write_qf()
 
-    def strays(self) -> NDArray[np.bool_]:
+    def strays(self) -> Bool:
         """Return the robots (M,) whose floating base is not finite or beyond FARTHEST."""
-        if self.spec.fixed_base:
-            return np.zeros(self.size, bool)
         return np.array(~(np.abs(self.read_base()) <= FARTHEST).all(1))
 
     def read_base(self) -> Float64:
@@ -259,8 +260,9 @@ class Pack(ModelPack):
         if self.spec.fixed_base:
             return None
         roots = np.array([read_root(robot) for robot in self.robots], np.float64)
+        turn = matrix_of(roots[:, 3:7])
         parts = np.array(self.spec.gravity), roots[:, 10:]
-        return np.concatenate([turned_back(roots[:, 3:7], part) for part in parts], axis=1)
+        return np.concatenate([unrotate(turn, part) for part in parts], axis=1)
 
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         bases = self.read_base()[rows]
@@ -373,7 +375,7 @@ class Pack(ModelPack):
         robot = 2 * self.dof + ROOT_SIZE + self._turning.size
         return [robot + content.size for content in self._contents] or [robot] * self.size
 
-    def read_state(self) -> NDArray[np.float64]:
+    def read_state(self) -> Float64:
         """Return the state of each scene (M, values): qpos, qvel, root, positions without jumps of
         coupled continuous joints, content, then NaN.
         """
@@ -388,7 +390,7 @@ class Pack(ModelPack):
             states[row, : sizes[row]] = np.concatenate(parts)
         return states
 
-    def write_state_rows(self, states: NDArray[np.float64]) -> None:
+    def write_state_rows(self, states: Float64) -> None:
         ends = np.cumsum([self.dof, self.dof, ROOT_SIZE, self._turning.size])
         qpos, qvel, roots, turned, contents = np.split(states.astype(np.float32), ends, axis=1)
         self._place(range(self.size), qpos, qvel, roots)
@@ -397,7 +399,7 @@ class Pack(ModelPack):
         for content, row in zip(self._contents, contents, strict=False):
             content.write(row)
 
-    def suspend(self, mask: NDArray[np.bool_]) -> None:
+    def suspend(self, mask: Bool) -> None:
         if (mask == self._suspended).all():
             return
         for robot, suspended in zip(self.robots, mask, strict=True):

@@ -7,7 +7,6 @@ from typing import get_args
 from batchpid.sim.engine.native.library import obstacle
 from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import Capability, Engine
-from batchpid.sim.engine.sapien.building import scene_tree
 from batchpid.sim.engine.sapien.pack import Pack
 
 ENGINE = Engine(
@@ -17,6 +16,5 @@ ENGINE = Engine(
     physics=PHYSICS,
     group_size=4,
     make_pack=Pack,
-    scene_tree=scene_tree,
     native_obstacle=obstacle,
 )

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import sapien
-from numpy.typing import NDArray
 from sapien.physx import (
     PhysxArticulationLinkComponent,
     PhysxCollisionShapeConvexMesh,
@@ -26,7 +25,7 @@ from sapien.physx import (
 from sapien.wrapper.actor_builder import ActorBuilder, CollisionShapeRecord, preprocess_mesh_file
 from sapien.wrapper.articulation_builder import ArticulationBuilder, LinkBuilder
 
-from batchpid.arrays.array_types import Array, SapienScene
+from batchpid.arrays.array_types import Array, Float32, SapienScene
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import Build, SceneSpec
 
@@ -77,7 +76,7 @@ def _attach(link: Any, record: CollisionShapeRecord, groups: list[int]) -> None:
 
 
 @lru_cache(maxsize=256)
-def _hull(filename: str) -> NDArray[np.float32]:
+def _hull(filename: str) -> Float32:
     """Return the vertices (n, 3) of the convex hull of a mesh file, unscaled; SAPIEN, too, reads a
     file only once.
     """
@@ -143,6 +142,7 @@ class SceneContent:
     def __init__(
         self, spec: SceneSpec, build: Build, scene: SapienScene, env: int, links: Frames
     ) -> None:
+        # What exists now is the robot and the ground; the rest is the user's.
         before = {entity.per_scene_id for entity in scene.entities}  # the robot and the ground
         self.watched = _call(build, scene, env, links)
         if not spec.collisions:
@@ -164,7 +164,7 @@ class SceneContent:
         """Put everything that moves where ``build`` left it, at rest."""
         self.write(self._start)
 
-    def read(self, at_rest: bool = False) -> NDArray[np.float32]:
+    def read(self, at_rest: bool = False) -> Float32:
         """Return the state of everything that moves (size,), with zero velocities if
         ``at_rest``.
         """
@@ -194,19 +194,20 @@ class SceneContent:
             ]
         return np.concatenate(parts, dtype=np.float32)
 
-    def write(self, state: NDArray[np.float32]) -> None:
+    def write(self, state: Float32) -> None:
         """Put everything that moves into the state that :meth:`read` returned; values beyond
         ``size`` are ignored.
         """
         values = iter(np.asarray(state, np.float32))
 
-        def take(count: int) -> NDArray[np.float32]:
+        def take(count: int) -> Float32:
             return np.fromiter(values, np.float32, count)
 
         for entity, body in self._bodies:
             entity.set_pose(sapien.Pose(take(3), take(4)))
             linear = take(3)
             angular = take(3)
+            # PhysX refuses velocities of kinematic bodies.
             if not body.kinematic:
                 body.set_linear_velocity(linear)
                 body.set_angular_velocity(angular)
@@ -216,7 +217,7 @@ class SceneContent:
             robot.set_qvel(take(robot.dof))
             robot.set_qf(take(robot.dof))
 
-    def poses(self) -> NDArray[np.float32]:
+    def poses(self) -> Float32:
         """Return the poses of the watched entities (watched, 7): x, y, z [m] and the quaternion w,
         x, y, z.
         """
@@ -282,14 +283,14 @@ def _call(
 ROOT_SIZE = 13
 
 
-def read_root(articulation: Any) -> NDArray[np.float32]:
+def read_root(articulation: Any) -> Float32:
     """Return the state of the root link of a SAPIEN articulation (13,)."""
     pose = articulation.get_root_pose()
     velocity = articulation.get_root_linear_velocity(), articulation.get_root_angular_velocity()
     return np.concatenate([pose.p, pose.q, *velocity], dtype=np.float32)
 
 
-def write_root(articulation: Any, state: NDArray[np.float32]) -> None:
+def write_root(articulation: Any, state: Float32) -> None:
     """Set the state of the root link of a SAPIEN articulation (13,)."""
     articulation.set_root_pose(sapien.Pose(state[:3], state[3:7]))
     articulation.set_root_linear_velocity(state[7:10])

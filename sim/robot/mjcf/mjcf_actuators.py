@@ -60,6 +60,7 @@ def read_couplings(model: MjModel, names: Names, findings: list[Finding]) -> Cou
             kind = _EQ(model.eq_type[equality]).name.removeprefix("mjEQ_").lower()
             others.append(f"{kind} {label(model.equality(equality))}")
             continue
+        # From here on it couples joints of the robot: one leader, linear, or a finding.
         name = names.joints[follower]
         offset, multiplier, *higher = model.eq_data[equality, :5].tolist()
         problem = None
@@ -83,10 +84,6 @@ def read_couplings(model: MjModel, names: Names, findings: list[Finding]) -> Cou
         text = f"{ALONE} equality constraints other than of the robot's joints: {', '.join(others)}"
         remedy = "in SAPIEN expect closed loops to be open"
         findings.append(Finding("warning", "equality", text, remedy))
-    inactive = [label(model.equality(int(at))) for at in np.flatnonzero(model.eq_active0 == 0)]
-    if inactive:
-        text = f"equality constraints that the file has switched off: {', '.join(inactive)}"
-        findings.append(Finding("note", "equality", text, "expect no effect"))
     return couplings
 
 
@@ -116,7 +113,6 @@ def read_motors(
             _add(model, actuator, name, arm, motors, findings)
             if len(arms) == 1:
                 _add_gains(model, actuator, name, arm, motors)
-                findings += _narrower(model, names, actuator, name, arm)
     # A follower has no motor: its leader moves its armature, too.
     armature = dict(motors.armature)
     for follower in couplings:
@@ -129,6 +125,7 @@ def read_motors(
             text = "no actuator of the file moves the joint: it is controlled as all others"
             remedy = "give it gains of 0 to let it move freely"
             findings.append(Finding("warning", "actuator", text, remedy, name))
+        # A limit of 0 counts as none.
         limit = motors.effort_limit.get(name, math.inf) or math.inf
         if model.jnt_actfrclimited[joint]:
             limit = min(limit, _magnitude(model.jnt_actfrcrange[joint], name, findings))
@@ -146,6 +143,7 @@ def _add(
     if model.actuator_forcelimited[actuator]:
         low, high = model.actuator_forcerange[actuator].tolist()
     ends = _input_range(model, actuator)
+    # The range of a servo's control is one of positions, not of forces.
     if ends is not None and _servo(model, actuator) == (0.0, 0.0):
         least, most = sorted((model.actuator_gainprm[actuator, 0] * ends).tolist())
         low = max(low, least)
@@ -159,6 +157,7 @@ def _add(
 
 def _servo(model: MjModel, actuator: int) -> tuple[float, float]:
     """Return the gains kp and kv of an actuator, both 0 for a motor and for unknown laws."""
+    # A plugin's parameters have other meanings.
     is_known = model.actuator_plugin[actuator] < 0
     if is_known and model.actuator_biastype[actuator] == _BIAS.mjBIAS_AFFINE:
         kp, kv = (-model.actuator_biasprm[actuator, 1:3]).tolist()
@@ -184,6 +183,7 @@ def _effects(model: MjModel, actuator: int) -> Iterator[str]:
     if model.actuator_plugin[actuator] >= 0:
         yield "a plugin"
         return
+    # A <pid> has a law of its own; the rest is about <general> and its shortcuts.
     if _is_pid(model, actuator):
         if dynamics != _DYN.mjDYN_NONE:
             yield "an integral, or a limit of the setpoint's rate"
@@ -230,33 +230,6 @@ def _input_range(model: MjModel, actuator: int) -> Any | None:
     if model.actuator_ctrllimited[first]:
         return model.actuator_ctrlrange[first]
     return None
-
-
-def _narrower(
-    model: MjModel, names: Names, actuator: int, name: str, arm: float
-) -> Iterator[Finding]:
-    """Yield a finding if a servo limits the setpoint of a joint to less than the joint's range."""
-    kp, _ = _servo(model, actuator)
-    ends = _input_range(model, actuator)
-    gain = model.actuator_gainprm[actuator, 0]
-    if _is_pid(model, actuator):  # of which the input is a position
-        gain = kp
-    if ends is None or kp <= 0 or not gain:
-        return
-    joint = next(joint for joint, other in names.joints.items() if other == name)
-    low, high = sorted((gain / kp / arm * ends).tolist())
-    lower, upper = -math.inf, math.inf
-    if model.jnt_limited[joint]:
-        lower, upper = model.jnt_range[joint].tolist()
-    if math.isfinite(upper - lower):
-        margin = 1e-3 * (upper - lower)
-    else:
-        margin = 0.0
-    if low > lower + margin or high < upper - margin:
-        text = "the setpoint is not limited to the range that the servo has in the file"
-        remedy = "pass make_guard(lower=...)"
-        detail = f"{low:g} to {high:g}"
-        yield Finding("note", "actuator", text, remedy, name, detail=detail)
 
 
 def _field(model: MjModel, name: str, index: int) -> float:
@@ -306,6 +279,7 @@ def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
     """Return the magnitude of a symmetric range, else the smaller one that is not zero, with a
     finding.
     """
+    # Limits here are symmetric; the smaller is safe in both directions.
     magnitudes = sorted(abs(float(end)) for end in ends)
     if magnitudes[0] != magnitudes[1]:
         text = (
@@ -319,31 +293,14 @@ def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
 
 
 def _tendons(model: MjModel) -> Iterator[Finding]:
-    """Yield findings of tendons that act on the joints by themselves, and of tendons that do not
-    act.
-    """
-    effects = [
-        "stiffness",
-        "stiffnesspoly",
-        "damping",
-        "dampingpoly",
-        "frictionloss",
-        "armature",
-        "limited",
+    """Yield a finding of tendons that act on the joints by themselves."""
+    effects = "stiffness", "damping", "frictionloss", "armature", "limited"
+    acting = [
+        label(model.tendon(tendon))
+        for tendon in range(model.ntendon)
+        if any(np.any(getattr(model, f"tendon_{name}")[tendon]) for name in effects)
     ]
-    pulled = model.actuator_trnid[model.actuator_trntype == _TRN.mjTRN_TENDON, 0].tolist()
-    acting = []
-    idle = []
-    for tendon in range(model.ntendon):
-        named = label(model.tendon(tendon))
-        if any(np.any(getattr(model, f"tendon_{name}", [0])[tendon:][:1]) for name in effects):
-            acting.append(named)
-        elif tendon not in pulled:
-            idle.append(named)
     if acting:
         text = f"{ALONE} springs, damping, friction, armature and limits of tendons: "
         remedy = "in SAPIEN expect their joints to move freely"
         yield Finding("warning", "tendon", text + ", ".join(acting), remedy)
-    if idle:
-        text = f"tendons without an effect are left out: {', '.join(idle)}"
-        yield Finding("note", "tendon", text, "expect no effect")

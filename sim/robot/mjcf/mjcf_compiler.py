@@ -112,6 +112,7 @@ def _strip(
     """Remove textures, geoms that add neither shape nor mass, and those of missing meshes; return
     the latter.
     """
+    # A <pair> makes geoms collide whatever their masks say.
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     absent = {}
     for mesh in spec.meshes:
@@ -126,6 +127,7 @@ def _strip(
     weighing: dict[tuple[str, str], None] = {}
     used: set[str] = set()
     for geom in list(spec.geoms):
+        # A texture that is missing would stop the compilation.
         geom.material = ""
         drawn_only = not (geom.contype | geom.conaffinity) and geom.name not in paired
         weighs = _weighs(spec, geom)
@@ -143,21 +145,21 @@ def _strip(
             geom.conaffinity = 0
             geom.mass = 0.0
             for pair in [
-                each
-                for each in spec.pairs
-                if geom.name in (each.geomname1, each.geomname2) and geom.name
+                element
+                for element in spec.pairs
+                if geom.name in (element.geomname1, element.geomname2) and geom.name
             ]:
                 spec.delete(pair)
         elif geom.meshname:
             used.add(geom.meshname)
     for site in spec.sites:
         site.material = ""
-    for each in [
+    for element in [
         *spec.materials,
         *spec.textures,
         *(mesh for mesh in spec.meshes if mesh.name not in used),
     ]:
-        spec.delete(each)
+        spec.delete(element)
     return tuple(missing), tuple(weighing)
 
 
@@ -165,6 +167,7 @@ def _weighs(spec: Any, geom: Any) -> bool:
     """Return whether the mass of a geom's body depends on the geom."""
     inferred = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     low, high = spec.compiler.inertiagrouprange
+    # A geom adds no mass by its own mass, by its density, or by its group.
     weightless = (
         geom.mass == 0
         or (math.isnan(geom.mass) and geom.density == 0)
@@ -199,7 +202,7 @@ def _missing(path: Path) -> str | None:
 
 def _refusal(path: Path, problem: str) -> str:
     """Return the message for a file that MuJoCo refuses."""
-    included = [each.get("file", "") for each in parse_xml(path).iter("{*}include")]
+    included = [element.get("file", "") for element in parse_xml(path).iter("{*}include")]
     for name in (*re.findall(r"'([^']+)'", problem), *included):
         with suppress(OSError, ValueError):
             if _missing(path.parent / name) == LFS_PROBLEM:
@@ -235,14 +238,14 @@ class Names:
         self._bodies = model.jnt_bodyid
         self._roots = model.body_rootid
         self._left_out: set[int] = set()
-        given = [model.body(body).name for body in range(1, model.nbody)]
+        names = [model.body(body).name for body in range(1, model.nbody)]
         self._links, self._joints = (
-            {"world", *given},
+            {"world", *names},
             {model.joint(joint).name for joint in range(model.njnt)},
         )
         self.bodies = {0: "world"}
         self.bodies |= {
-            body: name or self.new_link(f"body{body}") for body, name in enumerate(given, start=1)
+            body: name or self.new_link(f"body{body}") for body, name in enumerate(names, start=1)
         }
         self.joints = {
             joint: model.joint(joint).name or self.new_joint(f"joint{joint}")

@@ -5,7 +5,7 @@ pose.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,6 +40,8 @@ _OURS = ("GRAVITY", "ACTUATION", "CLAMPCTRL")
 """Parts of MuJoCo's physics that a file cannot disable in either engine."""
 _OTHERS = ("CONTACT", "LIMIT", "EQUALITY", "FRICTIONLOSS", "DAMPER", "CONSTRAINT")
 """Parts that it can disable in MuJoCo."""
+_ELSEWHERE = "expect another motion in SAPIEN"
+"""Remedy for content that only the engine MuJoCo simulates."""
 
 
 def read_mjcf(path: Path, name: str, fixed_base: bool | None, missing_meshes: str) -> Source:
@@ -76,6 +78,7 @@ def read_mjcf(path: Path, name: str, fixed_base: bool | None, missing_meshes: st
         return read_only(np.array([values.get(joint, 0.0) for joint in joints], np.float64))
 
     defaults = FileDefaults(column(start))
+    # A file of motors alone has no gains to offer.
     if any((*motors.kp.values(), *motors.kv.values())):
         defaults = replace(defaults, kp=column(motors.kp), kv=column(motors.kv))
     armature = column(motors.armature)
@@ -100,6 +103,7 @@ def home(model: MjModel) -> int | None:
 def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> MjcfFile:
     """Return the data of the file that the engine MuJoCo needs."""
     model = compiled.model
+    # Loops between links, which MuJoCo closes and a tree cannot have.
     loops = []
     for equality in np.flatnonzero(model.eq_active0):
         at = [model.eq_obj1id[equality], model.eq_obj2id[equality]]
@@ -136,6 +140,7 @@ def content_of(path: Path) -> str:
     names = set[str]()
     folders = set[Path]()
     models = [path]
+    # The list grows while it is read: included models include others.
     for model in models:
         folders.add(model.parent)
         for element in parse_xml(model).iter():
@@ -159,107 +164,56 @@ def content_of(path: Path) -> str:
     )
 
 
-def _in_radians(model: MjModel, names: Names) -> list[Finding]:
-    """Return a finding if all limited hinges have ranges within 3.2 degrees, as if radians were
-    read as degrees.
+def _disabled(model: MjModel, flags: Sequence[str]) -> str:
+    """Return the parts of MuJoCo's physics among ``flags`` that a file disables."""
+    bits = {flag: getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}", 0) for flag in flags}
+    return ", ".join(flag.lower() for flag, bit in bits.items() if model.opt.disableflags & bit)
+
+
+def _in_radians(model: MjModel, names: Names) -> Iterator[Finding]:
+    """Yield a finding if all limited hinges have ranges within 3.2 degrees, as if radians were read
+    as degrees.
     """
-    hinges = [
-        joint for joint in names.joints if model.jnt_limited[joint] and not names.is_slide(joint)
-    ]
-    if not hinges or np.abs(model.jnt_range[hinges]).max() > np.deg2rad(3.2):
-        return []
-    text = (
-        "the ranges of all hinges are tiny: angles of an MJCF file are in degrees unless it says"
-        " otherwise"
-    )
-    return [
-        Finding(
-            "warning", "limits", text, 'add <compiler angle="radian"/> if the file is in radians'
-        )
-    ]
+    # Slides are in metres in either case.
+    hinges = [joint for joint in names.joints if not names.is_slide(joint)]
+    ranges = model.jnt_range[[joint for joint in hinges if model.jnt_limited[joint]]]
+    if ranges.size and np.abs(ranges).max() <= np.deg2rad(3.2):
+        text = "the ranges of all hinges are tiny: angles are in degrees unless the file says otherwise"
+        remedy = 'add <compiler angle="radian"/> if the file is in radians'
+        yield Finding("warning", "limits", text, remedy)
 
 
-def _unused(model: MjModel, names: Names, key: int | None) -> list[Finding]:
-    """Return findings for content that is not simulated, apart from motors, couplings, shapes and
+def _unused(model: MjModel, names: Names, key: int | None) -> Iterator[Finding]:
+    """Yield findings of content that is not simulated, apart from motors, couplings, shapes and
     keyframe ``key``.
     """
-    found = []
-    counts = {
-        "site": model.nsite,
-        "sensor": model.nsensor,
-        "camera": model.ncam,
-        "skin": model.nskin,
-    }
-    counts["keyframe"] = model.nkey - (key is not None)
-    if listed := [f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items() if count]:
-        text = f"elements that the simulation does not use are left out: {', '.join(listed)}"
-        found.append(Finding("note", "unknown-element", text, "expect no effect"))
+    keyframes = model.nkey - (key is not None)
+    counts = {"sites": model.nsite, "sensors": model.nsensor, "keyframes": keyframes}
+    left_out = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+    if left_out:
+        text = f"elements that the simulation does not use are left out: {left_out}"
+        yield Finding("note", "unknown-element", text, "expect no effect")
     option = model.opt
-    if tuple(option.gravity) != GRAVITY:
-        text = (
-            f"gravity {tuple(option.gravity.tolist())} of the file is not used: {GRAVITY} m/s^2 is"
-        )
-        found.append(Finding("warning", "option", text, "expect other loads"))
-    ours, others = (
-        [
-            name.lower()
-            for name in flags
-            if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}", 0)
-        ]
-        for flags in (_OURS, _OTHERS)
-    )
-    if ours:
-        text = f"<flag> of the file is not used, which disables: {', '.join(ours)}"
-        found.append(
-            Finding(
-                "warning", "option", text, "expect all of these to act; remove them from the file"
-            )
-        )
-    if option.enableflags & int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)):
-        found.append(
-            Finding(
-                "note", "option", "no body falls asleep, as the file has it", "expect slower steps"
-            )
-        )
-    special = {
-        f"the absence of what <flag> disables: {', '.join(others)}": others,
-        "drag of the medium (<option density= viscosity=>)": option.density or option.viscosity,
-        "flexible bodies": model.nflex,
-    }
-    remedy = "expect another motion in SAPIEN"
-    found += [
-        Finding("warning", "option", f"{ALONE} {text}", remedy)
-        for text, there in special.items()
-        if there
-    ]
+    ours, others = _disabled(model, _OURS), _disabled(model, _OTHERS)
+    is_other_gravity = tuple(option.gravity) != GRAVITY
+    has_medium = option.density or option.viscosity
+    # Every row: whether the file has it, what is simulated, and the remedy.
+    for is_there, text, remedy in (
+        (is_other_gravity, f"gravity is {GRAVITY} m/s^2, not the file's", "expect other loads"),
+        (ours, f"<flag> of the file is not used, which disables {ours}", "expect these to act"),
+        (others, f"{ALONE} the absence of {others}, which <flag> disables", _ELSEWHERE),
+        (has_medium, f"{ALONE} the medium (<option density= viscosity=>)", _ELSEWHERE),
+        (model.nflex, f"{ALONE} flexible bodies", _ELSEWHERE),
+    ):
+        if is_there:
+            yield Finding("warning", "option", text, remedy)
     for joint, name in names.joints.items():
-        if model.jnt_stiffness[joint] or np.any(
-            getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[joint]
-        ):
+        if model.jnt_stiffness[joint]:
             text = f"{ALONE} the spring of the joint"
-            remedy = "in SAPIEN add its effort in a controller"
-            detail = (
-                f"{model.jnt_stiffness[joint]:g} {'N/m' if names.is_slide(joint) else 'N m/rad'}"
-            )
-            found.append(Finding("warning", "spring", text, remedy, name, detail=detail))
-        if np.any(
-            getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1)))[model.jnt_dofadr[joint]]
-        ):
-            text = f"{ALONE} damping that grows with the speed, SAPIEN its linear part"
-            found.append(
-                Finding(
-                    "warning", "dynamics", text, "give the damping at the speeds of interest", name
-                )
-            )
+            detail = f"{model.jnt_stiffness[joint]:g} in units of N, m and rad"
+            yield Finding("warning", "spring", text, _ELSEWHERE, name, detail=detail)
     for body in np.flatnonzero(model.body_gravcomp):
-        text = "gravity compensation of this body (gravcomp) is not simulated"
-        remedy = "let the controller compensate"
         if names.is_of_robot(body):
-            found.append(Finding("note", "gravcomp", text, remedy, link=names.bodies[int(body)]))
-    for body in np.flatnonzero(model.body_plugin >= 0):
-        text = f"{ALONE} the plugin of the body"
-        remedy = "in SAPIEN expect the body to be rigid and to move freely"
-        found.append(
-            Finding("warning", "unknown-element", text, remedy, link=names.bodies[int(body)])
-        )
-    return found
+            text = "gravity compensation of this body (gravcomp) is not simulated"
+            remedy = "let the controller compensate"
+            yield Finding("note", "gravcomp", text, remedy, link=names.bodies[int(body)])

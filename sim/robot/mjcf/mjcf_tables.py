@@ -70,6 +70,7 @@ def find_base(model: MjModel, names: Names, path: Path, findings: list[Finding])
     left_out = {body for body in tops if model.body_mocapid[body] >= 0} | (free - moving) | soft
     if moving:
         left_out |= balls - moving
+    # A robot on a free joint is one object; all others are scenery.
     if floating:
         left_out |= tops - floating
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_BALL):
@@ -137,6 +138,7 @@ class TableReader:
             self._add(0, Body(names[0], None), ORIGIN)
         else:
             self._report_world()
+        # A free joint that is held keeps its turn: a row above the base has it.
         root = None
         if base != 0 and is_held and model.body_quat[base][0] != 1:
             root = Body(self._names.new_link(f"{names[base]}_frame"), None)
@@ -228,6 +230,7 @@ class TableReader:
         axes = model.body_iquat[body]
         center = model.body_ipos[body] - anchor
         inertia = np.diag(model.body_inertia[body])
+        # Else the row would get the mass of its shapes.
         if mass == 0 and body in self.solid:
             mass = NO_MASS
             center = ORIGIN
@@ -255,6 +258,7 @@ class TableReader:
                 size = tuple(sizes[:count].tolist())
             elif shape_type in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF):
                 vertices = _hull(self._model, int(self._model.geom_dataid[geom]))
+            # PhysX has no ellipsoids.
             elif shape_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
                 vertices = _ellipsoid(sizes)
                 text = "an ellipsoid collides in SAPIEN as a polyhedron inscribed in it"
@@ -294,22 +298,15 @@ class TableReader:
         else:
             kind = "height field"
         text = f"{ALONE} the {kind} {named} of the file"
-        height = float(self._model.geom_pos[geom, 2])
-        (_, x, y, _) = self._model.geom_quat[geom]
+        # A ground at another height, or not level, changes the run.
+        is_ground = not np.any([*self._model.geom_pos[geom, 2:], *self._model.geom_quat[geom, 1:3]])
         if body != 0 or kind != "plane":
             self._report("warning", body, text, "in SAPIEN add it with build=")
-        elif height == x == y == 0:
+        elif is_ground:
             self._report("note", None, text, "SAPIEN has a ground at height 0")
         else:
-            if x == y == 0:
-                where = f"at height {height:g} m"
-            else:
-                where = "which is not level"
-            remedy = (
-                "SAPIEN has a ground at height 0 instead: add the plane with build= of Runner, or"
-                " pass ground=False"
-            )
-            self._report("warning", None, f"{text}, {where}", remedy)
+            remedy = "SAPIEN has a level ground at height 0: add the plane with build="
+            self._report("warning", None, text, remedy)
 
     def _report(self, severity: str, body: int | None, text: str, remedy: str) -> None:
         link = None if body is None else self._names.bodies[body]

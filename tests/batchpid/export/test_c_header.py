@@ -25,7 +25,7 @@ from tests.c_programs import COMPILERS, STRICT, TABLE, compiled, efforts_in_c
 
 pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 SINGLE = {name: case for name, case in OPTIONS.items() if not name.endswith("per env")}
-SANITIZED = ("-std=c99", "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+SANITIZED = ("-std=c99", "-O0", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 DT = 0.003
 
 

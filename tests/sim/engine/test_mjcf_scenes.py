@@ -592,9 +592,7 @@ def test_a_link_between_two_joints_of_a_body_has_no_sensor_and_no_payload(load):
 def test_ground_friction_is_drawn_around_that_of_the_file(load, draw, ground, arm):
     text = ARM.replace(LINK, LINK[:-2] + ' friction=".4"/>')
     robot = load(text.replace('type="plane"', 'type="plane" friction=".8"'))
-    spec = SceneSpec(
-        robot.tables, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
-    )
+    spec = SceneSpec(robot.tables, (), robot.joints, 1e-3, SOLVERS["accurate"], mjcf=robot.mjcf)
     nominal = nominal_values("ground_friction", robot, robot.mjcf)
     pack = ENGINE.make_pack(
         spec, 1, variation=Variation(ground_friction=draw.apply(nominal, draw.low))

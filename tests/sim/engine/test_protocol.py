@@ -54,7 +54,7 @@ def check_members(protocol, value):
 def test_an_engine_has_the_members_of_each_protocol(name):
     engine = engines.load_engine(name)
     check_members(Engine, engine)
-    spec = SceneSpec(PANDA.tables, (), PANDA.joints, DT, engine.physics["accurate"], engine=name)
+    spec = SceneSpec(PANDA.tables, (), PANDA.joints, DT, engine.physics["accurate"])
     pack = engine.make_pack(spec, 1)
     for protocol in (EnginePack, DrivenPack, CompiledPack):
         check_members(protocol, pack)
@@ -72,6 +72,7 @@ class DoubleIntegrators:
         self.spec, self.size, self.first_env, self.dof = spec, size, first_env, len(spec.joints)
         self.qf = np.zeros((size, self.dof))
         self.friction, self.armature = Friction(), np.zeros((1, self.dof))
+        self.rigid_tree = sliders(spec)
         self._state, self._moves = np.zeros((2, size, self.dof)), np.ones((size, 1))
 
     def read_qpos(self, dtype=np.float64):
@@ -157,7 +158,6 @@ ENGINE = engines.Engine(
     physics={"accurate": Solver(1)},
     group_size=4,
     make_pack=lambda spec, size, first_env=0, **_: DoubleIntegrators(spec, size, first_env),
-    scene_tree=sliders,
     native_obstacle=lambda: "a toy",
 )
 

@@ -272,7 +272,7 @@ def test_a_state_keeps_its_dtype(panda):
         runner.step(np.zeros(panda.dof))
         snapshot = runner.snapshot()
         runner.restore(snapshot)
-    assert [snapshot.states.controller[name].dtype for name in ("steps", "count")] == [
+    assert [snapshot.states.control[f"law/{name}"].dtype for name in ("steps", "count")] == [
         np.float64,
         np.int64,
     ]

@@ -37,12 +37,12 @@ def test_one_warning_lists_joints_and_envs(arm):
         assert (
             message
             == "qpos is outside the joint limits, where no joint can follow: joint 'one' at 1.5"
-            " rad, not in [-1, 1] (env 3); joint 'two' at -3 rad, not in [-1, 1] (envs 5, 6, 7);"
+            " rad, not in [-1, 1] (env 3 first); joint 'two' at -3 rad, not in [-1, 1] (env 5 first);"
             " move it inside"
         )
         (message,) = warned(lambda: runner.step(np.full(2, 2.0)))
         assert "setpoint" in message
-        assert "(envs 0, 1, 2, 3 and 4 more)" in message
+        assert "(env 0 first)" in message
         assert warned(lambda: runner.rollout(np.full((2, 2), 2.0))) == []
 
 
@@ -52,4 +52,4 @@ def test_envs_that_are_not_reset_are_not_checked(arm):
         assert warned(lambda: runner.reset(pose, mask=np.array([True, False, False]))) == []
         (message,) = warned(lambda: runner.reset(pose, mask=np.array([True, False, True])))
         assert "'one'" not in message
-        assert "(env 2)" in message
+        assert "(env 2 first)" in message

@@ -365,29 +365,11 @@ def test_a_pid_has_gains_and_further_effects_are_told(load):
             '<motor joint="j" group="2"/></actuator><option actuatorgroupdisable="2"/><actuator>',
             "disables its group",
         ),
-        (
-            (
-                '<general joint="j" gainprm="8" biastype="affine" biasprm="0 -4" ctrlrange="-1 2"'
-                ' gear="-2"/>'
-            ),
-            "(-2 to 1)",
-        ),
     ],
 )
 def test_what_an_actuator_does_besides_is_told(load, actuator, said):
     robot = load(two_links(rest=f"<actuator>{actuator}</actuator>"))
     assert [said in str(each) for each in robot.repairs if each.code == "actuator"] == [True]
-
-
-def test_the_range_of_a_joint_is_no_narrower_range_of_its_setpoint(load):
-    joint = '<joint name="j" range="-90 90"/>'
-    for share, told in ((1, 0), (0.5, 1)):
-        robot = load(
-            two_links(
-                joint, rest=f'<actuator><pid joint="j" kp="2" inheritrange="{share}"/></actuator>'
-            )
-        )
-        assert len(robot.repairs) == told
 
 
 def test_the_gear_of_an_actuator_after_an_orientation_servo_is_its_own(load):
@@ -434,7 +416,6 @@ FINDINGS = {
     "spring": (two_links('<joint name="j" stiffness="3"/>'), "spring", "j"),
     "gravity": (two_links(rest='<option gravity="0 0 0"/>'), "option", None),
     "flag": (two_links(rest='<option><flag contact="disable"/></option>'), "option", None),
-    "sleep": (two_links(rest='<option><flag sleep="enable"/></option>'), "option", None),
     "medium": (two_links(rest='<option density="1.2"/>'), "option", None),
     "gravcomp": (two_links().replace('name="b"', 'name="b" gravcomp="1"'), "gravcomp", None),
     "site": (two_links().replace(BOX, f'{BOX}<site name="s"/>', 1), "unknown-element", None),
@@ -492,31 +473,24 @@ def test_all_that_is_left_out_is_named(load):
     floor = '<geom {} type="plane" size="1 1 .1"/>'
     named = floor.format("name='floor'")
     world = f'{named}<geom name="wall" size=".1"/><geom type="box" size=".1 .1 .1"/>'
-    rest = """<tendon><fixed name="idle"><joint joint="hip1" coef="1"/></fixed></tendon><equality>
-      <weld name="hold" body1="leg1"/><connect name="off" body1="leg2" anchor="0 0 0" active="false"/></equality>"""
+    rest = """<equality><weld name="hold" body1="leg1"/></equality>"""
     told = "\n".join(
         map(str, load(WALKER.replace("<worldbody>", f"{rest}<worldbody>{world}")).repairs)
     )
     for name in (
         "'floor'",
         "'wall', 'number 2'",
-        "'idle'",
         "weld 'hold'",
-        "'off'",
         "'ball'",
         "'goal'",
     ):
         assert name in told
-    for place, said in (
-        ('pos="0 0 -1"', "at height -1 m"),
-        ('euler="30 0 0"', "which is not level"),
-    ):
+    for place in ('pos="0 0 -1"', 'euler="30 0 0"'):
         (found,) = load(
             two_links().replace("<worldbody>", f"<worldbody>{floor.format(place)}")
         ).repairs
         assert (found.severity, found.code) == ("warning", "collision")
         assert "plane 'number 0'" in found.text
-        assert said in found.text
 
 
 def test_a_plain_file_needs_no_repair(load):

@@ -93,19 +93,6 @@ def test_a_number_that_cannot_be_read_is_quoted(at, key, tmp_path):
         assert may_be_infinite or written in report(write(tmp_path, text)), written
 
 
-@pytest.mark.parametrize(("at", "key"), NUMBERS)
-def test_a_decimal_comma_is_read_and_quoted(at, key, tmp_path):
-    text, written = changed(at, key, lambda value: value.replace(".", ","))
-    loaded, whole = (
-        Robot.load(write(tmp_path, text)),
-        Robot.load(write(tmp_path, WHOLE, "whole.urdf")),
-    )
-    said = f"{written!r}> is read with points in place of decimal commas"
-    assert any(said in each.text for each in loaded.repairs) == ("," in written)
-    assert loaded.tables == whole.tables
-    assert loaded.joints == whole.joints
-
-
 @pytest.mark.parametrize("expression", ["$(arg x)", "$(eval 1 + 1)", "${x}"])
 @pytest.mark.parametrize(("at", "key"), NUMBERS)
 def test_an_expression_of_xacro_is_refused(at, key, expression, tmp_path):
@@ -116,16 +103,13 @@ def test_an_expression_of_xacro_is_refused(at, key, expression, tmp_path):
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic", "continuous"])
 @pytest.mark.parametrize("key", ["effort", "velocity"])
-@pytest.mark.parametrize(
-    ("text", "limit"), [("-1", None), ("-1.0", None), ("0", None), ("-7.5", 7.5)]
-)
-def test_a_limit_that_is_not_positive(kind, key, text, limit, tmp_path):
-    given = {"lower": "-1", "upper": "1", "effort": "9", "velocity": "9"} | {key: text}
-    inner = "<limit {}/>".format(" ".join(f'{each}="{value}"' for each, value in given.items()))
+@pytest.mark.parametrize("text", ["-1", "-1.0", "0", "-7.5"])
+def test_a_limit_that_is_not_positive_counts_as_not_given(kind, key, text, tmp_path):
+    limits = {"lower": "-1", "upper": "1", "effort": "9", "velocity": "9"} | {key: text}
+    inner = "<limit {}/>".format(" ".join(f'{name}="{value}"' for name, value in limits.items()))
     loaded = Robot.load(write(tmp_path, one_joint(inner, kind)))
-    found = {"effort": loaded.effort_limit, "velocity": loaded.velocity_limit}[key]
-    assert found == (float("inf") if limit is None else limit)
-    assert any(text in str(each) for each in loaded.repairs)
+    assert getattr(loaded, f"{key}_limit") == float("inf")
+    assert any(text in str(finding) for finding in loaded.repairs)
 
 
 @pytest.mark.parametrize(
@@ -133,9 +117,7 @@ def test_a_limit_that_is_not_positive(kind, key, text, limit, tmp_path):
     [
         ('lower="-1.25"', 'lower="-170"', "'hinge' .lower -170 rad"),
         ('upper="1.25"', 'upper="90"', "'hinge' .upper 90 rad"),
-        ('soft_upper_limit="0.75"', 'soft_upper_limit="80"', "'hinge' .*soft_upper 80 rad"),
         ('offset="0.25"', 'offset="45"', "'follower' .mimic offset 45 rad"),
-        ('rpy="0.125 0.25 0.5"', 'rpy="0 0 90"', "'arm' .*<inertial> rpy 0 0 90"),
     ],
 )
 def test_degrees_are_recognised(old, new, said, tmp_path):
@@ -144,10 +126,3 @@ def test_degrees_are_recognised(old, new, said, tmp_path):
 
     assert re.search(said, findings(WHOLE.replace(old, new)))
     assert "degrees" not in findings(WHOLE)
-
-
-def test_soft_limits_without_a_range_are_reported(tmp_path):
-    text = WHOLE.replace('soft_lower_limit="-0.75"', 'soft_lower_limit="0.8"')
-    assert re.search(
-        r"0\.8, 0\.75.*soft limits without a range have no effect", report(write(tmp_path, text))
-    )

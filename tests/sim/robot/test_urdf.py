@@ -255,9 +255,7 @@ def test_a_default_namespace_is_ignored(head, tmp_path):
 def test_a_robot_without_a_name_is_called_after_its_file(tmp_path):
     loaded = Robot.load(write(tmp_path, one_joint().replace(' name="test"', ""), "arm.urdf"))
     assert loaded.name == "arm"
-    assert "<robot> has no name: called 'arm'" in str(loaded.repairs[0])
     assert '<robot name="arm">' in to_urdf(loaded).text
-    assert any("<robot> has no name" in each for each in to_urdf(loaded).differences)
     with Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0)) as runner:
         assert runner.step([0.0]).ok.all()
 
