@@ -323,8 +323,9 @@ class Controller(Protocol):
         """Return the state of ``num_envs`` envs at their start: None, an array, or tuples and dicts
         of these.
 
-        ``timestep`` [s] is the time from one call of the controller to the next. Every array has the envs as its first axis: states are reset by mask, and kept in snapshots.
-        Later states have the same structure, shapes and dtypes.
+        ``timestep`` [s] is the time from one call of the controller to the next. Every array has
+        the envs as its first axis: states are reset by mask, and kept in snapshots. Later states
+        have the same structure, shapes and dtypes.
         """
 
     def __call__(
