@@ -62,8 +62,12 @@ OUTLIER = 2.0
 """Ratio of a residual to its size above which its weight in the loss decreases."""
 ROUNDS = 4
 """Most fits, each with residuals of the size that the one before has left."""
-SETTLED = 0.8
+SETTLED = 0.5
 """Ratio of that size to the one before from which no further fit follows."""
+SHORT = 2e-3
+"""Delay of setpoints up to which the fit is repeated without it [s]."""
+EVIDENCE = 5.0
+"""Least decrease of the cost for such a delay: about three standard deviations."""
 PARTS = 10
 """Number of parts of the logs for the jackknife."""
 INTERVAL = 2.0
@@ -100,7 +104,7 @@ class Solution(NamedTuple):
     point: Float64
     """Coordinates of the unknowns."""
     size: Float64
-    """Size of the residuals (joints,)."""
+    """Size of the residuals that the fit was weighted with (joints,)."""
     cost: float
     converged: bool
 
@@ -199,25 +203,32 @@ class Problem:
         return float(np.linalg.norm(self.size(self.evaluate(self.unknowns.start))))
 
     def fit(self, evaluations: int, progress: Callable[[], Any] | None = None) -> Fit:
-        """Return the fit: first of all unknowns, then of those that the logs show."""
+        """Return the fit: first of all unknowns, then of those that the logs show, then without a
+        short delay of setpoints if that explains the logs as well.
+        """
         fitted = replace(self, windows=[window for window in self.windows if window.fitted.any()])
-        start = self.unknowns.start
-        solution = fitted.solve(start, evaluations, None, progress)
+        solution = fitted.solve(self.unknowns.start, evaluations, None, progress)
         intervals = fitted.intervals(solution)
+        values = self.unknowns.values(solution.point[None])[0]
         shown = intervals.shown
-        unknowns = self.unknowns.only(shown)
-        if not shown.all():
-            fitted = replace(fitted, unknowns=unknowns)
-            point = solution.point[shown]
-            solution = fitted.solve(point, evaluations, solution.size, progress)
-            intervals = fitted.intervals(solution)
-        return Fit(
-            self.unknowns.only(~shown),
-            fitted,
-            replace(self, unknowns=unknowns),
-            solution,
-            intervals,
-        )
+        late = [entry.kind == "setpoint_delay" for entry in self.unknowns.entries]
+        brief = late & (np.abs(values) < SHORT)
+        stays = np.ones(len(values), bool)
+        for mask, evidence in ((shown, np.inf), (shown & ~brief, EVIDENCE)):
+            if mask.sum() == stays.sum():
+                continue
+            # The other unknowns make up for a delay, as their correlations say.
+            deviation = intervals.deviation
+            moved = (brief & ~mask) * values / deviation @ intervals.correlation * deviation
+            unknowns = self.unknowns.only(mask)
+            point = unknowns.points((values - moved)[None, mask])[0]
+            other = replace(fitted, unknowns=unknowns)
+            usual = other.solve(point, evaluations, solution.size, progress)
+            if usual.cost < solution.cost + evidence:
+                fitted, solution, stays = other, usual, mask
+        hidden = self.unknowns.only(~stays)
+        problem = replace(self, unknowns=fitted.unknowns)
+        return Fit(hidden, fitted, problem, solution, fitted.intervals(solution))
 
     def solve(
         self,
@@ -263,17 +274,17 @@ class Problem:
                 x_scale="jac",
                 loss="soft_l1",
                 f_scale=OUTLIER,
-                ftol=1e-5,
-                xtol=1e-3,
+                ftol=1e-4,
+                xtol=1e-4,
                 gtol=1e-8,
                 max_nfev=evaluations,
             )
             point = optimum.x
             evaluations -= optimum.nfev
             size = self.size(at(point))
-            if evaluations < 1 or (size > SETTLED * weight).all():
+            if evaluations < 1 or np.median(size / weight) > SETTLED:
                 break
-        return Solution(point, size, float(optimum.cost), optimum.status > 0)
+        return Solution(point, weight, float(optimum.cost), optimum.status > 0)
 
     def system(
         self, evaluation: FitResiduals, point: Float64, size: Float64

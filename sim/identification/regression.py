@@ -189,8 +189,11 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
             options.append(Guess(values, costs))
         guesses.append(min(options, key=_cost))
     # The sum of both delays is certain, but armature and damping make up for their shares.
+    # Setpoints that were logged late are the last explanation.
     least = min(map(_cost, guesses)) + ALIKE
-    return sorted([guess for guess in guesses if guess.cost < least], key=_cost)
+    alike = sorted([guess for guess in guesses if guess.cost < least], key=_cost)
+    usual = [guess for guess in alike if guess.values["setpoint_delay"][0] > -1e-9]
+    return usual or alike
 
 
 def _cost(guess: Guess) -> float:

