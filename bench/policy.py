@@ -36,7 +36,7 @@ class ResidualPolicy:
             rng.normal(0, n**-0.5, (n, m)).astype(np.float32) for n, m in pairwise(sizes)
         ]
 
-    def init(self, robot: Robot, num_envs: int) -> None:
+    def init(self, robot: Robot, num_envs: int, timestep: float) -> None:
         """Return no state."""
 
     def __call__(

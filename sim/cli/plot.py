@@ -67,8 +67,8 @@ def plot(
 ) -> Recording:
     """Draw a recorded run, compare it with another one, or film it.
 
-    The recording may be complete, cut short by a kill, or still being written. A film has the
-    robot's meshes if the robot is named, or bundled; else its shapes, from the recording.
+    The recording may be complete, cut short by a kill, or still being written. A film draws
+    the robot of the recording, or the one that is named.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ def view(
     """Show moving robots in the browser: sliders for setpoints and gains, and charts.
 
     The page is served on localhost only; from another machine, use ``ssh -L``. With ``--play`` it
-    shows a recorded run, with the robot's meshes if the robot is named, or bundled.
+    shows a recorded run, of the robot in the recording, or of the one that is named.
 
     Parameters
     ----------

@@ -140,7 +140,7 @@ def controller_errors(controller: OwnController | None, step: int = 0) -> Iterat
 def _begin(options: RunnerOptions, envs: int) -> Any:
     """Return the initial state of the caller's own controller for ``envs`` envs."""
     assert not isinstance(options.control, str)
-    start = partial(options.control.init, options.robot, envs)
+    start = partial(options.control.init, options.robot, envs, options.timestep)
     if options.backend != "jax":
         return start()
     with own_settings("float64"):  # its arrays have this dtype, not JAX's default in this process

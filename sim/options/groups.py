@@ -319,12 +319,13 @@ class Controller(Protocol):
     has one.
     """
 
-    def init(self, robot: Robot, num_envs: int) -> Any:
+    def init(self, robot: Robot, num_envs: int, timestep: float) -> Any:
         """Return the state of ``num_envs`` envs at their start: None, an array, or tuples and dicts
         of these.
 
-        Every array has the envs as its first axis: states are reset by mask, and kept in snapshots.
-        Later states have the same structure, shapes and dtypes.
+        ``timestep`` [s] is the time from one call of the controller to the next. Every array has
+        the envs as its first axis: states are reset by mask, and kept in snapshots. Later states
+        have the same structure, shapes and dtypes.
         """
 
     def __call__(

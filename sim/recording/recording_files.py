@@ -16,6 +16,7 @@ import io
 import json
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks.validate import file_path, instance, integer
-from batchpid.errors import BatchPIDError, InvalidArgumentError
+from batchpid.errors import BatchPIDError, InvalidArgumentError, RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.signals.command import CommandSpec
@@ -176,6 +177,7 @@ def create_datasets(
     """Write ``info`` to a new file; return empty datasets that can grow: time and
     :attr:`RunInfo.recorded`.
     """
+    info = replace(info, urdf=_urdf_of(info))
     file.attrs.update(attributes(info) | {"format": FORMAT, "num_envs": num_envs, "tick": tick})
     datasets = {
         "time": file.create_dataset(
@@ -193,6 +195,19 @@ def create_datasets(
         if info.units_of(name):
             datasets[name].attrs["unit"] = list(info.units_of(name))
     return datasets
+
+
+def _urdf_of(info: RunInfo) -> str | None:
+    """Return the robot of a run as a URDF; None for one whose file is gone or has changed."""
+    robot = info.description
+    if robot is None:
+        return info.urdf
+    if robot.path.is_file():  # reading a pipe again could block
+        from batchpid.sim.robot.urdf_export import to_urdf
+
+        with suppress(RobotError):
+            return to_urdf(robot).text
+    return None
 
 
 def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Mapping[str, Any]) -> None:

@@ -131,9 +131,11 @@ class RunInfo:
     redraws: tuple[Redraw, ...] = ()
     """Episodes that began after that."""
     description: Any = field(default=None, repr=False)
-    """Robot (:class:`batchpid.sim.Robot`) of the run, for :meth:`Rollout.findings`; not
-    recorded.
+    """Robot (:class:`batchpid.sim.Robot`) of the run, for :meth:`Rollout.findings`; a recording
+    keeps its :attr:`urdf` instead.
     """
+    urdf: str | None = field(default=None, repr=False)
+    """Robot of a recording, as :func:`batchpid.sim.to_urdf` writes it, to be drawn."""
     options: Mapping[str, Any] | None = None
     """Further options of the runner that recordings keep, by name."""
 

@@ -203,8 +203,8 @@ class OperationalSpace:
             type(self).__name__, [self.link, "setpoints " + " ".join(self.command.names)]
         )
 
-    def init(self, robot: Robot, num_envs: int) -> ts.OSCState:
-        """Return the state of ``num_envs`` envs.
+    def init(self, robot: Robot, num_envs: int, timestep: float) -> ts.OSCState:
+        """Return the state of ``num_envs`` envs; :meth:`in_runner` takes the time step.
 
         Raises
         ------

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.digest import digest
 from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
@@ -27,7 +31,7 @@ class Playback:
     ------
     InvalidArgumentError
         The run has more robots than fit on a page, or another number of joints than the robot; or
-        it holds no description of its robot, which is not bundled.
+        the recording holds no robot.
     """
 
     def __init__(
@@ -87,20 +91,35 @@ class Playback:
 
 
 def recorded_robot(rollout: Rollout) -> Robot:
-    """Return the robot of a run in this process, or the bundled one that was recorded.
+    """Return the robot of a run in this process, or the bundled one that was recorded, or the one
+    in the recording; its meshes are read from their files, and left out where these are gone.
 
-    Raises InvalidArgumentError if it is neither.
+    Raises InvalidArgumentError if the recording has none.
     """
     info = rollout.info
     if isinstance(info.description, Robot):
         return info.description
-    problem = f"{info.robot!r} of the recording is not bundled"
     if info.robot in Robot.bundled():
         bundled = Robot.load(info.robot, fixed_base=info.fixed_base)
         if info.digest in (None, bundled.digest):
             return bundled
-        problem = f"{info.robot!r} of the recording is another one than the bundled robot"
-    raise InvalidArgumentError("robot", problem, remedy="name its URDF or MJCF file")
+    if info.urdf is None:
+        raise InvalidArgumentError(
+            "robot",
+            f"{info.robot!r} is not bundled, and the recording holds no description of it",
+            remedy="name its URDF or MJCF file",
+        )
+    path = Path(_folder().name, f"{digest(info.urdf)[:32]}.urdf")
+    path.write_text(info.urdf, encoding="utf-8")
+    return Robot.load(path, fixed_base=info.fixed_base)
+
+
+@cache
+def _folder() -> TemporaryDirectory[str]:
+    """Return the folder of recorded robots, whose files are read again when they are drawn; it is
+    removed at the end of the process.
+    """
+    return TemporaryDirectory(prefix="batchpid-")
 
 
 def rows_at(rollout: Rollout, seconds: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -14,7 +14,7 @@ ARM = slice(0, 7)
 class SimplePIDs:
     """SimplePID of the tutorial on arrays, and the passive force."""
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         self.gains = robot.settings
         return tuple(np.zeros((2, num_envs, robot.dof)))
 

@@ -45,7 +45,7 @@ class Law:
     def version(self):
         return self.kp
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         return None
 
     def __call__(self, state, setpoint, qpos, qvel, passive):

@@ -39,7 +39,7 @@ class Cartesian:
     def __init__(self, command=XY):
         self.command = command
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         return None
 
     def __call__(self, state, setpoint, qpos, qvel, passive):

@@ -57,7 +57,7 @@ class Damped:
     of its sim steps.
     """
 
-    def init(self, robot: Any, num_envs: int) -> Any:
+    def init(self, robot: Any, num_envs: int, timestep: float) -> Any:
         return {"steps": np.zeros(num_envs), "last": (np.zeros((num_envs, robot.dof)), None)}
 
     def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:

@@ -162,7 +162,7 @@ class Acts:
     def __init__(self, act: Callable[[int], object]) -> None:
         self.act = act
 
-    def init(self, robot: Any, num_envs: int) -> Any:
+    def init(self, robot: Any, num_envs: int, timestep: float) -> Any:
         return np.zeros(num_envs, int)
 
     def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:

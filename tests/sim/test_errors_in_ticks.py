@@ -27,7 +27,7 @@ class FailsLater:
     def __init__(self, failures, kind="raises"):
         self.failures, self.kind = failures, kind
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         return np.zeros(num_envs, int)
 
     def __call__(self, state, setpoint, qpos, qvel, passive):
@@ -144,11 +144,11 @@ def test_an_error_in_a_reset_closes_the_runner(workers):
             super().__init__([])
             self.calls = 0
 
-        def init(self, robot, num_envs):
+        def init(self, robot, num_envs, timestep):
             self.calls += 1
             if self.calls > 4:
                 raise BatchPIDError("no more")
-            return super().init(robot, num_envs)
+            return super().init(robot, num_envs, timestep)
 
     with Runner(ROBOT, 4, workers=workers, control=FailsAtReset()) as runner:
         with pytest.raises(ControllerError, match="no more"):

@@ -251,7 +251,7 @@ class Hold:
 
     command = ("x", "z")
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         return None
 
     def __call__(self, state, setpoint, qpos, qvel, passive):

@@ -60,7 +60,7 @@ class Hold:
     def __init__(self, **more: Any) -> None:
         vars(self).update(more)
 
-    def init(self, robot: Any, num_envs: int) -> Any:
+    def init(self, robot: Any, num_envs: int, timestep: float) -> Any:
         return None
 
     def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:

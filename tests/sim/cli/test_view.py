@@ -10,18 +10,26 @@ from tiny_urdf import INERTIAL, joint, link, robot
 from tiny_urdf import write as write_urdf
 
 import batchpid as bp
-from batchpid.sim import Observation, Robot, Rollout, RunInfo, write_recording
+from batchpid.sim import (
+    Observation,
+    Robot,
+    Rollout,
+    RunInfo,
+    read_recording,
+    write_recording,
+)
+from batchpid.sim.view.playback import recorded_robot
 
 pytest.importorskip("viser")
 SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
 
 
-def write(path, robot="panda", envs=1, **changed):
+def write(path, robot=None, envs=1, name="panda"):
     """Write a rollout of two ticks at rest."""
-    panda = load_bundled("panda")
-    zeros = np.zeros((2, envs, panda.dof), np.float32)
+    robot = load_bundled("panda") if robot is None else robot
+    zeros = np.zeros((2, envs, robot.dof), np.float32)
     seen = Observation(zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool), zeros > 0)
-    info = replace(RunInfo.of(panda), robot=robot, **changed)
+    info = replace(RunInfo.of(robot), robot=name)
     return write_recording(
         Rollout(np.array([0.1, 0.2]), zeros.astype(float), seen, tick=0.1, info=info), path
     )
@@ -86,18 +94,29 @@ def test_a_port_in_use_is_named_with_the_next(batchpid):
     assert f"port {port} is in use; the page is at " in said
 
 
-def test_a_run_of_another_robot_with_the_name_of_a_bundled_one_is_not_shown_as_that(
-    batchpid, tmp_path
-):
-    run = write(tmp_path / "my run.h5", digest="of another robot")
-    problem = "robot: 'panda' of the recording is another one than the bundled robot; name its URDF"
-    assert problem in batchpid("view", "--play", run)[2]
+def test_the_robot_of_a_recording_is_shown(batchpid, tmp_path):
+    """Also one that has the name of a bundled one, and whose file is gone."""
+    text = '<collision><geometry><box size="1 2 3"/></geometry></collision>'
+    path = write_urdf(
+        tmp_path, robot(link("base"), link("arm", INERTIAL + text), joint("j", "base", "arm"))
+    )
+    arm = Robot.load(path)
+    for name in ("panda", "my arm"):
+        run = write(tmp_path / f"{name}.h5", arm, name=name)
+        seen = recorded_robot(read_recording(run))
+        assert (seen.digest, seen.path.parent == tmp_path) == (arm.digest, False)
+    path.unlink()
+    assert batchpid("view", *SHORT[2:], "--play", run, "--time-limit", 0.1)[0] == 0
 
 
-def test_a_run_of_a_robot_that_is_not_bundled_asks_for_its_file(batchpid, tmp_path):
-    run = write(tmp_path / "run.h5", robot="arm")
-    problem = "robot: 'arm' of the recording is not bundled; name its URDF"
-    assert problem in batchpid("view", "--play", run)[2]
+def test_a_recording_without_robot_asks_for_its_file(batchpid, tmp_path):
+    """Its file was gone when it was recorded."""
     path = tmp_path / "arm.urdf"
+    path.write_text(load_bundled("panda").path.read_text())
+    arm = Robot.load(path)
+    path.unlink()
+    run = write(tmp_path / "run.h5", arm, name="arm")
+    problem = "'arm' is not bundled, and the recording holds no description of it; name its URDF"
+    assert problem in batchpid("view", "--play", run)[2]
     path.write_text(load_bundled("panda").path.read_text())
     assert batchpid("view", path, *SHORT, "--play", run, "--time-limit", 0.1)[0] == 0

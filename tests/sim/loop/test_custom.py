@@ -26,7 +26,7 @@ class Law:
     def __init__(self, params):
         self.params, self.k = params, None
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         return bp.init(self.params, np.tile(robot.start, (num_envs, 1)).astype(np.float32))
 
     def __call__(self, state, setpoint, qpos, qvel, passive):
@@ -38,7 +38,7 @@ class Law:
 class Counter:
     """Efforts from a state of several parts: the number of steps, and a filtered velocity."""
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         return {"steps": np.zeros(num_envs), "filter": (np.zeros((num_envs, robot.dof)), None)}
 
     def __call__(self, state, setpoint, qpos, qvel, passive):
@@ -69,7 +69,7 @@ def test_the_law_as_a_controller_is_the_pid(panda):
 
 
 class WrongState(Counter):
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         return {"steps": np.zeros(3)}
 
 
@@ -170,7 +170,7 @@ class Keeps:
     def __init__(self, keep):
         self.keep = keep
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         return [np.zeros((num_envs, robot.dof))] * 4
 
     def __call__(self, state, *inputs):
@@ -207,7 +207,7 @@ class Reuses(Counter):
     def _own(self, *shape):
         return self.arrays.setdefault(shape, np.zeros(shape)) if self.reuse else np.zeros(shape)
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         return self._own(num_envs, 1)
 
     def __call__(self, state, setpoint, qpos, qvel, passive):
@@ -234,8 +234,8 @@ class Changes(Counter):
     def __init__(self, change):
         self.change = change
 
-    def init(self, robot, num_envs):
-        return super().init(robot, num_envs) | {"count": np.zeros(num_envs, int)}
+    def init(self, robot, num_envs, timestep):
+        return super().init(robot, num_envs, timestep) | {"count": np.zeros(num_envs, int)}
 
     def __call__(self, state, setpoint, qpos, qvel, passive):
         return self.change({**state, "steps": state["steps"] + 1}), passive
@@ -281,7 +281,7 @@ def test_a_state_keeps_its_dtype(panda):
 class KeepsDynamics:
     """Computed torque, with the dynamics of the robot as an attribute from ``init`` on."""
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         self.dynamics = robot.dynamics()
 
     def __call__(self, state, setpoint, qpos, qvel, passive):

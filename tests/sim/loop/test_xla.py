@@ -18,7 +18,7 @@ N = 5
 class NumPyOnly:
     """Controller that JAX cannot trace."""
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         return None
 
     def __call__(self, state, setpoint, qpos, qvel, passive):

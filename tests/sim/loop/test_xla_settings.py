@@ -21,7 +21,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 class Integrator:
     """Efforts from a state that init makes by JAX; NaN where the setpoint is beyond 0.5."""
 
-    def init(self, robot, num_envs):
+    def init(self, robot, num_envs, timestep):
         return {"sum": jnp.zeros((num_envs, robot.dof)), "calls": jnp.zeros(num_envs, jnp.int32)}
 
     def __call__(self, state, setpoint, qpos, qvel, passive):

@@ -102,7 +102,7 @@ def test_a_tool_has_a_point_and_the_neutral_setpoint_is_its_pose(panda):
     tree = panda.kinematic_tree()
     pose = ts.task_dynamics(tree, START[None], 0 * START[None], HAND, point=point).pose[0]
     np.testing.assert_array_equal(control.command.neutral, pose)
-    state = control.init(panda, 1)
+    state = control.init(panda, 1, 1 / 2000)
     _, effort = control(state, pose[None], START[None], np.zeros((1, 9)), np.ones((1, 9)))
     np.testing.assert_allclose(effort, 1.0, atol=1e-9)
 
