@@ -355,12 +355,21 @@ def advice(problem: Problem, solution: Solution) -> str:
     if kind != "mass":
         words = f"{kind} would explain {100 * gains[name]:.0f} % of the remaining squared error"
         return f"{words} (extras: {kind})"
-    # A fit tells by how much: the mass may be far off.
-    mass = effects[name][0]
-    wider = replace(problem, unknowns=replace(unknowns, entries=(*unknowns.entries, mass)))
-    fit = wider.solve(np.append(solution.point, 1.0), FEW, solution.size)
-    percent = 100 * (wider.unknowns.values(fit.point[None])[0, -1] - 1)
-    words = f"link {name} {abs(percent):.0f} % {'heavier' if percent > 0 else 'lighter'}"
+    # A heavier link is a lighter other one with weaker motors: fits tell which changes least.
+    links = problem.data[0].plant.heavy_links
+    changes = dict[float, str]()
+    for link in sorted(links, key=lambda link: -gains[link])[:2]:
+        wider = replace(
+            problem, unknowns=replace(unknowns, entries=(*unknowns.entries, *effects[link]))
+        )
+        fit = wider.solve(np.append(solution.point, 1.0), FEW, solution.size)
+        values = wider.unknowns.values(fit.point[None])[0]
+        factors = [KINDS[entry.kind].neutral == 1.0 for entry in wider.unknowns.entries]
+        percent = 100 * (values[-1] - 1)
+        more = "heavier" if percent > 0 else "lighter"
+        words = f"link {link} {abs(percent):.0f} % {more}"
+        changes[np.abs(np.log(values[factors])).sum()] = words
+    words = changes[min(changes)]
     return f"{words} would explain most of the error (extras: mass), or the strengths: weigh it"
 
 
