@@ -44,7 +44,7 @@ def bare_engine(robot: Robot, num_envs: int, ticks: int) -> float:
     """Return the processor time of an env step of ``mujoco.batch`` alone, of the same robots under
     fixed efforts.
     """
-    options: dict[str, Any] = {"ground": robot.has_ground, "engine": "mujoco"}
+    options: dict[str, Any] = {"ground": robot.has_ground}
     spec = SceneSpec(
         robot.tables, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
     )

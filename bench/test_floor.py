@@ -111,7 +111,7 @@ def bare_engine(
     """Return what :func:`closed_loop` returns, of ``mujoco.batch`` under ``efforts`` (steps,
     dof).
     """
-    options = {"fixed_base": False, "engine": "mujoco"}
+    options = {"fixed_base": False}
     built = robot_model(
         SceneSpec(
             robot.tables, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options

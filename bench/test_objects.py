@@ -47,7 +47,7 @@ def step_alone(robot: Robot, efforts: NDArray[Any]) -> tuple[float, NDArray[Any]
     """Return the processor time of an env step of ``mujoco.batch`` under efforts (steps, envs,
     dof), and the end.
     """
-    options: dict[str, Any] = {"mjcf": robot.mjcf, "ground": robot.has_ground, "engine": "mujoco"}
+    options: dict[str, Any] = {"mjcf": robot.mjcf, "ground": robot.has_ground}
     options |= {"fixed_base": robot.fixed_base}
     built = robot_model(
         SceneSpec(

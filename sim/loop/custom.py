@@ -4,7 +4,8 @@ envs.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import inspect
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -140,7 +141,11 @@ def controller_errors(controller: OwnController | None, step: int = 0) -> Iterat
 def _begin(options: RunnerOptions, envs: int) -> Any:
     """Return the initial state of the caller's own controller for ``envs`` envs."""
     assert not isinstance(options.control, str)
-    start = partial(options.control.init, options.robot, envs, options.timestep)
+    init: Callable[..., Any] = options.control.init
+    start = partial(init, options.robot, envs)
+    # A controller without a time step of its own may leave the last argument out.
+    if "timestep" in inspect.signature(start).parameters:
+        start = partial(start, timestep=options.timestep)
     if options.backend != "jax":
         return start()
     with own_settings("float64"):  # its arrays have this dtype, not JAX's default in this process

@@ -141,6 +141,6 @@ def test_inspects_an_mjcf_file(tmp_path, batchpid):
     path.write_text(f"<mujoco><worldbody>{link.format('arm', '<site/>')}</worldbody></mujoco>")
     status, out, _ = batchpid("inspect", path)
     assert status == 0
-    assert "1 site; expect no effect" in out
+    assert "1 degrees of freedom" in out
     assert "world > arm" in out
     assert "2 kg" in out
