@@ -60,7 +60,7 @@ class Trajectory(NamedTuple):
         InvalidArgumentError
             The tick or the shape differs.
         """
-        # The ticks are counted anew: sums of times would collect rounding.
+        # Times are ticks times dt: sums of times would collect rounding.
         dt = self.time[0]
         if other.position.shape[1:] != self.position.shape[1:]:
             problem = (

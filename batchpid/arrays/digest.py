@@ -89,7 +89,7 @@ def _of_array(array: Array, where: str) -> bytes:
         raise InvalidArgumentError(
             f"values{where}", f"is an array of {array.dtype}, which has no digest", remedy=remedy
         )
-    # Byte order and strides are no content.
+    # Equal numbers have one digest, whatever their byte order and strides.
     content = array.astype(dtype, order="C", copy=False).tobytes()
     head = _of_bytes("dtype", dtype.str.encode()), _of_bytes("shape", str(array.shape).encode())
     return _of_parts("array", [*head, _of_bytes("content", content)])

@@ -22,7 +22,7 @@ def span(values: Array) -> str:
         array = np.asarray(values)
         if array.dtype == bool:
             return f"{array.sum()} of {array.size}"
-        # A range of what is there, and "nan" beside it.
+        # The range is that of the other entries; "nan" follows it.
         present = array[~np.isnan(array)]
     except (TypeError, ValueError, RuntimeError):
         return type(values).__name__

@@ -1,6 +1,6 @@
 """Records of arrays: named tuples whose fields are declared once, and their constructors.
 
-A record is a class beside a ``NamedTuple``: ``class Guard(Record, GuardFields)``. So it is a pytree
+A record inherits from a ``NamedTuple``: ``class Guard(Record, GuardFields)``. So it is a pytree
 that JAX knows without registration. A leaf is an array (1 | envs, joints), None (off), or a choice
 without a number (:mod:`batchpid.arrays.choices`). Unit, bounds and neutral value of a field stand
 in its annotation, a :class:`batchpid.arrays.field_tables.Field`; checks, files, randomizations and
@@ -37,7 +37,7 @@ Ends = tuple[Array, Array]
 
 
 class Record(tuple[Any, ...]):
-    """Mixin beside a named tuple of leaves: parts, sizes, checks and representation."""
+    """Mixin for a named tuple of leaves: its parts, sizes, checks and representation."""
 
     __slots__ = ()
     NAME: ClassVar[str] = ""

@@ -125,7 +125,7 @@ class Header:
             matrix = ["mass_matrix"]
         self.inputs = ["setpoint", "measurement", *self._optional(inputs), *matrix]
         """Inputs of a step, in their order."""
-        # init runs on a measurement of NaN: what is NaN afterwards is a copy of the measurement.
+        # init runs on a measurement of NaN: an entry that is NaN afterwards copies the measurement.
         nan = np.full((1, joints), math.nan, params.dtype)
         if guard is None:
             held = None
@@ -321,7 +321,7 @@ class {p}_controller {{
         unused = "  (void)state;\n  (void)measurement;\n"
         lines = []
         for name, leaf in leaves.items():
-            # NaN marks what starts at the measurement; equal numbers need no table.
+            # NaN marks an entry that starts at the measurement. Equal numbers are written once.
             numbers = [
                 "measurement[j]" if math.isnan(number) else self.names.number(number)
                 for number in leaf[0].tolist()

@@ -191,7 +191,7 @@ def helpers(c: Dialect, body: str) -> Iterator[str]:
     p = c.prefix
     t = c.type
     n = c.size
-    # Only what is called is written, or a compiler would warn of unused functions.
+    # Functions without a call are left out, since a compiler would warn of them.
     across = f"{p}_row_minimum(" in body
     for name, sign in (("max", ">"), ("min", "<")):
         if f"{p}_{name}(" in body or (across and name == "min"):

@@ -140,7 +140,7 @@ def stability_bound(
 
 
 def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) -> StabilityBound:
-    """Return the bound of loops whose efforts are late; ``columns`` are those of :func:`_loop`
+    """Return the bound of loops whose efforts are late; ``columns`` are the rows of :func:`_loop`
     (..., joints).
     """
     ratio = np.zeros(m.shape[:-2])

@@ -69,7 +69,7 @@ def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coe
     of another type, and unless dt is positive and finite; an array of JAX is not checked.
     """
     dt = checked_dt(dt, instance("params", params, PIDParams, "build them with make_params").dtype)
-    # The implicit law is the explicit one with other gains; what it adds is kept beside them.
+    # The implicit law is the explicit one with other gains and three further coefficients.
     c = params.setpoint_weight_derivative
     c_given = None
     share = None

@@ -298,7 +298,7 @@ def reset(
     """
     (measurement,) = checked_inputs(params, state, measurement)
     mask = checked_mask(mask, state)
-    # Every env is started, and those of the mask are taken.
+    # Every env is started; the rows of the mask are taken.
     fresh = init(params, measurement)
     if keep_integral:
         fresh = fresh._replace(integral=state.integral)

@@ -199,7 +199,7 @@ def discretise(
             return leaf
         return xp.broadcast_to(leaf, (*leaf.shape[:-2], num_envs, leaf.shape[-1])).copy()
 
-    # The envelopes are tuples of their own.
+    # An envelope is a tuple within the tuple.
     flat = {name: spread(leaf) for name, leaf in k._asdict().items() if not isinstance(leaf, tuple)}
     ends, commands = (Envelope(*map(spread, item)) for item in (k.envelope, k.commands))
     return k._replace(**flat, envelope=ends, commands=commands)
@@ -247,7 +247,7 @@ def _delivered(
     before, None without.
     """
     xp = namespace(effort, qpos, qvel)
-    # The lag is within the envelope, too: it cannot deliver what the motor does not have.
+    # The lagged effort stays within the envelope, too.
     low, high = limits(k.envelope, qvel)
     motor = clip(_motor(k, effort), low, high, xp)
     if k.intake is not None:

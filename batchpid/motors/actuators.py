@@ -218,7 +218,7 @@ def make_actuators(
     """
     build = LeafBuilder(joints, joint_names, dtype, effects.values())
     leaves = build.options(FIELDS, effects)
-    # Friction at rest that is never more than in motion is none, and then no speed ends it.
+    # Friction at rest counts only where it is more than in motion; without it no speed ends it.
     if leaves["static"] is None and effects.get("static") is not None:
         leaves["stribeck"] = None
     _check_together(leaves, build.names)

@@ -62,7 +62,7 @@ def projections(
     task_inertia, null_inertia, spring_inertia, singular = _inertias(
         k, gram(y[..., :6], y[..., :6]), xp
     )
-    # The wrench that accelerates the tool's inertia, less what the motion does by itself.
+    # The wrench that accelerates the tool's inertia, less the acceleration of the motion itself.
     f = product(task_inertia, a - d.jacobian_rate)
     f = f if wrench is None else f + wrench
     task = gram(j, f[..., None])[..., 0]

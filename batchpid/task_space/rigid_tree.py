@@ -176,7 +176,7 @@ class RigidTree:
         # Gravity belongs to the world, and to no link or joint.
         tables["gravity"] = _array("gravity", self.gravity, (3,))
         for name, table in tables.items():
-            # An infinite limit of position is none.
+            # An infinite limit of position counts as no limit.
             finite = np.isfinite(table).reshape(len(table), -1).all(1) | (
                 name in ("lower", "upper")
             )

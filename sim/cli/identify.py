@@ -47,7 +47,7 @@ class Identified:
         raise InvalidArgumentError("logs", problem, remedy=remedy)
 
     def save(self, path: Path) -> None:
-        """Write the actuators, and the gains that were found beside them."""
+        """Write the actuators to one file and the identified gains to another."""
         import batchpid as bp
 
         self.result.save(path)

@@ -12,7 +12,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.sim import Robot, Rollout, write_recording
-from batchpid.sim.diagnosis.findings import settled_envs
+from batchpid.sim.diagnosis.causes import settled_envs
 from batchpid.sim.tuning.comparison import (
     cause_lines,
     median_and_worst,

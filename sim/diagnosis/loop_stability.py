@@ -196,7 +196,7 @@ class StabilityCheck:
             report = stability_report(self._robot, params, start, self._timestep, motors)
         except InvalidArgumentError:  # the robot's mass matrix is not positive definite
             return
-        # A caller who changes gains in a loop is told once.
+        # A caller who changes gains in a loop gets one warning.
         is_beyond = report.robot_ratio >= 1
         if is_beyond and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Rows
-from batchpid.sim.engine.robot_model import contacts_of
+from batchpid.sim.engine.scene_model import contacts_of
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 DEPTH = 1e-3

@@ -21,7 +21,7 @@ from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import BASES, STATUS, Group, ModelStruct, Refresh
 from batchpid.sim.engine.protocol import CompiledModel
-from batchpid.sim.engine.robot_model import passive_force
+from batchpid.sim.engine.scene_model import passive_force
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -78,7 +78,7 @@ class NativeModel:
         """
         tree = self._pack.rigid_tree
         if self._inertias is None:
-            # From now on each robot has inertias of its own.
+            # From now on the robots have different inertias.
             self.__dict__.pop("_structure", None)
             self._inertias = np.tile(tree.inertias(), (size, 1, 1))
         picked = np.asarray(rows, np.intp)

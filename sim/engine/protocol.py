@@ -1,7 +1,7 @@
 """Interface of the physics engines to the loop, the robots and the tuning.
 
 The loop holds the M envs of a group as one :class:`EnginePack`. Robots, controls and tuning use a
-:class:`batchpid.sim.engine.robot_model.RobotModel`. :func:`load_engine` returns an :class:`Engine`
+:class:`batchpid.sim.robot.robot_model.RobotModel`. :func:`load_engine` returns an :class:`Engine`
 by its name, which makes packs; the engine's packages are imported at its first use.
 
 A feature of only some engines is a capability. :func:`require` raises an error if the engine lacks
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from sys import modules
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -40,7 +40,6 @@ Capability = Literal[
 """
 
 
-@runtime_checkable
 class EnginePack(Protocol):
     """M envs with a robot of ``spec`` each, read and written as arrays (M, dof), in the order of
     its joints, SI units.
@@ -209,7 +208,6 @@ class EnginePack(Protocol):
         """Free the envs. The pack cannot be used afterwards."""
 
 
-@runtime_checkable
 class DrivenPack(EnginePack, Protocol):
     """Pack whose joints have drives: PD control that the engine integrates implicitly."""
 
@@ -251,7 +249,6 @@ class CompiledModel(Protocol):
         """Address of the model, for structures of the extension."""
 
 
-@runtime_checkable
 class CompiledPack(EnginePack, Protocol):
     """Pack whose sim steps can run in native code and in programs of XLA.
 

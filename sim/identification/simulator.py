@@ -183,7 +183,7 @@ class Dynamics:
         self.force = np.empty((rows, joints))
         self._columns = plant.columns
         self._parts = list[Any]()
-        # Robots of equal masses stand in line: one part for each kind.
+        # Robots of equal masses follow one another: one part for each kind.
         starts = [row for row in range(rows) if not row or masses[row] != masses[row - 1]]
         for first, last in zip(starts, [*starts[1:], rows], strict=True):
             tree = plant.tree_of(masses[first])

@@ -118,7 +118,7 @@ class FaultLog:
         if np.logical_and.reduce(arrays.observation.ok):  # ok.all() takes a call of Python
             return self
         fault = arrays.fault
-        # A fault is new if its step differs from that of the env's last one.
+        # A fault is new if it has another step than the env's last fault.
         log = self.restored(fault.step)
         new = list[Fault]()
         for env in np.flatnonzero((log._steps >= 0) & (log._steps != self._steps)).tolist():

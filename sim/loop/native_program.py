@@ -293,7 +293,7 @@ _NATIVE: dict[str, Callable[[TickProgram, Values], Values]] = {
     "constraint": TickProgram._add_nothing,
     "engine": TickProgram._add_nothing,
 }
-"""Stages that are no programs, or have a native function, with what each adds."""
+"""Stages without a program or with a native function, and the arrays that each adds."""
 
 _TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
 """Dtypes of arrays that are not float64."""

@@ -365,7 +365,7 @@ class Rollout:
         InvalidArgumentError
             The robot is not known, or has other joints than the run.
         """
-        from batchpid.sim.diagnosis.findings import unsettled_findings
+        from batchpid.sim.diagnosis.causes import unsettled_findings
 
         robot = self.info.description if robot is None else robot
         if robot is None:

@@ -57,7 +57,7 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.gains.stability import stability_bound
 from batchpid.metrics import StepMetrics
 from batchpid.motors.actuators import Actuators
-from batchpid.sim.diagnosis.findings import absolute_band
+from batchpid.sim.diagnosis.causes import absolute_band
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.randomization.checks import prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization

@@ -22,7 +22,7 @@ from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
-from batchpid.sim.diagnosis.findings import absolute_band
+from batchpid.sim.diagnosis.causes import absolute_band
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.options.groups import EngineName
 from batchpid.sim.robot.robot import Robot

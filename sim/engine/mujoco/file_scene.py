@@ -165,7 +165,7 @@ def _start(model: MjModel) -> Document:
 
 def _set_pairs(scene: MjSpec, ignored: Iterable[tuple[str, str]], robot: set[str]) -> None:
     """Exclude exactly those pairs of the robot's bodies that do not collide."""
-    # The file's pairs may be others than those of the robot's options.
+    # The file may exclude other pairs than the robot's options.
     for exclude in list(scene.excludes):
         if {exclude.bodyname1, exclude.bodyname2} <= robot:
             scene.delete(exclude)

@@ -1,6 +1,6 @@
 """MJCF of the simulated robot, with the law or its motors in MuJoCo's own actuators.
 
-The equations are in :mod:`batchpid.sim.engine.mujoco.mjcf_actuators`. ``<pid>`` is this package's
+The equations are in :mod:`batchpid.sim.engine.mujoco.actuator_export`. ``<pid>`` is this package's
 law with the measured velocity and ``integration="output_first"``, without anti-windup.
 """
 
@@ -21,7 +21,7 @@ from batchpid.law.params import PIDParams, make_params
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.motors.guard import Guard
-from batchpid.sim.engine.mujoco.mjcf_actuators import FAR, MjcfActuators, numbers_text
+from batchpid.sim.engine.mujoco.actuator_export import FAR, MjcfActuators, numbers_text
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
@@ -97,7 +97,7 @@ def to_mjcf(
     # their digits.
     scene, names = robot_spec(spec)
     scene.modelname = robot.name
-    # The engine switches off what the loop computes for it; other programs need it all.
+    # Our engine switches off effects that the loop computes. Other programs need them.
     scene.option.disableflags = 0
     for row in spec.simulated.bodies:
         _set_inertia(scene.body(names[row.name]), row.spatial_inertia, row.name, drive)
@@ -207,7 +207,7 @@ def _exact(scene: MjSpec) -> Any:
         _write(inertial, body, pos="ipos", quat="iquat", mass="mass", diaginertia="inertia")
     for element in root.iterfind("worldbody//joint[@name]"):
         joint = scene.joint(element.get("name"))
-        if joint.actfrclimited:
+        if joint.actfrclimited == mujoco.mjtLimited.mjLIMITED_TRUE:
             # MuJoCo leaves out a range that is nearly 0, and then refuses to read the joint.
             element.set("actuatorfrcrange", "0 0")
         _write(element, joint, axis="axis", range="range", actuatorfrcrange="actfrcrange")

@@ -229,7 +229,7 @@ class SapienStep(NativeStep):
         return super().prepare()
 
     def may_have_failed(self, status: int) -> bool:
-        # A return to Python for the sensors is no failure.
+        # A call also returns to Python for the sensors; that is not a failure.
         failed = super().may_have_failed(status & ~_SENSE)
         if self._sense is not None:
             self._sense()

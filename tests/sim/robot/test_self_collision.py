@@ -18,7 +18,7 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
 from batchpid.sim.engine.protocol import SceneSpec
-from batchpid.sim.engine.robot_model import contacts_of
+from batchpid.sim.engine.scene_model import contacts_of
 
 BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
 SLIDE = '<limit lower="-0.5" upper="0.5" effort="10" velocity="2"/>'
