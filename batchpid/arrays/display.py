@@ -26,13 +26,12 @@ def span(values: Array) -> str:
         present = array[~np.isnan(array)]
     except (TypeError, ValueError, RuntimeError):
         return type(values).__name__
-    ends = (
-        dict.fromkeys(f"{end:.4g}" for end in (present.min(), present.max()))
-        if present.size
-        else ()
-    )
-    parts = [" to ".join(ends)] if ends else []
-    return " or ".join([*parts, "nan"] if present.size < array.size else parts) or "empty"
+    parts = []
+    if present.size:
+        parts.append(" to ".join(dict.fromkeys(f"{e:.4g}" for e in (present.min(), present.max()))))
+    if present.size < array.size:
+        parts.append("nan")
+    return " or ".join(parts) or "empty"
 
 
 def summary(name: str, parts: Iterable[str]) -> str:

@@ -42,9 +42,6 @@ SAPIENS_OWN = dataclasses.replace(ARM, dissipation="sapien")
 ROW, ROWS, NAN = np.zeros(DOF), np.zeros((N, DOF)), np.array([[0.0, 0.0], [np.nan, 0.0]])
 
 
-NAN.flags.writeable = False
-
-
 class Odd:
     """Object that cannot be converted to an array."""
 
