@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.arrays import Arrays, FaultArrays, StateRows
+from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.options.groups import FaultAction
 
 CAUSES = (
@@ -132,7 +132,7 @@ class FaultLog:
         return log
 
 
-class FaultContainment(StateRows):
+class FaultContainment:
     """Last fault of each of M envs, and the state in which a failed env goes on.
 
     Attributes
@@ -244,7 +244,7 @@ class FaultContainment(StateRows):
 
     @property
     def state(self) -> dict[str, Rows]:
-        """Arrays of the state (M, ...), by name."""
+        """Arrays that a snapshot holds (M, ...), by name."""
         names = "suspended", "failed", "start_qpos", "start_qvel", "start_base", "suspended_qpos"
         return {name: getattr(self, name) for name in names} | self.rows._asdict()
 

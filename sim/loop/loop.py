@@ -26,7 +26,7 @@ from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_group import EnvGroup
 from batchpid.sim.loop.failure import Failure, RunError, order
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks
-from batchpid.sim.loop.snapshot import EnvStates, Snapshot
+from batchpid.sim.loop.snapshot import Snapshot, join_rows
 from batchpid.sim.loop.xla_executor import ROWS
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
@@ -167,15 +167,15 @@ class Loop:
             error = error.at(step, self.options.timestep)
         return Failure(step, self._first_env + group.envs.start, group.tick, error)
 
-    def snapshot(self) -> EnvStates:
-        """Return the state of every env. It is a barrier: the loop goes on as if restored from
-        it.
+    def snapshot(self) -> dict[str, Rows]:
+        """Return the state of every env, arrays by name. It is a barrier: the loop goes on as if
+        restored from it.
         """
-        states = EnvStates.join([group.read() for group in self.groups])
-        for group in self.groups:
+        parts = [group.read() for group in self.groups]
+        for group, rows in zip(self.groups, parts, strict=True):
             acting = group.acting
-            self._restore(group, states, acting.params, acting.actuators, acting.draws)
-        return states
+            self._restore(group, rows, acting.params, acting.actuators, acting.draws)
+        return join_rows(parts)
 
     def restore(self, snapshot: Snapshot, draws: Draws) -> None:
         """Put every env into its state in ``snapshot``, with its params and ``draws``."""
@@ -184,13 +184,14 @@ class Loop:
             envs, motors = group.envs, snapshot.actuators
             motors = None if motors is None else motors.for_envs(envs)
             params = snapshot.params.for_envs(envs)
-            self._restore(group, snapshot.states, params, motors, draws.for_envs(envs))
+            rows = {name: array[envs] for name, array in snapshot.rows.items()}
+            self._restore(group, rows, params, motors, draws.for_envs(envs))
             group.observe_first()
 
     def _restore(
         self,
         group: EnvGroup,
-        states: EnvStates,
+        rows: dict[str, Rows],
         params: bp.PIDParams,
         actuators: bp.Actuators | None,
         draws: Draws | None,
@@ -203,7 +204,7 @@ class Loop:
         if varies or not pack.state_is_complete:
             pack.close()
             pack = self._build(group.envs, draws)
-        group.write(pack, states.for_envs(group.envs), params, actuators, draws)
+        group.write(pack, rows, params, actuators, draws)
 
     def state_sizes(self) -> list[int]:
         """Return the number of values in the engine's state of each env."""

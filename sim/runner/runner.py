@@ -444,7 +444,7 @@ class Runner(SingleOwner):
         """
         self._ready("restore")
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
-        restore = restored(self.options, self._state, snapshot, self._state_sizes)
+        restore = restored(self.options, snapshot, self._state_sizes)
         self._execute(restore)
         self._pool.start_replay_from(restore)
         self._warnings.set_params(self._state.params)
