@@ -103,8 +103,13 @@ class Snapshot:
         _expect(is_fault.all(), "has a fault of an unknown joint or cause")
         beyond = self.rows["engine"][np.isnan(fresh["engine"])]
         _expect(np.isnan(beyond).all(), "holds other content than this runner's build makes")
-        episodes = self.rows.get("episodes", joint)
-        _expect((episodes >= 0).all(), "has a negative episode")
+
+    def episodes(self, num_envs: int) -> NDArray[np.int64]:
+        """Return the checked stream and episode of each of ``num_envs`` envs."""
+        episodes = self.rows.get("episodes", np.zeros(0))
+        is_table = episodes.shape == (num_envs, 2) and episodes.dtype == np.int64
+        _expect(is_table and (episodes >= 0).all(), "has no valid episodes of its envs")
+        return episodes
 
     def for_envs(self, envs: slice | Sequence[int] | Rows) -> Snapshot:
         """Return a snapshot of the envs with these numbers, in this order, and repeatedly where a

@@ -98,7 +98,7 @@ class Reset(Operation):
             setpoint, rate = motion
             rate = np.where(chosen, self.qvel, 0.0 if rate is None else rate)
             motion = np.where(chosen, self.qpos, setpoint), rate
-        faults = state.faults.without(self.mask).with_faults(outcome.present)
+        faults = state.faults.without(self.mask).with_events(outcome.present)
         return state._replace(faults=faults, draws=self.draws, motion=motion)
 
 
@@ -142,11 +142,9 @@ class Run(Operation):
         are_ok = np.logical_and.reduce(outcome.ticks.arrays.observation.ok[:count], axis=None)
         if not are_ok or contacts is not None:
             for arrays in outcome.completed:
-                faults = faults.with_faults(arrays)
-                if contacts is None:
-                    contacts = None
-                else:
-                    contacts = contacts.with_contacts(arrays)
+                faults = faults.with_events(arrays)
+                if contacts is not None:
+                    contacts = contacts.with_events(arrays)
         if motion is not None and count:
             motion = setpoint[count - 1], None if rate is None else rate[count - 1]
         steps = count * self.substeps
@@ -282,9 +280,9 @@ def restored(options: RunnerOptions, snapshot: Snapshot, engine_sizes: list[int]
         IDEAL if snapshot.actuators is None else snapshot.actuators
     )
     draws = NOTHING
-    if randomization is not None and "episodes" in snapshot.rows:
+    if randomization is not None:
         # Delays of drawn actuators say how long the histories are.
-        draws = randomization.draw(options.robot, snapshot.rows["episodes"])
+        draws = randomization.draw(options.robot, snapshot.episodes(options.num_envs))
         acting = randomization.randomized_actuators(actuators, draws, options.robot)
     fresh = fresh_rows(options, params, acting, engine_sizes)
     snapshot.check_rows(fresh, options.command.size)

@@ -31,6 +31,7 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.versions import package_versions
+from batchpid.sim.loop.faults import MissedContactWarning
 from batchpid.sim.options.groups import EngineName
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
@@ -43,7 +44,6 @@ from batchpid.sim.tuning.evaluation import SUBSTEPS, tuning_engine
 from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
 from batchpid.sim.tuning.randomization_files import reseeded
-from batchpid.sim.workers.contact_log import MissedContactWarning
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
