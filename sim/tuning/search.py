@@ -31,6 +31,7 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.versions import package_versions
+from batchpid.sim.loop.faults import MissedContactWarning
 from batchpid.sim.options.groups import EngineName
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
@@ -39,7 +40,6 @@ from batchpid.sim.tuning.comparison import Comparison, compare
 from batchpid.sim.tuning.evaluation import SUBSTEPS, reseeded, tuning_engine
 from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
-from batchpid.sim.workers.contact_log import MissedContactWarning
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
