@@ -6,7 +6,7 @@ from batchpid.arrays.array_types import Bool, Rows
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.arrays import StateRows
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.signals.observation import untouched
+from batchpid.sim.signals.quantities import untouched
 
 
 class LinkSensors(StateRows):

@@ -28,7 +28,7 @@ from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.runner.arguments import base_rows, joint_rows
 from batchpid.sim.runner.runner_state import RunnerState
-from batchpid.sim.signals.observation import untouched
+from batchpid.sim.signals.quantities import untouched
 from batchpid.sim.workers.pool import Outcome
 from batchpid.sim.workers.requests import Request
 

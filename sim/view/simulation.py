@@ -15,7 +15,7 @@ from batchpid.checks.validate import choice, integer, number
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
-from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.quantities import Observation
 from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.view.playback import HISTORY_SECONDS
 from batchpid.sim.view.scene import MAX_ROBOTS
