@@ -219,6 +219,9 @@ class RobotInFile:
         free = {int(root) for root in roots[model.jnt_type == _FREE]}
         balls = {int(root) for root in roots[model.jnt_type == _BALL]}
         moving = {int(roots[joint]) for joint in joints}
+        # A flexible body has three slides for each vertex.
+        soft = {int(body) for body in model.flex_vertbodyid if not model.body_geomnum[body]} & tops
+        moving -= soft
         if driven := moving & _roots_of_actuators(model):
             moving -= (moving & free) - driven
         floating = moving & free
@@ -227,7 +230,8 @@ class RobotInFile:
             raise RobotError(
                 f"{path}: holds several robots, {listed}; leave one of them in the file"
             )
-        self._left_out = {body for body in tops if model.body_mocapid[body] >= 0} | (free - moving)
+        mocaps = {body for body in tops if model.body_mocapid[body] >= 0}
+        self._left_out = mocaps | soft | (free - moving)
         if moving:
             self._left_out |= balls - moving
         # A robot on a free joint is one object; all others are scenery.
@@ -239,7 +243,7 @@ class RobotInFile:
                 where = f"{path}: body {self.bodies[body]!r}"
                 problem = f"the ball joint {label(model.joint(joint))} has no single position"
                 raise RobotError(f"{where}: {problem} to control; replace it by three hinges")
-        for body in sorted(self._left_out):
+        for body in sorted(self._left_out - soft):
             text = f"is apart from the robot: {ALONE} it"
             remedy = "in SAPIEN add it with build="
             findings.append(Finding("note", "loose-link", text, remedy, link=self.bodies[body]))
