@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.diagnosis.run_checks import MovingSetpointWarning, SetpointWarning
-from batchpid.sim.loop.faults import Fault, FaultWarning
+from batchpid.sim.loop.faults import Fault, FaultWarning, MissedContact, MissedContactWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import Controller, Ray
 from batchpid.sim.options.options import RunnerKeywords, RunnerOptions
@@ -25,7 +25,6 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.quantities import CommandSpec, Observation
 from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.tool_space import OperationalSpace
-from batchpid.sim.workers.contact_log import MissedContact, MissedContactWarning
 
 if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf

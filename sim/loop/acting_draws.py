@@ -53,9 +53,15 @@ class ActingDraws:
         self.actuators = actuators
         if randomization is not None:
             actuators = randomization.randomized_actuators(actuators, self.draws, robot)
-        acts = actuators is not None and (actuators.measures or actuators.delivers)
-        self.motors = actuators if acts else None
+        self.motors = effective(actuators)
         return actuators
+
+
+def effective(actuators: bp.Actuators | None) -> bp.Actuators | None:
+    """Return ``actuators`` if they have an effect on efforts or measurements, else None."""
+    if actuators is not None and (actuators.measures or actuators.delivers):
+        return actuators
+    return None
 
 
 def make_pack(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from itertools import repeat
 from operator import is_not, itemgetter
@@ -116,24 +115,6 @@ class Arrays(NamedTuple):
             self.observation.map(part),
             FaultArrays._make(map(part, self.fault)),
         )
-
-
-class StateRows(ABC):
-    """State of M envs that a snapshot holds as arrays by name."""
-
-    @property
-    @abstractmethod
-    def state(self) -> dict[str, Rows]:
-        """Arrays of the state (M, ...)."""
-
-    def read(self) -> dict[str, Rows]:
-        """Return copies of the arrays, for :meth:`write`."""
-        return {name: rows.copy() for name, rows in self.state.items()}
-
-    def write(self, state: Mapping[str, Rows]) -> None:
-        """Set the state that :meth:`read` returned."""
-        for name, rows in self.state.items():
-            rows[...] = state[name]
 
 
 class Ticks:

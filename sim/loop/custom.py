@@ -118,11 +118,11 @@ class OwnController:
         return new, effort, *limited
 
 
-def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, Rows]:
-    """Return the initial state of the control of all envs, as arrays by name."""
-    if not isinstance(options.control, str):
-        return flatten(_begin(options, options.num_envs))
-    return bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32)).leaves()
+def initial_state(options: RunnerOptions, params: bp.PIDParams) -> Any:
+    """Return the initial state of the law of all envs."""
+    if isinstance(options.control, str):
+        return bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32))
+    return flatten(_begin(options, options.num_envs))
 
 
 @contextmanager

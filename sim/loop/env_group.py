@@ -6,13 +6,14 @@ command that is not finite, a push, the sensors of links, a reset, new params or
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.arrays.elementwise import clip
 from batchpid.arrays.trees import flatten, leaves, structure
 from batchpid.motors import ActuatorState, advance_measurement
@@ -21,14 +22,12 @@ from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.acting_draws import ActingDraws, variation
 from batchpid.sim.loop.arrays import Arrays, Command, Ticks
 from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.loop.env_parts import LinkSensors, Pushes
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
 from batchpid.sim.loop.model_functions import steps_natively
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
 from batchpid.sim.loop.native_program import Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
-from batchpid.sim.loop.pushes import Pushes
-from batchpid.sim.loop.sensed import LinkSensors
-from batchpid.sim.loop.snapshot import EnvStates
 from batchpid.sim.loop.step_setup import (
     Setup,
     init_motors,
@@ -343,36 +342,48 @@ class EnvGroup:
 
     # -- snapshots
 
-    def read(self) -> EnvStates:
-        """Return the state of these envs, physics and controller."""
-        last = self._last
+    def read(self) -> dict[str, Rows]:
+        """Return the state of these envs, physics and controller, as arrays by name (M, ...).
+
+        ``engine`` are robots and content, of which only the engine knows the meaning
+        (:meth:`batchpid.sim.engine.protocol.EnginePack.read_state`). ``control/...`` are the arrays
+        of :class:`batchpid.sim.loop.step_values.StepState`.
+        """
         # Each tick begins with a new mass matrix.
         control = self._executor.read_state()._replace(matrix=None)
-        return EnvStates(
-            engine=self.pack.read_state(),
-            **{name: getattr(last, name).copy() for name in _RESULTS},
-            episode=self._episode.copy(),
-            control=flatten(control),
-            containment=self._faults.read(),
-            sensors=self._sensors.read(),
-            pushes=self._pushes.read(),
-        )
+        tree = {"engine": self.pack.read_state(), "control": control} | self._parts()
+        return flatten(tree, read=np.array)
+
+    def _parts(self) -> Document:
+        """Return the arrays outside engine and control that a snapshot holds: results of the last
+        sim step, episodes of the motors' noise, and those of faults, sensors and pushes.
+        """
+        last = self._last
+        return {
+            "effort": last.effort,
+            "saturated": last.saturated,
+            "guarded": last.guarded,
+            "episode": self._episode,
+            "containment": self._faults.state,
+            "sensors": self._sensors.values,
+            "pushes": self._pushes.counts,
+        }
 
     def write(
         self,
         pack: EnginePack,
-        states: EnvStates,
+        rows: Mapping[str, Rows],
         params: bp.PIDParams,
         actuators: bp.Actuators | None,
         draws: Draws | None,
     ) -> None:
-        """Continue with ``pack`` in the given state, with the params, actuators and draws of a
-        snapshot.
+        """Continue with ``pack`` in a state that :meth:`read` returned, with the params, actuators
+        and draws of a snapshot.
         """
-        acting, last = self.acting, self._last
+        acting = self.acting
+        is_custom = self._controller is not None
         # The control step stays where nothing of it can have changed, since a new one takes time.
-        stays = pack is self.pack and self._controller is None
-        stays = stays and self._options.randomization is None
+        stays = pack is self.pack and not is_custom and self._options.randomization is None
         stays = stays and _are_equal((params, actuators), (acting.params, acting.actuators))
         self.pack = pack
         acting.draws = draws
@@ -382,17 +393,12 @@ class EnvGroup:
             if actuators is not None or acting.actuators is not None:
                 self._with_actuators(self._executor.read_state(), actuators)
         # Placing robots clears efforts and suspension, so these follow.
-        pack.write_state_rows(states.engine)
-        self._faults.write(states.containment)
+        pack.write_state_rows(rows["engine"])
+        for name, array in flatten(self._parts()).items():
+            array[...] = rows[name]
         pack.suspend(self._faults.suspended)
-        pack.write_qf(states.effort)
-        for name in _RESULTS:
-            getattr(last, name)[...] = getattr(states, name)
-        self._episode[...] = states.episode
-        self._sensors.write(states.sensors)
-        self._pushes.write(states.pushes)
-        is_custom = self._controller is not None
-        state = state_of(states.control, is_custom, acting.motors is not None)
+        pack.write_qf(self._last.effort)
+        state = state_of(rows, is_custom, acting.motors is not None)
         executor = self._executor
         if stays:
             executor.failed = False

@@ -40,35 +40,26 @@ class StepState(NamedTuple):
     """Mass matrix of the law (M, dof, dof). Each tick begins with a new one."""
 
 
-_RECORDS: dict[str, Any] = {
-    "law": PIDState,
-    "friction": FrictionState,
-    "motors": ActuatorState,
-    "guard": GuardState,
-}
-"""Records of the parts of a :class:`StepState`."""
-
-
-def state_of(arrays: Mapping[str, Rows], is_custom: bool, has_motors: bool) -> StepState:
-    """Return the state with these arrays by name, as :func:`batchpid.arrays.trees.flatten` names
-    them.
+def state_of(rows: Mapping[str, Rows], is_custom: bool, has_motors: bool) -> StepState:
+    """Return the state with the arrays "control/..." of a snapshot.
 
     ``is_custom`` and ``has_motors`` say whether the law is the caller's own, and whether there are
     motors, which may be without arrays.
     """
-    parts: dict[str, Any] = {"law": {}}  # of efforts it has no arrays
-    if has_motors:
-        parts["motors"] = {}
-    for name, rows in arrays.items():
+    # Of efforts the law has no arrays.
+    parts: dict[str, Any] = {"law": {}, "motors": {}, "friction": {}}
+    for path, array in rows.items():
+        group, _, name = path.partition("/")
         part, _, leaf = name.partition("/")
-        if leaf:
-            parts.setdefault(part, {})[leaf] = rows
-        else:
-            parts[part] = rows
-    for part, record in _RECORDS.items():
-        if part in parts and not (is_custom and part == "law"):
-            parts[part] = record(**parts[part])
-    return StepState(**parts)
+        if group == "control" and leaf:
+            parts.setdefault(part, {})[leaf] = array
+    return StepState(
+        law=parts["law"] if is_custom else PIDState(**parts["law"]),
+        friction=FrictionState(**parts["friction"]),
+        age=rows.get("control/age"),
+        motors=ActuatorState(**parts["motors"]) if has_motors else None,
+        guard=GuardState(**parts["guard"]) if "guard" in parts else None,
+    )
 
 
 class Measured(NamedTuple):

@@ -6,10 +6,9 @@ import batchpid as bp
 from batchpid.checks.warn import warn
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
-from batchpid.sim.loop.faults import FaultLog, FaultWarning
+from batchpid.sim.loop.faults import EventLog, FaultWarning, MissedContactWarning
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.tool_space import OperationalSpace
-from batchpid.sim.workers.contact_log import MissedContactLog, MissedContactWarning
 from batchpid.sim.workers.pool import RecoveryWarning
 
 
@@ -48,16 +47,21 @@ class RunWarnings:
             self._moving.set_params(params)
             self.moving = self._moving if self._moving.is_watching else None
 
-    def issue(self, faults: FaultLog, contacts: MissedContactLog | None, lost: list[str]) -> None:
+    def issue(self, faults: EventLog, contacts: EventLog | None, lost: list[str]) -> None:
         """Warn of lost workers (the messages ``lost``, which are removed), faults and missed
         contacts.
         """
         while lost:
             warn(lost.pop(), RecoveryWarning)
-        if faults.faults and not self._has_warned_of_fault:
+        if faults.events and not self._has_warned_of_fault:
             self._has_warned_of_fault = True
             more = "see runner.faults for more, of which there is no further warning"
-            warn(f"{faults.faults[0]}; {more}", FaultWarning)
-        if contacts is not None and contacts.contacts and not self._has_warned_of_contact:
+            warn(f"{faults.events[0]}; {more}", FaultWarning)
+        if contacts is not None and contacts.events and not self._has_warned_of_contact:
             self._has_warned_of_contact = True
-            warn(contacts.message(), MissedContactWarning)
+            problem = "without collisions robots went through what they would have touched"
+            remedy = "use collisions=True, or other moves; see runner.missed_contacts for more"
+            text = (
+                f"{problem}: {contacts.events[0]}; {remedy}, of which there is no further warning"
+            )
+            warn(text, MissedContactWarning)

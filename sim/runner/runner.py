@@ -30,7 +30,7 @@ from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.backend import describe
-from batchpid.sim.loop.faults import Fault
+from batchpid.sim.loop.faults import Fault, MissedContact
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.options.options import KINDS, OPTIONS, RunnerOptions, arguments_of, checked_option
@@ -52,7 +52,6 @@ from batchpid.sim.runner.run_warnings import RunWarnings
 from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.signals.quantities import CommandSpec, Observation, empty_observation
 from batchpid.sim.signals.rollout import Rollout, RunInfo
-from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, WorkerPool
@@ -339,7 +338,7 @@ class Runner(SingleOwner):
         next(shown, None)  # the end
         further = {name: derive(seen) for name, derive in options.derived.items()}
         seen = seen._replace(**further)
-        if (faults := self._state.faults.faults) is not info.faults:
+        if (faults := self._state.faults.events) is not info.faults:
             info = replace(info, faults=faults)
         return Rollout(times, command.setpoint, seen, tick, info, command.feedforward)
 
@@ -443,7 +442,7 @@ class Runner(SingleOwner):
         """
         self._ready("restore")
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
-        restore = restored(self.options, self._state, snapshot, self._state_sizes)
+        restore = restored(self.options, snapshot, self._state_sizes)
         self._execute(restore)
         self._pool.start_replay_from(restore)
         self._warnings.set_params(self._state.params)
@@ -475,7 +474,7 @@ class Runner(SingleOwner):
             start=start,
             versions=dict(self._versions),
             begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
-            faults=state.faults.faults,
+            faults=state.faults.events,
         )
 
     @cached_property
@@ -495,7 +494,7 @@ class Runner(SingleOwner):
     @property
     def faults(self) -> tuple[Fault, ...]:
         """Envs that failed, latest last: the last ten thousand."""
-        return self._settled().faults.faults
+        return self._settled().faults.events
 
     @property
     def missed_contacts(self) -> tuple[MissedContact, ...]:
@@ -505,7 +504,7 @@ class Runner(SingleOwner):
         contacts = self._settled().contacts
         if contacts is None:
             return ()
-        return tuple(contacts.contacts)
+        return contacts.events
 
     @property
     def draws(self) -> dict[str, NDArray[np.float64]]:
@@ -710,7 +709,7 @@ class Runner(SingleOwner):
             moving.see(rows, rates is not None, run.substeps * self.timestep)
         faults = self._state.faults
         contacts = self._state.contacts
-        if pool.warnings or faults.faults or contacts is not None:
+        if pool.warnings or faults.events or contacts is not None:
             self._warnings.issue(faults, contacts, pool.warnings)
         return outcome
 

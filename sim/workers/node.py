@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, WorkerError
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.failure import Failure, failure_of
+from batchpid.sim.loop.loop import Failure
 from batchpid.sim.options.groups import Ray
 from batchpid.sim.workers.exchange import SharedArrays
-from batchpid.sim.workers.placement import split_in_shares
-from batchpid.sim.workers.requests import Build, Request, Start
+from batchpid.sim.workers.requests import Build, Request, Start, split_in_shares
 from batchpid.sim.workers.worker import Worker, WorkerLost, pickled
 
 NODE_STEPS = 25_000
@@ -112,7 +111,7 @@ def _answer(act: Callable[[], Answer]) -> Answer:
     except WorkerLost as error:
         return Answer(None, Failure(0, 0, 0, WorkerLost(str(error.__cause__))))
     except Exception as error:
-        return Answer(None, failure_of(error).portable())
+        return Answer(None, Failure.of(error).portable())
 
 
 class Cluster:

@@ -18,13 +18,18 @@ import batchpid as bp
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import ClosedError
 from batchpid.sim.loop.arrays import Arrays, Ticks
-from batchpid.sim.loop.failure import Failure, order
+from batchpid.sim.loop.loop import Failure, order
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeInfo, NodeWorker
-from batchpid.sim.workers.placement import pinned_cores, split_in_shares
-from batchpid.sim.workers.requests import Build, Request, Start
-from batchpid.sim.workers.worker import LocalWorker, ProcessWorker, Worker, WorkerLost
+from batchpid.sim.workers.requests import Build, Request, Start, split_in_shares
+from batchpid.sim.workers.worker import (
+    LocalWorker,
+    ProcessWorker,
+    Worker,
+    WorkerLost,
+    pinned_cores,
+)
 
 MAX_LOSSES = 5
 """Number of losses of one worker during the same request after which the pool gives up."""

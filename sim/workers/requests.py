@@ -1,10 +1,14 @@
-"""Requests to workers (:mod:`batchpid.sim.runner.operations`), and the start of a loop."""
+"""Requests to workers (:mod:`batchpid.sim.runner.operations`), the start of a loop, and the division
+of envs among workers.
+"""
 
 from __future__ import annotations
 
 import pickle
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from typing import Any, Self
 
 import batchpid as bp
@@ -89,3 +93,9 @@ class Build(Request):
 
     def apply(self, loop: Loop) -> None:
         pass
+
+
+def split_in_shares(num_envs: int, shares: Sequence[int]) -> list[slice]:
+    """Return contiguous slices of envs in proportion to ``shares``; some can be empty."""
+    cuts = [num_envs * part // sum(shares) for part in accumulate(shares, initial=0)]
+    return [slice(low, high) for low, high in pairwise(cuts)]

@@ -30,8 +30,7 @@ from batchpid.errors import InvalidArgumentError, WorkerError
 from batchpid.io.files import standard_streams_occupied
 from batchpid.sim.engine import native
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.failure import Failure, failure_of
-from batchpid.sim.loop.loop import Loop
+from batchpid.sim.loop.loop import Failure, Loop
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.requests import Build, Request, Start
@@ -118,7 +117,7 @@ class LocalWorker(Worker):
                 self._loop = self._start.build(Arrays.from_fields(self._shared.arrays))
             self._result = request.apply(self._loop)
         except Exception as error:
-            self._result = failure_of(error)
+            self._result = Failure.of(error)
 
     def receive(self) -> Any:
         return self._result
@@ -257,3 +256,16 @@ def _refuses(value: Any) -> bool:
     except Exception:
         return True
     return False
+
+
+def pinned_cores(workers: int) -> list[int]:
+    """Return one core for each worker if there are as many workers as cores; else none.
+
+    The kernel may wake two workers on the core of the parent and leave another core idle for
+    milliseconds. Fewer workers than cores are not pinned: several programs could pin their workers
+    to the same cores.
+    """
+    cores = sorted(os.sched_getaffinity(0))
+    if workers == len(cores):
+        return cores
+    return []

@@ -206,7 +206,7 @@ def test_its_envs_are_suspended_reset_and_restored_from_its_rows():
             before = mine.rollout(table[:10])
         assert before.ok[-1].tolist() == [True, False, True]
         snapshot = mine.snapshot()
-        assert snapshot.states.engine.shape == (N, 2 * PANDA.dof)
+        assert snapshot.rows["engine"].shape == (N, 2 * PANDA.dof)
         went_on = mine.rollout(table[10:])
         np.testing.assert_array_equal(went_on.qpos[-1, 1], before.qpos[-1, 1])
         mine.restore(snapshot)

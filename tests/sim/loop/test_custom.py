@@ -119,7 +119,7 @@ def test_a_fault_names_the_controller_whose_effort_is_nan(panda, how):
         snapshot = runner.snapshot()
     assert fault[:2] == (3, 7 + delay)
     assert (fault.joint, fault.cause) == ("panda_joint5", "effort")
-    assert snapshot.states.containment["cause"][3] == 7  # files hold the numbers of causes
+    assert snapshot.rows["containment/cause"][3] == 7  # files hold the numbers of causes
 
 
 class Diverges(Counter):
@@ -272,7 +272,7 @@ def test_a_state_keeps_its_dtype(panda):
         runner.step(np.zeros(panda.dof))
         snapshot = runner.snapshot()
         runner.restore(snapshot)
-    assert [snapshot.states.control[f"law/{name}"].dtype for name in ("steps", "count")] == [
+    assert [snapshot.rows[f"control/law/{name}"].dtype for name in ("steps", "count")] == [
         np.float64,
         np.int64,
     ]

@@ -147,7 +147,7 @@ def test_a_suspended_env_stands_still_until_it_is_reset():
     with make() as runner:
         with pytest.warns(FaultWarning):
             runner.rollout(table)
-        qvel = runner.snapshot().states.engine[1, 9:18]  # of the robot itself, not as observed
+        qvel = runner.snapshot().rows["engine"][1, 9:18]  # of the robot itself, not as observed
         assert np.abs(qvel).max() < 1e-6
         obs = runner.reset(mask=~runner.observe().ok)
         assert obs.ok.all()

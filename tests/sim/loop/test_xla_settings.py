@@ -77,4 +77,4 @@ def test_the_state_of_a_controller_has_the_precision_of_the_runner():
                 load_bundled(RUBBING), 2, backend="jax", control=Integrator(), workers=0
             ) as runner,
         ):
-            assert runner.snapshot().states.control["law/sum"].dtype == np.float64
+            assert runner.snapshot().rows["control/law/sum"].dtype == np.float64

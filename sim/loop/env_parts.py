@@ -1,4 +1,4 @@
-"""Pushes of floating bases at random times, as a randomization draws them."""
+"""Parts of a group of envs with a state of their own: sensors of links, and pushes of bases."""
 
 from __future__ import annotations
 
@@ -6,16 +6,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Bool, Float64, Rows
-from batchpid.sim.loop.arrays import StateRows
+from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.signals.quantities import untouched
 
 Int64 = NDArray[np.int64]
 COUNTS = ("steps", "due", "number")
 """Sim steps since the reset, those at which the next push is due, and pushes so far."""
 
 
-class Pushes(StateRows):
-    """Pushes of ``size`` envs, if the randomization of ``options`` has some.
+class LinkSensors:
+    """Quantities of ``size`` envs from the sensors of links, averaged over a tick, if ``options`` observe
+    some.
+    """
+
+    def __init__(self, options: RunnerOptions, size: int) -> None:
+        self.values: dict[str, Rows] = untouched(size, options.observed)
+        """Quantities of :class:`batchpid.sim.Observation` in the last tick (size, ...), by name."""
+
+    def begin(self, pack: EnginePack) -> None:
+        """Begin a tick."""
+        if self.values:
+            pack.take_sensed()
+
+    def end(self, pack: EnginePack, substeps: int, failed: Bool) -> None:
+        """Take the means over a tick of ``substeps`` sim steps, 0 for ``failed`` envs (size,)."""
+        sums = pack.take_sensed() if self.values else {}
+        for name, rows in sums.items():
+            values = self.values[name]
+            if values.dtype == bool:
+                values[...] = rows > 0
+            else:
+                values[...] = rows / substeps
+            values[failed] = 0
+
+    def clear(self, mask: Bool) -> None:
+        """Set the values of the envs of ``mask`` (size,) to 0."""
+        for values in self.values.values():
+            values[mask] = 0
+
+
+class Pushes:
+    """Pushes of ``size`` envs at random times, if the randomization of ``options`` has some.
 
     A push comes at the beginning of the first tick after its time, at most one in a tick.
     """
@@ -42,11 +74,6 @@ class Pushes(StateRows):
         self.counts["number"][rows] += 1
         self._take(rows, episodes)
         return rows.tolist(), twists
-
-    @property
-    def state(self) -> dict[str, Rows]:
-        """Arrays of the state (M, ...), by name."""
-        return dict(self.counts)
 
     def _take(self, rows: NDArray[np.intp], episodes: Int64) -> None:
         """Set the time of the next push of envs ``rows``."""
