@@ -6,8 +6,9 @@ from pathlib import Path
 
 from lxml import etree
 
-from batchpid.errors import MissingDependencyError, RobotError
+from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.mjcf_reader import read_mjcf
 from batchpid.sim.robot.urdf import Source, read_urdf
 from batchpid.sim.robot.xml import parse_xml
 
@@ -24,23 +25,14 @@ def read_robot(
     RobotError
         A file that cannot be read, a structure or number that SAPIEN cannot build, a bad mesh, or
         an MJCF file that MuJoCo does not compile.
-    MissingDependencyError
-        The file is MJCF, and the package ``mujoco`` is missing.
     """
     findings: list[Finding] = []
     root = parse_xml(path, findings)
     if not is_mjcf(root):
         return read_urdf(root, path, findings, fixed_base, package_dirs, missing_meshes)
+    # MuJoCo opens the file by its path, and workers do so again.
     if not path.is_file():
-        raise RobotError(
-            f"{path}: an MJCF file is read several times, also by workers; save it as a file first"
-        )
-    try:
-        import mujoco  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError("mujoco>=3.17", "reading an MJCF file") from error
-    from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
-
+        raise RobotError(f"{path}: an MJCF file is read several times; save it as a file first")
     name = root.get("model") or path.stem
     try:
         source = read_mjcf(path, name, fixed_base, missing_meshes)

@@ -93,8 +93,6 @@ class Robot(RobotDescription):
         RobotError
             The file is neither a usable URDF nor a usable MJCF file; the message names the element
             and the remedy. With ``strict``, it needs repairs, which the message lists.
-        MissingDependencyError
-            The file is MJCF, and the package ``mujoco`` is missing.
         InvalidArgumentError
             An option has none of the values above.
         """

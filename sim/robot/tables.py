@@ -1,7 +1,7 @@
 """Record of a robot: bodies with their joints, and collision shapes, as rows of arrays and names.
 
 A :class:`Tables` is made once, by the reader of a URDF (:mod:`batchpid.sim.robot.urdf`) or of an
-MJCF file (:mod:`batchpid.sim.robot.mjcf.mjcf_reader`). Everything else reads it: engines, rigid
+MJCF file (:mod:`batchpid.sim.robot.mjcf_reader`). Everything else reads it: engines, rigid
 trees, distances and exports.
 
 :func:`batchpid.sim.robot.merging.merge_links` makes the tables that engines simulate, with one body

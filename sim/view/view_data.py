@@ -20,7 +20,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
-from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.quantities import Observation
 from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.view.scene import MAX_ROBOTS
 
