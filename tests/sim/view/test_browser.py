@@ -30,9 +30,7 @@ def number_box(page, label):
     """Return the number box of the slider with this label."""
     from selenium.webdriver.common.by import By
 
-    return page.find_element(
-        By.XPATH, f"//label[.='{label}']/following::input[@type='text'][1]"
-    )
+    return page.find_element(By.XPATH, f"//label[.='{label}']/following::input[@type='text'][1]")
 
 
 def press(page, text):
@@ -54,9 +52,7 @@ def slide(page, label, steps):
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
 
-    thumb = page.find_element(
-        By.XPATH, f"//label[.='{label}']/following::*[@role='slider'][1]"
-    )
+    thumb = page.find_element(By.XPATH, f"//label[.='{label}']/following::*[@role='slider'][1]")
     for _ in range(steps):
         thumb.send_keys(Keys.ARROW_RIGHT)
 
