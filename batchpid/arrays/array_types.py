@@ -1,6 +1,6 @@
 """Types of NumPy arrays, for annotations."""
 
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,11 @@ Bool = NDArray[np.bool_]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-Array: TypeAlias = Any
+if TYPE_CHECKING:
+    import jax
+    Array: TypeAlias = NDArray[Any] | jax.Array
+else:
+    Array = Any
 """An array of NumPy or JAX, or a value of the tracer: code that takes one runs on each of them."""
 
 Rows = NDArray[Any]
