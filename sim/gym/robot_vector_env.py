@@ -26,7 +26,7 @@ from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import LARGEST
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
-from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.quantities import Observation
 
 RUNNER_OPTIONS = tuple(OPTIONS.keys() - {"robot", "num_envs", "substeps"})
 """Options of the runner, without ``substeps``, which follow from ``rate_hz``."""

@@ -11,8 +11,7 @@ import batchpid as bp
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.randomization.distributions import Draws
-from batchpid.sim.randomization.fields import elements, nominal_values
+from batchpid.sim.randomization.distributions import Draws, elements, nominal_values
 from batchpid.sim.randomization.randomization import PHYSICAL
 
 

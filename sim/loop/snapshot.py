@@ -36,7 +36,7 @@ from batchpid.sim.loop.env_parts import COUNTS
 from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, FaultContainment
 from batchpid.sim.loop.step_values import StepState
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.signals.observation import untouched
+from batchpid.sim.signals.quantities import untouched
 
 _FORMAT = 16
 _DIGITS = 64

@@ -26,7 +26,7 @@ from batchpid.arrays.array_types import Float64, Rows
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.sim.signals.observation import OBSERVED
+from batchpid.sim.signals.quantities import OBSERVED
 from batchpid.sim.signals.rollout import Rollout
 
 FORMATS = (".png", ".svg")

@@ -13,7 +13,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN
 from batchpid.motors.actuators import DELAYS, NOISES
 from batchpid.motors.actuators import FIELDS as OF_ACTUATORS
-from batchpid.sim.randomization.fields import GROUPS, Field, elements, nominal_values, parts
+from batchpid.sim.randomization.distributions import GROUPS, Field, elements, nominal_values, parts
 from batchpid.sim.randomization.randomization import EVENTS, FIELDS, Randomization
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
@@ -27,7 +27,7 @@ def check_robot(randomization: Randomization, robot: Robot, mjcf: MjcfFile | Non
     """Check that the names and ranges of ``randomization`` fit ``robot``. Raises
     InvalidArgumentError if not.
 
-    ``mjcf`` as for :func:`batchpid.sim.randomization.fields.nominal_values`.
+    ``mjcf`` as for :func:`batchpid.sim.randomization.distributions.nominal_values`.
     """
     _check_events(randomization, robot)
     for name, field in (randomization.given | randomization.events).items():

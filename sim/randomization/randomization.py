@@ -24,12 +24,15 @@ from batchpid.arrays.field_tables import declared, in_group
 from batchpid.checks.validate import choice, integer, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
-from batchpid.sim.randomization.distributions import Distribution, Draws, Episodes, generators
-from batchpid.sim.randomization.fields import (
+from batchpid.sim.randomization.distributions import (
     GROUPS,
     SINGLE,
+    Distribution,
+    Draws,
+    Episodes,
     Field,
     elements,
+    generators,
     mapping,
     parts,
     read_field,
@@ -60,7 +63,7 @@ class Randomization:
 
     seed: int = 0
     """Seed of all draws."""
-    each: Literal["episode", "env"] = "episode"
+    per: Literal["episode", "env"] = "episode"
     """Draw for each ``"episode"``, when it begins with a reset, or once for each ``"env"``."""
     payload: Annotated[Distribution | None, Bounds("kg", group="robot")] = None
     """Mass at the center of mass of ``payload_link`` [kg]; nominal 0."""
@@ -110,7 +113,7 @@ class Randomization:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seed", integer("seed", self.seed, 0, LARGEST))
-        choice("each", self.each, get_args(Literal["episode", "env"]))
+        choice("per", self.per, get_args(Literal["episode", "env"]))
         for name in (*GROUPS, *FIELDS):
             object.__setattr__(self, name, _copied(getattr(self, name)))
         for group in GROUPS:
@@ -166,7 +169,7 @@ class Randomization:
         columns = elements(name, robot)
         rows = np.full((len(episodes), len(columns)), np.nan)
         for part, chosen, distribution in parts(name, value, columns):
-            streams = generators(self.seed, part, episodes, self.each == "env", number)
+            streams = generators(self.seed, part, episodes, self.per == "env", number)
             # Each env draws from a stream of its own, in the order of the columns.
             size = 1 if distribution.shared else len(chosen)
             for row, generator in zip(rows, streams, strict=True):

@@ -17,7 +17,7 @@ from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.mujoco.mujoco_engine import ENGINE  # noqa: E402
 from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation  # noqa: E402
-from batchpid.sim.randomization.fields import nominal_values  # noqa: E402
+from batchpid.sim.randomization.distributions import nominal_values  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits"

@@ -13,7 +13,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors import friction
 from batchpid.sim import Choice, LogUniform, Normal, Randomization, Robot, Uniform
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
-from batchpid.sim.randomization.fields import elements
+from batchpid.sim.randomization.distributions import elements
 
 PANDA = load_bundled("panda")
 FIELDS = {
@@ -99,7 +99,7 @@ def test_shared_and_named_draws():
 
 
 def test_what_is_drawn_once_for_each_env_does_not_depend_on_the_episode():
-    values = drawn(Randomization(each="env", **FIELDS), [(2, 0), (2, 9), (3, 0)])
+    values = drawn(Randomization(per="env", **FIELDS), [(2, 0), (2, 9), (3, 0)])
     for name, rows in values.items():
         np.testing.assert_array_equal(rows[0], rows[1], name)
     assert values["payload"][0] != values["payload"][2]
@@ -181,7 +181,7 @@ def test_static_friction_below_coulombs_is_coulombs():
 
 
 def test_it_is_what_its_dict_describes():
-    randomization = Randomization(seed=3, each="env", payload_link="panda_hand", **FIELDS)
+    randomization = Randomization(seed=3, per="env", payload_link="panda_hand", **FIELDS)
     assert Randomization.from_dict(randomization.to_dict()) == randomization
 
 
@@ -215,7 +215,7 @@ def test_it_is_what_its_dict_describes():
         ({"friction": {}}, "friction: is not a distribution"),
         ({"params": Uniform(0, 1)}, "params: is not a mapping"),
         ({"seed": -1}, "seed: out of range"),
-        ({"each": "tick"}, "each: unknown option"),
+        ({"per": "tick"}, "per: unknown option"),
     ],
 )
 def test_what_does_not_fit_is_refused(fields, message):
