@@ -60,8 +60,8 @@ class RunWarnings:
         if contacts is not None and contacts.events and not self._has_warned_of_contact:
             self._has_warned_of_contact = True
             problem = "without collisions robots went through what they would have touched"
-            remedy = "use collisions=True, or other moves; see runner.missed_contacts for more"
+            remedy = "Use collisions=True, or other moves; see runner.missed_contacts for more"
             text = (
-                f"{problem}: {contacts.events[0]}; {remedy}, of which there is no further warning"
+                f"{problem}: {contacts.events[0]}. {remedy}, of which there is no further warning"
             )
             warn(text, MissedContactWarning)
