@@ -24,7 +24,6 @@ from batchpid.sim.loop.arrays import Arrays, Command, Ticks
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_parts import LinkSensors, Pushes
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
-from batchpid.sim.loop.model_functions import steps_natively
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
 from batchpid.sim.loop.native_program import Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
@@ -34,6 +33,7 @@ from batchpid.sim.loop.step_setup import (
     make_setup,
     reset_friction,
     reset_guard,
+    steps_natively,
     with_friction,
     with_matrix,
     with_params,

@@ -23,8 +23,7 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
 from batchpid.sim.loop.control_step import COUPLING_STEPS, STAGES, SimStage
-from batchpid.sim.loop.model_functions import steps_natively
-from batchpid.sim.loop.step_setup import Setup, moves_drives
+from batchpid.sim.loop.step_setup import Setup, moves_drives, steps_natively
 from batchpid.sim.loop.step_values import (
     Layout,
     Measured,
