@@ -227,13 +227,16 @@ class Restore(Operation):
 
 
 @dataclass(frozen=True)
-class ReadStateSizes(Operation):
-    """Read the number of values in the engine's state of each env."""
+class ReadStateSize(Operation):
+    """Read the largest number of values in the engine's state of an env."""
 
     changes_loop = False
 
-    def apply(self, loop: Loop) -> list[int]:
-        return loop.state_sizes()
+    def apply(self, loop: Loop) -> int:
+        return loop.state_size()
+
+    def join(self, results: list[int]) -> int:
+        return max(results)
 
 
 @dataclass(frozen=True)
@@ -268,10 +271,9 @@ def snapshot_of(options: RunnerOptions, state: RunnerState, rows: dict[str, Rows
     return Snapshot(options.described, state.steps, state.params, rows, state.actuators)
 
 
-def restored(options: RunnerOptions, snapshot: Snapshot, engine_sizes: list[int]) -> Restore:
-    """Return the operation that restores a snapshot, checked and copied.
-
-    ``engine_sizes`` are the numbers of values in the engine's state of each env.
+def restored(options: RunnerOptions, snapshot: Snapshot, engine_size: int) -> Restore:
+    """Return the operation that restores a snapshot, checked and copied; ``engine_size`` is the
+    number of values in the engine's states.
     """
     snapshot.check_options(options.described)
     randomization = options.randomization
@@ -284,6 +286,6 @@ def restored(options: RunnerOptions, snapshot: Snapshot, engine_sizes: list[int]
         # Delays of drawn actuators say how long the histories are.
         draws = randomization.draw(options.robot, snapshot.episodes(options.num_envs))
         acting = randomization.randomized_actuators(actuators, draws, options.robot)
-    fresh = fresh_rows(options, params, acting, engine_sizes)
-    snapshot.check_rows(fresh, options.command.size)
+    fresh = fresh_rows(options, params, acting, engine_size)
+    snapshot.check_rows(fresh)
     return Restore(replace(snapshot.copy(), params=params, actuators=actuators), draws)

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from inspect import Signature, signature
-from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from time import strftime
@@ -38,7 +37,7 @@ from batchpid.sim.runner.arguments import count_ticks, read_command
 from batchpid.sim.runner.operations import (
     Operation,
     ReadPoses,
-    ReadStateSizes,
+    ReadStateSize,
     Reset,
     Restore,
     Run,
@@ -451,7 +450,7 @@ class Runner(SingleOwner):
         """
         self._ready()
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
-        restore = restored(self.options, snapshot, self._state_sizes)
+        restore = restored(self.options, snapshot, self._state_size)
         self._execute(restore)
         self._pool.start_replay_from(restore)
         self._warnings.set_params(self._state.params)
@@ -482,9 +481,10 @@ class Runner(SingleOwner):
         )
 
     @cached_property
-    def _state_sizes(self) -> list[int]:
-        """Number of values in the engine's state of each env."""
-        return [*chain.from_iterable(self._execute(ReadStateSizes()).results)]
+    def _state_size(self) -> int:
+        """Number of values in the engine's states."""
+        size: int = self._read(ReadStateSize())
+        return size
 
     @cached_property
     def _versions(self) -> dict[str, str]:

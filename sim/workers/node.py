@@ -13,7 +13,6 @@ import os
 import pickle
 from typing import Any, NamedTuple
 
-from batchpid.arrays.array_types import Document
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Failure
@@ -134,16 +133,8 @@ def _connect(options: Ray) -> Any:
     if ray.is_initialized():
         return ray
     logging.getLogger("ray").setLevel(logging.ERROR)
-    settings: Document = {"log_to_driver": False, "configure_logging": False}
-    cpus = len(os.sched_getaffinity(0))
-    local = settings | {"num_cpus": cpus, "include_dashboard": False}
-    address = options.address or os.environ.get("RAY_ADDRESS") or "auto"
-    try:
-        ray.init(address, **(local if address == "local" else settings))
-    except ConnectionError:
-        if address != "auto":
-            raise
-        ray.init("local", **local)
+    # Without an address Ray takes RAY_ADDRESS, or a cluster that runs here, or starts one.
+    ray.init(options.address, log_to_driver=False, configure_logging=False)
     return ray
 
 
