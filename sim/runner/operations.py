@@ -7,6 +7,7 @@ to the workers, and then replaces its state by the result of :meth:`Operation.co
 from __future__ import annotations
 
 import pickle
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain, repeat
 from operator import is_not, itemgetter
@@ -63,7 +64,7 @@ class Reset(Operation):
         pose: tuple[ArrayLike | None, ArrayLike | None],
         mask: ArrayLike | None,
         seed: int | ArrayLike | None,
-        base: tuple[ArrayLike | None, ArrayLike | None],
+        base: Mapping[str, ArrayLike | None],
     ) -> Self:
         """Return the operation for arguments of :meth:`batchpid.sim.Runner.reset`."""
         robot = options.robot
@@ -86,7 +87,7 @@ class Reset(Operation):
             )
         qpos = robot.coupling.positions(qpos)
         qvel = robot.coupling.rates(qvel)
-        return cls(chosen, qpos, qvel, draws, base_rows(options, *base, qpos, chosen))
+        return cls(chosen, qpos, qvel, draws, base_rows(options, base, qpos, chosen))
 
     def apply(self, loop: Loop) -> None:
         loop.reset(self.mask, self.qpos, self.qvel, self.draws, self.base)

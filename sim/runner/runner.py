@@ -125,9 +125,9 @@ class Runner(SingleOwner):
         """Start the workers, and reset all envs."""
         options = self.options
         checks = self._warnings
-        none = None, None
         seed = None if options.randomization is None else 0
-        start = Reset.read(options, self._state, checks.limits, none, None, seed, none)
+        base = {"base_pose": None, "base_twist": None}
+        start = Reset.read(options, self._state, checks.limits, (None, None), None, seed, base)
         self._call.begin()
         try:
             self._call.waits = True
@@ -192,8 +192,9 @@ class Runner(SingleOwner):
         """
         self._ready()
         limits = self._warnings.limits
-        pose, base = (qpos, qvel), (base_pose, base_twist)
-        self._execute(Reset.read(self.options, self._state, limits, pose, mask, seed, base))
+        base = {"base_pose": base_pose, "base_twist": base_twist}
+        start = Reset.read(self.options, self._state, limits, (qpos, qvel), mask, seed, base)
+        self._execute(start)
         return self.observe()
 
     def step(
