@@ -271,9 +271,9 @@ class Loop:
             pack = self._build(group.envs, draws)
         group.write(pack, rows, params, actuators, draws)
 
-    def state_size(self) -> int:
-        """Return the largest number of values in the engine's state of an env."""
-        return max(max(group.pack.state_sizes()) for group in self.groups)
+    def read(self) -> dict[str, Rows]:
+        """Return the state of every env, arrays by name."""
+        return join_rows([group.read() for group in self.groups])
 
     def poses(self, names: Sequence[str] | None = None) -> list[Rows]:
         """Return the poses of the entities that ``build`` returned for each env, or of bodies

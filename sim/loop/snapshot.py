@@ -23,19 +23,9 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
-from batchpid.arrays.trees import flatten
 from batchpid.checks.validate import file_path, integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.motors.friction import FrictionState
-from batchpid.motors.guard import GuardState
-from batchpid.sim.loop.acting_draws import effective
-from batchpid.sim.loop.custom import initial_state
-from batchpid.sim.loop.env_parts import COUNTS
-from batchpid.sim.loop.faults import FaultContainment
-from batchpid.sim.loop.step_values import StepState
-from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.signals.observation import untouched
 
 _FORMAT = 16
 
@@ -198,47 +188,6 @@ def _widened(table: Rows, width: int) -> Rows:
     """Return a table with NaN in further columns."""
     missing = width - table.shape[1]
     return np.pad(table, ((0, 0), (0, missing)), constant_values=np.nan)
-
-
-def fresh_rows(
-    options: RunnerOptions,
-    params: bp.PIDParams,
-    actuators: bp.Actuators | None,
-    engine_size: int,
-) -> dict[str, Rows]:
-    """Return arrays in the names, shapes and dtypes of a snapshot of a runner with ``options`` under
-    these ``params`` and ``actuators``; ``engine_size`` is the number of the engine's values.
-    """
-    num_envs = options.num_envs
-    counts = np.zeros(num_envs, np.int64)
-    table = np.zeros((num_envs, options.robot.dof))
-    mask = np.zeros(table.shape, bool)
-    state = StepState(initial_state(options, params))
-    motors = effective(actuators)
-    if motors is not None:
-        state = state._replace(motors=bp.motors.init(motors, table, options.timestep))
-    if options.has_stiction(actuators):
-        friction = FrictionState(*[table] * len(FrictionState._fields))
-        state = state._replace(friction=friction, age=counts)
-    if options.guard is not None:
-        state = state._replace(guard=GuardState(table, table))
-    tree: Document = {
-        "engine": np.zeros((num_envs, engine_size)),
-        "effort": table.astype(np.float32),
-        "saturated": mask,
-        "guarded": mask,
-        "episode": counts,
-        "control": state,
-        "containment": FaultContainment(*table.shape, "hold").state,
-        "sensors": untouched(num_envs, options.observed),
-    }
-    if options.has_pushes:
-        tree["pushes"] = dict.fromkeys(COUNTS, counts)
-    if options.sets_positions:
-        tree["motion"] = np.stack([table, table], axis=1)
-    if options.randomization is not None:
-        tree["episodes"] = np.stack([counts, counts], axis=1)
-    return flatten(tree)
 
 
 def _expect(holds: Any, problem: str) -> None:

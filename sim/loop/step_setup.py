@@ -26,6 +26,7 @@ from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import FrictionState
+from batchpid.motors.guard import GuardState
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import CompiledPack, EnginePack
 from batchpid.sim.loop.control_step import REFRESH_STEPS, mass_matrix, refreshed, uses_mass_matrix
@@ -163,6 +164,24 @@ def _turns(pack: EnginePack) -> Array:
     if turns.any():
         return turns
     return None
+
+
+def empty_state(
+    options: RunnerOptions, law: Any, actuators: bp.Actuators | None, stiction: bool, envs: int
+) -> StepState:
+    """Return a state of the control of ``envs`` envs with this part of the law, in the structure
+    that it has with ``actuators`` (None: without an effect), and with Coulomb friction or without.
+    """
+    rows = np.zeros((envs, options.robot.dof))
+    state = StepState(law)
+    if actuators is not None:
+        state = state._replace(motors=bp.motors.init(actuators, rows, options.timestep))
+    if stiction:
+        friction = FrictionState(*[rows] * len(FrictionState._fields))
+        state = state._replace(friction=friction, age=np.zeros(envs, np.int64))
+    if options.guard is not None:
+        state = state._replace(guard=GuardState(rows, rows))
+    return state
 
 
 def reset_friction(setup: Setup, state: StepState, mask: Bool) -> StepState:

@@ -37,7 +37,7 @@ from batchpid.sim.runner.arguments import count_ticks, read_command
 from batchpid.sim.runner.operations import (
     Operation,
     ReadPoses,
-    ReadStateSize,
+    ReadRows,
     Reset,
     Restore,
     Run,
@@ -451,7 +451,7 @@ class Runner(SingleOwner):
         """
         self._ready()
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
-        restore = restored(self.options, snapshot, self._state_size)
+        restore = restored(self.options, snapshot, self._present)
         self._execute(restore)
         self._pool.start_replay_from(restore)
         self._warnings.set_params(self._state.params)
@@ -482,10 +482,9 @@ class Runner(SingleOwner):
         )
 
     @cached_property
-    def _state_size(self) -> int:
-        """Number of values in the engine's states."""
-        size: int = self._read(ReadStateSize())
-        return size
+    def _present(self) -> Snapshot:
+        """Snapshot of a moment, whose names and shapes those to restore are compared with."""
+        return snapshot_of(self.options, self._state, self._read(ReadRows()))
 
     @cached_property
     def _versions(self) -> dict[str, str]:
