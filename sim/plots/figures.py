@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -174,36 +174,34 @@ def comparison(
     return figure
 
 
-class FitErrors(NamedTuple):
-    """Position errors along a simulated stretch of a log: measured less simulated positions."""
-
-    time: Float64
-    """Times (rows,) [s]."""
-    fitted: NDArray[np.bool_]
-    """Rows that were fitted; the others were kept to judge (rows,)."""
-    before: Float64
-    """Of the robot as its description says (rows, joints) [rad or m]."""
-    after: Float64
-    """Of the robot as identified."""
-
-
 def fit_errors(
-    fits: Sequence[FitErrors], names: Sequence[str], units: Sequence[str], title: str
+    fits: Sequence[tuple[Float64, NDArray[np.bool_], Float64, Float64]],
+    names: Sequence[str],
+    units: Sequence[str],
+    title: str,
 ) -> Figure:
-    """Draw the position errors of the joints ``names`` along the stretches of one log, before and
-    after.
+    """Draw the position errors of an identification along stretches of one log.
 
     The part that was kept to judge is shaded.
+
+    Parameters
+    ----------
+    fits
+        For each stretch its times (rows,) [s], which of its rows were fitted (rows,), and the
+        errors before and after the fit (rows, joints) [rad or m].
+    names, units
+        Of the joints.
     """
-    figure, blocks = _grid(names, 1, title, fits[-1].time[-1])
+    figure, blocks = _grid(names, 1, title, fits[-1][0][-1])
     for joint, (axes,) in enumerate(blocks):
         axes.set_ylabel(units[joint], fontsize=SMALL)
-        for fit in fits:
-            for label, colour in (("before", SECOND), ("after", ENV)):
-                # An error of 0 has no place on a logarithmic axis.
-                size = np.maximum(np.abs(getattr(fit, label)[:, joint]), 1e-9)
-                axes.semilogy(fit.time, size, color=colour, lw=0.8, label=label)
-            held_out = fit.time[~fit.fitted]
+        for time, fitted, before, after in fits:
+            # An error of 0 has no place on a logarithmic axis.
+            first = np.maximum(np.abs(before[:, joint]), 1e-9)
+            second = np.maximum(np.abs(after[:, joint]), 1e-9)
+            axes.semilogy(time, first, color=SECOND, lw=0.8, label="before")
+            axes.semilogy(time, second, color=ENV, lw=0.8, label="after")
+            held_out = time[~fitted]
             if len(held_out):
                 axes.axvspan(held_out[0], held_out[-1], color=SETPOINT, alpha=0.15, lw=0)
     _add_legend(figure)
@@ -256,7 +254,7 @@ def _grid(
     """Return a figure, and for each of ``names`` a column of ``rows`` axes, positions above
     efforts, up to the time ``end`` [s].
     """
-    columns = min(len(names), 3 if len(names) <= 9 else 4)
+    columns = min(len(names), 3)
     lines = math.ceil(len(names) / columns)
     heights = (1.7, 0.85)[:rows]
     figure = Picture(figsize=(4.0 * columns, sum(heights) * lines + 0.8), layout="constrained")
@@ -348,12 +346,9 @@ def _draw_line(axes: Axes, time: Rows, values: Rows) -> None:
 
 
 def _draw_limits(axes: Axes, low: float, high: float) -> None:
-    """Draw a line at each finite limit, and hatching beyond it."""
-    for limit, sign in ((low, -1), (high, 1)):
+    """Draw a line at each finite limit."""
+    for limit in (low, high):
         if math.isfinite(limit):
-            # Far, but finite: the range of the axes is set by the data.
-            far = limit + sign * 1e3 * max(1.0, abs(limit))
-            axes.axhspan(limit, far, fc="none", ec=LIMIT, alpha=0.25, hatch="////", lw=0, zorder=0)
             axes.axhline(limit, color=LIMIT, lw=0.9, zorder=2, label="limit")
 
 
