@@ -283,7 +283,7 @@ def restored(options: RunnerOptions, snapshot: Snapshot, engine_sizes: list[int]
     if randomization is not None:
         # Delays of drawn actuators say how long the histories are.
         draws = randomization.draw(options.robot, snapshot.episodes(options.num_envs))
-        acting = randomization.randomized_actuators(actuators, draws, options.robot)
+        acting = randomization.randomized("actuators", actuators, draws, options.robot)
     fresh = fresh_rows(options, params, acting, engine_sizes)
     snapshot.check_rows(fresh, options.command.size)
     return Restore(replace(snapshot.copy(), params=params, actuators=actuators), draws)
