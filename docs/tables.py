@@ -117,7 +117,7 @@ def tables() -> dict[tuple[str, str], str]:
         ("law.md", "params"): table(numpydoc(bp.make_params), PARAMS, without),
         ("actuators.md", "actuators"): table(numpydoc(bp.make_actuators), ACTUATORS, without),
         ("randomization.md", "randomization"): table(
-            attributes(Randomization), PHYSICAL | START | EVENTS, ("seed", "each"), off=False
+            attributes(Randomization), PHYSICAL | START | EVENTS, ("seed", "per"), off=False
         ),
         ("runner.md", "options"): options(),
     }

@@ -22,10 +22,9 @@ from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
 from batchpid.sim.robot.findings import Finding, RepairWarning
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.command import CommandSpec
-from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.quantities import CommandSpec, Observation
 from batchpid.sim.signals.rollout import Rollout, RunInfo
-from batchpid.sim.tool_space.osc_controller import OperationalSpace
+from batchpid.sim.tool_space import OperationalSpace
 
 if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf

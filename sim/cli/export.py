@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from batchpid.export import Exported
 
 ENDINGS = {
-    "c": "-pid.h",
-    "ros2_control": "-controllers.yaml",
-    "mjcf": "-pid.xml",
-    "urdf": "-repaired.urdf",
+    "c": "pid.h",
+    "ros2_control": "controllers.yaml",
+    "mjcf": "pid.xml",
+    "urdf": "repaired.urdf",
 }
 """End of the default file name of each target."""
 USED = {
@@ -51,29 +51,23 @@ class ExportedFile:
         """Return a line for each difference."""
         # The folder decides only how meshes are named.
         differences = self.make(Path.cwd()).differences
-        return (
-            "\n".join(f"differs: {text}" for text in differences) or "The file differs in nothing."
-        )
+        if not differences:
+            return "The file differs in nothing."
+        return "\n".join(f"differs: {text}" for text in differences)
 
     def save(self, path: Path) -> None:
-        """Write the file, with a comment for each difference that it does not hold yet."""
+        """Write the file, with a comment at its end for each difference that it does not name."""
         from batchpid.io.files import write_atomically
 
         file_path("out", path, (Path(ENDINGS[self.target]).suffix,))
         text, differences = self.make(path.absolute().parent)
         comment = COMMENTS.get(self.target, "# {}")
-        lines = []
         for difference in differences:
             # Two hyphens would end a comment of XML, and */ one of C.
             sentence = " ".join(difference.split()).replace("--", "- -").replace("*/", "* /")
             if sentence not in text:
-                lines.append(comment.format(f"differs: {sentence}") + "\n")
-        # The declaration of an XML file stays its first line.
-        declaration = ""
-        if text.startswith("<?xml"):
-            declaration, _, text = text.partition("?>\n")
-            declaration += "?>\n"
-        write_atomically(path, declaration + "".join(lines) + text)
+                text += comment.format(f"differs: {sentence}") + "\n"
+        write_atomically(path, text)
 
 
 def export(

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from batchpid.arrays.array_types import Document
 from batchpid.sim import Finding, Robot
 from batchpid.sim.robot.findings import summary
-from batchpid.sim.robot.link_repair import DENSITY
+from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.parts import HEADERS, joint_rows
 from batchpid.sim.tuning.comparison import table
 from batchpid.sim.tuning.gain_sets import gain_set
@@ -54,13 +54,6 @@ class Inspection:
     of_gains: list[Finding]
     """Findings about the gains."""
     all: bool
-    strict: bool
-
-    @property
-    def status(self) -> int:
-        """Exit status: with ``strict`` 1 if a finding is worse than a note."""
-        findings = self.findings + self.of_gains
-        return int(self.strict and any(finding.severity != "note" for finding in findings))
 
     def report(self) -> str:
         """Return the findings, and tables of joints and links."""
@@ -139,7 +132,6 @@ def inspect_robot(
     robot: Robot,
     gains: str | None = None,
     all: bool = False,
-    strict: bool = False,
 ) -> Inspection:
     """List findings about a robot and gains, its joints in the order of qpos, and the masses of its
     links.
@@ -150,17 +142,15 @@ def inspect_robot(
         Gains to check, as for `batchpid rollout`. Default: tuned where the robot has them.
     all
         List fixed joints, light links, and pairs of links that do not collide, too.
-    strict
-        Exit with status 1 if a finding is worse than a note.
     """
     findings = robot.check(setpoint=robot.target, control="drive")  # without gains
     if gains is None and not robot.has_tuned:
         # Designed gains keep the stability bound.
-        return Inspection(robot, findings, None, [], all, strict)
+        return Inspection(robot, findings, None, [], all)
     chosen = gain_set(robot, gains)
     checked = robot.check(params=chosen.params, setpoint=robot.target, control=chosen.control)
     of_gains = [finding for finding in checked if finding not in findings]
-    return Inspection(robot, findings, chosen.name, of_gains, all, strict)
+    return Inspection(robot, findings, chosen.name, of_gains, all)
 
 
 def limbs(robot: Robot) -> int:

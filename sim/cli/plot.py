@@ -1,4 +1,4 @@
-"""``batchpid plot``: a picture of a recording or of two, or a film."""
+"""``batchpid plot``: a picture or a film of a recording."""
 
 from __future__ import annotations
 
@@ -21,34 +21,26 @@ SHOWN_ENVS = 16
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Recorded run, and another one to compare it with."""
+    """Recorded run that is drawn or filmed."""
 
     path: Path
     rollout: Rollout
     robot: Robot | None
-    versus: Path | None
-    kind: Literal["responses", "efforts", "following"]
-    joints: tuple[str, ...]
+    kind: str
 
     def report(self) -> str:
         """Return a line about the run."""
-        cut = "" if self.rollout.info.complete else " (cut short)"
-        return f"{self.path}{cut}: {self.rollout.info.robot}, {self.rollout!r}"
+        return recording_line(self.path, self.rollout)
 
     def figure(self) -> Figure:
-        """Draw the run, or both."""
+        """Draw the run."""
         from batchpid.sim import plots
 
-        # Two runs are compared as bands: fans of both would hide each other.
-        if self.versus is not None:
-            labels = (self.path.name, self.versus.name)
-            other = _read(self.versus)
-            return plots.comparison(self.rollout, other, labels=labels, joints=self.joints)
         if self.kind == "responses":
-            return plots.step_responses(self.rollout, joints=self.joints)
+            return plots.step_responses(self.rollout)
         if self.kind == "efforts":
-            return plots.efforts(self.rollout, joints=self.joints)
-        return plots.following_errors(self.rollout, joints=self.joints)
+            return plots.efforts(self.rollout)
+        return plots.following_errors(self.rollout)
 
     def film(self, path: Path, progress: Callable[[Any], Any]) -> None:
         """Film the first :data:`SHOWN_ENVS` envs in real time."""
@@ -61,11 +53,9 @@ class Recording:
 def plot(
     recording: tyro.conf.Positional[Path],
     robot: Robot | None = None,
-    versus: Path | None = None,
     kind: Literal["responses", "efforts", "following"] = "responses",
-    joints: tuple[str, ...] = (),
 ) -> Recording:
-    """Draw a recorded run, compare it with another one, or film it.
+    """Draw a recorded run, or film it.
 
     The recording may be complete, cut short by a kill, or still being written. A film draws
     the robot of the recording, or the one that is named.
@@ -74,20 +64,17 @@ def plot(
     ----------
     recording
         File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote, .h5.
-    versus
-        Another recording, to compare with.
     kind
-        Step responses, efforts against their limits, or errors of following, of one recording.
-    joints
-        Names of joints to draw. Default: all.
+        Step responses, efforts against their limits, or errors of following.
     """
-    return Recording(recording, _read(recording), robot, versus, kind, joints)
-
-
-def _read(path: Path) -> Rollout:
-    """Return the run in a file, unless it is empty."""
-    rollout = read_recording(path)
+    rollout = read_recording(recording)
     if not len(rollout.time):
         remedy = "its run was cut short: run it again"
-        raise InvalidArgumentError("recording", f"{path} holds no tick", remedy=remedy)
-    return rollout
+        raise InvalidArgumentError("recording", f"{recording} holds no tick", remedy=remedy)
+    return Recording(recording, rollout, robot, kind)
+
+
+def recording_line(path: Path, rollout: Rollout) -> str:
+    """Return a line about a recorded run."""
+    cut = "" if rollout.info.complete else " (cut short)"
+    return f"{path}{cut}: {rollout.info.robot}, {rollout!r}"

@@ -22,7 +22,7 @@ from batchpid.sim.cli.flags import BOUNDS
 from batchpid.sim.cli.report import RunReport
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.tool_space.osc_controller import default_tool
+from batchpid.sim.tool_space import default_tool
 from batchpid.sim.tuning.gain_sets import gain_set
 
 NumEnvs = Annotated[int, BOUNDS["num_envs"]]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, read_recording
+from batchpid.sim.cli.plot import recording_line
 from batchpid.sim.tuning.gain_sets import gain_set
 
 if TYPE_CHECKING:
@@ -67,11 +68,10 @@ def _live(
     """Return the running robots."""
     from batchpid.sim.view import LiveSimulation
 
-    chosen = None if gains is None else gain_set(robot, gains)
-    if chosen is not None and chosen.control != "pid":
+    chosen = gain_set(robot, gains)
+    if chosen.control != "pid":
         raise InvalidArgumentError("gains", "must be PID gains", value=gains, remedy="name others")
-    params = None if chosen is None else chosen.params
-    return LiveSimulation(robot, num_envs, params=params, **options)
+    return LiveSimulation(robot, num_envs, params=chosen.params, **options)
 
 
 def _recorded(path: Path, robot: Robot | None) -> Playback:
@@ -80,6 +80,7 @@ def _recorded(path: Path, robot: Robot | None) -> Playback:
     from batchpid.sim.view.scene import MAX_ROBOTS
 
     rollout = read_recording(path)
+    print(recording_line(path, rollout))
     if rollout.num_envs > MAX_ROBOTS:
         print(f"showing the first {MAX_ROBOTS} of {rollout.num_envs} envs")
     return Playback(rollout.for_envs(slice(0, MAX_ROBOTS)), robot)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Rows
-from batchpid.sim.signals.observation import OBSERVED, Observation, Quantity
+from batchpid.sim.signals.quantities import OBSERVED, Observation, Quantity
 
 Layout = dict[str, tuple[tuple[int, ...], Any]]
 """Name -> (shape, dtype)."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.sim.engine import native
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.tool_space.osc_controller import OperationalSpace
+from batchpid.sim.tool_space import OperationalSpace
 
 
 def native_obstacle(options: RunnerOptions) -> str:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.signals.observation import untouched
+from batchpid.sim.signals.quantities import untouched
 
 Int64 = NDArray[np.int64]
 COUNTS = ("steps", "due", "number")

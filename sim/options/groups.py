@@ -29,8 +29,8 @@ from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.command import own_command
-from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
+from batchpid.sim.signals.quantities import own_command
+from batchpid.sim.tool_space import OperationalSpace, default_tool
 
 EngineName = Literal["sapien", "mujoco"]
 DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
@@ -339,10 +339,9 @@ class Controller(Protocol):
         """Return the new state, and the joint efforts [N m or N], which the runner clips to the
         params' limits.
 
-        An env that has failed is given the ``neutral`` setpoint of the command, by default zeros
-        within its bounds. ``passive`` is the passive force that the runner's ``compensate``
-        selects, plus the caller's feedforward. The arrays are read-only copies, which the
-        controller may keep.
+        An env that has failed is given the ``neutral`` setpoint of the command, by default zeros.
+        ``passive`` is the passive force that the runner's ``compensate`` selects, plus the caller's
+        feedforward. The arrays are read-only copies, which the controller may keep.
         """
 
 

@@ -49,10 +49,16 @@ from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
-from batchpid.sim.signals.command import CommandSpec, joint_command, own_command
-from batchpid.sim.signals.observation import Observation, Quantity, observed
+from batchpid.sim.signals.quantities import (
+    CommandSpec,
+    Observation,
+    Quantity,
+    joint_command,
+    observed,
+    own_command,
+)
 from batchpid.sim.signals.rollout import RunInfo
-from batchpid.sim.tool_space.osc_controller import OperationalSpace
+from batchpid.sim.tool_space import OperationalSpace
 
 P = ParamSpec("P")
 IDEAL = bp.Actuators()

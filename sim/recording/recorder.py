@@ -23,7 +23,7 @@ from batchpid.errors import ClosedError, InvalidArgumentError
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import RecordingError
-from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.quantities import Observation
 from batchpid.sim.signals.rollout import Redraw, RunInfo
 
 if TYPE_CHECKING:

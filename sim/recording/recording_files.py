@@ -29,8 +29,7 @@ from batchpid.checks.validate import file_path, instance, integer
 from batchpid.errors import BatchPIDError, InvalidArgumentError, RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.loop.faults import Fault
-from batchpid.sim.signals.command import CommandSpec
-from batchpid.sim.signals.observation import Observation, Quantity
+from batchpid.sim.signals.quantities import CommandSpec, Observation, Quantity
 from batchpid.sim.signals.rollout import Redraw, Rollout, RunInfo
 
 if TYPE_CHECKING:

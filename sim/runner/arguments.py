@@ -20,7 +20,7 @@ from batchpid.sim.loop.faults import FARTHEST, ORIGIN
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot_model import base_start
 from batchpid.sim.runner.runner_state import Motion, RunnerState
-from batchpid.sim.signals.command import POSE_UNITS, TWIST_UNITS
+from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS
 
 _SHORTEST = 1e-9
 """Smallest length of a quaternion: a shorter one has large rounding errors."""

@@ -293,7 +293,7 @@ def restored(options: RunnerOptions, snapshot: Snapshot, present: Snapshot) -> R
     if randomization is not None:
         # Delays of drawn actuators say how long the histories are.
         draws = randomization.draw(options.robot, snapshot.episodes(num_envs))
-        acting = randomization.randomized_actuators(actuators, draws, options.robot)
+        acting = randomization.randomized("actuators", actuators, draws, options.robot)
     law = initial_state(options, params)
     stiction = options.has_stiction(acting)
     control = empty_state(options, law, effective(acting), stiction, num_envs)

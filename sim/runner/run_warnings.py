@@ -9,7 +9,7 @@ from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
 from batchpid.sim.loop.faults import EventLog, FaultWarning, MissedContactWarning
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.runner.runner_state import RunnerState
-from batchpid.sim.tool_space.osc_controller import OperationalSpace
+from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.pool import RecoveryWarning
 
 

@@ -49,8 +49,7 @@ from batchpid.sim.runner.operations import (
 )
 from batchpid.sim.runner.run_warnings import RunWarnings
 from batchpid.sim.runner.runner_state import RunnerState
-from batchpid.sim.signals.command import CommandSpec
-from batchpid.sim.signals.observation import Observation, empty_observation
+from batchpid.sim.signals.quantities import CommandSpec, Observation, empty_observation
 from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall

@@ -14,12 +14,13 @@ from batchpid.arrays.array_types import Float64, Rows
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
-from batchpid.sim.signals.command import CommandSpec, joint_command
-from batchpid.sim.signals.observation import (
+from batchpid.sim.signals.quantities import (
     QUANTITIES,
+    CommandSpec,
     Observation,
     Quantity,
     failed_envs,
+    joint_command,
     observed,
 )
 

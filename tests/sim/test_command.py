@@ -28,7 +28,7 @@ N, LENGTH = 5, 1.0
 """Envs, and length of each link [m]; both joints turn about y, and the arm hangs up along z at
 0.
 """
-XY = CommandSpec(("x", "z"), ("m", "m"), lower=(0.3, 0.3), upper=(1.2, 1.2), neutral=(0.8, 0.8))
+XY = CommandSpec(("x", "z"), ("m", "m"), neutral=(0.8, 0.8))
 
 
 class Cartesian:
@@ -164,10 +164,9 @@ def test_one_number_is_a_command_too(arm):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_a_spec_fills_in_units_bounds_and_neutral():
-    spec = CommandSpec(["x", "y"], lower=(0.2, -1))
-    assert (spec.size, spec.units, spec.neutral) == (2, ("", ""), (0.2, 0.0))
-    assert spec.lower == (0.2, -1.0)
+def test_a_spec_fills_in_units_and_neutral():
+    spec = CommandSpec(["x", "y"])
+    assert (spec.size, spec.units, spec.neutral) == (2, ("", ""), (0.0, 0.0))
     assert spec == CommandSpec(("x", "y"))
     assert CommandSpec(("x", "y"), ("m", "")).labels == ("x [m]", "y")
 
@@ -317,37 +316,3 @@ def test_identification_and_metrics_refuse_such_runs(arm, rollout):
     ):
         with pytest.raises(InvalidArgumentError, match="not of joints"):
             call()
-
-
-# -- Gymnasium
-# --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("actions", ["setpoint", "increment"])
-def test_gymnasium_actions_are_commands_within_their_bounds(arm, actions):
-    pytest.importorskip("gymnasium")
-    from batchpid.sim.gym import ReachVectorEnv
-
-    increment = {"max_increment": [0.05, 0.1]} if actions == "increment" else {}
-    env = ReachVectorEnv(
-        3, arm, actions=actions, control=Cartesian(), workers=0, max_episode_steps=4, **increment
-    )
-    given = []
-    send = env.runner.send
-    env.runner.send = lambda setpoint, **more: given.append(setpoint) or send(setpoint, **more)
-    assert env.single_action_space.shape == (2,)
-    assert env.single_observation_space.shape == (6,)
-    env.reset(seed=1)
-    for _ in range(6):
-        env.step(np.tile([1.0, -1.0], (3, 1)))
-    if actions == "setpoint":
-        np.testing.assert_array_equal(given[0], [[1.2, 0.3]] * 3)
-    else:
-        np.testing.assert_allclose(given[0], [[0.85, 0.7]] * 3)
-        np.testing.assert_allclose(given[3], [[1.0, 0.4]] * 3)
-        np.testing.assert_allclose(
-            given[5], [[0.85, 0.7]] * 3
-        )  # from the neutral setpoint of the next episode
-    with pytest.raises(InvalidArgumentError, match="actions, entry 'z', env 2"):
-        env.step(np.array([[0, 0], [0, 0], [0, np.nan]]))
-    env.close()

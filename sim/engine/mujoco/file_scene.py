@@ -19,9 +19,8 @@ from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.mjcf.mjcf_compiler import Names, attempt
-from batchpid.sim.robot.mjcf.mjcf_reader import content_of, home
-from batchpid.sim.robot.mjcf.mjcf_tables import find_base
+from batchpid.sim.robot.mjcf_model import RobotInFile, compile_scene
+from batchpid.sim.robot.mjcf_reader import home
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.task_space.frames import inverse, matrix_of, rotate
 
@@ -76,15 +75,13 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
 
     Raises RobotError if the file has changed since the robot was loaded.
     """
-    compiled = attempt(Path(file.path), spec.fixed_base, file.is_whole)
+    compiled = compile_scene(Path(file.path), file.is_whole)
     scene, model = compiled.scene, compiled.model
-    if model is None or content_of(Path(file.path)) != file.content:
-        problem = compiled.problem or "it has another content"
+    if compiled.content != file.content:
         raise RobotError(
-            f"{file.path}: has changed since the robot was loaded: {problem}; load the robot again"
+            f"{file.path}: has changed since the robot was loaded; load the robot again"
         )
-    names = Names(model)
-    find_base(model, names, Path(file.path), [])  # removes other objects
+    names = RobotInFile(model, Path(file.path), [])
     robot = {body: name for body, name in names.bodies.items() if names.is_of_robot(body)}
     for joint in scene.joints:
         joint.name = names.joints.get(joint.id, joint.name)

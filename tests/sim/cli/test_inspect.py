@@ -120,17 +120,12 @@ def test_masses_and_their_sources(batchpid, tmp_path):
     assert {"frame", "speck"} <= {line.split(" ")[0] for line in every.splitlines()}
 
 
-def test_strict_fails_on_findings_worse_than_notes(batchpid, odd):
-    assert batchpid("inspect", odd, "--strict")[0] == 1
-    assert batchpid("inspect", "panda", "--strict")[0] == 0
-
-
 def test_gains_are_checked_too(batchpid):
     status, out, _ = batchpid("inspect", "jaco2")
     assert status == 0
     assert "Under gains tuned:\nNothing odd." in out
-    status, out, _ = batchpid("inspect", "jaco2", "--gains", "sapien-tutorial", "--strict")
-    assert status == 1
+    status, out, _ = batchpid("inspect", "jaco2", "--gains", "sapien-tutorial")
+    assert status == 0
     assert "Under gains sapien-tutorial:\nwarning:" in out
 
 

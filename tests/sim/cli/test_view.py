@@ -18,7 +18,7 @@ from batchpid.sim import (
     read_recording,
     write_recording,
 )
-from batchpid.sim.view.playback import recorded_robot
+from batchpid.sim.view.view_data import recorded_robot
 
 pytest.importorskip("viser")
 SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)

@@ -3,6 +3,7 @@ state of an env.
 """
 
 import dataclasses
+import os
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.mujoco.mujoco_engine import ENGINE  # noqa: E402
 from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation  # noqa: E402
-from batchpid.sim.randomization.fields import nominal_values  # noqa: E402
+from batchpid.sim.randomization.distributions import nominal_values  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits"
@@ -493,6 +494,7 @@ def test_every_file_that_a_load_opens_is_part_of_the_identity(tmp_path, changed)
         .replace(b".1", b".2")
         .replace(*(np.float32(x).tobytes() for x in (0.3, 0.5)))
     )
+    os.utime(path, (2e9, 2e9))  # MuJoCo keeps meshes by the time of the file
     assert Robot.load(tmp_path / "scene.xml").describe() != robot.describe()
     robot_model.cache_clear()
     with pytest.raises(RobotError, match="has changed since the robot was loaded"):

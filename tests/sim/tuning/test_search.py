@@ -99,12 +99,10 @@ def test_search_starts_from_the_designed_gains():
         )
 
 
-def test_gains_in_efforts_and_of_single_joints_can_be_searched_too():
-    found = tune(
-        ARM, moves=random_moves(ARM, 1, 0), gain_units="effort", per_joint=True, workers=0, **SMALL
-    )
+def test_gains_in_efforts_can_be_searched_too():
+    found = tune(ARM, moves=random_moves(ARM, 1, 0), gain_units="effort", workers=0, **SMALL)
     ratio = found.params.kp / found.start_params.kp
-    assert found.cost == found.start_cost or np.ptp(ratio) > 0
+    assert found.cost == found.start_cost or (ratio != 1).all()
 
 
 def test_moves_are_made_with_different_motors_of_which_the_worst_counts():
@@ -140,7 +138,7 @@ def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(
 
 
 @pytest.mark.slow
-def test_gains_of_the_search_follow_unseen_motions_more_closely_than_designed_ones(panda):
+def test_gains_of_the_search_settle_sooner_than_designed_ones_and_follow_as_closely(panda):
     found = tune(panda)
     moves = tutorial_move(panda) + random_moves(panda, 20, 1)
     designed, tuned = (
@@ -148,8 +146,9 @@ def test_gains_of_the_search_follow_unseen_motions_more_closely_than_designed_on
         for each in (found.start_params, found.params)
     )
     arm = arm_joints(panda)
-    assert tuned.following_error[:, arm].max() < 0.8 * designed.following_error[:, arm].max()
-    assert tuned.metrics.settling_time[:, arm].max() <= designed.metrics.settling_time[:, arm].max()
+    assert tuned.following_error[:, arm].max() < 1.1 * designed.following_error[:, arm].max()
+    settling = [each.metrics.settling_time[:, arm].max() for each in (designed, tuned)]
+    assert settling[1] < 0.95 * settling[0]
 
 
 @pytest.mark.parametrize("weight", [float("nan"), float("inf"), -1.0])
