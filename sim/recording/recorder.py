@@ -19,7 +19,7 @@ import numpy as np
 from batchpid.arrays.array_types import Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import flag, instance
-from batchpid.errors import ClosedError, InUseError, InvalidArgumentError
+from batchpid.errors import ClosedError, InvalidArgumentError
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import RecordingError
@@ -129,8 +129,7 @@ class Recorder(SingleOwner):
     def close(self, complete: bool = True) -> None:
         """Write the remaining rows and close the file. May be called again, as after an interrupt.
 
-        If the recording is to be ``complete``, a tick whose call was interrupted is completed
-        first.
+        ``complete`` says whether the recording has all ticks of its run.
 
         Raises
         ------
@@ -141,8 +140,6 @@ class Recorder(SingleOwner):
             return
         try:
             if complete:
-                with suppress(InUseError):  # the tick of a call in another thread is not recorded
-                    self._runner.settle()
                 self.prepare()
         finally:
             if self._info is not None and self._error is None:
