@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from batchpid.arrays.array_types import Document
 from batchpid.sim import Finding, Robot
 from batchpid.sim.robot.findings import summary
-from batchpid.sim.robot.link_repair import DENSITY
+from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.parts import HEADERS, joint_rows
 from batchpid.sim.tuning.comparison import table
 from batchpid.sim.tuning.gain_sets import gain_set

@@ -27,7 +27,7 @@ from batchpid.sim.robot.mjcf_model import (
 )
 from batchpid.sim.robot.mjcf_tables import TableReader, excluded_pairs
 from batchpid.sim.robot.parts import FileDefaults, MjcfFile
-from batchpid.sim.robot.urdf import Source
+from batchpid.sim.robot.tables import Source
 from batchpid.task_space.rigid_tree import GRAVITY
 
 _KEYFRAME = "home"

@@ -22,11 +22,10 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.link_repair import possible_inertia
+from batchpid.sim.robot.inertia import possible_inertia
 from batchpid.sim.robot.mjcf_actuators import Couplings, Motors
 from batchpid.sim.robot.mjcf_model import ALONE, RobotInFile, can_collide, label, unique
-from batchpid.sim.robot.parts import Joint, Mimic
-from batchpid.sim.robot.self_collision import DisabledPair
+from batchpid.sim.robot.parts import DisabledPair, Joint, Mimic
 from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Shape, ShapeKind, Tables, breadth_first
 from batchpid.task_space.frames import about, compose, matrix_of, rotate
 

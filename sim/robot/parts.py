@@ -69,6 +69,23 @@ class Joint:
         return {"rad": "N m", "m": "N"}[self.unit]
 
 
+class DisabledPair(NamedTuple):
+    """Two links that do not collide.
+
+    ``reason`` is one of MoveIt's: "Adjacent" (neighbours), "Default" (in contact at the start
+    pose), "Always" (in nearly every sampled pose), "Never" or "User" (in an .srdf).
+    """
+
+    first: str
+    second: str
+    reason: str
+
+    @property
+    def links(self) -> frozenset[str]:
+        """Names of the links."""
+        return frozenset((self.first, self.second))
+
+
 class LinkMass(NamedTuple):
     """Simulated mass of a link of the URDF.
 

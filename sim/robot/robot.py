@@ -23,8 +23,8 @@ from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Findings, report
 from batchpid.sim.robot.mimics import couple
 from batchpid.sim.robot.parts import DISSIPATION, Joint, Settings
-from batchpid.sim.robot.reader import read_robot
 from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
+from batchpid.sim.robot.urdf import read_robot
 from batchpid.task_space.rigid_tree import RigidTree
 
 _ASSETS = Path(assets.__file__).parent

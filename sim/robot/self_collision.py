@@ -18,7 +18,7 @@ from batchpid.sim.robot.collision_groups import link_groups
 from batchpid.sim.robot.contacts import Contacts
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.merging import merge_links, rigid_bodies
-from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.parts import DisabledPair, Joint
 from batchpid.sim.robot.simulated_links import rigid_tree
 from batchpid.sim.robot.xml import parse_xml
 
@@ -32,23 +32,6 @@ PhysX pushes links apart that just touch at the start.
 """
 SAMPLES = 200
 """Number of sampled poses; MoveIt's."""
-
-
-class DisabledPair(NamedTuple):
-    """Two links that do not collide.
-
-    ``reason`` is one of MoveIt's: "Adjacent" (neighbours), "Default" (in contact at the start
-    pose), "Always" (in nearly every sampled pose), "Never" or "User" (in an .srdf).
-    """
-
-    first: str
-    second: str
-    reason: str
-
-    @property
-    def links(self) -> frozenset[str]:
-        """Names of the links."""
-        return frozenset((self.first, self.second))
 
 
 class Srdf(NamedTuple):

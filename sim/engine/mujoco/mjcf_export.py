@@ -26,7 +26,7 @@ from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_sp
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.link_repair import nearest_physical
+from batchpid.sim.robot.inertia import nearest_physical
 from batchpid.sim.robot.robot_model import base_start
 from batchpid.task_space.spatial_inertia import SpatialInertia
 

@@ -207,9 +207,7 @@ def test_visuals_are_looked_up_in_package_dirs(tmp_path):
 
 
 def test_a_malformed_visual_is_an_error_that_names_it(tmp_path):
-    with pytest.raises(
-        RobotError, match=r"link 'a': <sphere radius='big'> needs one finite number"
-    ):
+    with pytest.raises(RobotError, match=r"link 'a': <sphere radius='big'> needs 1 finite number"):
         surfaces(load(tmp_path, a=visual('<sphere radius="big"/>')))
 
 
