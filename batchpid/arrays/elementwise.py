@@ -17,7 +17,7 @@ TURN = 2 * math.pi
 _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
 
 
-def namespace(*leaves: Array) -> Array:
+def namespace(*leaves: Array) -> ArrayModule:
     """Return the array namespace in which all these leaves can be used: NumPy's, unless one belongs
     to another.
     """

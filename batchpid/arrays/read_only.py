@@ -13,6 +13,6 @@ def read_only(array: T) -> T:
     """Return a read-only view of a NumPy array; return any other object unchanged."""
     if not isinstance(array, np.ndarray):
         return array
-    view: Any = array.view()
+    view = array.view()
     view.flags.writeable = False
     return view

@@ -89,7 +89,6 @@ def check_time_step(argument: str, value: object) -> None:
 
 def choice(argument: str, value: object, known: Collection[S]) -> S:
     """Return ``value`` if it is one of ``known``."""
-    chosen: Any = value
     if not isinstance(value, str) or value not in known:
         raise InvalidArgumentError(
             argument,

@@ -163,9 +163,8 @@ class _Run:
         effort = self.rollout.effort.astype(np.float64)
         params = self.info.params
         if self.info.control == "drive" and params is not None:
-            if params.kd is None:
-                rate = 0.0
-            else:
+            rate = 0.0 * self.error
+            if params.kd is not None:
                 rate = params.kd * self.rollout.qvel
             effort += np.clip(params.kp * self.error - rate, -self.limit, self.limit)
         return effort

@@ -241,7 +241,7 @@ def _controller(layout: Layout, constants: Constants, values: Values) -> Values:
 def _law(layout: Layout, constants: Constants, values: Values) -> Values:
     """Effort within the limits of params and motors."""
     qpos, qvel, _ = values.seen
-    limits = None, None
+    limits: tuple[Array, Array] = (None, None)
     if constants.motors is not None:
         limits = command_limits(constants.motors, qpos, qvel)
     values = _LAWS[layout.control](layout, constants, values, limits)
