@@ -4,7 +4,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 Bool = NDArray[np.bool_]
 Float32 = NDArray[np.float32]
@@ -34,7 +34,7 @@ MjModel: TypeAlias = Any
 Kind = object
 """The type of a field, as its annotation declares it."""
 
-DType = DTypeLike
+DType = type | np.dtype[Any] | str | None
 """What ``np.dtype`` takes."""
 
 MjSpec: TypeAlias = Any

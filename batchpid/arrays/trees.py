@@ -33,7 +33,7 @@ def leaves(tree: Pytree) -> list[Any]:
     return []
 
 
-def mapped(function: Callable[[Any], Any], tree: T) -> T:
+def mapped(function: Callable[[Any], Any], tree: Pytree) -> Any:
     """Return a tree of tuples with ``function`` applied to its leaves."""
     if is_leaf(tree):
         return function(tree)

@@ -12,7 +12,8 @@ import hashlib
 import importlib
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 NOT_BUILT = "the extension was not built: it needs a C++ compiler when batchpid is installed"
@@ -62,7 +63,7 @@ class Extension(NamedTuple):
 
 
 @cache
-def load(extension: Extension) -> Any:
+def load(extension: Extension) -> ModuleType:
     """Return the module of an extension.
 
     Raises

@@ -196,7 +196,8 @@ class _Search(NamedTuple):
 
     def size(self, nearest: _Found) -> Float64:
         """Return the larger of position and rotation error over its tolerance (n,)."""
-        return (nearest.errors / self.tolerance).max(-1)
+        worst: Float64 = (nearest.errors / self.tolerance).max(-1)
+        return worst
 
     def reached(self, nearest: _Found) -> Bool:
         """Return the rows (n,) with both errors within the tolerances."""
@@ -343,7 +344,8 @@ def _wholly_turning(tree: RigidTree) -> NDArray[np.bool_]:
         turning, tree.coupling.multiplier % 1, tree.coupling.multiplier
     )  # 0 if the follower is back, too
     back = np.bincount(tree.coupling.leader, pitch != 0, minlength=tree.dof) == 0
-    return turning & back & tree.independent
+    flipped: NDArray[np.bool_] = turning & back & tree.independent
+    return flipped
 
 
 def _report(result: IKResult, on_failure: str) -> None:

@@ -72,8 +72,9 @@ def _loop(
             rows = np.zeros(robot.dof)
         else:
             rows = np.asarray(armature, np.float64)
-        inertia = np.atleast_2d(rows)[:, None] * np.eye(robot.dof)
-        return coupling.reduced(robot.mass_matrix(qpos) + inertia)
+        added = np.atleast_2d(rows)[:, None] * np.eye(robot.dof)
+        inertia: Float64 = coupling.reduced(robot.mass_matrix(qpos) + added)
+        return inertia
 
     loop: Document = {name: column(getattr(params, name)) for name in ("kp", "ki", "kd")}
     eye = np.eye(loop["kp"].shape[1])

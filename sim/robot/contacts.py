@@ -161,7 +161,10 @@ class Contacts:
         if pair >= len(self._pairs):
             return self._lowest(self._grounded[pair - len(self._pairs)])
         first, second = self._pairs[pair].tolist()
-        return mujoco.mj_geomDistance(self._model, self._data, first, second, _FARTHEST, None)
+        distance: float = mujoco.mj_geomDistance(
+            self._model, self._data, first, second, _FARTHEST, None
+        )
+        return distance
 
     def in_contact(self, qpos: Rows, clearance: float = 0.0) -> NDArray[np.bool_]:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground

@@ -238,7 +238,8 @@ def pickled(message: Any, options: RunnerOptions) -> bytes:
         One of ``options`` cannot be pickled.
     """
     try:
-        return cloudpickle.dumps(message)
+        reply: bytes = cloudpickle.dumps(message)
+        return reply
     except Exception as error:
         raise InvalidArgumentError(
             next(

@@ -100,7 +100,8 @@ class MujocoPack(ModelPack):
     @property
     def data(self) -> list[Any]:
         """``mujoco.MjData`` of each robot, in its state."""
-        return self._pool.take(self)
+        sensors: list[Any] = self._pool.take(self)
+        return sensors
 
     def _update(self, rows: Iterable[int]) -> None:
         """Compute all that follows from the states of robots ``rows``, after a change of models."""
