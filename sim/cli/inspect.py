@@ -109,9 +109,7 @@ class Inspection:
             "mass": sum(link.mass for link in masses.values()),
             "findings": [asdict(finding) for finding in self.findings + self.of_gains],
             "joints": joints,
-            "links": {
-                name: {"mass": link.mass, "source": link.source} for name, link in masses.items()
-            },
+            "links": masses,
         }
 
 
