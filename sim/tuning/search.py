@@ -90,7 +90,9 @@ class Tuning:
 
     def report(self) -> str:
         """Return the costs, and the table of the :attr:`comparison`."""
-        lines = [f"cost {self.start_cost:.4f} as designed, {self.cost:.4f} as tuned\n"]
+        lines = [
+            f"cost of the designed gains {self.start_cost:.4f}, of the tuned gains {self.cost:.4f}\n"
+        ]
         if self.rejected is not None:
             lines.append(f"The designed gains are the result: {self.rejected}.")
         return "\n".join([*lines, self.comparison.report()])
@@ -187,7 +189,7 @@ def tune(
         raise InvalidArgumentError(name, problem, remedy=remedy)
     if motors is not None and runner_options.get("actuators") is not None:
         remedy = "leave it out: the control knows the actuators of the robot"
-        raise InvalidArgumentError("actuators", "is given with motors", remedy=remedy)
+        raise InvalidArgumentError("actuators", "cannot be combined with motors", remedy=remedy)
     weights = Weights() if weights is None else weights
     build = runner_options.get("build")
     engine = tuning_engine(build) if engine is None else engine

@@ -41,7 +41,7 @@ def test_gains_and_implicit_laws_are_refused(panda):
             r"params: .*explicit gains; .*bp\.design_gains makes implicit gains",
         ),
         ({"discretization": "implicit"}, r"discretization: .*explicit gains; .*bp\.design_gains"),
-        ({"motors": motors, "actuators": motors}, "actuators: is given with motors"),
+        ({"motors": motors, "actuators": motors}, "actuators: cannot be combined with motors"),
     ):
         with pytest.raises(InvalidArgumentError, match=message):
             tune(panda, workers=0, **options)
