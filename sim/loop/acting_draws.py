@@ -44,7 +44,7 @@ class ActingDraws:
         robot = self._options.robot
         self.params = self.acting_params = params
         if randomization is not None:
-            self.acting_params = randomization.randomized_params(params, self.draws, robot)
+            self.acting_params = randomization.randomized("params", params, self.draws, robot)
 
     def set_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
         """Put actuators into effect; return them with the draws applied."""
@@ -52,7 +52,7 @@ class ActingDraws:
         robot = self._options.robot
         self.actuators = actuators
         if randomization is not None:
-            actuators = randomization.randomized_actuators(actuators, self.draws, robot)
+            actuators = randomization.randomized("actuators", actuators, self.draws, robot)
         self.motors = effective(actuators)
         return actuators
 
@@ -89,7 +89,7 @@ def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variati
     assert randomization is not None
     values = {}
     for name in PHYSICAL:
-        if name not in randomization.given:
+        if getattr(randomization, name) is None:
             continue
         nominal = nominal_values(name, robot, options.mjcf)
         rows = np.tile(nominal, (size, 1))

@@ -165,7 +165,7 @@ def written(folder: Path) -> set[Path]:
         ("rollout --tool panda_hand", "tool: is for control 'osc'"),
         ("rollout --substeps 0", "substeps: out of range"),
         ("rollout --out a.npz", "out: unknown file format"),
-        ("rollout --gains tunned", "did you mean 'tuned'?"),
+        ("rollout --gains tunned", "use tuned, designed, "),
         ("tune nobody", "no robot 'nobody'"),
         ("tune arm.urdf --population 1", "population: out of range"),
         ("compare --gains drive:a,b", "DAMPING"),

@@ -54,12 +54,12 @@ def assert_same_info(first, second):
 
 def test_rollouts_are_read_as_they_were_written(tmp_path, rollout):
     path = tmp_path / "new" / "run.h5"
-    assert write_recording(rollout, path, seed=7) == path
+    assert write_recording(rollout, path) == path
     read = read_recording(path)
     assert_identical(read, rollout)
     np.testing.assert_array_equal(read.feedforward, rollout.feedforward)
     assert read.tick == rollout.tick == 0.001
-    assert_same_info(read.info, replace(rollout.info, seed=7))
+    assert_same_info(read.info, rollout.info)
     (fault,) = read.info.faults
     assert (fault.env, fault.joint, fault.cause) == (1, "panda_joint4", "setpoint")
     assert (read.info.physics, read.info.compensate, read.info.complete) == (
@@ -99,8 +99,6 @@ def test_bad_paths_are_refused(path, rollout):
 def test_bad_arguments_are_refused(tmp_path, rollout):
     with pytest.raises(InvalidArgumentError, match="rollout"):
         write_recording(None, tmp_path / "run.h5")
-    with pytest.raises(InvalidArgumentError, match="seed"):
-        write_recording(rollout, tmp_path / "run.h5", seed=-1)
     with pytest.raises(InvalidArgumentError, match="every"):
         read_recording(tmp_path / "run.h5", every=0)
     assert not os.listdir(tmp_path)
