@@ -340,8 +340,8 @@ def test_a_wrong_trajectory_is_refused(batchpid, tmp_path, panda, motion, change
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--seconds", 1), "seconds: is as --trajectory says"),
-        (("--setpoint", 0, 0), "setpoint: is as --trajectory says"),
+        (("--seconds", 1), "seconds: is given by the trajectory"),
+        (("--setpoint", 0, 0), "setpoint: is given by the trajectory"),
         (("--control", "osc"), "excludes --control osc"),
         (("--gains", "sapien-tutorial"), "setpoint_accelerations: is for gains in accelerations"),
         (("--control", "drive"), "setpoint_accelerations: is for gains in accelerations"),

@@ -126,7 +126,7 @@ def test_any_run_can_be_drawn(tmp_path_factory, bad, first, envs, limits, unit, 
     folder = tmp_path_factory.mktemp("plots")
     for name, figure in (
         ("step", plots.step_responses(rollout, mark=0)),
-        ("efforts", plots.efforts(rollout, mark=1)),
+        ("efforts", plots.efforts(rollout)),
         ("comparison", plots.comparison(rollout, make(1))),
     ):
         assert plots.save(figure, folder / f"{name}.png", dpi=40).stat().st_size > 1000
