@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny_urdf import gripper, joint, link, write
 
 import batchpid as bp
 from batchpid.sim import Robot, Runner, read_recording
 from batchpid.trajectories import Trajectory, minimum_jerk
-from tests.sim.tiny_urdf import gripper, joint, link, write
 
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
 FILE = "run.h5"
