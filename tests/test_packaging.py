@@ -20,7 +20,7 @@ from setuptools.config.expand import read_attr
 import batchpid
 from batchpid.sim.cli import main
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.library import TESTED
+from batchpid.sim.engine.sapien.calls import TESTED
 
 ROOT = Path(__file__).parents[1]
 LIMITED_API = "cp311"

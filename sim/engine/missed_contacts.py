@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Rows
-from batchpid.sim.engine.scene_model import contacts_of
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 DEPTH = 1e-3
@@ -29,7 +28,7 @@ class MissedContacts:
     """
 
     def __init__(self, spec: SceneSpec, size: int, ground: bool) -> None:
-        self._contacts, tree = contacts_of(spec, ground), spec.rigid_tree.held
+        self._contacts, tree = spec.contact_model(ground), spec.rigid_tree.held
         slides = tree.bodies.slides.ravel() > 0
         parents = tree.body_parents
         body, balls = self._contacts.balls

@@ -24,7 +24,6 @@ from batchpid.sim.loop.arrays import Arrays, Command, Ticks
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_parts import LinkSensors, Pushes
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
-from batchpid.sim.loop.model_functions import steps_natively
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
 from batchpid.sim.loop.native_program import Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
@@ -112,7 +111,7 @@ class EnvGroup:
         self._executor: NumPyExecutor | NativeExecutor | XLAExecutor
         if self._options.backend == "jax":
             self._executor = XLAExecutor(setup, state)
-        elif steps_natively(self.pack) and runs_natively(setup):
+        elif self.pack.steps_natively and runs_natively(setup):
             self._executor = NativeExecutor(setup, state, self._last)
         else:
             self._executor = NumPyExecutor(setup, state)

@@ -23,7 +23,6 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
 from batchpid.sim.loop.control_step import COUPLING_STEPS, STAGES, SimStage
-from batchpid.sim.loop.model_functions import steps_natively
 from batchpid.sim.loop.step_setup import Setup, moves_drives
 from batchpid.sim.loop.step_values import (
     Layout,
@@ -81,7 +80,6 @@ class TickProgram:
         self, setup: Setup, buffers: Buffers, table: Table, noise: Any, reads_force: bool
     ) -> None:
         _, pack, layout, constants, _ = setup
-        assert steps_natively(pack)
         self._setup, self._buffers = setup, buffers
         self._native = native.extension("_gateway")
         self._programs, self._stages = list[Any](), list[interface.Stage]()

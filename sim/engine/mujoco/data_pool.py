@@ -9,7 +9,7 @@ A pack that is not at work keeps the rows of its states; back at work it compute
 from __future__ import annotations
 
 import copy
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -18,21 +18,13 @@ from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import FARTHEST
 
+if TYPE_CHECKING:
+    from batchpid.sim.engine.mujoco.mujoco_pack import MujocoPack
+
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Parts of the state: all of the inputs of a sim step."""
 POSITIONS = 1
 """Place of the positions in the state, after the time."""
-
-
-class User(Protocol):
-    """Pack that uses a :class:`DataPool`: a model and a row of the state for each robot."""
-
-    models: list[Any]
-    rows: Float64
-
-    @property
-    def data(self) -> list[Any]:
-        """``mujoco.MjData`` of each robot, in its state."""
 
 
 def rest(model: MjModel, data: Any) -> None:
@@ -55,7 +47,7 @@ class DataPool:
         self.model = copy.copy(robot.model)
         self._data = list[Any]()
         self._taken = list[Any]()
-        self._user: User | None = None
+        self._user: MujocoPack | None = None
         self._initial = np.empty(mujoco.mj_stateSize(robot.model, STATE))
         (data,) = self._new(1)
         rest(robot.model, data)
@@ -65,7 +57,7 @@ class DataPool:
         """Return the rows of ``size`` robots at rest."""
         return np.tile(self._initial, (size, 1))
 
-    def take(self, user: User) -> list[Any]:
+    def take(self, user: MujocoPack) -> list[Any]:
         """Return the data of the robots of ``user``, in their states; another user's states are
         kept in its rows.
         """
@@ -90,7 +82,7 @@ class DataPool:
                     mujoco.mj_step1(model, data)
         return self._taken
 
-    def leave(self, user: User) -> None:
+    def leave(self, user: MujocoPack) -> None:
         """Forget the states of ``user``."""
         if self._user is user:
             self._user = None

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene, set_ground
-from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
+from batchpid.sim.engine.mujoco.mujoco_sensors import add_link_sensors
 from batchpid.sim.engine.physics import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import add_geom

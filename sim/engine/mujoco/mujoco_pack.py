@@ -19,7 +19,6 @@ from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ModelPack
 from batchpid.sim.engine.mujoco.data_pool import STATE, DataPool, rest
 from batchpid.sim.engine.mujoco.file_scene import check_links
-from batchpid.sim.engine.mujoco.link_sensors import MujocoLinkSensors
 from batchpid.sim.engine.mujoco.model_builder import (
     FLOATING,
     LARGEST_FORCE,
@@ -27,10 +26,12 @@ from batchpid.sim.engine.mujoco.model_builder import (
     robot_model,
     set_inertia,
 )
+from batchpid.sim.engine.mujoco.mujoco_sensors import MujocoLinkSensors
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
-from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.scene_model import passive_force
+from batchpid.sim.engine.native_model import NativeModel, passive_force
+from batchpid.sim.engine.physics import SOLVERS
+from batchpid.sim.engine.protocol import Engine
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import CONTACT_FRICTION
@@ -47,7 +48,7 @@ _JOINTS = ("dof_armature", "dof_damping", "actuator_biasprm", "actuator_forceran
 class MujocoPack(ModelPack):
     """M robots of ``spec``. Arrays are (M, dof), in the order of ``spec.joints``, SI units.
 
-    Implements :class:`batchpid.sim.engine.protocol.CompiledPack` and DrivenPack.
+    Implements :class:`batchpid.sim.engine.protocol.EnginePack`.
     """
 
     state_is_complete = True
@@ -460,3 +461,14 @@ class MujocoPack(ModelPack):
 
 
 _ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
+
+
+ENGINE = Engine(
+    name="mujoco",
+    title="MuJoCo",
+    capabilities=frozenset({"base_state"}),
+    physics=SOLVERS,
+    group_size=64,
+    make_pack=MujocoPack,
+    native_obstacle=obstacle,
+)

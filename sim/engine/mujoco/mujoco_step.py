@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -18,10 +19,12 @@ import numpy as np
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
-from batchpid.sim.engine.mujoco.data_pool import User
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import Mujoco
 from batchpid.sim.engine.native_model import NativeStep
+
+if TYPE_CHECKING:
+    from batchpid.sim.engine.mujoco.mujoco_pack import MujocoPack
 
 FUNCTIONS = {
     "step1": "mj_step1",
@@ -100,7 +103,7 @@ class MujocoStep(NativeStep):
 
     def __init__(
         self,
-        pack: User,
+        pack: MujocoPack,
         robot: RobotMj,
         reads_force: bool,
         speed_limit: Float64 | None,
