@@ -105,7 +105,7 @@ COMMANDS = {
             "out": Output("Actuators file", DOCUMENTS, "out/{ROBOT}.actuators.yaml"),
             "picture": PICTURE._replace(default="{NAME}-fit.png"),
             "json": FIGURES,
-            "corrected_urdf": Output("URDF with the masses that were found", (".urdf",)),
+            "corrected_urdf": Output("URDF with the identified masses", (".urdf",)),
         },
     ),
     "export": CommandFunction(
@@ -223,6 +223,9 @@ def _settings(robot: Robot, values: Document) -> Iterator[str]:
     gains = values.get("gains")
     if gains:
         yield f"gains {gains if isinstance(gains, str) else ', '.join(gains)}"
+    # Drives and tools have other gains.
+    elif values.get("control", "pid") != "pid":
+        yield f"control {values['control']}"
     elif "moves" in values:
         yield f"gains {', '.join(default_sets(robot))}"
     elif "generations" in values:
@@ -230,8 +233,6 @@ def _settings(robot: Robot, values: Document) -> Iterator[str]:
     # Logs have the gains that drove their robot.
     elif "gains" in values and "logs" not in values:
         yield f"gains {default_gains(robot)}"
-    if values.get("control", "pid") != "pid":
-        yield f"control {values['control']}"
     timestep = values.get("timestep", RunnerOptions.timestep if "engine" in values else None)
     if timestep is not None:
         yield f"{1 / timestep:g} Hz"

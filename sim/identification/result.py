@@ -238,8 +238,8 @@ class Identification:
             strict=True,
         )
         errors = []
-        for window, pair in zip(windows, pairs, strict=True):
-            errors.append(plots.FitErrors(window.time, window.fitted, *pair))
+        for window, (first, last) in zip(windows, pairs, strict=True):
+            errors.append((window.time, window.fitted, first, last))
         names = [self.robot.joint_names[joint] for joint in self.joints]
         units = [self.robot.units[joint] for joint in self.joints]
         title = f"{self.robot.name}: position error, shaded where it was not fitted"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.arrays.elementwise import clip
-from batchpid.arrays.trees import flatten, leaves, structure
+from batchpid.arrays.trees import flatten, leaves, structure, unflatten
 from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.sim.engine.missed_contacts import MissedContacts
 from batchpid.sim.engine.protocol import EnginePack
@@ -29,6 +29,7 @@ from batchpid.sim.loop.native_program import Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
 from batchpid.sim.loop.step_setup import (
     Setup,
+    empty_state,
     init_motors,
     make_setup,
     reset_friction,
@@ -37,7 +38,7 @@ from batchpid.sim.loop.step_setup import (
     with_matrix,
     with_params,
 )
-from batchpid.sim.loop.step_values import StepState, state_of
+from batchpid.sim.loop.step_values import StepState
 from batchpid.sim.loop.xla_executor import XLAExecutor
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
@@ -397,8 +398,13 @@ class EnvGroup:
             array[...] = rows[name]
         pack.suspend(self._faults.suspended)
         pack.write_qf(self._last.effort)
-        state = state_of(rows, is_custom, acting.motors is not None)
         executor = self._executor
+        like = executor.read_state()
+        if not stays:
+            law = like.law if is_custom else bp.init(acting.acting_params, pack.read_qpos())
+            slips = pack.friction.coulomb is not None
+            like = empty_state(self._options, law, acting.motors, slips, pack.size)
+        state = unflatten(like._replace(matrix=None), rows, name="control")
         if stays:
             executor.failed = False
             executor.measure()

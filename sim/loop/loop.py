@@ -271,9 +271,9 @@ class Loop:
             pack = self._build(group.envs, draws)
         group.write(pack, rows, params, actuators, draws)
 
-    def state_sizes(self) -> list[int]:
-        """Return the number of values in the engine's state of each env."""
-        return [size for group in self.groups for size in group.pack.state_sizes()]
+    def read(self) -> dict[str, Rows]:
+        """Return the state of every env, arrays by name."""
+        return join_rows([group.read() for group in self.groups])
 
     def poses(self, names: Sequence[str] | None = None) -> list[Rows]:
         """Return the poses of the entities that ``build`` returned for each env, or of bodies

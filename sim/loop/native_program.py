@@ -28,7 +28,6 @@ from batchpid.sim.loop.step_values import (
     Layout,
     Measured,
     Model,
-    Outputs,
     Step,
     StepState,
     Values,
@@ -226,10 +225,11 @@ class TickProgram:
         # Arrays for the results: the state's own, and new ones for the others.
         outputs = [np.zeros(shape, bool if is_mask else float) for is_mask in traced.program.masks]
         for array, place in zip(state, traced.places, strict=False):  # the state comes first
-            if place.is_result:
-                outputs[place.number] = array
-        arrays = ((outputs if place.is_result else inputs)[place.number] for place in traced.places)
-        after = values._replace(**filled(traced.values, arrays)._asdict(), noise=None)
+            if place >= len(inputs):
+                outputs[place - len(inputs)] = array
+        arrays = [*inputs, *outputs]
+        changed = filled(traced.changed, iter([arrays[place] for place in traced.places]))
+        after = values._replace(**dict(zip(_CHANGED, changed, strict=True)), noise=None)
         if outputs:
             program = ArrayProgram(traced.program, leaves(constants), len(inputs), shape)
             pairs = tuple([(array, _row_size(array)) for array in inputs])
@@ -297,30 +297,20 @@ _TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
 """Dtypes of arrays that are not float64."""
 
 
-class _Changed(NamedTuple):
-    """Values that programs change."""
-
-    state: StepState
-    seen: Measured
-    outputs: Outputs
-
-
-class _Place(NamedTuple):
-    """Place of an array of the values after a program."""
-
-    is_result: bool
-    """Whether the program computes it; otherwise it is one of its inputs."""
-    number: int
+_CHANGED = ("state", "seen", "outputs")
+"""Values that programs change."""
 
 
 class _Traced(NamedTuple):
     """Program of some stages."""
 
     program: Trace
-    values: Pytree
-    """Structure of the :class:`_Changed` values after it."""
-    places: tuple[_Place, ...]
-    """Places of the arrays in these."""
+    changed: Pytree
+    """Structure of the values :data:`_CHANGED` after it."""
+    places: tuple[int, ...]
+    """Places of the arrays in these, among the inputs of the program and, after them, its
+    results.
+    """
 
 
 @lru_cache(maxsize=64)
@@ -347,21 +337,21 @@ def _trace(
         for stage in stages:
             assert stage.function is not None
             values = stage.function(layout, k, values)
-        changed = _Changed(values.state, values.seen, values.outputs)
+        changed = tuple([getattr(values, name) for name in _CHANGED])
         numbers = {symbol: number for number, symbol in enumerate(symbols[first:])}
-        outputs = set(map(id, leaves(changed.outputs)))
+        outputs = set(map(id, leaves(values.outputs)))
         results = list[Any]()
-        places = list[_Place]()
+        places = list[int]()
         for at, leaf in enumerate(leaves(changed)):
             is_state = at < len(histories)
             number = numbers.get(leaf)
             if is_state and (number == at or histories[at]):
-                places.append(_Place(False, at))
+                places.append(at)
             # An output that is an input is copied, since the next sim step changes the input.
             elif number is not None and not is_state and id(leaf) not in outputs:
-                places.append(_Place(False, number))
+                places.append(number)
             else:
-                places.append(_Place(True, len(results)))
+                places.append(count + len(results))
                 results.append(leaf)
         result_parts[:] = structure(changed), tuple(places)
         return results

@@ -155,7 +155,7 @@ class EngineSteps:
             self._pack.write_qf(qf)
             self._pack.step()
             measured = self.measure()
-            limit = self._setup.speed_limit
+            limit = self._setup.options.speed_limit
             is_slow = limit is None or bool((np.abs(measured.qvel) <= limit).all())
             return measured, not (is_near(measured.qpos) and is_slow)
         step = self.compiled()
@@ -175,7 +175,7 @@ class EngineSteps:
                 parts = (False, False)
             drives = self._setup.layout.control == "drive"
             self._bound = pack.calls
-            self._step = pack.compiled_step(*parts, True, self._setup.speed_limit, drives)
+            self._step = pack.compiled_step(*parts, True, self._setup.options.speed_limit, drives)
         return self._step
 
     def _passive_force(self, like: Float64) -> Float64:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import json
 import os
-import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,23 +23,11 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
-from batchpid.arrays.trees import flatten
 from batchpid.checks.validate import file_path, integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.motors.friction import FrictionState
-from batchpid.motors.guard import GuardState
-from batchpid.sim.loop.acting_draws import effective
-from batchpid.sim.loop.custom import initial_state
-from batchpid.sim.loop.env_parts import COUNTS
-from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, FaultContainment
-from batchpid.sim.loop.step_values import StepState
-from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.signals.quantities import untouched
 
 _FORMAT = 16
-_DIGITS = 64
-"""Length of a digest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,42 +54,27 @@ class Snapshot:
 
     def check_options(self, about: Mapping[str, Any]) -> None:
         """Raise InvalidArgumentError if a runner with options ``about`` cannot restore it."""
-        different = [key for key, ours in about.items() if self.about.get(key) != ours]
-        if not different:
-            return
-        key = different[0]
-        ours = about[key]
-        theirs = self.about.get(key)
-        problem = f"{key} {reprlib.repr(theirs)}, not {reprlib.repr(ours)}"
-        if _DIGITS in (len(str(ours)), len(str(theirs))):
-            problem = f"another {key}"
-        problem = ", and another ".join([problem, *different[1:]])
-        remedy = "restore it in a runner made with the same options"
-        raise InvalidArgumentError("snapshot", f"is of a runner with {problem}", remedy=remedy)
+        different = [key for key, value in about.items() if self.about.get(key) != value]
+        if different:
+            problem = f"is of a runner with another {', and another '.join(different)}"
+            remedy = "restore it in a runner made with the same options"
+            raise InvalidArgumentError("snapshot", problem, remedy=remedy)
 
-    def check_rows(self, fresh: Mapping[str, Rows], command_size: int) -> None:
+    def check_rows(self, fresh: Mapping[str, Rows]) -> None:
         """Compare the arrays with the ``fresh`` ones of the runner that restores them.
-
-        ``command_size`` is the size of a setpoint. Values of the engine that are NaN in ``fresh``
-        are beyond the state of their env.
 
         Raises
         ------
         InvalidArgumentError
-            An array is missing, unknown, or of another shape, dtype or range.
+            An array is missing, unknown, or of another shape or dtype.
         """
-        ours, theirs = _kinds(fresh), _kinds(self.rows)
+        theirs, ours = (
+            {name: f"{table.dtype.str} {table.shape}" for name, table in rows.items()}
+            for rows in (self.rows, fresh)
+        )
         for name in ours | theirs:
             kind, other = theirs.get(name), ours.get(name)
             _expect(kind == other, f"has {kind} for {name}, not {other}")
-        joint = self.rows["containment/joint"]
-        cause = self.rows["containment/cause"]
-        of_command = np.isin(cause, [CAUSES.index(name) for name in COMMAND_CAUSES])
-        joints = np.where(of_command, command_size, self.rows["effort"].shape[1])
-        is_fault = (joint >= 0) & (joint < joints) & (cause >= 0) & (cause < len(CAUSES))
-        _expect(is_fault.all(), "has a fault of an unknown joint or cause")
-        beyond = self.rows["engine"][np.isnan(fresh["engine"])]
-        _expect(np.isnan(beyond).all(), "holds other content than this runner's build makes")
 
     def episodes(self, num_envs: int) -> NDArray[np.int64]:
         """Return the checked stream and episode of each of ``num_envs`` envs."""
@@ -199,75 +171,23 @@ class Snapshot:
 
 
 def join_rows(parts: Sequence[dict[str, Rows]]) -> dict[str, Rows]:
-    """Return the state of the envs of all ``parts``; the engine's values are as many as the most
-    of an env, with NaN after those of an env with fewer.
+    """Return the state of the envs of all ``parts``. Where ``build`` adds other content to an env,
+    the engine has fewer values for it, with NaN after them.
     """
-    if len(parts) == 1:
-        return parts[0]
-    joined = {
-        name: np.concatenate([part[name] for part in parts])
-        for name in parts[0]
-        if name != "engine"
-    }
-    # Content of ``build`` differs between envs.
-    engine = [row for part in parts for row in part["engine"]]
-    return joined | {"engine": _table(engine)}
+    width = max(part["engine"].shape[1] for part in parts)
+    joined = {}
+    for name in parts[0]:
+        tables = [part[name] for part in parts]
+        if name == "engine":
+            tables = [_widened(table, width) for table in tables]
+        joined[name] = np.concatenate(tables)
+    return joined
 
 
-def _table(rows: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return rows of different lengths as a table, with NaN at the end of the shorter ones."""
-    table = np.full((len(rows), max(map(len, rows))), np.nan)
-    for line, row in zip(table, rows, strict=True):
-        line[: len(row)] = row
-    return table
-
-
-def fresh_rows(
-    options: RunnerOptions,
-    params: bp.PIDParams,
-    actuators: bp.Actuators | None,
-    engine_sizes: Sequence[int],
-) -> dict[str, Rows]:
-    """Return arrays in the names, shapes and dtypes of a snapshot of a runner with ``options`` under
-    these ``params`` and ``actuators``.
-
-    ``engine_sizes`` (envs,) are the numbers of values in the engine's states; the others are NaN.
-    """
-    num_envs = options.num_envs
-    counts = np.zeros(num_envs, np.int64)
-    table = np.zeros((num_envs, options.robot.dof))
-    mask = np.zeros(table.shape, bool)
-    state = StepState(initial_state(options, params))
-    motors = effective(actuators)
-    if motors is not None:
-        state = state._replace(motors=bp.motors.init(motors, table, options.timestep))
-    if options.has_stiction(actuators):
-        friction = FrictionState(*[table] * len(FrictionState._fields))
-        state = state._replace(friction=friction, age=counts)
-    if options.guard is not None:
-        state = state._replace(guard=GuardState(table, table))
-    tree: Document = {
-        "engine": _table([np.zeros(size) for size in engine_sizes]),
-        "effort": table.astype(np.float32),
-        "saturated": mask,
-        "guarded": mask,
-        "episode": counts,
-        "control": state,
-        "containment": FaultContainment(*table.shape, "hold").state,
-        "sensors": untouched(num_envs, options.observed),
-    }
-    if options.has_pushes:
-        tree["pushes"] = dict.fromkeys(COUNTS, counts)
-    if options.sets_positions:
-        tree["motion"] = np.stack([table, table], axis=1)
-    if options.randomization is not None:
-        tree["episodes"] = np.stack([counts, counts], axis=1)
-    return flatten(tree)
-
-
-def _kinds(rows: Mapping[str, Rows]) -> dict[str, str]:
-    """Return dtype and shape of arrays."""
-    return {name: f"{table.dtype.str} {table.shape}" for name, table in rows.items()}
+def _widened(table: Rows, width: int) -> Rows:
+    """Return a table with NaN in further columns."""
+    missing = width - table.shape[1]
+    return np.pad(table, ((0, 0), (0, missing)), constant_values=np.nan)
 
 
 def _expect(holds: Any, problem: str) -> None:

@@ -4,18 +4,15 @@ of an executor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Rows
+from batchpid.arrays.array_types import Array
 from batchpid.law.coefficients import Coefficients
-from batchpid.law.state import PIDState
-from batchpid.motors.actuator_state import ActuatorState
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction, FrictionState
-from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.pid_law import PIDLaw
 
@@ -38,28 +35,6 @@ class StepState(NamedTuple):
     """:class:`batchpid.motors.guard.GuardState`; None without guard."""
     matrix: Array = None
     """Mass matrix of the law (M, dof, dof). Each tick begins with a new one."""
-
-
-def state_of(rows: Mapping[str, Rows], is_custom: bool, has_motors: bool) -> StepState:
-    """Return the state with the arrays "control/..." of a snapshot.
-
-    ``is_custom`` and ``has_motors`` say whether the law is the caller's own, and whether there are
-    motors, which may be without arrays.
-    """
-    # Of efforts the law has no arrays.
-    parts: dict[str, Any] = {"law": {}, "motors": {}, "friction": {}}
-    for path, array in rows.items():
-        group, _, name = path.partition("/")
-        part, _, leaf = name.partition("/")
-        if group == "control" and leaf:
-            parts.setdefault(part, {})[leaf] = array
-    return StepState(
-        law=parts["law"] if is_custom else PIDState(**parts["law"]),
-        friction=FrictionState(**parts["friction"]),
-        age=rows.get("control/age"),
-        motors=ActuatorState(**parts["motors"]) if has_motors else None,
-        guard=GuardState(**parts["guard"]) if "guard" in parts else None,
-    )
 
 
 class Measured(NamedTuple):

@@ -482,7 +482,7 @@ class Ray:
     """Largest number of machines. Default: all that have enough CPUs."""
     cpus_per_node: Annotated[int | None, Field(low=1, high=100_000)] = None
     """Workers on each machine, each on one CPU of Ray's count. Machines with fewer CPUs are not
-    used. Default: all CPUs that Ray counts.
+    used. Default: the CPUs of the smallest one.
     """
     runtime_env: Document | None = None
     """Ray's ``runtime_env`` of the processes on the machines, such as ``{"working_dir": "."}``."""

@@ -7,6 +7,7 @@ to the workers, and then replaces its state by the result of :meth:`Operation.co
 from __future__ import annotations
 
 import pickle
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain, repeat
 from operator import is_not, itemgetter
@@ -17,12 +18,16 @@ from numpy.typing import ArrayLike
 
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64, Rows
+from batchpid.arrays.trees import flatten
 from batchpid.checks.validate import env_mask
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.run_checks import SetpointCheck
+from batchpid.sim.loop.acting_draws import effective
 from batchpid.sim.loop.arrays import Arrays, Command
+from batchpid.sim.loop.custom import initial_state
 from batchpid.sim.loop.loop import Loop
-from batchpid.sim.loop.snapshot import Snapshot, fresh_rows, join_rows
+from batchpid.sim.loop.snapshot import Snapshot, join_rows
+from batchpid.sim.loop.step_setup import empty_state
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.runner.arguments import base_rows, joint_rows
@@ -63,7 +68,7 @@ class Reset(Operation):
         pose: tuple[ArrayLike | None, ArrayLike | None],
         mask: ArrayLike | None,
         seed: int | ArrayLike | None,
-        base: tuple[ArrayLike | None, ArrayLike | None],
+        base: Mapping[str, ArrayLike | None],
     ) -> Self:
         """Return the operation for arguments of :meth:`batchpid.sim.Runner.reset`."""
         robot = options.robot
@@ -86,7 +91,7 @@ class Reset(Operation):
             )
         qpos = robot.coupling.positions(qpos)
         qvel = robot.coupling.rates(qvel)
-        return cls(chosen, qpos, qvel, draws, base_rows(options, *base, qpos, chosen))
+        return cls(chosen, qpos, qvel, draws, base_rows(options, base, qpos, chosen))
 
     def apply(self, loop: Loop) -> None:
         loop.reset(self.mask, self.qpos, self.qvel, self.draws, self.base)
@@ -227,13 +232,16 @@ class Restore(Operation):
 
 
 @dataclass(frozen=True)
-class ReadStateSizes(Operation):
-    """Read the number of values in the engine's state of each env."""
+class ReadRows(Operation):
+    """Read the state of every env."""
 
     changes_loop = False
 
-    def apply(self, loop: Loop) -> list[int]:
-        return loop.state_sizes()
+    def apply(self, loop: Loop) -> dict[str, Rows]:
+        return loop.read()
+
+    def join(self, results: list[dict[str, Rows]]) -> dict[str, Rows]:
+        return join_rows(results)
 
 
 @dataclass(frozen=True)
@@ -268,12 +276,14 @@ def snapshot_of(options: RunnerOptions, state: RunnerState, rows: dict[str, Rows
     return Snapshot(options.described, state.steps, state.params, rows, state.actuators)
 
 
-def restored(options: RunnerOptions, snapshot: Snapshot, engine_sizes: list[int]) -> Restore:
+def restored(options: RunnerOptions, snapshot: Snapshot, present: Snapshot) -> Restore:
     """Return the operation that restores a snapshot, checked and copied.
 
-    ``engine_sizes`` are the numbers of values in the engine's state of each env.
+    ``present`` is a snapshot of the runner, whose rows have the same names and shapes but for those
+    that depend on params and actuators.
     """
-    snapshot.check_options(options.described)
+    snapshot.check_options(present.about)
+    num_envs = options.num_envs
     randomization = options.randomization
     params = options.check_params(snapshot.params)
     acting = actuators = options.check_actuators(
@@ -282,8 +292,11 @@ def restored(options: RunnerOptions, snapshot: Snapshot, engine_sizes: list[int]
     draws = NOTHING
     if randomization is not None:
         # Delays of drawn actuators say how long the histories are.
-        draws = randomization.draw(options.robot, snapshot.episodes(options.num_envs))
+        draws = randomization.draw(options.robot, snapshot.episodes(num_envs))
         acting = randomization.randomized("actuators", actuators, draws, options.robot)
-    fresh = fresh_rows(options, params, acting, engine_sizes)
-    snapshot.check_rows(fresh, options.command.size)
+    law = initial_state(options, params)
+    stiction = options.has_stiction(acting)
+    control = empty_state(options, law, effective(acting), stiction, num_envs)
+    rows = {name: table for name, table in present.rows.items() if "control/" not in name}
+    snapshot.check_rows(rows | flatten({"control": control}))
     return Restore(replace(snapshot.copy(), params=params, actuators=actuators), draws)

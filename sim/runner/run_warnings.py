@@ -8,6 +8,7 @@ from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
 from batchpid.sim.loop.faults import EventLog, FaultWarning, MissedContactWarning
 from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.pool import RecoveryWarning
 
@@ -31,15 +32,15 @@ class RunWarnings:
         self._moving = MovingSetpointCheck(robot) if control == "pid" else None
         self._has_warned_of_fault = self._has_warned_of_contact = False
 
-    def check_stability(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
-        """Warn of gains beyond the stability bound of the sampled loop."""
-        if self._stability is not None:
-            self._stability.check(params, actuators)
-
     def check_controller(self) -> None:
         """Warn of such gains of operational-space control."""
         if isinstance(self._control, OperationalSpace):
             self._control.check_stability()
+
+    def check_stability(self, state: RunnerState) -> None:
+        """Warn of gains beyond the stability bound of the sampled loop."""
+        if self._stability is not None:
+            self._stability.check(state.params, state.actuators)
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Watch the next ticks for what these gains may lead to."""
@@ -60,8 +61,8 @@ class RunWarnings:
         if contacts is not None and contacts.events and not self._has_warned_of_contact:
             self._has_warned_of_contact = True
             problem = "without collisions robots went through what they would have touched"
-            remedy = "use collisions=True, or other moves; see runner.missed_contacts for more"
+            remedy = "Use collisions=True, or other moves; see runner.missed_contacts for more"
             text = (
-                f"{problem}: {contacts.events[0]}; {remedy}, of which there is no further warning"
+                f"{problem}: {contacts.events[0]}. {remedy}, of which there is no further warning"
             )
             warn(text, MissedContactWarning)

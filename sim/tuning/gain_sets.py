@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,9 +9,6 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.options.groups import ControlMode
 from batchpid.sim.robot.robot import Robot
-
-NAMES = ("tuned", "designed", "sapien-tutorial", "mjcf", "drive")
-"""Names of gain sets; "drive" is "drive:20,5"."""
 
 
 class GainSet(NamedTuple):
@@ -53,25 +49,20 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     }
     if name in named:
         return GainSet(name, named[name]())
-    if name.partition(":")[0] == "drive":
+    kind, _, figures = name.partition(":")
+    if kind == "drive":
         try:
-            stiffness, damping = map(float, (name.partition(":")[2] or "20,5").split(","))
+            stiffness, damping = map(float, (figures or "20,5").split(","))
         except ValueError:
+            remedy = "write drive:STIFFNESS,DAMPING, e.g. drive:20,5"
             raise InvalidArgumentError(
-                "gains",
-                "is not a drive",
-                value=name,
-                remedy="write drive:STIFFNESS,DAMPING, e.g. drive:20,5",
+                "gains", "is not a drive", value=name, remedy=remedy
             ) from None
         params = robot.params(kp=stiffness, ki=0.0, kd=damping, effort_limit=None)
         return GainSet(f"drive ({stiffness:g}, {damping:g})", params, "drive")
     path = Path(name)
     if not path.is_file():
-        near = difflib.get_close_matches(name, NAMES, 1)
-        if near:
-            remedy = f"did you mean {near[0]!r}?"
-        else:
-            remedy = f"use a file or {', '.join(NAMES)}"
+        remedy = f"use {', '.join(named)}, drive, or a params file"
         raise InvalidArgumentError(
             "gains", "is neither a name nor a file", value=name, remedy=remedy
         )

@@ -22,7 +22,7 @@ from batchpid.sim.loop.loop import Failure, order
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeInfo, NodeWorker
-from batchpid.sim.workers.requests import Build, Request, Start, split_in_shares
+from batchpid.sim.workers.requests import Build, Request, Start, split
 from batchpid.sim.workers.worker import (
     LocalWorker,
     ProcessWorker,
@@ -99,13 +99,13 @@ class WorkerPool(SingleOwner):
         if options.cluster is not None:
             cluster = Cluster(options.cluster, num_envs)
             slices = cluster.slices
-            widest = cluster.widest
+            loops = len(slices) * cluster.workers
             most_steps = NODE_STEPS
         else:
-            slices = split_in_shares(num_envs, [1] * max(1, min(count or 0, num_envs)))
-            widest = -(-num_envs // len(slices))
+            slices = split(num_envs, max(1, min(count or 0, num_envs)))
+            loops = len(slices)
             most_steps = _MAX_STEPS
-        steps = max(_LEAST_STEPS, most_steps // widest)
+        steps = max(_LEAST_STEPS, most_steps * loops // num_envs)
         ticks = ticks or max(1, steps // options.substeps)
         layout = Arrays.layout(
             ticks, num_envs, options.robot.dof, options.command.size, options.observed

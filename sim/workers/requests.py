@@ -6,9 +6,8 @@ from __future__ import annotations
 
 import pickle
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from typing import Any, Self
 
 import batchpid as bp
@@ -95,7 +94,7 @@ class Build(Request):
         pass
 
 
-def split_in_shares(num_envs: int, shares: Sequence[int]) -> list[slice]:
-    """Return contiguous slices of envs in proportion to ``shares``; some can be empty."""
-    cuts = [num_envs * part // sum(shares) for part in accumulate(shares, initial=0)]
+def split(num_envs: int, parts: int) -> list[slice]:
+    """Return contiguous slices of envs, as equal as they can be."""
+    cuts = [num_envs * part // parts for part in range(parts + 1)]
     return [slice(low, high) for low, high in pairwise(cuts)]

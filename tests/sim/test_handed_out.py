@@ -77,7 +77,7 @@ def test_writes_to_a_snapshot_do_not_reach_the_runner(panda):
             taken, restored = runner.snapshot(), runner.snapshot()
             runner.restore(restored)
             if write:
-                taken.episodes[:] = 7
+                taken.rows["episodes"][:] = 7
             after = runner.step(panda.settings.target)
             return after.qpos, runner.reset() and runner.draws["payload"]
 
