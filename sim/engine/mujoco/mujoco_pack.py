@@ -101,7 +101,7 @@ class MujocoPack(ModelPack):
     @property
     def data(self) -> list[Any]:
         """``mujoco.MjData`` of each robot, in its state."""
-        return self._pool.take(self)
+        return self._pool.take(self.models, self.rows)
 
     def _update(self, rows: Iterable[int]) -> None:
         """Compute all that follows from the states of robots ``rows``, after a change of models."""
@@ -196,7 +196,14 @@ class MujocoPack(ModelPack):
         constraint = None if self._constraint is None else self._constraint.address
         reads_force = gravity and coriolis
         return MujocoStep(
-            self, self._robot, reads_force, speed_limit, arrays, self._suspended, constraint
+            self._pool,
+            self.models,
+            self.rows,
+            reads_force,
+            speed_limit,
+            arrays,
+            self._suspended,
+            constraint,
         )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
@@ -454,7 +461,7 @@ class MujocoPack(ModelPack):
         """Give back all that fits the present kind of model alone: working memory, and data made
         for its size.
         """
-        self._pool.leave(self)
+        self._pool.leave(self.rows)
         self._own_step = None
         for name in ("_scratch", "_rubbing"):
             self.__dict__.pop(name, None)

@@ -90,7 +90,7 @@ def test_one_warning_names_envs_and_links(falling):
     ) as runner:
         runner.reset([[0.0], [1.5], [0.0]])
         with pytest.warns(
-            MissedContactWarning, match=r"env 1: 'arm' and the ground at 0\.\d* s; "
+            MissedContactWarning, match=r"env 1: 'arm' and the ground at 0\.\d* s\. "
         ) as caught:
             runner.rollout(np.zeros((40, 1)))
         assert len(caught) == 1
