@@ -134,8 +134,7 @@ class MujocoPack(ModelPack):
     def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
         if self.steps_read_force(gravity, coriolis):
             return np.array([data.qfrc_bias[self._moves] for data in self.data], dtype)
-        state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
-        return self._passive_force(*state).astype(dtype)
+        return self._model_force(gravity, coriolis, dtype)
 
     @cached_property
     def _bias_model(self) -> NativeModel:
@@ -193,7 +192,6 @@ class MujocoPack(ModelPack):
         arrays = {"qf": self.qf, "sensed": self._sensed}
         if drives:
             arrays |= {"stiffness": self._stiffness, "rate_gain": self._rate_gain}
-        constraint = None if self._constraint is None else self._constraint.address
         reads_force = gravity and coriolis
         return MujocoStep(
             self._pool,
@@ -203,7 +201,7 @@ class MujocoPack(ModelPack):
             speed_limit,
             arrays,
             self._suspended,
-            constraint,
+            self._constraint_address,
         )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:

@@ -183,11 +183,12 @@ class Pack(ModelPack):
         speed_limit: Float64 | None,
         drives: bool = False,
     ) -> SapienStep:
-        constraint = None if self._constraint is None else self._constraint.address
         reads = (gravity, coriolis, velocities)
         joints = self._joints if drives else None
         sense = None if self._sensors is None else self._sensors.add
-        return SapienStep(self.calls, self._stepped, *reads, speed_limit, constraint, joints, sense)
+        return SapienStep(
+            self.calls, self._stepped, *reads, speed_limit, self._constraint_address, joints, sense
+        )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
         if self._constraint is not None:
@@ -247,8 +248,7 @@ class Pack(ModelPack):
     def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
         if self.steps_read_force(gravity, coriolis):
             return self._calls.passive_force(gravity, coriolis, dtype)
-        state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
-        return self._passive_force(*state).astype(dtype)
+        return self._model_force(gravity, coriolis, dtype)
 
     def write_qf(self, effort: Rows) -> None:
         self.qf[...] = effort
