@@ -167,7 +167,6 @@ class StabilityCheck:
             motors = actuators.for_envs(slice(0, MOST))
         if params.num_envs > 1 and motors is not None:
             params = params.for_envs(slice(0, MOST))
-        rows = max(params.num_envs, 1 if motors is None else motors.num_envs)
         start = self._robot.start
         try:
             report = stability_report(self._robot, params, start, self._timestep, motors)
@@ -177,7 +176,9 @@ class StabilityCheck:
         is_beyond = report.robot_ratio >= 1
         if is_beyond and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
-            env = f", env {report.env}" if rows > 1 else ""
+            env = ""
+            if report.env:
+                env = f", env {report.env}"
             warn(
                 f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the"
                 f" sampled PID loop, mostly of joint {joint!r}{env}, at the start pose with a time"

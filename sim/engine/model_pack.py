@@ -25,6 +25,9 @@ from batchpid.sim.engine.scene_spec import (
 )
 from batchpid.task_space.rigid_tree import RigidTree
 
+ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
+"""Pose and twist of a base at rest at the origin."""
+
 
 class ModelPack(EnginePack, SingleOwner):
     """Pack of ``size`` robots of ``spec``, numbered from ``first_env``, with mass matrices and

@@ -28,6 +28,18 @@ REMOVED = ("tuples", "sensors", "actuators", "keys", "cameras", "lights")
 """Elements of a file that a scene does not have."""
 
 
+_OF_CONTACTS = (
+    "material",
+    "condim",
+    "priority",
+    "friction",
+    "solmix",
+    "solref",
+    "solimp",
+    "margin",
+    "gap",
+)
+"""Attributes of a geom that a default class may set, for contacts and for its appearance."""
 _EVERYTHING = 2**31 - 1
 """Mask of a geom that collides with every geom that collides at all."""
 
@@ -127,6 +139,9 @@ def set_ground(scene: MjSpec, ground: bool) -> None:
     planes = [geom for geom in planes if geom.contype or geom.conaffinity]
     if ground and not planes:
         added = scene.worldbody.add_geom(type=plane, size=[0, 0, 1])
+        plain = mujoco.MjSpec().worldbody.add_geom()
+        for name in _OF_CONTACTS:  # the file's default class would apply otherwise
+            setattr(added, name, getattr(plain, name))
         added.contype = added.conaffinity = _EVERYTHING
     if not ground:
         for geom in planes:
