@@ -14,8 +14,7 @@ from batchpid.sim import Finding, Robot
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.parts import HEADERS, joint_rows
-from batchpid.sim.tuning.comparison import table
-from batchpid.sim.tuning.gain_sets import gain_set
+from batchpid.sim.tuning.comparison import gain_set, table
 
 SOURCES = {
     "inertial": "<inertial>",
