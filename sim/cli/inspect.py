@@ -143,7 +143,8 @@ def limbs(robot: Robot) -> int:
     sizes = Counter[str]()
     # Of each joint, the first moving joint on the way from the root.
     for joint in robot.joints:
-        first, link = joint.name, joint.parent_link
+        first = joint.name
+        link = joint.parent_link
         while link in above:
             first = above[link].name if above[link].moves else first
             link = above[link].parent_link
