@@ -94,8 +94,8 @@ class TickProgram:
             gravity=layout.gravity,
             coriolis=layout.coriolis,
         )
-        left = np.zeros(()) if layout.moves else None
-        self._place(**buffers.measured._asdict(), before=buffers.before, left=left)
+        self._left = np.zeros(())
+        self._place(**buffers.measured._asdict(), before=buffers.before, left=self._left)
         # SAPIEN knows neither measured states nor the model of varied robots.
         if layout.gravity and (layout.measures or not reads_force):
             if layout.measures:
@@ -112,7 +112,7 @@ class TickProgram:
             state=state._replace(law=law, age=None),
             command=buffers.command,
             measured=buffers.measured,
-            step=Step(0, 1, left),
+            step=Step(0, 1, self._left if layout.moves else None),
             seen=buffers.measured,
             noise=noise,
         )
@@ -269,7 +269,7 @@ class TickProgram:
 
     def _add_controller(self, values: Values) -> Values:
         controller: Any = self._setup.options.control
-        self.control = controller.bound(*values.seen)
+        self.control = controller.bound(*values.seen, self._left)
         self.control.set_state(self._buffers.state.law)
         self.tick.control = self.control.address
         outputs = values.outputs._replace(returned=self.control.effort)

@@ -63,10 +63,11 @@ def make_setup(
     ``motors``, their state, are None without an effect on efforts or measurements.
     """
     parts = options.compensate.split("+")
-    is_pid = options.control == "pid"
+    law = PIDLaw.of(params) if options.control == "pid" else None
     layout = Layout(
         control=options.control if isinstance(options.control, str) else "custom",
-        law=PIDLaw.of(params) if is_pid else None,
+        law=law,
+        implicit=any(part is not None and part.implicit for part in (law, controller)),
         measures=actuators is not None and actuators.measures,
         gravity="gravity" in parts,
         coriolis="coriolis" in parts,

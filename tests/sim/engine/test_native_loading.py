@@ -4,10 +4,7 @@ the work.
 
 from __future__ import annotations
 
-import importlib
 import re
-import sys
-import warnings
 
 import numpy as np
 import pytest
@@ -78,17 +75,6 @@ def test_worker_processes_give_no_warning_of_their_own(monkeypatch, panda, capfd
     found, _ = rollout(panda, workers=2)
     assert_identical(expected, found)
     assert "Warning" not in capfd.readouterr().err
-
-
-def test_an_extension_that_was_not_built_is_no_fault(monkeypatch, tmp_path, panda):
-    monkeypatch.delitem(sys.modules, "batchpid.sim.engine.native._gateway", raising=False)
-    monkeypatch.setattr(native, "__path__", [str(tmp_path)])
-    importlib.invalidate_caches()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
-        assert (
-            rollout(panda)[1] == f"law in NumPy, Python calls into SAPIEN ({extensions.NOT_BUILT})"
-        )
 
 
 @needs_extension

@@ -90,20 +90,6 @@ def test_existing_files_are_replaced_only_when_asked(tmp_path, rollout):
     assert_identical(read_recording(path), rollout)
 
 
-def test_a_failed_write_leaves_the_older_file(tmp_path, rollout, monkeypatch):
-    path = write_recording(rollout, tmp_path / "run.h5")
-    content = path.read_bytes()
-
-    def full(descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(RecordingError, match=r"run\.h5: cannot be written: .*No space"):
-        write_recording(rollout, path, overwrite=True)
-    assert path.read_bytes() == content
-    assert os.listdir(tmp_path) == ["run.h5"]
-
-
 @pytest.mark.parametrize("path", ["run.csv", "run.npz", "run", 3, None, "a\0b.h5"])
 def test_bad_paths_are_refused(path, rollout):
     with pytest.raises(InvalidArgumentError, match="path"):
