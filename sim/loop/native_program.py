@@ -23,7 +23,7 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
 from batchpid.sim.loop.control_step import COUPLING_STEPS, STAGES, SimStage
-from batchpid.sim.loop.step_setup import Setup, moves_drives, steps_natively
+from batchpid.sim.loop.step_setup import Setup, moves_drives
 from batchpid.sim.loop.step_values import (
     Layout,
     Measured,
@@ -79,7 +79,6 @@ class TickProgram:
         self, setup: Setup, buffers: Buffers, table: Table, noise: Any, reads_force: bool
     ) -> None:
         _, pack, layout, constants, _ = setup
-        assert steps_natively(pack)
         self._setup, self._buffers = setup, buffers
         self._native = native.extension("_gateway")
         self._programs, self._stages = list[Any](), list[interface.Stage]()
