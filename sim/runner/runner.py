@@ -724,7 +724,7 @@ class Runner(SingleOwner):
     def _max_ticks(self) -> int:
         """Return the number of ticks that one request may have: none beyond the next checkpoint."""
         left = CHECKPOINT_STEPS - self._state.steps_since_checkpoint % CHECKPOINT_STEPS
-        return min(len(self._pool.ticks), -(-left // self.options.substeps))
+        return min(len(self._pool.arrays.observation.ok), -(-left // self.options.substeps))
 
 
 _PARAMETERS = signature(RunnerOptions).parameters.items()
