@@ -141,11 +141,10 @@ class Runner(SingleOwner):
 
     def __repr__(self) -> str:
         options = self.options
-        where = f"{len(self.nodes) or len(self.pids)} {'nodes' if self.nodes else 'workers'}"
         state = "closed" if self.closed else f"at {self.time:g} s"
         return (
-            f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control"
-            f" {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
+            f"Runner({self.robot.name}, {self.num_envs} envs, {options.workers} workers,"
+            f" control {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
             f" {self.substeps} substeps, {state})"
         )
 
