@@ -105,7 +105,7 @@ COMMANDS = {
             "out": Output("Actuators file", DOCUMENTS, "out/{ROBOT}.actuators.yaml"),
             "picture": PICTURE._replace(default="{NAME}-fit.png"),
             "json": FIGURES,
-            "corrected_urdf": Output("URDF with the masses that were found", (".urdf",)),
+            "corrected_urdf": Output("URDF with the identified masses", (".urdf",)),
         },
     ),
     "export": CommandFunction(

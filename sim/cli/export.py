@@ -52,7 +52,7 @@ class ExportedFile:
         # The folder decides only how meshes are named.
         differences = self.make(Path.cwd()).differences
         if not differences:
-            return "The file differs in nothing."
+            return "The file has no differences."
         return "\n".join(f"differs: {text}" for text in differences)
 
     def save(self, path: Path) -> None:
@@ -119,7 +119,7 @@ def export(
     if motors:
         if gains is not None or limits:
             remedy = "leave out --gains and --limits"
-            raise InvalidArgumentError("motors", "are written without a law", remedy=remedy)
+            raise InvalidArgumentError("motors", "exclude gains and limits", remedy=remedy)
         exported = _mjcf(robot, None, timestep, False)
     else:
         params = _gains(robot, gains)
@@ -139,7 +139,7 @@ def _gains(robot: Robot, gains: str | None) -> bp.PIDParams:
     chosen = gain_set(robot, gains)
     if chosen.control != "pid":
         remedy = "choose gains of the law: tuned, designed, sapien-tutorial, or a file"
-        problem = "are a drive's, which has no file"
+        problem = "belong to a drive, which is not exported"
         raise InvalidArgumentError("gains", problem, value=chosen.name, remedy=remedy)
     return chosen.params
 
@@ -158,7 +158,7 @@ def _c_header(
         prefix=prefix,
         tree=robot.kinematic_tree() if dynamics else None,
     )
-    return _with_followers(robot, exported, "joints of their own in the file; ignore their efforts")
+    return _with_followers(robot, exported, "separate joints in the file; ignore their efforts")
 
 
 def _controllers(

@@ -30,17 +30,6 @@ NO_GROUND = "No ground: links other than the fixed base reach it at the start po
 LEGS = "A robot with legs? Its base is fixed: --base free, or fixed_base=False, puts it on a floor."
 LIMB = 3
 """Joints of the shortest limb."""
-IN_JSON = (
-    "type",
-    "unit",
-    "lower",
-    "upper",
-    "effort_limit",
-    "velocity_limit",
-    "damping",
-    "friction",
-)
-"""Figures of a joint for --json."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,17 +103,13 @@ class Inspection:
     def document(self) -> Document:
         """Return findings, joints and links."""
         masses = self.robot.link_masses
-        joints = {}
-        for joint in self.robot.joints:
-            joints[joint.name] = {name: getattr(joint, name) for name in IN_JSON}
+        joints = {joint.name: {"unit": joint.unit} | asdict(joint) for joint in self.robot.joints}
         return {
             "robot": self.robot.name,
             "mass": sum(link.mass for link in masses.values()),
             "findings": [asdict(finding) for finding in self.findings + self.of_gains],
             "joints": joints,
-            "links": {
-                name: {"mass": link.mass, "source": link.source} for name, link in masses.items()
-            },
+            "links": masses,
         }
 
 

@@ -51,15 +51,12 @@ def view(
     else:
         source = _recorded(play, robot)
     with closing(source), View(source, port=port) as page:
-        if page.port != port:
-            print(f"port {port} is in use; the page is at {page.port}")
         for finding in page.findings:
             print(f"batchpid: {finding}", file=sys.stderr)
         print(f"Open in a browser: {page.url}  (Ctrl-C ends it)", flush=True)
         # Ctrl-C is how a view ends.
         with suppress(KeyboardInterrupt):
             page.run(time_limit)
-        print(f"{page.rate:.0f} frames/s, real-time factor {page.factor:.2f}")
 
 
 def _live(

@@ -107,29 +107,27 @@ def step_responses(
     return figure
 
 
-def efforts(
-    rollout: Rollout, *, joints: Joints = None, mark: int | None = None, title: str = ""
-) -> Figure:
+def efforts(rollout: Rollout, *, joints: Joints = None) -> Figure:
     """Draw, for each joint, efforts against their limit.
 
     Parameters as in :func:`step_responses`.
     """
     run = _blank_failed(rollout)
-    figure, chosen, blocks = _joint_axes([run], joints, 1, title)
+    figure, chosen, blocks = _joint_axes([run], joints, 1)
     for joint, (axes,) in zip(chosen, blocks, strict=True):
-        _draw_efforts(axes, run, joint, mark)
+        _draw_efforts(axes, run, joint, None)
     _add_legend(figure)
     return figure
 
 
-def following_errors(rollout: Rollout, *, joints: Joints = None, title: str = "") -> Figure:
+def following_errors(rollout: Rollout, *, joints: Joints = None) -> Figure:
     """Draw, for each joint, position minus setpoint at the ends of the ticks, where a setpoint
     holds.
 
     Parameters as in :func:`step_responses`.
     """
     run = _blank_failed(rollout)
-    figure, chosen, blocks = _joint_axes([run], joints, 1, title)
+    figure, chosen, blocks = _joint_axes([run], joints, 1)
     for joint, (axes,) in zip(chosen, blocks, strict=True):
         error = run.qpos[..., joint] - run.setpoint[..., joint]
         _draw_fan(axes, run.time, error, None)
@@ -143,7 +141,6 @@ def comparison(
     second: Rollout,
     *,
     labels: tuple[str, str] = ("first", "second"),
-    joints: Joints = None,
     title: str = "",
 ) -> Figure:
     """Draw median and 10 to 90 % of the envs of two runs of the same joints, positions above
@@ -152,7 +149,7 @@ def comparison(
     Raises
     ------
     InvalidArgumentError
-        The runs have different joints, or the robot has no such joint.
+        The runs have different joints.
     """
     info = first.info
     if info.joint_names != second.info.joint_names:
@@ -160,7 +157,7 @@ def comparison(
         remedy = f"compare runs with the joints {', '.join(info.joint_names)}"
         raise InvalidArgumentError("second", problem, remedy=remedy)
     runs = [_blank_failed(first), _blank_failed(second)]
-    figure, chosen, blocks = _joint_axes(runs, joints, 2, title)
+    figure, chosen, blocks = _joint_axes(runs, None, 2, title)
     for joint, (above, below) in zip(chosen, blocks, strict=True):
         for run, colour, label in zip(runs, (ENV, SECOND), labels, strict=True):
             _draw_band(above, run.time, run.qpos[..., joint], colour, label)
@@ -230,7 +227,11 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
 
 
 def _joint_axes(
-    runs: Sequence[Rollout], joints: Joints, rows: int, title: str, labels: Sequence[str] = ()
+    runs: Sequence[Rollout],
+    joints: Joints,
+    rows: int,
+    title: str = "",
+    labels: Sequence[str] = (),
 ) -> tuple[Figure, list[int], list[list[Axes]]]:
     """Return a figure, the indices of the chosen joints, and the axes of each, and of each of
     ``labels``.

@@ -113,8 +113,6 @@ class RunInfo:
     """Motors and sensors at the start, before draws of a randomization; None for ideal ones."""
     start: Rows | None = None
     """Positions before the first tick (envs, joints) [rad or m]."""
-    seed: int | None = None
-    """Seed of the run."""
     versions: Mapping[str, str] | None = None
     """Versions of the packages that results depend on, by name."""
     begun: str | None = None

@@ -12,7 +12,7 @@ from batchpid.sim.tuning.evaluation import (
     step_response_metrics,
 )
 from batchpid.sim.tuning.gain_sets import GainSet, gain_set
-from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
+from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 from batchpid.sim.tuning.search import Tuning, tune
 
 __all__ = [
@@ -30,7 +30,6 @@ __all__ = [
     "load_randomization",
     "random_moves",
     "run_moves",
-    "search_moves",
     "step_response_metrics",
     "tune",
     "tutorial_move",

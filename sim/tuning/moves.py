@@ -51,8 +51,6 @@ LINE = 24
 """Points of a move's line."""
 SAMPLES = 200
 """Samples of the effort in a smooth motion."""
-NEARBY = 0.3
-"""Largest distance of a start pose from the tutorial's [rad or m]."""
 EDGE = 0.02
 """Distance of a move from the joint limits, as a share of the range."""
 PATIENCE = 50
@@ -93,31 +91,6 @@ def tutorial_move(robot: Robot) -> Moves:
         none = np.empty((0, robot.dof))
         return Moves(none, none, ())
     return Moves(robot.settings.start[None], robot.settings.target[None], ("tutorial",))
-
-
-def search_moves(robot: Robot, seed: int = 0) -> Moves:
-    """Return the moves that gains are searched on.
-
-    The tutorial's, where there is one, with the hardest of 64 that start within 0.3 rad [or m] of
-    it; a random move of each kind; and the hardest of 28 more. The hardest needs most time under
-    the effort limits, so it limits how fast the gains may be.
-    """
-    moves = tutorial_move(robot)
-    if robot.settings is not None:
-        spread = np.minimum(NEARBY, (robot.upper - robot.lower) / 4)
-        shift = np.random.default_rng(seed).uniform(-spread, spread, (64, robot.dof))
-        starts = np.clip(robot.settings.start + shift, robot.lower, robot.upper)
-        targets = np.tile(robot.settings.target, (64, 1))
-        moves += _hardest(robot, Moves(starts, targets, ("near the tutorial's",) * 64))
-    drawn = random_moves(robot, 32, seed)
-    moves += drawn.take(range(len(KINDS)))
-    return moves + _hardest(robot, drawn.take(range(len(KINDS), 32)))
-
-
-def _hardest(robot: Robot, moves: Moves) -> Moves:
-    """Return the move that takes longest under the effort limits."""
-    duration = shortest_durations(robot, moves)
-    return moves.take([int(np.argmax(np.where(np.isfinite(duration), duration, -1.0)))])
 
 
 def random_moves(

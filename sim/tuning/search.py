@@ -39,7 +39,7 @@ from batchpid.sim.tuning.candidates import FACTORS, Candidates, Weights
 from batchpid.sim.tuning.comparison import Comparison, compare
 from batchpid.sim.tuning.evaluation import SUBSTEPS, reseeded, tuning_engine
 from batchpid.sim.tuning.gain_sets import GainSet
-from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
+from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,10 +48,8 @@ INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
 HEADROOM = 0.9
 """Share of the effort limits that candidates may use."""
-VARIED_MOVES = 20
-"""Number of random moves in the search for robots that differ from the model."""
-DRAWN_MOVES = 8
-"""The same with drawn motors."""
+SEARCH_MOVES = 12
+"""Number of random moves of the search."""
 FINAL_MOVES = 24
 """Number of moves of the final round."""
 FINALISTS = 3
@@ -92,7 +90,9 @@ class Tuning:
 
     def report(self) -> str:
         """Return the costs, and the table of the :attr:`comparison`."""
-        lines = [f"cost {self.start_cost:.4f} as designed, {self.cost:.4f} as tuned\n"]
+        lines = [
+            f"cost of the designed gains {self.start_cost:.4f}, of the tuned gains {self.cost:.4f}\n"
+        ]
         if self.rejected is not None:
             lines.append(f"The designed gains are the result: {self.rejected}.")
         return "\n".join([*lines, self.comparison.report()])
@@ -148,11 +148,9 @@ def tune(
         Of the terms of the cost. Default: 1 for a second of a step's settling time and 1 for the
         logarithm of the following error.
     moves
-        Default: :func:`batchpid.sim.tuning.moves.search_moves`, and FINAL_MOVES random ones in the
-        final round. For robots with actuators or a randomization, the search uses the tutorial's
-        move and VARIED_MOVES random ones (with drawn ``motors`` DRAWN_MOVES), because the hardest
-        moves within the effort limits of the model are too hard for such robots. Given moves
-        replace them, with contacts, since they may touch something. There is then no final round.
+        Default: the tutorial's move and SEARCH_MOVES random ones, and FINAL_MOVES others in the
+        final round. Given moves replace them, with contacts, since they may touch something. There
+        is then no final round.
     randomization
         Draw the robot of each move, the same for all candidates: a YAML file
         (docs/randomization.md), e.g. `payload: {uniform: [0, 0.5]}`.
@@ -191,7 +189,7 @@ def tune(
         raise InvalidArgumentError(name, problem, remedy=remedy)
     if motors is not None and runner_options.get("actuators") is not None:
         remedy = "leave it out: the control knows the actuators of the robot"
-        raise InvalidArgumentError("actuators", "is given with motors", remedy=remedy)
+        raise InvalidArgumentError("actuators", "cannot be combined with motors", remedy=remedy)
     weights = Weights() if weights is None else weights
     build = runner_options.get("build")
     engine = tuning_engine(build) if engine is None else engine
@@ -204,11 +202,7 @@ def tune(
     fast = Document()
     if moves is None:
         unseen = random_moves(robot, FINAL_MOVES, seed + FINAL_SEED)
-        if differs:
-            count = VARIED_MOVES if motors is None else DRAWN_MOVES
-            moves = tutorial_move(robot) + random_moves(robot, count, seed)
-        else:
-            moves = search_moves(robot, seed)
+        moves = tutorial_move(robot) + random_moves(robot, SEARCH_MOVES, seed)
         if robot.fixed_base and build is None:
             fast = SEARCH_SCENE
 

@@ -28,7 +28,7 @@ from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
 from batchpid.sim.view.view_data import Playback, rows_at
 from batchpid.task_space.frames import matrix_of, rotate
 
-LIGHT = np.array([0.5, 0.2, 0.85]) / np.linalg.norm([0.5, 0.2, 0.85])
+LIGHT = np.array([0.5, 0.2, 0.84])
 """Direction to the light."""
 _FLOOR = "#bdc6d3"
 _GRID = "#d5dae2"

@@ -66,10 +66,6 @@ class View(AbstractContextManager["View"]):
         """Port of the page."""
         self.url = f"http://{HOST}:{gate.port}/{gate.token}/"
         """Address of the page, with the token that opens it."""
-        self.rate = 0.0
-        """Frames per second of wall time."""
-        self.factor = 0.0
-        """Real-time factor."""
         self._stopped = False
         make = partial(
             viser.ViserServer, host=HOST, port=gate.port, verbose=False, label="batchpid"
@@ -103,7 +99,8 @@ class View(AbstractContextManager["View"]):
         panel = self.panel
         began = deadline = lap = time.monotonic()
         count = 0
-        self._show(charts=True)
+        rate = 0.0
+        self._show(True, rate)
         while not self._stopped and (seconds is None or time.monotonic() - began < seconds):
             requested = panel.run_requests()
             running = panel.frames_left > 0
@@ -114,11 +111,10 @@ class View(AbstractContextManager["View"]):
             now = time.monotonic()
             due = running and count % CHARTS_EVERY == 0
             if due:
-                self.rate = CHARTS_EVERY / (now - lap)
-                self.factor = self.rate * data.period
+                rate = CHARTS_EVERY / (now - lap)
                 lap = now
             if running or requested:
-                self._show(charts=requested or due)
+                self._show(requested or due, rate)
             # A late frame is not caught up, which would only hurry the next ones.
             deadline = max(deadline + data.period / panel.speed, now)
             time.sleep(deadline - now)
@@ -137,13 +133,15 @@ class View(AbstractContextManager["View"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _show(self, charts: bool) -> None:
-        """Send the present frame to the pages, and with ``charts`` these and the status."""
+    def _show(self, charts: bool, rate: float) -> None:
+        """Send the present frame to the pages, and with ``charts`` these and the status: ``rate``
+        is the number of frames per second of wall time.
+        """
         frame = self.data.frame()
         self._nodes.update(frame, self.panel.env)
         if charts:
             self._draw_charts()
-            self.panel.update_status(frame, self.factor, self.rate)
+            self.panel.update_status(frame, rate)
 
     def _draw_charts(self) -> None:
         """Draw the recent past of the watched joint."""

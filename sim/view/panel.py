@@ -82,10 +82,13 @@ class Panel:
                 self._problem = html.escape(str(error))
         return count > 0
 
-    def update_status(self, frame: Rollout, factor: float, rate: float) -> None:
-        """Show time, real-time factor, frame rate, and how many robots diverged or saturate."""
+    def update_status(self, frame: Rollout, rate: float) -> None:
+        """Show time, real-time factor, frame ``rate`` [1/s], and how many robots diverged or
+        saturate.
+        """
         data = self._data
         time = float(frame.time[0])
+        factor = rate * data.period
         pace = f"t = {time:.2f} s · {factor:.2f} x real time · {rate:.0f} frames/s"
         saturated = int(frame.saturated.any(-1).sum())
         diverged = int((~frame.ok).sum())

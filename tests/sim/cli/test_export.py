@@ -35,7 +35,7 @@ def test_the_header_is_that_of_the_function(batchpid, tmp_path):
     assert (status, out.read_text()) == (0, exported.text)
     lines = [
         "panda: 9 joints, gains tuned, 1000 Hz",
-        "The file differs in nothing.",
+        "The file has no differences.",
         f"written: {out}",
     ]
     assert said.splitlines() == lines
@@ -44,8 +44,8 @@ def test_the_header_is_that_of_the_function(batchpid, tmp_path):
 def test_followers_are_reported_and_left_out_of_controllers(batchpid, tmp_path):
     path = write(tmp_path, robot(*map(link, "xyz"), joint("a", "x", "y"), MIMIC))
     status, said, _ = batchpid("export", path, "--out", out := tmp_path / "arm.h")
-    assert (status, "\ndiffers: b: followers are joints of their own" in said) == (0, True)
-    assert "\n/* differs: b: followers are joints of their own" in out.read_text()
+    assert (status, "\ndiffers: b: followers are separate joints" in said) == (0, True)
+    assert "\n/* differs: b: followers are separate joints" in out.read_text()
     out = tmp_path / "controllers.yaml"
     status, said, _ = batchpid("export", path, "--to", "ros2_control", "--out", out)
     assert (status, "differs: b: followers are not in the file" in said) == (0, True)

@@ -171,7 +171,7 @@ def written(folder: Path) -> set[Path]:
         ("compare --gains drive:a,b", "DAMPING"),
         ("identify arm.urdf", "logs: are missing"),
         ("identify arm.urdf run.h5 --extras speed", "extras"),
-        ("export panda --gains drive", "gains: are a drive's"),
+        ("export panda --gains drive", "gains: belong to a drive"),
         ("inspect panda2", "'panda2'"),
         ("inspect --gains nothing", "gains: is neither"),
         ("compare arm.urdf --moves 0", "moves: out of range"),

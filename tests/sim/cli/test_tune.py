@@ -29,7 +29,7 @@ SHORT = (
 def few_moves(monkeypatch):
     """Use one random move in the final of a search and in the commands' table."""
     monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
-    monkeypatch.setattr("batchpid.sim.tuning.search.VARIED_MOVES", 1)
+    monkeypatch.setattr("batchpid.sim.tuning.search.SEARCH_MOVES", 1)
     monkeypatch.setattr(
         "batchpid.sim.tuning.comparison.random_moves",
         lambda robot, moves, seed: random_moves(robot, min(moves, 1), seed),

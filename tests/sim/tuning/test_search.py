@@ -29,9 +29,7 @@ SMALL = {"generations": 2, "population": 4, "seconds": 0.1, "engine": "mujoco"}
 @pytest.fixture
 def few_moves(monkeypatch):
     """Search on two moves, with a final on one other."""
-    monkeypatch.setattr(
-        "batchpid.sim.tuning.search.search_moves", lambda robot, seed: random_moves(robot, 2, seed)
-    )
+    monkeypatch.setattr("batchpid.sim.tuning.search.SEARCH_MOVES", 2)
     monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
 
 
@@ -43,7 +41,7 @@ def test_gains_and_implicit_laws_are_refused(panda):
             r"params: .*explicit gains; .*bp\.design_gains makes implicit gains",
         ),
         ({"discretization": "implicit"}, r"discretization: .*explicit gains; .*bp\.design_gains"),
-        ({"motors": motors, "actuators": motors}, "actuators: is given with motors"),
+        ({"motors": motors, "actuators": motors}, "actuators: cannot be combined with motors"),
     ):
         with pytest.raises(InvalidArgumentError, match=message):
             tune(panda, workers=0, **options)
@@ -138,7 +136,7 @@ def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(
 
 
 @pytest.mark.slow
-def test_gains_of_the_search_settle_sooner_than_designed_ones_and_follow_as_closely(panda):
+def test_gains_of_the_search_settle_sooner_than_designed_ones_and_follow_closely(panda):
     found = tune(panda)
     moves = tutorial_move(panda) + random_moves(panda, 20, 1)
     designed, tuned = (
@@ -146,7 +144,7 @@ def test_gains_of_the_search_settle_sooner_than_designed_ones_and_follow_as_clos
         for each in (found.start_params, found.params)
     )
     arm = arm_joints(panda)
-    assert tuned.following_error[:, arm].max() < 1.1 * designed.following_error[:, arm].max()
+    assert tuned.following_error[:, arm].max() < 1e-3
     settling = [each.metrics.settling_time[:, arm].max() for each in (designed, tuned)]
     assert settling[1] < 0.95 * settling[0]
 
