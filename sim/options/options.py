@@ -218,6 +218,7 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def derived(self) -> dict[str, Callable[[Observation], Rows]]:
         """Functions from what the loop observed to further quantities, by name."""
+        # The loop observes joints; the pose of the tool follows from them.
         if not isinstance(self.control, OperationalSpace):
             return {}
         tool_pose = self.control.tool_pose
@@ -245,6 +246,7 @@ class RunnerOptions(RunnerKeywords):
         """
         robot = self.robot
         instance("params", params, bp.PIDParams, "build them with robot.params() or make_params()")
+        # Units of gains are a matter of the law, which other controls do not have.
         if params.gain_units is not None and self.control != "pid":
             problem = f"have no meaning under control {self.control_name!r}"
             remedy = "use control 'pid', or params with gain_units 'effort'"
@@ -279,6 +281,7 @@ class RunnerOptions(RunnerKeywords):
         fitted: bp.Actuators | None = fit_actuators(
             actuators, self.robot, self.num_envs, self.control
         )
+        # Actuators without effect cost time in every sim step.
         if fitted is not None and fitted.is_ideal:
             fitted = None
         if self.randomization is not None:
@@ -298,8 +301,8 @@ class RunnerOptions(RunnerKeywords):
         """
         values = {}
         for name, entry in OPTIONS.items():
-            if place in entry.kept:
-                values[name] = getattr(self, entry.kept[place] or name)
+            if place in entry.places:
+                values[name] = getattr(self, entry.places[place] or name)
         # A recording is read without the classes of the engine and of the randomization.
         if place == "recording":
             values["physics"] = str(self.physics)
@@ -312,7 +315,8 @@ class RunnerOptions(RunnerKeywords):
         """Robot and options that two runners must share to restore each other's snapshots, as plain
         values.
         """
-        robot, command = self.robot, self.own_command
+        robot = self.robot
+        command = self.own_command
         options = {name: _plain(value) for name, value in self.values_for("snapshot").items()}
         return options | {
             **robot.describe(),
@@ -340,6 +344,7 @@ def default_params(
     InvalidArgumentError
         The robot ships no gains and none can be designed: its mass matrix is not positive definite.
     """
+    # Other controls need the effort limits alone.
     if control not in ("pid", "drive"):
         return robot.params(kp=0.0, ki=0.0, kd=0.0)
     settings = robot.settings
