@@ -32,8 +32,8 @@ from batchpid.sim.robot.parts import (
     Settings,
 )
 from batchpid.sim.robot.robot_model import RobotModel
+from batchpid.sim.robot.robot_options import setpoint_guard
 from batchpid.sim.robot.self_collision import SelfContact, Srdf, self_contact
-from batchpid.sim.robot.setpoint_limits import setpoint_guard
 from batchpid.sim.robot.simulated_links import link_masses, rigid_tree
 from batchpid.sim.robot.tables import Body, Tables
 from batchpid.task_space.rigid_tree import RigidTree

@@ -18,11 +18,11 @@ from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.read_only import read_only
 from batchpid.checks.validate import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
-from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Findings, report
 from batchpid.sim.robot.mimics import couple
 from batchpid.sim.robot.parts import DISSIPATION, Joint, Settings
+from batchpid.sim.robot.robot_options import load_robot_actuators
 from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
 from batchpid.sim.robot.urdf import read_robot
 from batchpid.task_space.rigid_tree import RigidTree
