@@ -59,8 +59,9 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     coupled = []
     for index, joint in enumerate(joints):
         low, high = limits[index]
-        dissipation = {"friction": float(friction[index]), "damping": float(damping[index])}
-        coupled.append(replace(joint, lower=low, upper=high, **dissipation))
+        rubs = float(friction[index])
+        damps = float(damping[index])
+        coupled.append(replace(joint, lower=low, upper=high, friction=rubs, damping=damps))
     return tuple(coupled)
 
 
