@@ -25,7 +25,7 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import BAND, known_joints
 from batchpid.sim.signals.quantities import POSE_UNITS, CommandSpec
 from batchpid.task_space import native_law, native_rows
-from batchpid.task_space.frames import pose_error
+from batchpid.task_space.frames import moved, pose_error
 from batchpid.task_space.native_law import BoundOSC
 from batchpid.task_space.osc_params import AXES
 from batchpid.task_space.symmetric import gram, solve
@@ -65,7 +65,8 @@ class OperationalSpace:
     twist, acceleration
         Whether setpoints give the velocity of the tool (m/s and rad/s), and its acceleration, in
         the world: a tool that moves follows its setpoint without the delay kd/kp, and on a circle
-        without the error r w^2/kp.
+        without the error r w^2/kp. They hold, as the pose does, at the end of the tick; within the
+        tick the pose moves with the twist. Without twist it is held.
     wrench
         Whether setpoints give the wrench of the tool on its surroundings (N and N m), in the axes
         of the params' frame.
@@ -238,9 +239,16 @@ class OperationalSpace:
         return None
 
     def _advance(
-        self, state: ts.OSCState, setpoint: Array, qpos: Array, qvel: Array, passive: Array
+        self,
+        state: ts.OSCState,
+        setpoint: Array,
+        qpos: Array,
+        qvel: Array,
+        passive: Array,
+        left: Array = 0.0,
     ) -> tuple[Array, Array, Array]:
         xp = namespace(setpoint, qpos)
+        setpoint = self._carried(setpoint, left)
         aimed = state
         if self._columns.any():
             aimed = state._replace(
@@ -268,14 +276,28 @@ class OperationalSpace:
         )
         return new._replace(posture=state.posture), terms.effort, terms.effort != terms.unsaturated
 
+    def _carried(self, setpoint: Array, left: Array) -> Array:
+        """Return setpoints at the time ``left`` [s] before the end of their tick, to which they
+        move with their twist: :func:`batchpid.sim.loop.control_step.carried` for poses.
+        """
+        if "twist" not in self._parts:
+            return setpoint
+        twist = setpoint[:, 7:13]
+        change: Array = 0.0
+        if "acceleration" in self._parts:
+            change = left * setpoint[:, self._parts["acceleration"]]
+        pose = moved(setpoint[:, :7], -left * (twist - 0.5 * change))
+        parts = [pose, twist - change, setpoint[:, 13:]]
+        return namespace(setpoint).concatenate(parts, axis=-1)
+
     @property
     def is_native(self) -> bool:
         """Whether native code has this law; a subclass may change it."""
         return type(self) is OperationalSpace
 
-    def bound(self, qpos: Array, qvel: Array, passive: Array) -> BoundOSC | None:
-        """Return this controller as a native call on these arrays (envs, dof); None where it must
-        run in Python.
+    def bound(self, qpos: Array, qvel: Array, passive: Array, left: Array) -> BoundOSC | None:
+        """Return this controller as a native call on these arrays (envs, dof), and the time to the
+        end of the tick (); None where it must run in Python.
         """
         if not self.is_native or native_rows.in_use() is None:
             return None
@@ -289,6 +311,7 @@ class OperationalSpace:
             self._friction,
             self._timestep,
             (qpos, qvel, passive),
+            left,
         )
 
     def _coefficients(self, setpoint: Array) -> ts.OSCCoefficients:

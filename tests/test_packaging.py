@@ -18,7 +18,7 @@ from setuptools import find_packages
 from setuptools.config.expand import read_attr
 
 import batchpid
-from batchpid.sim.engine.native.library import TESTED
+from batchpid.sim.engine.sapien.calls import TESTED
 
 ROOT = Path(__file__).parents[1]
 LIMITED_API = "cp311"

@@ -84,7 +84,7 @@ PyObject *kinematics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
 
 // Columns of an array of `law`.
 std::int64_t law_columns(int array, std::int64_t dof) {
-  constexpr int ONE[] = {POSITION_LIMIT, ROTATION_LIMIT, SMALLEST, TASK_SHARE, POSTURE_SHARE, NEAR_SINGULAR};
+  constexpr int ONE[] = {LEFT, POSITION_LIMIT, ROTATION_LIMIT, SMALLEST, TASK_SHARE, POSTURE_SHARE, NEAR_SINGULAR};
   constexpr int SIX[] = {TASK_RATE, TWIST, ACCELERATION, WRENCH, INTEGRAL, KP, KD, C, ACCELERATION_SHARE, KI_DT, KI_DT2,
                          INTEGRAL_LIMIT, SELECTED, FORCE_AXES, NEXT_INTEGRAL, TASK_ERROR, FORCE};
   if (array == TASK_POSE || array == SETPOINT) return POSE;

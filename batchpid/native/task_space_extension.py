@@ -18,7 +18,7 @@ the tool are results.
 LAW = (
     *("pose", "jacobian", "jacobian_rate", "mass_matrix", "bias", "chain"),
     *("setpoint", "qpos", "qvel", "twist", "acceleration", "wrench", "feedforward"),
-    *("damping", "added_inertia", "posture", "integral"),
+    *("damping", "added_inertia", "left", "posture", "integral"),
     *("kp", "kd", "c", "acceleration_share", "ki_dt", "ki_dt2", "posture_kp", "posture_kd"),
     *("limit_kp", "limit_kd", "limit_margin", "limit_low", "limit_high", "integral_limit"),
     *("position_error_limit", "rotation_error_limit", "smallest_eigenvalue", "axes", "force_axes"),

@@ -2,7 +2,7 @@
 
 A frame is a matrix (..., 3, 4): the axes of the frame as columns, and its position. A pose (..., 7)
 is a position and a unit quaternion (w, x, y, z), the order that SAPIEN and viser use. Functions of
-quaternions that follow :func:`pose_error` are for NumPy alone. Products are written as sums of elementwise
+quaternions that follow :func:`compose` are for NumPy alone. Products are written as sums of elementwise
 products: their rounding does not depend on the number of rows, as a library's does.
 """
 
@@ -146,7 +146,20 @@ def pose_error(goal: Array, pose: Array) -> Array:
     return namespace(goal, pose).concatenate([goal[..., :3] - pose[..., :3], turn], axis=-1)
 
 
-def compose(a: Rows, b: Rows) -> Rows:
+def moved(pose: Array, step: Array) -> Array:
+    """Return poses (..., 7) shifted and turned by ``step`` (..., 6) [m, rad], in the axes of the
+    world.
+    """
+    xp = namespace(pose, step)
+    half = 0.5 * step[..., 3:]
+    angle = xp.sqrt((half * half).sum(-1, keepdims=True))
+    # sinc(x) is sin(pi x) / (pi x): without a turn it is 1.
+    turn = xp.concatenate([xp.cos(angle), xp.sinc(angle / np.pi) * half], axis=-1)
+    wxyz = compose(turn, pose[..., 3:])
+    return xp.concatenate([pose[..., :3] + step[..., :3], wxyz], axis=-1)
+
+
+def compose(a: Array, b: Array) -> Array:
     """Return the rotation b followed by a: Hamilton's product of (..., 4) and (..., 4)."""
     aw, ax, ay, az = (a[..., k] for k in range(4))
     bw, bx, by, bz = (b[..., k] for k in range(4))
@@ -154,7 +167,7 @@ def compose(a: Rows, b: Rows) -> Rows:
     x = aw * bx + ax * bw + ay * bz - az * by
     y = aw * by - ax * bz + ay * bw + az * bx
     z = aw * bz + ax * by - ay * bx + az * bw
-    return np.stack([w, x, y, z], axis=-1)
+    return namespace(a, b).stack([w, x, y, z], axis=-1)
 
 
 def inverse(q: Rows) -> Rows:

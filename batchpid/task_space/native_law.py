@@ -57,7 +57,7 @@ def law(
         (qpos, qvel), *_ = prepared(tool.tree, qpos=inputs.qpos, qvel=inputs.qvel)
         inputs = inputs._replace(qpos=qpos, qvel=qvel)
         dynamics_arrays = (read_point(qpos, tool.point),)
-    arrays = (*inputs, None, None, *state, *k[:-1])
+    arrays = (*inputs, None, None, None, *state, *k[:-1])
     if (native := native_rows.for_rows(inputs.qpos, *dynamics_arrays, *arrays)) is None:
         return None
     rows, dof = inputs.qpos.shape
@@ -135,6 +135,7 @@ class BoundOSC:
         friction: tuple[Float64, Float64] | None,
         timestep: float,
         reading: tuple[Float64, Float64, Float64],
+        left: Float64,
     ) -> None:
         qpos, qvel, bias = reading
         (rows, dof), native = qpos.shape, native_rows.in_use()
@@ -144,6 +145,8 @@ class BoundOSC:
         self._given = {
             name: np.zeros((rows, part.stop - part.start)) for name, part in self._parts.items()
         }
+        if "twist" in parts:  # the pose moves within the tick
+            self._given["left"] = left.reshape(1, 1)
         self._posture = np.zeros_like(qpos)
         # The call keeps the addresses of these arrays: they are written in place from now on.
         self.state = {"posture": np.zeros_like(qpos)}

@@ -15,6 +15,7 @@ from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.native_model import NativeModel, passive_force_of
+from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.engine.scene_spec import (
     SceneSpec,
     Variation,
@@ -25,7 +26,7 @@ from batchpid.sim.engine.scene_spec import (
 from batchpid.task_space.rigid_tree import RigidTree
 
 
-class ModelPack(SingleOwner):
+class ModelPack(EnginePack, SingleOwner):
     """Pack of ``size`` robots of ``spec``, numbered from ``first_env``, with mass matrices and
     forces from its model.
 

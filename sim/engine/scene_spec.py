@@ -16,6 +16,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
+from batchpid.sim.robot.contacts import Contacts
 from batchpid.sim.robot.merging import merge_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
@@ -78,6 +79,13 @@ class SceneSpec:
         measured.
         """
         return self.wrenches or ()
+
+    def contact_model(self, ground: bool) -> Contacts:
+        """Return distances of the robot's links, even of one simulated without shapes; ``ground``
+        is at height 0.
+        """
+        ignored = {frozenset(pair) for pair in self.ignored}
+        return Contacts(self.rigid_tree, self.simulated.shapes, ignored, ground)
 
     @property
     def is_alone(self) -> bool:

@@ -20,10 +20,7 @@ def native_obstacle(options: RunnerOptions) -> str:
         return "the controller is one of Python"
     if options.robot.dof > MOST_SUMMED:
         return f"more than {MOST_SUMMED} joints"
-    engine = options.load_engine()
-    if "compiled_steps" in engine.capabilities:
-        return ""
-    return f"the sim steps of {engine.name!r} are calls of Python"
+    return ""
 
 
 def describe(options: RunnerOptions) -> str:

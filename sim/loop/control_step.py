@@ -229,8 +229,8 @@ def _feedforward(layout: Layout, constants: Constants, values: Values) -> Values
 
 def _controller(layout: Layout, constants: Constants, values: Values) -> Values:
     """The caller's own controller; the feedforward is one of its inputs."""
-    setpoint = values.command.setpoint
-    law, returned, *limited = layout.model.controller(values.state.law, setpoint, *values.seen)
+    inputs = values.command.setpoint, *values.seen, values.step.left
+    law, returned, *limited = layout.model.controller(values.state.law, *inputs)
     return values._replace(
         state=values.state._replace(law=law),
         limited=limited[0] if limited else None,

@@ -37,8 +37,10 @@ class OwnController:
         self.name = type(options.control).__name__
         if isinstance(options.control, OperationalSpace):
             self._reporting = options.control.reporting
+            self.implicit = options.control.params.discretization is not None
         else:
             self._reporting = None
+            self.implicit = False
         self._structure: Any = None
 
     def init(self, envs: int) -> dict[str, Rows]:
@@ -70,8 +72,8 @@ class OwnController:
         return rows
 
     def __call__(self, state: Mapping[str, Any], *inputs: Float64) -> tuple[Array, ...]:
-        """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel and passive
-        force.
+        """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel, passive
+        force, and the time to the end of the tick, which only operational-space control takes.
 
         Operational-space control limits efforts itself; a third result are the joints with limited
         efforts (M, dof).
@@ -92,7 +94,7 @@ class OwnController:
     def _called(self, *arguments: Any) -> tuple[Array, ...]:
         if self._reporting is not None:
             return self._reporting(*arguments)
-        state, effort = self._controller(*arguments)
+        state, effort = self._controller(*arguments[:-1])
         return state, effort
 
     def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[Array, ...]:

@@ -34,7 +34,6 @@ from batchpid.sim.loop.step_setup import (
     make_setup,
     reset_friction,
     reset_guard,
-    steps_natively,
     with_friction,
     with_matrix,
     with_params,
@@ -113,7 +112,7 @@ class EnvGroup:
         self._executor: NumPyExecutor | NativeExecutor | XLAExecutor
         if self._options.backend == "jax":
             self._executor = XLAExecutor(setup, state)
-        elif steps_natively(self.pack) and runs_natively(setup):
+        elif self.pack.steps_natively and runs_natively(setup):
             self._executor = NativeExecutor(setup, state, self._last)
         else:
             self._executor = NumPyExecutor(setup, state)

@@ -23,7 +23,7 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
 from batchpid.sim.loop.control_step import COUPLING_STEPS, STAGES, SimStage
-from batchpid.sim.loop.step_setup import Setup, moves_drives, steps_natively
+from batchpid.sim.loop.step_setup import Setup, moves_drives
 from batchpid.sim.loop.step_values import (
     Layout,
     Measured,
@@ -79,7 +79,6 @@ class TickProgram:
         self, setup: Setup, buffers: Buffers, table: Table, noise: Any, reads_force: bool
     ) -> None:
         _, pack, layout, constants, _ = setup
-        assert steps_natively(pack)
         self._setup, self._buffers = setup, buffers
         self._native = native.extension("_gateway")
         self._programs, self._stages = list[Any](), list[interface.Stage]()
@@ -94,8 +93,8 @@ class TickProgram:
             gravity=layout.gravity,
             coriolis=layout.coriolis,
         )
-        left = np.zeros(()) if layout.moves else None
-        self._place(**buffers.measured._asdict(), before=buffers.before, left=left)
+        self._left = np.zeros(())
+        self._place(**buffers.measured._asdict(), before=buffers.before, left=self._left)
         # SAPIEN knows neither measured states nor the model of varied robots.
         if layout.gravity and (layout.measures or not reads_force):
             if layout.measures:
@@ -112,7 +111,7 @@ class TickProgram:
             state=state._replace(law=law, age=None),
             command=buffers.command,
             measured=buffers.measured,
-            step=Step(0, 1, left),
+            step=Step(0, 1, self._left if layout.moves else None),
             seen=buffers.measured,
             noise=noise,
         )
@@ -269,7 +268,7 @@ class TickProgram:
 
     def _add_controller(self, values: Values) -> Values:
         controller: Any = self._setup.options.control
-        self.control = controller.bound(*values.seen)
+        self.control = controller.bound(*values.seen, self._left)
         self.control.set_state(self._buffers.state.law)
         self.tick.control = self.control.address
         outputs = values.outputs._replace(returned=self.control.effort)

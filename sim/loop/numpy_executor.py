@@ -14,7 +14,7 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import COUPLING_STEPS, sim_step
 from batchpid.sim.loop.custom import controller_errors
 from batchpid.sim.loop.faults import is_near
-from batchpid.sim.loop.step_setup import Setup, moves_drives, steps_natively
+from batchpid.sim.loop.step_setup import Setup, moves_drives
 from batchpid.sim.loop.step_values import (
     Constants,
     Layout,
@@ -133,11 +133,10 @@ class EngineSteps:
         self.reads_force = layout.gravity and not layout.measures
         """Whether a reading has the passive force, which is otherwise 0."""
         self._parts = layout.gravity, layout.coriolis
-        self._is_native = steps_natively(setup.pack)
+        self._is_native = setup.pack.steps_natively
         self.native_force = False
         """Whether the native sim step reads the passive force."""
-        # Not isinstance, which would make the pack's native models.
-        if hasattr(setup.pack, "steps_read_force"):
+        if self._is_native:
             self.native_force = self.reads_force and setup.pack.steps_read_force(*self._parts)
         self._step: CompiledStep | None = None
         self._bound: object = None
@@ -168,7 +167,7 @@ class EngineSteps:
 
     def compiled(self) -> CompiledStep:
         """Return the native sim step of the present robots."""
-        pack: Any = self._setup.pack  # a CompiledPack, which takes long to check
+        pack = self._pack
         if self._step is None or self._bound is not pack.calls:
             if self.native_force:
                 parts = self._parts

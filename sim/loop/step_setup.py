@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from functools import partial
 from operator import itemgetter
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import FrictionState
 from batchpid.motors.guard import GuardState
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
-from batchpid.sim.engine.protocol import CompiledPack, EnginePack
+from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.control_step import REFRESH_STEPS, mass_matrix, refreshed, uses_mass_matrix
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.pid_law import PIDLaw
@@ -63,10 +63,11 @@ def make_setup(
     ``motors``, their state, are None without an effect on efforts or measurements.
     """
     parts = options.compensate.split("+")
-    is_pid = options.control == "pid"
+    law = PIDLaw.of(params) if options.control == "pid" else None
     layout = Layout(
         control=options.control if isinstance(options.control, str) else "custom",
-        law=PIDLaw.of(params) if is_pid else None,
+        law=law,
+        implicit=any(part is not None and part.implicit for part in (law, controller)),
         measures=actuators is not None and actuators.measures,
         gravity="gravity" in parts,
         coriolis="coriolis" in parts,
@@ -270,7 +271,7 @@ def model_functions(
     pack: EnginePack, layout: Layout, constants: Constants, controller: OwnController | None
 ) -> Model:
     """Return the functions for NumPy arrays of the robots of ``pack``."""
-    native = steps_natively(pack)
+    native = pack.steps_natively
     model = Model(
         mass_matrix=mass_matrix_of(pack, native),
         joint_mass_matrix=partial(_joint_mass_matrix, pack),
@@ -283,17 +284,11 @@ def model_functions(
         model = model._replace(
             passive_force=lambda qpos, qvel: force(qpos, qvel, *parts, pack.read_base_motion())
         )
-    if steps_natively(pack) and constants.friction.coulomb is not None:
+    if native and constants.friction.coulomb is not None:
         inputs = constants.friction, constants.drive, constants.coupling, constants.timestep
         refresh = NativeRefresh(pack.joint_model, pack.size, pack.armature, *inputs, REFRESH_STEPS)
         model = model._replace(refresh=refresh)
     return model
-
-
-def steps_natively(pack: EnginePack) -> TypeGuard[CompiledPack]:
-    """Return whether native code does the sim steps of ``pack``."""
-    # Not isinstance: of a protocol it costs 50 us, and a restore asks several times.
-    return bool(getattr(pack, "steps_natively", False))
 
 
 def _joint_mass_matrix(pack: EnginePack, qpos: Float64) -> Float64:

@@ -169,8 +169,8 @@ class Model(NamedTuple):
     when: Callable[[Any, Callable[[], Any], Any], Any] = when
     """:func:`when`, or a conditional of JAX."""
     controller: Any = None
-    """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort), and,
-    if it limits efforts itself, the mask of joints with limited efforts.
+    """Caller's own controller: (state, setpoint, qpos, qvel, feedforward, time to the end of the
+    tick) -> (state, effort), and, if it limits efforts itself, the mask of joints with limited efforts.
     """
     noise: Any = None
     """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it
@@ -193,6 +193,8 @@ class Layout(NamedTuple):
     gravity: bool = False
     coriolis: bool = False
     """Parts of the passive force that are compensated."""
+    implicit: bool = False
+    """Whether the law, or operational-space control, is implicit."""
 
     def left(self, index: Any, end: Array, timestep: Array) -> Array:
         """Return the time from the law's setpoint in sim step ``index`` to the end of a tick of
@@ -206,4 +208,4 @@ class Layout(NamedTuple):
     @property
     def late(self) -> int:
         """1 if the law takes its setpoint at the end of a sim step, else 0."""
-        return int(self.control == "drive" or (self.law is not None and self.law.implicit))
+        return int(self.control == "drive" or self.implicit)

@@ -29,7 +29,6 @@ from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.native import xla
-from batchpid.sim.engine.protocol import require
 from batchpid.sim.engine.scene_spec import added_friction
 from batchpid.sim.options.groups import (
     Control,
@@ -120,8 +119,6 @@ class RunnerOptions(RunnerKeywords):
             options = group(**{entry.name: values[entry.name] for entry in fields(group)})
             values.update(vars(options.fit(robot)))
         # What follows takes options of several groups, in an order in which each is fitted once.
-        if self.control == "drive":
-            require(self.load_engine(), "drive", "control")
         if isinstance(self.control, OperationalSpace):
             self._check_tree("control", self.control, "control the joints")
             values["control"] = self.control.in_runner(self.timestep, self.compensate)
@@ -145,9 +142,7 @@ class RunnerOptions(RunnerKeywords):
         reads_force = robot.fixed_base or "base_state" in engine.capabilities
         if "coriolis" not in self.compensate and "partial_force" not in engine.capabilities:
             reads_force = False
-        obstacle = f"{engine.title} has no compiled sim steps"
-        if "compiled_steps" in engine.capabilities:
-            obstacle = engine.native_obstacle() or xla.obstacle()
+        obstacle = engine.native_obstacle() or xla.obstacle()
         floats_with_friction = not robot.fixed_base and robot.friction.any()
         lacking = {
             "backend": obstacle and f"is 'jax'; {obstacle}",

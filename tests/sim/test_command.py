@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from identical import assert_identical
+from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import (
@@ -22,7 +23,6 @@ from batchpid.sim import (
 )
 from batchpid.sim.identification import identify
 from batchpid.sim.tuning import step_response_metrics
-from tests.sim.tiny_urdf import INERTIAL, joint, link, robot, write
 
 N, LENGTH = 5, 1.0
 """Envs, and length of each link [m]; both joints turn about y, and the arm hangs up along z at
@@ -246,28 +246,6 @@ def test_a_failed_env_has_the_neutral_setpoint(arm):
     )
 
 
-def test_nan_efforts_of_a_failed_env_are_contained(arm):
-    """A controller that is NaN at its neutral setpoint cannot harm the others."""
-
-    class Unclipped(Cartesian):
-        def __call__(self, state, setpoint, qpos, qvel, passive):
-            state, effort = super().__call__(state, setpoint, qpos, qvel, passive)
-            return state, np.where((setpoint == 0).all(1, keepdims=True), np.nan, effort)
-
-    for on_fault in ("hold", "reset"):
-        control = Unclipped(("x", "z"))
-        with (
-            make(arm, control, on_invalid_input="contain", on_fault=on_fault) as runner,
-            make(arm, control) as sound,
-        ):
-            with pytest.warns(FaultWarning):
-                seen = runner.step(np.where(np.arange(N)[:, None] == 2, np.nan, goals()))
-            seen, expected = runner.step(goals()), (sound.step(goals()), sound.step(goals()))[1]
-            rows = np.arange(N) != 2
-            np.testing.assert_array_equal(seen.qpos[rows], expected.qpos[rows])
-            assert np.isfinite(seen.qpos).all()
-
-
 # -- snapshots
 # --------------------------------------------------------------------------------------------------
 
@@ -296,16 +274,6 @@ def test_recordings_hold_names_and_units(rollout, tmp_path):
     assert read.setpoint.shape == (12, N, 3)
     assert not read.info.sets_positions
     assert read.for_envs([1, 2]).setpoint.shape == (12, 2, 3)
-
-
-def test_a_recording_plays_back(arm, rollout):
-    pytest.importorskip("viser")
-    from batchpid.sim.view import Playback, View
-
-    playback = Playback(rollout, arm)
-    with View(playback, port=18090) as view:
-        view.run(seconds=0.2)
-    assert playback.frame().time[0] > 0
 
 
 def test_identification_and_metrics_refuse_such_runs(arm, rollout):

@@ -9,11 +9,11 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium.utils.env_checker import check_env, data_equivalence  # noqa: E402
 from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
+from tiny_urdf import LIMIT, gripper, joint, link, robot, write  # noqa: E402
 
 from batchpid.errors import CallOrderError, InvalidArgumentError  # noqa: E402
 from batchpid.sim import FaultWarning, Randomization, Robot, Uniform  # noqa: E402
 from batchpid.sim.gym import ReachVectorEnv  # noqa: E402
-from tests.sim.tiny_urdf import LIMIT, gripper, joint, link, robot, write  # noqa: E402
 
 ID = "batchpid.sim.gym:batchpid/Reach-v0"
 

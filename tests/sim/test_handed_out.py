@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tiny_urdf import gripper, write
 
 import batchpid as bp
 from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Uniform
-from tests.sim.tiny_urdf import gripper, write
 
 
 def arrays(value, path="", seen=None):

@@ -206,13 +206,6 @@ def test_a_snapshot_of_another_controller_is_refused(panda, other):
         runner.restore(snapshot)
 
 
-def test_a_snapshot_fits_an_equal_controller(panda):
-    with osc_runner(panda) as runner:
-        snapshot = runner.snapshot()
-    with osc_runner(panda) as runner:
-        runner.restore(snapshot)
-
-
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_drawn_start_is_the_first_setpoint(mode):

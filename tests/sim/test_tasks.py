@@ -7,11 +7,11 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium import spaces  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
+from tiny_urdf import one_joint, write  # noqa: E402
 
 from batchpid.errors import InvalidArgumentError  # noqa: E402
 from batchpid.sim import Robot, Runner  # noqa: E402
 from batchpid.sim.gym import RobotEnv, RobotVectorEnv  # noqa: E402
-from tests.sim.tiny_urdf import one_joint, write  # noqa: E402
 
 
 class Swing(RobotVectorEnv):

@@ -6,7 +6,7 @@ bit-identically to a robot alone.
 
 The engine takes changed payloads, masses, centers of mass and friction while a robot exists, and
 then moves bit-identically to a robot that was built with them. The loop uses only the members of
-:class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities. Longer than 350 lines because
+:class:`batchpid.sim.engine.protocol.EnginePack`. Longer than 350 lines because
 that is the whole interface between loop and engine.
 """
 
@@ -25,7 +25,8 @@ from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ModelPack
 from batchpid.sim.engine.native.interface import FARTHEST
-from batchpid.sim.engine.native.library import obstacle
+from batchpid.sim.engine.physics import PHYSICS
+from batchpid.sim.engine.protocol import Engine
 from batchpid.sim.engine.sapien.building import (
     RESTITUTION,
     build_scene,
@@ -35,8 +36,14 @@ from batchpid.sim.engine.sapien.building import (
     rounded_tree,
     set_inertia,
 )
-from batchpid.sim.engine.sapien.calls import EngineCalls, NativeCalls, PythonCalls, SapienStep
-from batchpid.sim.engine.sapien.link_sensors import SapienLinkSensors
+from batchpid.sim.engine.sapien.calls import (
+    EngineCalls,
+    NativeCalls,
+    PythonCalls,
+    SapienStep,
+    obstacle,
+)
+from batchpid.sim.engine.sapien.sapien_sensors import SapienLinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
@@ -459,3 +466,14 @@ def _read_drive(joint: Any) -> tuple[tuple[Any, ...], float, float, Float32]:
 def _disable_gravity(robot: Any, disabled: bool) -> None:
     for link in robot.links:
         link.disable_gravity = disabled
+
+
+ENGINE = Engine(
+    name="sapien",
+    title="SAPIEN",
+    capabilities=frozenset({"build", "partial_force", "sapien_dissipation"}),
+    physics=PHYSICS,
+    group_size=4,
+    make_pack=Pack,
+    native_obstacle=obstacle,
+)

@@ -1,92 +1,26 @@
 """Scenes that need no render device, and the content that the user's ``build`` function adds to
 them.
-
-Mirrored collision meshes have separate builders. A URDF mirrors a mesh by a negative scale. PhysX
-requires positive scales of convex meshes, SAPIEN passes on any scale, and the process ends with a
-segmentation fault once two such shapes touch. The mirrored vertices make a sound mesh.
 """
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import sapien
 from sapien.physx import (
     PhysxArticulationLinkComponent,
-    PhysxCollisionShapeConvexMesh,
     PhysxCpuSystem,
     PhysxRigidDynamicComponent,
-    get_default_material,
 )
-from sapien.wrapper.actor_builder import ActorBuilder, CollisionShapeRecord, preprocess_mesh_file
-from sapien.wrapper.articulation_builder import ArticulationBuilder, LinkBuilder
+from sapien.wrapper.actor_builder import ActorBuilder
+from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.arrays.array_types import Array, Float32, SapienScene
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import Build, SceneSpec
-
-
-class MirroringBuilder(ArticulationBuilder):
-    """Articulation builder that builds meshes of negative scale from mirrored vertices."""
-
-    def create_link_builder(self, parent: LinkBuilder | None = None) -> LinkBuilder:
-        """Return a builder of a link below ``parent``."""
-        builder = _LinkBuilder(len(self.link_builders), parent)
-        self.link_builders.append(builder)
-        return builder
-
-
-class _LinkBuilder(LinkBuilder):
-    collision_records: list[CollisionShapeRecord]
-
-    def build_physx_component(self, link_parent: Any = None) -> Any:
-        records = self.collision_records
-        self.collision_records = [record for record in records if min(record.scale) > 0]
-        try:
-            link = super().build_physx_component(link_parent)
-        finally:
-            self.collision_records = records
-        for record in records:
-            if min(record.scale) < 0:
-                _attach(link, record, self.collision_groups)
-        return link
-
-
-def _attach(link: Any, record: CollisionShapeRecord, groups: list[int]) -> None:
-    try:
-        hull = _hull(record.filename)
-    except (
-        RuntimeError
-    ):  # a mesh that SAPIEN cannot read: a shape less than asked for, which build_scene reports
-        return
-    scale = np.abs(record.scale)
-    shape = PhysxCollisionShapeConvexMesh(
-        hull * np.sign(record.scale).astype(np.float32), scale, record.material
-    )
-    shape.local_pose = record.pose
-    shape.set_collision_groups(groups)
-    shape.set_density(record.density)
-    shape.set_patch_radius(record.patch_radius)
-    shape.set_min_patch_radius(record.min_patch_radius)
-    link.attach(shape)
-
-
-@lru_cache(maxsize=256)
-def _hull(filename: str) -> Float32:
-    """Return the vertices (n, 3) of the convex hull of a mesh file, unscaled; SAPIEN, too, reads a
-    file only once.
-    """
-    shape = PhysxCollisionShapeConvexMesh(
-        preprocess_mesh_file(filename), (1, 1, 1), get_default_material()
-    )
-    vertices = np.array(shape.vertices)
-    vertices.setflags(write=False)
-    return vertices
-
 
 Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
 """Links of a robot by name: the entity that each is part of, and its pose in that, None for the
@@ -114,7 +48,7 @@ class HeadlessScene(sapien.Scene):
 
     def create_articulation_builder(self) -> Any:
         """Return a builder of articulations for this scene."""
-        return MirroringBuilder().set_scene(self)
+        return ArticulationBuilder().set_scene(self)
 
     def create_actor_builder(self) -> Any:
         """Return a builder of actors for this scene."""

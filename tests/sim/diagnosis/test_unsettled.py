@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from tiny_urdf import write
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
@@ -24,7 +25,6 @@ from batchpid.sim import (
     read_recording,
     write_recording,
 )
-from tests.sim.tiny_urdf import write
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*outside the joint limits", "ignore:setpoint moves in every tick"

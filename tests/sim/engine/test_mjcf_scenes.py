@@ -14,7 +14,7 @@ pytest.importorskip("mujoco.batch")
 from batchpid.errors import InvalidArgumentError, RobotError  # noqa: E402
 from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
-from batchpid.sim.engine.mujoco.mujoco_engine import ENGINE  # noqa: E402
+from batchpid.sim.engine.mujoco.mujoco_pack import ENGINE  # noqa: E402
 from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation  # noqa: E402
 from batchpid.sim.randomization.distributions import nominal_values  # noqa: E402

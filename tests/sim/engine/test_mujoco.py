@@ -80,7 +80,7 @@ def test_solver_settings_are_those_given(panda):
 
 
 def test_without_mujoco_the_error_names_the_package(panda, monkeypatch):
-    monkeypatch.delitem(sys.modules, "batchpid.sim.engine.mujoco.mujoco_engine", raising=False)
+    monkeypatch.delitem(sys.modules, "batchpid.sim.engine.mujoco.mujoco_pack", raising=False)
     monkeypatch.setitem(sys.modules, "mujoco.batch", None)
     with pytest.raises(MissingDependencyError, match="mujoco"):
         Runner(panda, 1, workers=0, engine="mujoco")

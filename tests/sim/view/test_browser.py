@@ -8,6 +8,8 @@ import pytest
 from batchpid.sim import Runner
 from batchpid.sim.view import LiveSimulation, Playback
 
+pytestmark = pytest.mark.timeout(900)  # each wait for the page has a limit of its own
+
 
 def picture(page):
     """Return a screenshot (height, width, 3)."""
