@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,11 +14,9 @@ from batchpid.arrays.records import frozen
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN, JOINT_SIDE
+from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import Joint
-
-if TYPE_CHECKING:
-    from batchpid.sim.robot.description import RobotDescription
 
 BAND = {"rad": 1e-4, "m": 2e-5}
 """Half width, by the joint's unit, of the band in which the compensation of friction is less than
