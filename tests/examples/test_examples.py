@@ -245,7 +245,6 @@ def test_a_short_training_ends_with_a_picture(run, tmp_path):
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_compilation")
 def test_a_short_training_to_walk_ends_with_a_picture_and_a_recording(run, tmp_path):
-    pytest.importorskip("mujoco")
     files = ("--picture", str(tmp_path / "curve.png"), "--record", str(tmp_path / "walk.h5"))
     text = run(
         "train_walk.py", *SMALL, "--epochs", "1", "--time", "0.2", "--evaluated", "4", *files
@@ -274,7 +273,6 @@ def test_the_trained_policy_reaches_nine_goals_of_ten(run, seed):
 
 @pytest.mark.slow
 def test_a_log_of_mujoco_is_written_with_the_params_that_drove_it(run, tmp_path):
-    pytest.importorskip("mujoco")
     said = run("mujoco_log.py", "panda", "--seconds", "1", "--out", str(tmp_path / "log.csv"))
     header = (tmp_path / "log.csv").read_text().partition("\n")[0].split(",")
     assert header[0] == "time"

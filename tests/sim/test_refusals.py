@@ -35,7 +35,6 @@ from batchpid.sim import (
 )
 from batchpid.sim.options.options import OPTIONS
 
-pytest.importorskip("mujoco.batch")
 DOF, N = ARM.dof, 2
 FREE = robot_with("floating base")
 SAPIENS_OWN = dataclasses.replace(ARM, dissipation="sapien")

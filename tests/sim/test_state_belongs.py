@@ -14,7 +14,6 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Randomization, Robot, Runner, RunnerOptions, Uniform
 from batchpid.sim.gym import ReachVectorEnv
 
-pytest.importorskip("mujoco")
 POSTURE = np.array([0, -0.5, 0, -2.2, 0, 1.8, 0.8, 0.02, 0.02])
 OTHER = {
     "stiffness": {"stiffness": 1000.0},

@@ -130,7 +130,6 @@ def test_gains_are_checked_too(batchpid):
 
 
 def test_inspects_an_mjcf_file(tmp_path, batchpid):
-    pytest.importorskip("mujoco")
     path = tmp_path / "arm.xml"
     link = '<body name="{}"><joint name="hinge" armature=".1"/><geom size=".1" mass="2"/>{}</body>'
     path.write_text(f"<mujoco><worldbody>{link.format('arm', '<site/>')}</worldbody></mujoco>")

@@ -80,7 +80,6 @@ def test_compare_lists_each_set_and_draws_the_first_two(batchpid, tmp_path):
 def test_compare_runs_each_set_in_both_engines(drawn, batchpid, tmp_path, request):
     if not drawn:
         request.getfixturevalue("undrawn")
-    pytest.importorskip("mujoco.batch")
     picture = tmp_path / "two.png"
     flags = ("--moves", 1, "--seconds", 0.9, "--workers", 0, "--picture", picture)
     status, said, error = batchpid(

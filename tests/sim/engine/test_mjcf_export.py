@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 from export_cases import JOINTS, random_params, values
@@ -14,9 +15,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors import actuator_dynamics as motor_model
 from batchpid.motors import guard as guard_model
 from batchpid.sim import Robot, Runner
-
-mujoco = pytest.importorskip("mujoco", "3.17")
-from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf  # noqa: E402
+from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
 
 DT = 1 / 2000
 

@@ -5,19 +5,17 @@ state of an env.
 import dataclasses
 import os
 
+import mujoco
 import numpy as np
 import pytest
 
-mujoco = pytest.importorskip("mujoco")
-pytest.importorskip("mujoco.batch")
-
-from batchpid.errors import InvalidArgumentError, RobotError  # noqa: E402
-from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform  # noqa: E402
-from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
-from batchpid.sim.engine.mujoco.mujoco_pack import ENGINE  # noqa: E402
-from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation  # noqa: E402
-from batchpid.sim.randomization.distributions import nominal_values  # noqa: E402
+from batchpid.errors import InvalidArgumentError, RobotError
+from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform
+from batchpid.sim.engine.mujoco.model_builder import robot_model
+from batchpid.sim.engine.mujoco.mujoco_pack import ENGINE
+from batchpid.sim.engine.physics import SOLVERS
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.randomization.distributions import nominal_values
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits"

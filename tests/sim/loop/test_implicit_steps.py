@@ -86,7 +86,6 @@ def test_its_integral_tracks_too(arm):
 
 
 def test_mujoco_runs_it(arm):
-    pytest.importorskip("mujoco")
     worst, after = largest_error(arm, 1 / 100, params_of(arm, 316.0), engine="mujoco")
     assert worst < 0.15e-3
     assert after < 1e-6

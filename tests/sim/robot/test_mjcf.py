@@ -7,19 +7,17 @@ from __future__ import annotations
 import random
 from contextlib import suppress
 
+import mujoco
 import numpy as np
 import pytest
 
-mujoco = pytest.importorskip("mujoco")
-pytest.importorskip("mujoco.batch")
-
-from batchpid.errors import InvalidArgumentError, RobotError  # noqa: E402
-from batchpid.sim import Robot, Runner, to_urdf  # noqa: E402
-from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
-from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
-from batchpid.sim.engine.protocol import SceneSpec  # noqa: E402
-from batchpid.sim.robot.shapes import surfaces  # noqa: E402
-from batchpid.sim.tuning import gain_set  # noqa: E402
+from batchpid.errors import InvalidArgumentError, RobotError
+from batchpid.sim import Robot, Runner, to_urdf
+from batchpid.sim.engine.mujoco.model_builder import robot_model
+from batchpid.sim.engine.physics import SOLVERS
+from batchpid.sim.engine.protocol import SceneSpec
+from batchpid.sim.robot.shapes import surfaces
+from batchpid.sim.tuning import gain_set
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
@@ -545,7 +543,6 @@ def test_a_mesh_beside_a_missing_one_keeps_its_shape(load, tmp_path):
 
 
 def test_a_default_namespace_changes_nothing(load, tmp_path):
-    pytest.importorskip("trimesh")
     (tmp_path / "part.xml").write_text(
         f'<mujocoinclude xmlns="urn:m"><body name="c">{BOX}</body></mujocoinclude>'
     )
@@ -606,7 +603,6 @@ def test_an_unwritable_cache_is_an_error(load, monkeypatch, tmp_path):
 
 
 def test_is_drawn_by_its_shapes(load):
-    pytest.importorskip("trimesh")
     assert {surface.link for surface in surfaces(load(ARM))} == {
         "base",
         "upper",

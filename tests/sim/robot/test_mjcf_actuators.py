@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 
-mujoco = pytest.importorskip("mujoco")
-pytest.importorskip("mujoco.batch")
-
-from batchpid.errors import RobotError  # noqa: E402
-from batchpid.sim import Robot, Runner, StabilityWarning  # noqa: E402
+from batchpid.errors import RobotError
+from batchpid.sim import Robot, Runner, StabilityWarning
 
 PID = '<extension><plugin plugin="mujoco.pid"/></extension>'
 FILE = """<mujoco>{extension}<compiler angle="radian"/><option timestep="1e-9"/>

@@ -45,8 +45,6 @@ def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
     """5 cm of radius, once in 2 s; the orientation is held. Damping and friction of the joints are
     compensated.
     """
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
     of = request.getfixturevalue(name)
     tool, start = (
         (HAND, START) if name == "panda" else ("l6", np.array([0.3, 0.4, 0.9, 0.2, 0.7, 0.1]))
