@@ -39,7 +39,6 @@ from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
 from batchpid.motors.friction import FrictionState
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.pid_law import half_way
 from batchpid.sim.loop.step_values import (
     Constants,
     Layout,
@@ -48,6 +47,7 @@ from batchpid.sim.loop.step_values import (
     Step,
     StepState,
     Values,
+    half_way,
 )
 
 REFRESH_STEPS = 64

@@ -87,8 +87,7 @@ class OwnController:
         new, returned, *limited = self._called(unflatten(self._structure, state), *copies)
         # Copies again: the controller may change its own arrays at any time.
         leaves = _like(state, flatten(new, read=np.array))
-        effort = np.array(returned, np.float64)
-        _check_effort(effort, inputs[1])
+        effort = _like({"effort": inputs[1]}, {"effort": np.array(returned, np.float64)})["effort"]
         return leaves, effort, *limited
 
     def _called(self, *arguments: Any) -> tuple[Array, ...]:
@@ -109,15 +108,14 @@ class OwnController:
         try:
             state, returned, *limited = self._called(unflatten(self._structure, leaves), *inputs)
             new = _like(leaves, flatten(state, read=jax.numpy.asarray))
-            effort = jax.numpy.asarray(returned, qpos.dtype)
+            efforts = {"effort": jax.numpy.asarray(returned, qpos.dtype)}
         except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
             raise InvalidArgumentError(
                 "control",
                 f"cannot be traced by JAX: {str(error).splitlines()[0]}",
                 remedy="write it in jax.numpy, or use backend='numpy'",
             ) from error
-        _check_effort(effort, qpos)
-        return new, effort, *limited
+        return new, _like({"effort": qpos}, efforts)["effort"], *limited
 
 
 def initial_state(options: RunnerOptions, params: bp.PIDParams) -> Any:
@@ -154,26 +152,12 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
         return unflatten(state := start(), flatten(state))
 
 
-def _check_effort(effort: Array, qpos: Array) -> None:
-    if effort.shape != qpos.shape:
-        # The number of rows depends on the groups.
-        has_rows = effort.shape[:1] == qpos.shape[:1]
-        if has_rows:
-            shape = ("envs", *effort.shape[1:])
-        else:
-            shape = effort.shape
-        problem = f"returned an effort of shape {shape}, not (envs, {qpos.shape[1]})"
-        raise InvalidArgumentError(
-            "control", problem, remedy="return (state, effort), effort of shape (envs, dof)"
-        )
-
-
 def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
-    """Return the arrays of a controller's state in the dtypes of ``before``.
+    """Return the arrays that a controller returned in the dtypes of ``before``.
 
     Raises InvalidArgumentError if names or shapes differ, or a dtype cannot be cast.
     """
-    for name in dict.fromkeys([*before, *leaves]):
+    for name in {**before, **leaves}:
         old: Any = before.get(name)
         new: Any = leaves.get(name)
         is_fit = old is not None and new is not None and new.shape == old.shape
@@ -184,7 +168,7 @@ def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
         ]
         raise InvalidArgumentError(
             "control",
-            "returned a state {!r} of {}, not {}".format(name, *kinds),
-            remedy="return a state as init does",
+            "returned {!r} of {}, not {}".format(name, *kinds),
+            remedy="return (state, effort): a state as init does, an effort of shape (envs, dof)",
         )
     return {name: leaf.astype(before[name].dtype, copy=False) for name, leaf in leaves.items()}

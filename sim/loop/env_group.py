@@ -7,6 +7,7 @@ command that is not finite, a push, the sensors of links, a reset, new params or
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,9 @@ from batchpid.arrays.trees import flatten, leaves, structure, unflatten
 from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.sim.engine.missed_contacts import MissedContacts
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.acting_draws import ActingDraws, variation
-from batchpid.sim.loop.arrays import Arrays, Command, Ticks
+from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.custom import OwnController
-from batchpid.sim.loop.env_parts import LinkSensors, Pushes
+from batchpid.sim.loop.env_parts import ActingDraws, LinkSensors, Pushes, variation
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
 from batchpid.sim.loop.native_program import Table
@@ -61,7 +61,7 @@ class EnvGroup:
         params: bp.PIDParams,
         options: RunnerOptions,
         controller: OwnController | None,
-        ticks: Ticks,
+        arrays: Arrays,
     ) -> None:
         self.pack = pack
         self.envs = envs
@@ -73,7 +73,8 @@ class EnvGroup:
         self._runs_whole = False  # whether the native code runs whole ticks
         self._options = options
         self._controller = controller
-        self._ticks = ticks
+        self._arrays = arrays
+        self._at = cache(arrays.at)  # views at a tick
         self.acting = ActingDraws(options, params)
         self._faults = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._sensors = LinkSensors(options, pack.size)
@@ -85,7 +86,7 @@ class EnvGroup:
         # Results of the last sim step, which outlive executors: native code writes them in each tick.
         shape = (pack.size, pack.dof)
         last = np.zeros(shape, np.float32), np.zeros(shape, bool), np.zeros(shape, bool)
-        self._last = Table(ticks.arrays, *last, self._faults.rows)
+        self._last = Table(arrays, *last, self._faults.rows)
         reads_base = "base_state" in options.load_engine().capabilities and pack.spec.mjcf is None
         is_read = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
         has_parts = bool(self._sensors.values or self._pushes.counts)
@@ -265,7 +266,7 @@ class EnvGroup:
     def _run_tick(self, substeps: int) -> None:
         """Run the present tick, or the rest of it, and observe it."""
         executor = self._executor
-        rows = self._ticks[self.tick]
+        rows = self._at(self.tick)
         done = self._step
         before = self._steps + self.tick * substeps
         command = rows.command
@@ -315,7 +316,7 @@ class EnvGroup:
         """
         if self._contacts is None or first == until:
             return
-        _, observation, fault = self._ticks.arrays.at(slice(first, until))
+        _, observation, fault = self._arrays.at(slice(first, until))
         steps = self._steps + substeps * np.arange(first + 1, until + 1)
         self._contacts.look(
             observation.qpos, steps, self._faults.missed_contact, fault.missed_contact
@@ -338,7 +339,7 @@ class EnvGroup:
 
     def observe_first(self) -> None:
         """Write observation and faults into the first tick, after a change between runs."""
-        self.observe(self._ticks[0])
+        self.observe(self._at(0))
 
     # -- snapshots
 

@@ -222,16 +222,13 @@ class FaultContainment:
         qpos = pack.read_qpos()
         qvel = pack.read_qvel()
         bad = ~(np.abs(qpos) <= FARTHEST) | ~np.isfinite(qvel) | pack.strays()[:, None]
-        # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first
-        # joint.
         failed = bad.any(1, keepdims=True)
-        source = ~np.isfinite(pack.qf) & failed
         if returned is not None:
-            wrong = ~np.isfinite(returned) & failed
-            # Actuators may have delayed it.
-            wrong = np.where(wrong.any(1, keepdims=True), wrong, source)
-            self.fail(wrong, "effort", step, before)
-        self.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, before)
+            # One step after a NaN effort at one joint, all joints are NaN. Actuators may have
+            # delayed it.
+            wrong = ~np.isfinite(returned) | ~np.isfinite(pack.qf)
+            self.fail(wrong & failed, "effort", step, before)
+        self.fail(bad, "state", step, before)
         if speed_limit is not None:
             self.fail((np.abs(qvel) > speed_limit) & ~failed, "speed", step, before)
 

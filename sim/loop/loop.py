@@ -20,11 +20,11 @@ from batchpid.arrays.array_types import Rows
 from batchpid.errors import BatchPIDError, ControllerError, WorkerError
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.loop.acting_draws import make_pack
-from batchpid.sim.loop.arrays import Arrays, Ticks
+from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.backend import native_obstacle
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_group import EnvGroup
+from batchpid.sim.loop.env_parts import make_pack
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks
 from batchpid.sim.loop.snapshot import Snapshot, join_rows
 from batchpid.sim.loop.xla_executor import ROWS
@@ -141,9 +141,9 @@ class Loop:
         # Each group has its own scenes; nothing else in the loop depends on the grouping.
         for first in range(0, count, size):
             rows = slice(first, min(first + size, count))
-            ticks = Ticks(arrays.at((slice(None), rows)))
+            part = arrays.at((slice(None), rows))
             own_params = params.for_envs(rows)
-            group = EnvGroup(self._build(rows), rows, own_params, options, controller, ticks)
+            group = EnvGroup(self._build(rows), rows, own_params, options, controller, part)
             self.groups.append(group)
         self.set_actuators(None if options.actuators is None else options.actuators.for_envs(envs))
         # Packs that share working memory cannot run in one native call.

@@ -146,44 +146,45 @@ class TickProgram:
         outputs = self.outputs
         measured = self._buffers.measured
         none = np.zeros(measured.qpos.shape, bool)
-        copies: list[tuple[str, Rows, Rows]] = [
-            *[
-                ("read", rows, row)
-                for rows, row in zip(command, self._buffers.command, strict=True)
-            ],
-            ("write_floats", seen.qpos, measured.qpos),
-            ("write_floats", seen.qvel, measured.qvel),
-            ("write_floats", seen.effort, outputs.motor),
-            ("write_bytes", seen.ok, np.ones(len(none), bool)),
+        copies: list[tuple[Rows, Rows]] = [
+            (seen.qpos, measured.qpos),
+            (seen.qvel, measured.qvel),
+            (seen.effort, outputs.motor),
+            (seen.ok, np.ones(len(none), bool)),
             # One row, which each tick overwrites.
-            ("write_floats", table.effort[None], outputs.motor),
-            *[("write_bytes", rows, row) for rows, row in zip(fault, table.fault, strict=True)],
+            (table.effort[None], outputs.motor),
+            *zip(fault, table.fault, strict=True),
         ]
         for name in ("saturated", "guarded"):
             mask = getattr(outputs, name)
             if mask is None:
                 mask = none
-            copies.append(("write_bytes", getattr(seen, name), mask))
-            copies.append(("write_bytes", getattr(table, name)[None], mask))
+            copies.append((getattr(seen, name), mask))
+            copies.append((getattr(table, name)[None], mask))
         if seen.base_pose is not None and seen.base_twist is not None:
             pose = np.zeros((len(none), 7))
             twist = np.zeros((len(none), 6))
             self._place(base_pose=pose, base_twist=twist)
-            copies.append(("write_floats", seen.base_pose, pose))
-            copies.append(("write_floats", seen.base_twist, twist))
-        transfers = [
-            self._transfer(kind, rows, row) for kind, rows, row in copies if row is not None
-        ]
+            copies += (seen.base_pose, pose), (seen.base_twist, twist)
+        transfers = [self._transfer(rows, row) for rows, row in copies]
+        for rows, row in zip(command, self._buffers.command, strict=True):
+            if row is not None:
+                transfers.append(self._transfer(rows, row))
         return (interface.Transfer * len(transfers))(*transfers)
 
-    def _transfer(self, kind: str, table: Rows, row: Rows) -> interface.Transfer:
+    def _transfer(self, table: Rows, row: Rows) -> interface.Transfer:
         """Return a copy between a row (M, ...) and the first of the ticks of ``table``."""
-        dtype = {"read": np.float64, "write_floats": np.float32}.get(kind, row.dtype)
+        # Of arrays of numbers only commands have tables in double precision.
+        kind, size = "write_bytes", row.nbytes
+        if row.dtype == np.float64:
+            kind, size = "write_floats", row.size
+            if table.dtype == np.float64:
+                kind = "read"
         return interface.Transfer(
-            table=self._address(table[0], dtype),
+            table=self._address(table[0], table.dtype),
             row=self._address(row, row.dtype),
             stride=0 if len(table) == 1 else table.strides[0],
-            size=row.nbytes if kind == "write_bytes" else row.size,
+            size=size,
             kind=interface.TRANSFERS.index(kind),
         )
 

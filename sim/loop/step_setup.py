@@ -31,8 +31,14 @@ from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, pass
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.control_step import REFRESH_STEPS, mass_matrix, refreshed, uses_mass_matrix
 from batchpid.sim.loop.custom import OwnController
-from batchpid.sim.loop.pid_law import PIDLaw
-from batchpid.sim.loop.step_values import Constants, Layout, Model, ModelledFriction, StepState
+from batchpid.sim.loop.step_values import (
+    Constants,
+    Layout,
+    Model,
+    ModelledFriction,
+    PIDLaw,
+    StepState,
+)
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.mimics import coupling_of

@@ -56,7 +56,6 @@ from batchpid.sim.signals.quantities import (
     observed,
     own_command,
 )
-from batchpid.sim.signals.rollout import RunInfo
 from batchpid.sim.tool_space import OperationalSpace
 
 P = ParamSpec("P")
@@ -140,25 +139,22 @@ class RunnerOptions(RunnerKeywords):
         require_jax()
         engine = self.load_engine()
         robot = self.robot
-        reads_force = robot.fixed_base or "base_state" in engine.capabilities
+        floats = not robot.fixed_base
+        # The program takes the passive force from the engine.
+        lacks_force = floats and "base_state" not in engine.capabilities
         if "coriolis" not in self.compensate and "partial_force" not in engine.capabilities:
-            reads_force = False
+            lacks_force = True
         obstacle = engine.native_obstacle() or xla.obstacle()
-        floats_with_friction = not robot.fixed_base and robot.friction.any()
-        lacking = {
-            "backend": obstacle and f"is 'jax'; {obstacle}",
-            "control": self.control == "drive" and "has no law to compile",
-            "compensate": "gravity" in self.compensate
-            and not reads_force
-            and "needs a passive force of NumPy",
-            "randomization": self.randomization is not None and "is given",
-            "guard": self.guard is not None and "is given",
-            "robot": (not robot.coupling.is_identity and "has coupled joints")
-            or (floats_with_friction and "has a floating base, and joints with friction")
-            or (robot.actuators is not None and "has actuators"),
-        }
-        for argument, problem in lacking.items():
-            if problem:
+        for argument, problem, is_lacking in (
+            ("backend", f"is 'jax'; {obstacle}", obstacle),
+            ("control", "has no law to compile", self.control == "drive"),
+            ("compensate", "needs NumPy's force", lacks_force and "gravity" in self.compensate),
+            ("randomization", "is given", self.randomization is not None),
+            ("guard", "is given", self.guard is not None),
+            ("robot", "has coupled joints", not robot.coupling.is_identity),
+            ("robot", "floats, and has friction", floats and robot.friction.any()),
+        ):
+            if is_lacking:
                 raise _not_in_program(argument, problem)
 
     def _check_tree(self, argument: str, value: object, remedy: str) -> None:
@@ -185,8 +181,7 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def observed(self) -> dict[str, Quantity]:
         """Quantities that the loop observes."""
-        quantities = observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
-        return {name: quantity for name, quantity in quantities.items() if quantity.derive is None}
+        return observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
 
     @property
     def misses_contacts(self) -> bool:
@@ -223,14 +218,10 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def derived(self) -> dict[str, Callable[[Observation], Rows]]:
         """Functions from what the loop observed to further quantities, by name."""
-        derived = {}
-        for name, quantity in observed(self.robot.fixed_base).items():
-            if quantity.derive is not None:
-                derived[name] = quantity.derive
-        if isinstance(self.control, OperationalSpace):
-            tool_pose = self.control.tool_pose
-            derived["tool_pose"] = lambda seen: tool_pose(seen.qpos)
-        return derived
+        if not isinstance(self.control, OperationalSpace):
+            return {}
+        tool_pose = self.control.tool_pose
+        return {"tool_pose": lambda seen: tool_pose(seen.qpos)}
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
@@ -302,8 +293,7 @@ class RunnerOptions(RunnerKeywords):
         """Return the options that are marked with ``place``, by name.
 
         - "snapshot": values that two runners must share to restore each other's snapshots;
-        - "recording": fields of :class:`batchpid.sim.RunInfo`, and in its field "options" the
-          values without a field;
+        - "recording": fields of :class:`batchpid.sim.RunInfo`;
         - "scene": fields of :class:`batchpid.sim.engine.scene_spec.SceneSpec`.
         """
         values = {}
@@ -315,8 +305,6 @@ class RunnerOptions(RunnerKeywords):
             values["physics"] = str(self.physics)
             if self.randomization is not None:
                 values["randomization"] = self.randomization.to_dict()
-            if further := sorted(values.keys() - RunInfo.__annotations__):
-                values["options"] = {name: values.pop(name) for name in further}
         return values
 
     @cached_property

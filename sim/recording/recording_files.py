@@ -221,7 +221,6 @@ READERS: dict[str, Callable[[Any], Any]] = {
     "draws": lambda draws: {name: np.array(rows, np.float64) for name, rows in draws.items()},
     "versions": dict,
     "randomization": dict,
-    "options": dict,
 }
 """Fields of :class:`RunInfo` that are JSON in a recording, and how they are read from it."""
 

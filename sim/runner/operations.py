@@ -22,9 +22,9 @@ from batchpid.arrays.trees import flatten
 from batchpid.checks.validate import env_mask
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.run_checks import SetpointCheck
-from batchpid.sim.loop.acting_draws import effective
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.custom import initial_state
+from batchpid.sim.loop.env_parts import effective
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.loop.snapshot import Snapshot, join_rows
 from batchpid.sim.loop.step_setup import empty_state
@@ -144,7 +144,7 @@ class Run(Operation):
         contacts = state.contacts
         motion = state.motion
         count = outcome.num_ticks
-        are_ok = np.logical_and.reduce(outcome.ticks.arrays.observation.ok[:count], axis=None)
+        are_ok = np.logical_and.reduce(outcome.arrays.observation.ok[:count], axis=None)
         if not are_ok or contacts is not None:
             for arrays in outcome.completed:
                 faults = faults.with_events(arrays)
@@ -190,14 +190,26 @@ class SetActuators(Operation):
 
 
 @dataclass(frozen=True)
-class TakeSnapshot(Operation):
-    """Read the state of every env, and go on as if restored from it."""
+class ReadRows(Operation):
+    """Read the state of every env."""
+
+    changes_loop = False
 
     def apply(self, loop: Loop) -> dict[str, Rows]:
-        return loop.snapshot()
+        return loop.read()
 
     def join(self, results: list[dict[str, Rows]]) -> dict[str, Rows]:
         return join_rows(results)
+
+
+@dataclass(frozen=True)
+class TakeSnapshot(ReadRows):
+    """Read the state of every env, and go on as if restored from it."""
+
+    changes_loop = True
+
+    def apply(self, loop: Loop) -> dict[str, Rows]:
+        return loop.snapshot()
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         return state._replace(steps_since_checkpoint=0)
@@ -229,19 +241,6 @@ class Restore(Operation):
             steps=snapshot.steps,
             steps_since_checkpoint=0,
         )
-
-
-@dataclass(frozen=True)
-class ReadRows(Operation):
-    """Read the state of every env."""
-
-    changes_loop = False
-
-    def apply(self, loop: Loop) -> dict[str, Rows]:
-        return loop.read()
-
-    def join(self, results: list[dict[str, Rows]]) -> dict[str, Rows]:
-        return join_rows(results)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ class RunWarnings:
         self._control = control
         self._stability = StabilityCheck(robot, timestep) if control == "pid" else None
         self._moving = MovingSetpointCheck(robot) if control == "pid" else None
-        self._has_warned_of_fault = self._has_warned_of_contact = False
+        self._issued = set[type[Warning]]()
 
     def check_controller(self) -> None:
         """Warn of such gains of operational-space control."""
@@ -54,15 +54,14 @@ class RunWarnings:
         """
         while lost:
             warn(lost.pop(), RecoveryWarning)
-        if faults.events and not self._has_warned_of_fault:
-            self._has_warned_of_fault = True
-            more = "see runner.faults for more, of which there is no further warning"
-            warn(f"{faults.events[0]}; {more}", FaultWarning)
-        if contacts is not None and contacts.events and not self._has_warned_of_contact:
-            self._has_warned_of_contact = True
+        if faults.events:
+            self._warn_once(f"{faults.events[0]}; see runner.faults for more", FaultWarning)
+        if contacts is not None and contacts.events:
             problem = "without collisions robots went through what they would have touched"
             remedy = "Use collisions=True, or other moves; see runner.missed_contacts for more"
-            text = (
-                f"{problem}: {contacts.events[0]}. {remedy}, of which there is no further warning"
-            )
-            warn(text, MissedContactWarning)
+            self._warn_once(f"{problem}: {contacts.events[0]}. {remedy}", MissedContactWarning)
+
+    def _warn_once(self, text: str, kind: type[Warning]) -> None:
+        if kind not in self._issued:
+            self._issued.add(kind)
+            warn(f"{text}, of which there is no further warning", kind)

@@ -141,11 +141,10 @@ class Runner(SingleOwner):
 
     def __repr__(self) -> str:
         options = self.options
-        where = f"{len(self.nodes) or len(self.pids)} {'nodes' if self.nodes else 'workers'}"
         state = "closed" if self.closed else f"at {self.time:g} s"
         return (
-            f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control"
-            f" {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
+            f"Runner({self.robot.name}, {self.num_envs} envs, {options.workers} workers,"
+            f" control {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
             f" {self.substeps} substeps, {state})"
         )
 
@@ -724,7 +723,7 @@ class Runner(SingleOwner):
     def _max_ticks(self) -> int:
         """Return the number of ticks that one request may have: none beyond the next checkpoint."""
         left = CHECKPOINT_STEPS - self._state.steps_since_checkpoint % CHECKPOINT_STEPS
-        return min(len(self._pool.ticks), -(-left // self.options.substeps))
+        return min(len(self._pool.arrays.observation.ok), -(-left // self.options.substeps))
 
 
 _PARAMETERS = signature(RunnerOptions).parameters.items()

@@ -2,8 +2,7 @@
 
 A sensor is one line of :class:`Observation`: dtype, text, unit, columns, and the option that it
 belongs to. Shared memory, snapshots, recordings and rollouts take names and shapes from that line.
-Its value comes from ``EnvGroup.observe``, from the engine's sensors of links, or from the function
-``derive`` of the line, if it follows from other quantities.
+Its value comes from ``EnvGroup.observe``, or from the engine's sensors of links.
 """
 
 from __future__ import annotations
@@ -122,10 +121,6 @@ class Quantity(NamedTuple):
     """
     links: tuple[str, ...] | None = None
     """These links."""
-    derive: Callable[[Any], Rows] | None = None
-    """Function from an observation, for a quantity that follows from the others; None for a
-    quantity that the loop reads.
-    """
 
     def shape(self, joints: tuple[int, ...]) -> tuple[int, ...]:
         """Return the shape of this quantity where that of a quantity per joint is ``joints`` (...,

@@ -135,8 +135,6 @@ class RunInfo:
     """
     urdf: str | None = field(default=None, repr=False)
     """Robot of a recording, as :func:`batchpid.sim.to_urdf` writes it, to be drawn."""
-    options: Mapping[str, Any] | None = None
-    """Further options of the runner that recordings keep, by name."""
 
     @classmethod
     def of(cls, robot: Any, **options: Any) -> RunInfo:

@@ -148,7 +148,7 @@ class NodeWorker(Worker):
         self._cluster = cluster
         self._arrays = Arrays.from_fields(shared.arrays)
         ticks = len(self._arrays.observation.ok)
-        self._message = pickled((pool_type, start, ticks), start.options)
+        self._message = pickled((pool_type, start, ticks))
         self._actor: Any = None
         self.info: NodeInfo | None = None
         """Known when the node has started."""

@@ -287,11 +287,11 @@ def test_a_controller_that_has_run_here_can_be_sent_to_workers(panda):
     assert_identical(rollout(panda, controller, workers=2), here)
 
 
-def test_an_error_names_the_option_that_cannot_be_sent(panda):
+def test_an_error_says_that_a_controller_cannot_be_sent(panda):
     controller = KeepsDynamics()
     controller.lock = threading.Lock()
     with pytest.raises(
         InvalidArgumentError,
-        match=r"^control: cannot be sent to a worker process.* or pass workers=0",
+        match=r"^control or build: cannot be sent to a worker process.* or pass workers=0",
     ):
         rollout(panda, controller, workers=1)
