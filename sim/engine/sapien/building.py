@@ -25,9 +25,8 @@ from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
 from batchpid.sim.robot.self_collision import Words, link_groups
 from batchpid.sim.robot.simulated_links import rigid_tree
 from batchpid.sim.robot.tables import Body, Shape, Tables
-from batchpid.task_space.frames import from_rpy, matrix_of
+from batchpid.task_space.frames import SpatialInertia, from_rpy, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.spatial_inertia import SpatialInertia
 
 FASTEST = 1000.0
 """Largest speed of links and joints [m/s or rad/s]. PhysX's defaults stop links at 10 m/s and 50
