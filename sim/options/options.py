@@ -44,10 +44,9 @@ from batchpid.sim.options.groups import (
     option,
 )
 from batchpid.sim.randomization.checks import check_params, prepared_actuators
-from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.setpoint_limits import fit_guard
+from batchpid.sim.robot.robot_options import fit_actuators, fit_guard, known_joints
 from batchpid.sim.signals.quantities import (
     CommandSpec,
     Observation,
@@ -262,7 +261,7 @@ class RunnerOptions(RunnerKeywords):
         return frozen(params)
 
     def check_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
-        """Return ``actuators`` as :func:`batchpid.sim.robot.actuator_checks.fit_actuators` does;
+        """Return ``actuators`` as :func:`batchpid.sim.robot.robot_options.fit_actuators` does;
         None if every effect is off.
 
         None selects the robot's own actuators; control "drive" uses only their friction and
