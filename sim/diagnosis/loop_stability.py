@@ -20,9 +20,9 @@ from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.implicit import as_explicit
-from batchpid.sim.robot.actuator_checks import known_joints
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.parts import DISSIPATION
+from batchpid.sim.robot.robot_options import known_joints
 
 
 class StabilityReport(NamedTuple):
