@@ -74,13 +74,14 @@ class Differences(list[str]):
 
     def _in_efforts(self, params: PIDParams, inertia: ArrayLike | None) -> PIDParams:
         """Return the params with gains in effort units."""
+        if inertia is not None:
+            poses = _inertia(inertia, self.joints)
         if params.gain_units is None:
             return params
         if inertia is None:
             problem = "is missing for gains per mass_matrix"
             remedy = "pass inertia=, the diagonal of the mass matrix, or gains in effort units"
             raise InvalidArgumentError("inertia", problem, remedy=remedy)
-        poses = _inertia(inertia, self.joints)
         # The gains fit the first pose; the others show how far they are off elsewhere.
         ratio = poses / poses[0]
         text = f"gains per mass_matrix are efforts at one inertia: {self.listed(poses[0])} kg m^2"
