@@ -63,9 +63,7 @@ class Differences(list[str]):
         # No target has the implicit law, but all can have its gains at one time step.
         explicit = as_explicit(params, self.dt)
         if explicit is not params:
-            share = explicit.kp[0] / np.where(params.kp[0] > 0, params.kp[0], np.inf)
-            text = f"gains of the explicit law at dt = {self.dt:g} s, for no other step: kp times"
-            text = f"{text} {self.listed(np.where(params.kp[0] > 0, share, 1.0))}"
+            text = f"gains of the explicit law at dt = {self.dt:g} s, for no other step"
             if params.ki is not None and np.any(params.ki > 0):
                 text += "; the integral takes the setpoint for the beginning of a step, a lead of"
                 text += " dt times its rate"
