@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Array
-from batchpid.native.operations import OPERATIONS
+from batchpid.native.extensions import OPERATIONS
 from batchpid.native.tracing import Trace
 
 _EXPRESSIONS = {

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import DType, Rows
-from batchpid.native.extensions import StaleExtensionError, load
-from batchpid.native.operations import PROGRAM
+from batchpid.native.extensions import PROGRAM, StaleExtensionError, load
 from batchpid.native.tracing import Trace
 
 NUMBERS_PER_THREAD = 2**17

@@ -16,7 +16,7 @@
 
 namespace batchpid {
 
-// Arrays of `law`: LAW in task_space_extension.py.
+// Arrays of `law`: LAW in extensions.py.
 enum Law {
   TASK_POSE, TASK_JACOBIAN, TASK_RATE, TASK_MASS, TASK_BIAS, CHAIN,
   SETPOINT, LAW_QPOS, LAW_QVEL, TWIST, ACCELERATION, WRENCH, FEEDFORWARD,

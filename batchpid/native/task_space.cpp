@@ -41,7 +41,7 @@ PyObject *make_tree(PyObject *, PyObject *arguments) {
   return capsule_of(std::move(made));
 }
 
-// Arrays of `kinematics`: KINEMATICS in task_space_extension.py.
+// Arrays of `kinematics`: KINEMATICS in extensions.py.
 enum Kinematics { QPOS, QVEL, TOOL, TOOL_POSE, JACOBIAN, JACOBIAN_RATE, MASS_MATRIX, BIAS, KINEMATICS };
 
 // Write results that are asked for; `body` is the body of the tool, or -1 for the base.
@@ -233,7 +233,7 @@ PyObject *search(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
-// Arrays of `move`: MOVE in task_space_extension.py; the first two are changed.
+// Arrays of `move`; the first two are changed.
 enum Move { AT, RATE, INERTIA, PUSH, ADDED, LOWER_END, UPPER_END, MOVE };
 
 // Step joints: sim/identification/simulator.py.

@@ -12,7 +12,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import DType
 from batchpid.arrays.trees import filled, leaves
-from batchpid.native.operations import OPERATIONS
+from batchpid.native.extensions import OPERATIONS
 from batchpid.native.symbols import Namespace, Symbol
 
 _Operation = tuple[str, tuple[Symbol, ...], Symbol]

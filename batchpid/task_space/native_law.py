@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Document, Float64
-from batchpid.native.task_space_extension import LAW
+from batchpid.native.extensions import LAW
 from batchpid.task_space import native_rows
 from batchpid.task_space.osc_coefficients import OSCCoefficients
 from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDynamics, Tool
@@ -103,10 +103,10 @@ def _of_tree(
     """Return the arguments of ``law`` and ``bind`` between sizes and arrays, and the chain to the
     tool (dof,).
     """
-    constants = native_rows.native_tree(native, tree)
     index = tree.index(link)
     body = tree.link_bodies[index]
-    fixed = k.frame is not None, constants.tree, body, native_rows.tool(constants, index, point)
+    capsule = native_rows.native_tree(native, tree)
+    fixed = k.frame is not None, capsule, body, native_rows.tool(tree, index, point)
     return fixed, np.array(tree.chains[body], np.float64)
 
 

@@ -92,7 +92,7 @@ class NativeModel:
         """Add spatial inertias (size, 6, 6) to links, by name, of the robots ``rows`` of ``size``
         in place.
 
-        They are :func:`batchpid.task_space.spatial_inertia.spatial_matrix`, in the axes of the
+        They are :func:`batchpid.task_space.frames.spatial_matrix`, in the axes of the
         links.
         """
         tree = self._pack.rigid_tree

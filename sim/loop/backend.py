@@ -4,7 +4,7 @@ why.
 
 from __future__ import annotations
 
-from batchpid.native.operations import MOST_SUMMED
+from batchpid.native.extensions import MOST_SUMMED
 from batchpid.sim.engine import native
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.tool_space import OperationalSpace

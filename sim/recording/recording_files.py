@@ -221,7 +221,6 @@ READERS: dict[str, Callable[[Any], Any]] = {
     "draws": lambda draws: {name: np.array(rows, np.float64) for name, rows in draws.items()},
     "versions": dict,
     "randomization": dict,
-    "options": dict,
 }
 """Fields of :class:`RunInfo` that are JSON in a recording, and how they are read from it."""
 
@@ -240,7 +239,10 @@ def attributes(info: RunInfo) -> Document:
             if isinstance(value, CommandSpec):
                 value = value.names, value.units
             value = json.dumps(value, default=np.ndarray.tolist)
-        values[name] = list(value) if isinstance(value, tuple) else value
+        if isinstance(value, tuple):
+            values[name] = list(value)
+        else:
+            values[name] = value
     return values
 
 

@@ -22,7 +22,7 @@ from batchpid.io.files import write_atomically
 from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.meshes import note_meshes, read_mesh
 from batchpid.sim.robot.tables import Shape
-from batchpid.task_space.spatial_inertia import SpatialInertia
+from batchpid.task_space.frames import SpatialInertia
 
 
 def hull(shape: Shape) -> Float64:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Float64
-from batchpid.task_space.spatial_inertia import SpatialInertia
+from batchpid.task_space.frames import SpatialInertia
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 """URDF joint types that SAPIEN turns into degrees of freedom."""

@@ -29,8 +29,7 @@ from batchpid.arrays.read_only import read_only
 from batchpid.motors import Actuators
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.parts import DisabledPair, FileDefaults, Joint, MjcfFile, Placement
-from batchpid.task_space.frames import matrix_of
-from batchpid.task_space.spatial_inertia import SpatialInertia
+from batchpid.task_space.frames import SpatialInertia, matrix_of
 
 ORIGIN = read_only(np.zeros(3))
 NO_TURN = read_only(np.array([1.0, 0.0, 0.0, 0.0]))

@@ -2,8 +2,7 @@
 
 A sensor is one line of :class:`Observation`: dtype, text, unit, columns, and the option that it
 belongs to. Shared memory, snapshots, recordings and rollouts take names and shapes from that line.
-Its value comes from ``EnvGroup.observe``, from the engine's sensors of links, or from the function
-``derive`` of the line, if it follows from other quantities.
+Its value comes from ``EnvGroup.observe``, or from the engine's sensors of links.
 """
 
 from __future__ import annotations
@@ -96,6 +95,7 @@ def own_command(control: object) -> CommandSpec | None:
     InvalidArgumentError
         The attribute is neither a CommandSpec nor a sequence of names.
     """
+    # A control that is a word has no attribute of this name.
     command = getattr(control, "command", None)
     if command is None or isinstance(command, CommandSpec):
         return command
@@ -122,10 +122,6 @@ class Quantity(NamedTuple):
     """
     links: tuple[str, ...] | None = None
     """These links."""
-    derive: Callable[[Any], Rows] | None = None
-    """Function from an observation, for a quantity that follows from the others; None for a
-    quantity that the loop reads.
-    """
 
     def shape(self, joints: tuple[int, ...]) -> tuple[int, ...]:
         """Return the shape of this quantity where that of a quantity per joint is ``joints`` (...,
@@ -133,9 +129,13 @@ class Quantity(NamedTuple):
         """
         if self.columns is None:
             return joints
-        rows = () if self.links is None else (len(self.links),)
-        columns = (len(self.columns),) if self.columns else ()
-        return (*joints[:-1], *rows, *columns)
+        # Links stand between the envs and the columns.
+        shape = joints[:-1]
+        if self.links is not None:
+            shape += (len(self.links),)
+        if self.columns:
+            shape += (len(self.columns),)
+        return shape
 
     def unit_for(self, position: str) -> str:
         """Return the unit for a joint whose position is in ``position``, "rad" or "m"."""
@@ -268,10 +268,8 @@ def untouched(num_envs: int, observed: Mapping[str, Quantity]) -> dict[str, Rows
 
 def failed_envs(ok: Bool) -> str:
     """Return in words how many envs failed in ``ok`` (..., envs)."""
-    if ok.size:
-        failed = int((~ok.reshape(-1, ok.shape[-1]).all(0)).sum())
-    else:
-        failed = 0
+    # Rows are ticks: an env that failed in one of them counts once.
+    failed = int((~ok.reshape(-1, ok.shape[-1])).any(0).sum())
     if failed:
         return f"{failed} failed"
     return "all ok"

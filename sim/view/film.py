@@ -164,7 +164,9 @@ def write_film(
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         for row in rows if progress is None else progress(rows):
-            base = None if rollout.base_pose is None else rollout.base_pose[row]
+            base = None
+            if rollout.base_pose is not None:
+                base = rollout.base_pose[row]
             yield painter.picture(rollout.qpos[row], base)
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -34,7 +34,7 @@ from batchpid.sim.engine.physics import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import add_geom
 from batchpid.sim.robot.parts import CONTACT_FRICTION, Joint, MjcfFile
-from batchpid.task_space.spatial_inertia import SpatialInertia
+from batchpid.task_space.frames import SpatialInertia
 
 FLOATING = 6
 """Degrees of freedom of a floating base, which come first in MuJoCo's arrays."""

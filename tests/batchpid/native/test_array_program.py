@@ -23,7 +23,7 @@ from batchpid.motors import delay
 from batchpid.native import array_program
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
-from batchpid.native.operations import OPERATIONS
+from batchpid.native.extensions import OPERATIONS
 from batchpid.native.symbols import Namespace, Symbol
 from batchpid.native.tracing import trace
 

@@ -11,7 +11,7 @@ import pytest
 from identical import assert_identical
 
 from batchpid.native import availability, extensions
-from batchpid.native.operations import PROGRAM
+from batchpid.native.extensions import PROGRAM
 from batchpid.sim import Runner
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import EXTENSIONS
