@@ -14,8 +14,7 @@ from batchpid.sim import Finding, Robot
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.parts import HEADERS, joint_rows
-from batchpid.sim.tuning.comparison import table
-from batchpid.sim.tuning.gain_sets import gain_set
+from batchpid.sim.tuning.comparison import gain_set, table
 
 SOURCES = {
     "inertial": "<inertial>",
@@ -144,7 +143,8 @@ def limbs(robot: Robot) -> int:
     sizes = Counter[str]()
     # Of each joint, the first moving joint on the way from the root.
     for joint in robot.joints:
-        first, link = joint.name, joint.parent_link
+        first = joint.name
+        link = joint.parent_link
         while link in above:
             first = above[link].name if above[link].moves else first
             link = above[link].parent_link

@@ -81,7 +81,9 @@ class RunReport:
             good = self.rollout.ok.all(0)
         else:
             good = settled_envs(self.rollout, self.robot)
-        return 0 if good.any() else NOT_SETTLED
+        if good.any():
+            return 0
+        return NOT_SETTLED
 
     @cached_property
     def columns(self) -> tuple[Sequence[str], Sequence[str], dict[str, Rows]]:
@@ -109,7 +111,9 @@ class RunReport:
             if has_effort:
                 figures["saturation_share"] = rollout.saturated.mean(0)
             return robot.joint_names, robot.units, figures
-        start = robot.start if rollout.info.start is None else rollout.info.start.astype(float)
+        start = robot.start
+        if rollout.info.start is not None:
+            start = rollout.info.start.astype(float)
         metrics = step_response_metrics(robot, rollout, start, with_effort=has_effort)
         overshoot = overshoot_of_settled(metrics.overshoot, metrics.settling_time)
         return robot.joint_names, robot.units, metrics._asdict() | {"overshoot": overshoot}

@@ -19,11 +19,10 @@ import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
-from batchpid.gains.stability import Oscillation, oscillation
 from batchpid.law.implicit import as_explicit
-from batchpid.sim.robot.actuator_checks import known_joints
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.parts import DISSIPATION
+from batchpid.sim.robot.robot_options import known_joints
 
 
 class StabilityReport(NamedTuple):
@@ -50,8 +49,7 @@ def _loop(
     timestep: float,
     actuators: bp.Actuators | None,
 ) -> Document:
-    """Return plant and gains at ``qpos`` (dof,), by the names of :func:`batchpid.stability_bound`,
-    and "ki".
+    """Return plant and gains at ``qpos`` (dof,), by the names of :func:`batchpid.stability_bound`.
 
     Arrays are (1 or envs, n, ...) of the independent joints. Strength of the motors is part of the
     gains, or of the model.
@@ -60,29 +58,24 @@ def _loop(
     motors = actuators or bp.Actuators()
     coupling = robot.coupling
 
-    def column(leaf: Array, neutral: float = 0.0) -> Float64:
+    def table(leaf: Array, neutral: float = 0.0) -> Float64:
         if leaf is None:
-            rows = np.full((1, robot.dof), neutral)
-        else:
-            rows = np.asarray(leaf, np.float64)
-        return np.broadcast_to(rows, (len(rows), robot.dof))[:, coupling.independent]
+            return np.full((1, robot.dof), neutral)
+        rows = np.atleast_2d(np.asarray(leaf, np.float64))
+        return np.broadcast_to(rows, (len(rows), robot.dof))
+
+    def column(leaf: Array, neutral: float = 0.0) -> Float64:
+        return table(leaf, neutral)[:, coupling.independent]
 
     def matrix(armature: Array) -> Float64:
-        if armature is None:
-            rows = np.zeros(robot.dof)
-        else:
-            rows = np.asarray(armature, np.float64)
-        inertia = np.atleast_2d(rows)[:, None] * np.eye(robot.dof)
+        inertia = table(armature)[:, None] * np.eye(robot.dof)
         return coupling.reduced(robot.mass_matrix(qpos) + inertia)
 
-    loop: Document = {name: column(getattr(params, name)) for name in ("kp", "ki", "kd")}
+    loop: Document = {name: column(getattr(params, name)) for name in ("kp", "kd")}
     eye = np.eye(loop["kp"].shape[1])
     strength = column(motors.strength, 1.0)
-    if motors.viscous is None:
-        viscous = np.zeros((1, robot.dof))
-    else:
-        viscous = motors.viscous
-    damping = np.stack([coupling.reduced_damping(robot.damping + row) for row in viscous])
+    viscous = robot.damping + table(motors.viscous)
+    damping = np.stack([coupling.reduced_damping(row) for row in viscous])
     if params.gain_units is None:
         loop = {name: strength * gain for name, gain in loop.items()}
         loop |= {"mass_matrix": matrix(motors.armature), "damping": damping}
@@ -115,17 +108,13 @@ def stability_report(
     friction count; rows are envs, as of the params.
     """
     loop = _loop(robot, params, qpos, timestep, actuators)
-    del loop["ki"]
     rows = max(len(leaf) for leaf in loop.values())
     mass_matrix = np.broadcast_to(loop.pop("mass_matrix"), (rows, *loop["kp"].shape[1:] * 2))
     bound = bp.stability_bound(mass_matrix, dt=timestep, **loop)
     worst = int(np.argmax(bound.ratio))
     ratio = float(bound.ratio[worst])
     effect = "efforts alternate from step to step, and the joint chatters or diverges"
-    if ratio:
-        remedy = f"use at most {0.5 / ratio:.1g} times these gains"
-    else:
-        remedy = ""
+    remedy = f"use at most {0.5 / max(ratio, 1e-9):.1g} times these gains"
     if np.isinf(ratio):
         remedy = "use a kd that is larger than kp times the delay and lag"
     if loop["delay"].any() or loop["lag"].any():
@@ -137,18 +126,6 @@ def stability_report(
         remedy += ", discretization='implicit'"
     shares = robot.coupling.of_all(bound.participation[worst])
     return StabilityReport(ratio, shares, worst, effect, f"{remedy} or robot.designed()")
-
-
-def slow_oscillation(
-    robot: RobotDescription, params: bp.PIDParams, qpos: Float64, timestep: float, env: int
-) -> Oscillation:
-    """Return the least damped oscillation that lasts, of one env's ``params`` at ``qpos`` (dof,),
-    with ideal motors.
-    """
-    loop = _loop(robot, params.for_envs(slice(env, env + 1)), qpos, timestep, None)
-    loop = {name: leaf[0] for name, leaf in loop.items() if name not in ("delay", "lag")}
-    slowest = oscillation(dt=timestep, **loop)
-    return slowest._replace(participation=robot.coupling.of_all(slowest.participation))
 
 
 class StabilityWarning(UserWarning):
@@ -190,7 +167,6 @@ class StabilityCheck:
             motors = actuators.for_envs(slice(0, MOST))
         if params.num_envs > 1 and motors is not None:
             params = params.for_envs(slice(0, MOST))
-        rows = max(params.num_envs, 1 if motors is None else motors.num_envs)
         start = self._robot.start
         try:
             report = stability_report(self._robot, params, start, self._timestep, motors)
@@ -200,7 +176,9 @@ class StabilityCheck:
         is_beyond = report.robot_ratio >= 1
         if is_beyond and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
-            env = f", env {report.env}" if rows > 1 else ""
+            env = ""
+            if report.env:
+                env = f", env {report.env}"
             warn(
                 f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the"
                 f" sampled PID loop, mostly of joint {joint!r}{env}, at the start pose with a time"

@@ -112,23 +112,19 @@ class MissedContacts:
         The step of the first one of a robot is written into ``first`` (size,), where that is 0,
         and into the rows of ``tables`` (ticks, size) from there on.
         """
-        rows = np.flatnonzero(first == 0)
-        ticks = np.zeros(len(rows), np.intp)
-        while rows.size:
-            # Most robots move too little in all ticks together, which is seen at once.
-            moved = np.abs(qpos[:, rows] - self._centers[rows])
-            may_close = (moved.max(axis=0) @ self._arms.T >= self._margins[rows]).any(axis=1)
-            rows, ticks = rows[may_close], ticks[may_close]
-            closes = (moved[:, may_close] @ self._arms.T >= self._margins[rows]).any(axis=2)
-            closes &= np.arange(len(qpos))[:, None] >= ticks
-            may_close = closes.any(axis=0)
-            rows, ticks = rows[may_close], closes.argmax(axis=0)[may_close]
+        # Most robots move too little in all ticks together, which is seen at once.
+        moved = np.abs(qpos - self._centers).max(axis=0)
+        if not (moved @ self._arms.T >= self._margins).any():
+            return
+        for tick, pose in enumerate(qpos):
+            rows = np.flatnonzero(first == 0)
+            moved = np.abs(pose[rows] - self._centers[rows])
+            rows = rows[(moved @ self._arms.T >= self._margins[rows]).any(axis=1)]
             if rows.size:
-                self._search(qpos[ticks, rows], rows)
-            missed = (self._margins[rows] < 0).any(axis=1)
-            for row, tick in zip(rows[missed].tolist(), ticks[missed].tolist(), strict=True):
-                first[row] = tables[tick:, row] = steps[tick]
-            rows, ticks = rows[~missed], ticks[~missed] + 1
+                self._search(pose[rows], rows)
+                missed = rows[(self._margins[rows] < 0).any(axis=1)]
+                first[missed] = steps[tick]
+                tables[tick:, missed] = steps[tick]
 
     def _search(self, qpos: Rows, rows: NDArray[np.intp]) -> None:
         """Compute the distances that motion of robots ``rows`` to ``qpos`` (rows, dof) can have

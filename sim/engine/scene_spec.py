@@ -197,13 +197,19 @@ def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
     """Return ``own`` friction and damping plus the actuators' friction and damping."""
     added = Actuators() if actuators is None else actuators
     static, load = added.static, added.load_friction
-    both = zip(own[:2], (added.coulomb, added.viscous), strict=True)
-    coulomb, viscous = (
-        one if more is None else more if one is None else one + more for one, more in both
-    )
+    coulomb = _sum(own.coulomb, added.coulomb)
+    viscous = _sum(own.viscous, added.viscous)
     if static is not None and own.coulomb is not None:
         static = static + own.coulomb
     if coulomb is None and (rubs := Friction(None, None, static, load=load).most) is not None:
         # Friction of the other kinds alone still needs an array of Coulomb friction.
         coulomb = np.zeros_like(rubs)
     return Friction(coulomb, viscous, static, added.stribeck, load)
+
+
+def _sum(first: Float64 | None, second: Float64 | None) -> Float64 | None:
+    if first is None:
+        return second
+    if second is None:
+        return first
+    return first + second

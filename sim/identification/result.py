@@ -18,8 +18,8 @@ from batchpid.io import documents
 from batchpid.sim.identification.fit import INTERVAL, STEP, Fit, Problem, Solution
 from batchpid.sim.identification.simulator import LogControl, changed_params
 from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknown, Unknowns
-from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_options import load_robot_actuators
 from batchpid.sim.robot.urdf_export import to_urdf
 
 if TYPE_CHECKING:

@@ -82,8 +82,10 @@ def step_responses(
         The robot has no such joint.
     """
     run = _blank_failed(rollout)
-    command = None if run.info.sets_positions else run.info.own_command
-    labels = [] if command is None else [f"setpoint {label}" for label in command.labels]
+    command = run.info.own_command
+    labels = []
+    if command is not None and not run.info.sets_positions:
+        labels = [f"setpoint {label}" for label in command.labels]
     figure, chosen, blocks = _joint_axes([run], joints, 2, title, labels)
     # Joints come first, entries of another command after them.
     for joint, (above, below) in zip(chosen, blocks, strict=False):

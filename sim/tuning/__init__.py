@@ -1,7 +1,7 @@
 """Gains by simulation: moves to evaluate them on, their evaluation, and the search for them."""
 
 from batchpid.sim.tuning.candidates import Weights
-from batchpid.sim.tuning.comparison import Comparison, compare
+from batchpid.sim.tuning.comparison import Comparison, GainSet, compare, gain_set
 from batchpid.sim.tuning.evaluation import (
     Evaluation,
     arm_joints,
@@ -11,7 +11,6 @@ from batchpid.sim.tuning.evaluation import (
     run_moves,
     step_response_metrics,
 )
-from batchpid.sim.tuning.gain_sets import GainSet, gain_set
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 from batchpid.sim.tuning.search import Tuning, tune
 

@@ -123,8 +123,10 @@ def random_moves(
     high = robot.upper - EDGE * reach
     line = np.linspace(0, 1 + MAX_OVERSHOOT, LINE)[:, None]
     center, movable = easy_pose(robot, dynamics, poses[:200])
+    clearance = CLEARANCE
     # Around a pose in contact, only deeper contact can be avoided.
-    clearance = 0.0 if dynamics.in_contact(center[None], CLEARANCE)[0] else CLEARANCE
+    if dynamics.in_contact(center[None], CLEARANCE)[0]:
+        clearance = 0.0
     moves = Moves(np.empty((0, robot.dof)), np.empty((0, robot.dof)), ())
     share = 1.0
     in_vain = 0

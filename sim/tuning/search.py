@@ -36,9 +36,8 @@ from batchpid.sim.options.groups import EngineName
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.candidates import FACTORS, Candidates, Weights
-from batchpid.sim.tuning.comparison import Comparison, compare
+from batchpid.sim.tuning.comparison import Comparison, GainSet, compare
 from batchpid.sim.tuning.evaluation import SUBSTEPS, reseeded, tuning_engine
-from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 if TYPE_CHECKING:

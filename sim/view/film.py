@@ -164,7 +164,9 @@ def write_film(
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         for row in rows if progress is None else progress(rows):
-            base = None if rollout.base_pose is None else rollout.base_pose[row]
+            base = None
+            if rollout.base_pose is not None:
+                base = rollout.base_pose[row]
             yield painter.picture(rollout.qpos[row], base)
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -190,12 +192,15 @@ def encode(
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=messages
         )
-        # The pipe breaks where ffmpeg has ended, with a message. At an exception it is closed, and
-        # ffmpeg ends, too.
-        with process, suppress(BrokenPipeError), cast("IO[bytes]", process.stdin) as pipe:
-            for picture in pictures:
-                pipe.write(picture.tobytes())
-        if process.returncode:
+        try:
+            # The pipe breaks where ffmpeg has ended, with a message.
+            with suppress(BrokenPipeError), cast("IO[bytes]", process.stdin) as pipe:
+                for picture in pictures:
+                    pipe.write(picture.tobytes())
+        finally:
+            # Its input is closed, so ffmpeg ends, also after Ctrl-C.
+            status = process.wait()
+        if status:
             messages.seek(0)
             text = messages.read().decode(errors="replace").strip()
             raise BatchPIDError(f"{path}: ffmpeg: {text}")

@@ -153,7 +153,9 @@ class View(AbstractContextManager["View"]):
         place = (slice(None), self.panel.env, self.panel.joint)
         joint = self.data.robot.joints[self.panel.joint]
         positions = history.qpos[place]
-        setpoints = history.setpoint[place] if history.info.sets_positions else positions
+        setpoints = positions
+        if history.info.sets_positions:
+            setpoints = history.setpoint[place]
         _draw(self._position, f"{joint.name} [{joint.unit}]", past, positions, setpoints)
         _draw(self._effort, f"effort [{joint.effort_unit}]", past, history.effort[place])
 
@@ -219,7 +221,9 @@ class SceneNodes:
 
     def update(self, frame: Rollout, env: int) -> None:
         """Place every robot, and the setpoint of robot ``env``."""
-        base = None if frame.base_pose is None else frame.base_pose[0]
+        base = None
+        if frame.base_pose is not None:
+            base = frame.base_pose[0]
         with self._server.atomic():
             _place(self._robots, self._scene.place(frame.qpos[0], base))
             if self._setpoints:

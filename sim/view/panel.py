@@ -112,7 +112,10 @@ class Panel:
             if event.client is not None:
                 self._requests.put(partial(action, handle.value))
 
-        register = handle.on_click if hasattr(handle, "on_click") else handle.on_update
+        if hasattr(handle, "on_click"):
+            register = handle.on_click
+        else:
+            register = handle.on_update
         register(changed)
         return handle
 

@@ -167,7 +167,9 @@ class Playback:
         self.robot = robot
         self.num_envs = integer("num_envs", rollout.num_envs, 1, MAX_ROBOTS)
         ground = rollout.info.ground
-        self.ground = robot.has_ground if ground is None else ground
+        if ground is None:
+            ground = robot.has_ground
+        self.ground = ground
         """True if the run had a ground at height 0."""
         self._rollout = replace(rollout, time=rollout.time - rollout.time[0])
         self.duration = float(self._rollout.time[-1])

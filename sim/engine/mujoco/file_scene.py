@@ -135,19 +135,17 @@ def set_ground(scene: MjSpec, ground: bool) -> None:
     one at height 0.
     """
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    planes = [
-        plane_shape
-        for plane_shape in scene.worldbody.geoms
-        if plane_shape.type == plane and (plane_shape.contype or plane_shape.conaffinity)
-    ]
+    planes = [geom for geom in scene.worldbody.geoms if geom.type == plane]
+    planes = [geom for geom in planes if geom.contype or geom.conaffinity]
     if ground and not planes:
         added = scene.worldbody.add_geom(type=plane, size=[0, 0, 1])
         plain = mujoco.MjSpec().worldbody.add_geom()
         for name in _OF_CONTACTS:  # the file's default class would apply otherwise
             setattr(added, name, getattr(plain, name))
         added.contype = added.conaffinity = _EVERYTHING
-    for plane_shape in [] if ground else planes:
-        plane_shape.contype, plane_shape.conaffinity = 0, 0
+    if not ground:
+        for geom in planes:
+            geom.contype = geom.conaffinity = 0
 
 
 def _start(model: MjModel) -> Document:

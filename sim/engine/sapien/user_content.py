@@ -4,7 +4,6 @@ them.
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -18,7 +17,7 @@ from sapien.physx import (
 from sapien.wrapper.actor_builder import ActorBuilder
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
-from batchpid.arrays.array_types import Array, Float32, SapienScene
+from batchpid.arrays.array_types import Float32, SapienScene
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import Build, SceneSpec
 
@@ -77,7 +76,7 @@ class SceneContent:
         self, spec: SceneSpec, build: Build, scene: SapienScene, env: int, links: Frames
     ) -> None:
         # What exists now is the robot and the ground; the rest is the user's.
-        before = {entity.per_scene_id for entity in scene.entities}  # the robot and the ground
+        before = {entity.per_scene_id for entity in scene.entities}
         self.watched = _call(build, scene, env, links)
         if not spec.collisions:
             _refuse_shapes(scene, env)
@@ -91,41 +90,21 @@ class SceneContent:
                     self._bodies.append((entity, component))
                 elif isinstance(component, PhysxArticulationLinkComponent) and component.is_root:
                     self._articulations.append(component.articulation)
-        self._start = self.read(at_rest=True)
+        self._start = self.read()
         self.size = self._start.size
 
     def reset(self) -> None:
-        """Put everything that moves where ``build`` left it, at rest."""
+        """Put everything that moves into the state in which ``build`` left it."""
         self.write(self._start)
 
-    def read(self, at_rest: bool = False) -> Float32:
-        """Return the state of everything that moves (size,), with zero velocities if
-        ``at_rest``.
-        """
-
-        def velocity(values: Array) -> Array:
-            if at_rest:
-                return np.zeros_like(values)
-            return values
-
+    def read(self) -> Float32:
+        """Return the state of everything that moves (size,)."""
         parts: list[Any] = [np.zeros(0, np.float32)]
         for entity, body in self._bodies:
             pose = entity.get_pose()
-            parts += [
-                pose.p,
-                pose.q,
-                velocity(body.get_linear_velocity()),
-                velocity(body.get_angular_velocity()),
-            ]
+            parts += [pose.p, pose.q, body.get_linear_velocity(), body.get_angular_velocity()]
         for robot in self._articulations:
-            root = read_root(robot)
-            parts += [
-                root[:7],
-                velocity(root[7:]),
-                robot.get_qpos(),
-                velocity(robot.get_qvel()),
-                robot.get_qf(),
-            ]
+            parts += [read_root(robot), robot.get_qpos(), robot.get_qvel(), robot.get_qf()]
         return np.concatenate(parts, dtype=np.float32)
 
     def write(self, state: Float32) -> None:
@@ -185,15 +164,9 @@ def _call(
     try:
         returned = build(scene, env)
     except Exception as error:
-        # In a worker, cloudpickle may have dropped the name of the file.
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        raise InvalidArgumentError(
-            "build",
-            f"raised {type(error).__name__}: {error} (in {where.name},"
-            f" {where.filename}:{where.lineno})",
-            env=env,
-            remedy="correct the function; try it with workers=0 for the whole traceback",
-        ) from error
+        problem = f"raised {type(error).__name__}: {error}"
+        remedy = "correct the function; try it with workers=0 for the traceback"
+        raise InvalidArgumentError("build", problem, env=env, remedy=remedy) from error
     if returned is None:
         return []
     several = isinstance(returned, Iterable) and not isinstance(returned, str)

@@ -16,7 +16,7 @@ import tyro
 from commands_that_write import WORDS, output, output_flags
 
 from batchpid.sim.cli import COMMANDS
-from batchpid.sim.cli.outputs import bar
+from batchpid.sim.cli.commands import bar
 
 HAVE = {
     "--gains": {"demo", "rollout", "compare", "identify", "export", "inspect", "view"},
