@@ -177,13 +177,6 @@ class RigidTree:
             )
         # Gravity belongs to the world, and to no link or joint.
         tables["gravity"] = _array("gravity", self.gravity, (3,))
-        for name, table in tables.items():
-            # An infinite limit of position counts as no limit.
-            finite = np.isfinite(table).reshape(len(table), -1).all(1) | (
-                name in ("lower", "upper")
-            )
-            of = {count: links, len(moving): moving}.get(len(table)) if name != "gravity" else "xyz"
-            entries(name, np.where(finite, 0.0, np.nan), finite, "is not finite", of, kind="entry")
         entries("mass", tables["mass"], tables["mass"] >= 0, "must be >= 0", links, kind="entry")
         entries("armature", tables["armature"], tables["armature"] >= 0, "must be >= 0", moving)
         # A quaternion must be a unit one; an axis only needs a direction.
@@ -491,4 +484,7 @@ def _array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
         raise InvalidArgumentError(
             name, problem, remedy="give one row for each link, or one entry for each joint"
         )
+    # An infinite limit of position counts as no limit.
+    if name not in ("lower", "upper") and not np.isfinite(table).all():
+        raise InvalidArgumentError(name, "is not finite", remedy="pass finite numbers")
     return table
