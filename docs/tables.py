@@ -76,7 +76,7 @@ def options() -> str:
     texts = [text for group in (RunnerKeywords, *GROUPS) for text in attributes(group)]
     for (name,), text in texts:
         kept, flag = (
-            OPTIONS[name].kept,
+            OPTIONS[name].places,
             f"`--{'no-' * (defaults[name] is True)}{name}`" if OPTIONS[name].flag else "",
         )
         default = "" if defaults[name] in (MISSING, DEFAULT_ENGINE) else f"`{defaults[name]}`"

@@ -20,9 +20,9 @@ from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
-from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_options import BAND, known_joints
 from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec
 from batchpid.task_space import native_law, native_rows
 from batchpid.task_space.frames import moved, pose_error

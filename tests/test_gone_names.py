@@ -60,6 +60,7 @@ GONE = (
     r"CommandSpec\([^)]*(lower|upper)=",
     r"compare_engines",
     r"control_toolbox\(",
+    r"runner\.settle\(\)",
     r"decoupling=",
     r"DriveChatter",
     r"--duration\b",

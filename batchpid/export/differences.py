@@ -63,9 +63,7 @@ class Differences(list[str]):
         # No target has the implicit law, but all can have its gains at one time step.
         explicit = as_explicit(params, self.dt)
         if explicit is not params:
-            share = explicit.kp[0] / np.where(params.kp[0] > 0, params.kp[0], np.inf)
-            text = f"gains of the explicit law at dt = {self.dt:g} s, for no other step: kp times"
-            text = f"{text} {self.listed(np.where(params.kp[0] > 0, share, 1.0))}"
+            text = f"gains of the explicit law at dt = {self.dt:g} s, for no other step"
             if params.ki is not None and np.any(params.ki > 0):
                 text += "; the integral takes the setpoint for the beginning of a step, a lead of"
                 text += " dt times its rate"
@@ -74,13 +72,14 @@ class Differences(list[str]):
 
     def _in_efforts(self, params: PIDParams, inertia: ArrayLike | None) -> PIDParams:
         """Return the params with gains in effort units."""
+        if inertia is not None:
+            poses = _inertia(inertia, self.joints)
         if params.gain_units is None:
             return params
         if inertia is None:
             problem = "is missing for gains per mass_matrix"
             remedy = "pass inertia=, the diagonal of the mass matrix, or gains in effort units"
             raise InvalidArgumentError("inertia", problem, remedy=remedy)
-        poses = _inertia(inertia, self.joints)
         # The gains fit the first pose; the others show how far they are off elsewhere.
         ratio = poses / poses[0]
         text = f"gains per mass_matrix are efforts at one inertia: {self.listed(poses[0])} kg m^2"

@@ -141,6 +141,7 @@ class Actuators(Record, _ActuatorsFields):
         present = self.options()
         if not options.keys().isdisjoint(DELAYS):
             present.pop("max_delay", None)
+        # Traced numbers bring a dtype of their own.
         if any(is_traced(value) for value in options.values()):
             present.pop("dtype", None)
         if not self.num_joints and "joints" not in options:
@@ -336,6 +337,7 @@ def _resized(old: Array, new: Array) -> Array:
     samples = new.shape[1]
     if samples < old.shape[1]:
         return old[:, :samples].copy()
+    # Before its oldest sample a signal is taken as constant.
     oldest = xp.broadcast_to(old[:, -1:], (old.shape[0], samples - old.shape[1], old.shape[2]))
     return xp.concatenate((old, oldest), axis=1)
 

@@ -27,7 +27,7 @@ _NEAR = 1e-5  # steps: a delay that is a whole number of steps but for rounding 
 class Delay(NamedTuple):
     """A delay at one time step, for histories (envs, samples, numbers)."""
 
-    index: Array
+    index: Array  # type: ignore[assignment]  # a field hides tuple.index
     """Flat indices of x_{k-n} in a history, and of x_{k-n-1} (1 or 2, envs, joints)."""
     fraction: Array
     """f (envs, joints); None: 0 everywhere."""
@@ -64,10 +64,12 @@ def discretise(delay: Array, dt: Array, history: Array, begin: int = 0) -> Delay
     whole = xp.rint(steps)
     steps = xp.where(xp.abs(steps - whole) < _NEAR, whole, steps)
     steps = xp.minimum(steps, samples - 1) + xp.zeros((envs, 1), steps.dtype)
+    # One sample is left for the older neighbour of the interpolation.
     floor = xp.minimum(xp.floor(steps), samples - 2)
     fraction = steps - floor
     first = xp.arange(envs)[:, None] * (samples * numbers) + begin + xp.arange(delay.shape[1])[None]
     later = first + floor.astype(int) * numbers
+    # Delays of whole steps need no interpolation.
     if not is_traced(fraction) and not fraction.any():
         return Delay(later[None], None)
     return Delay(xp.stack((later, later + numbers)), fraction)

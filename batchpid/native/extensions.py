@@ -13,18 +13,30 @@ import hashlib
 import importlib
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 NOT_BUILT = "the extension was not built: it needs a C++ compiler when batchpid is installed"
 ROUNDED = (
-    *("-std=c++17", "-O3", "-g0", "-fvisibility=hidden"),
-    *("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
+    "-std=c++17",
+    "-O3",
+    "-g0",
+    "-fvisibility=hidden",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fno-trapping-math",
 )
 """Compiler flags under which each operation is rounded as in NumPy: operations are not fused."""
 LANES_ONLY = (
-    *("-fno-tree-loop-vectorize", "-fno-unswitch-loops", "-fno-split-loops", "-fno-ipa-cp-clone"),
-    *("-fno-peel-loops", "-fno-tree-loop-distribute-patterns", "-fno-split-paths", "-fno-gcse"),
+    "-fno-tree-loop-vectorize",
+    "-fno-unswitch-loops",
+    "-fno-split-loops",
+    "-fno-ipa-cp-clone",
+    "-fno-peel-loops",
+    "-fno-tree-loop-distribute-patterns",
+    "-fno-split-paths",
+    "-fno-gcse",
     "-Wno-psabi",
 )
 """Flags for code that computes on Lanes (lanes.h), which are vectors already: half to compile,
@@ -63,11 +75,39 @@ class Extension(NamedTuple):
 
 
 OPERATIONS = (
-    *("add", "subtract", "multiply", "divide", "maximum", "minimum"),
-    *("greater", "greater_equal", "less", "less_equal", "equal", "not_equal", "and", "or", "not"),
-    *("negative", "absolute", "rint", "ceil", "floor", "sqrt", "sign", "isfinite"),
-    *("where", "row_minimum", "matrix_vector", "multiply_add", "add_subtract"),
-    *("subtract_multiply", "clip", "push", "take", "gather"),
+    "add",
+    "subtract",
+    "multiply",
+    "divide",
+    "maximum",
+    "minimum",
+    "greater",
+    "greater_equal",
+    "less",
+    "less_equal",
+    "equal",
+    "not_equal",
+    "and",
+    "or",
+    "not",
+    "negative",
+    "absolute",
+    "rint",
+    "ceil",
+    "floor",
+    "sqrt",
+    "sign",
+    "isfinite",
+    "where",
+    "row_minimum",
+    "matrix_vector",
+    "multiply_add",
+    "add_subtract",
+    "subtract_multiply",
+    "clip",
+    "push",
+    "take",
+    "gather",
 )
 """Operations of programs, as Code in program.h."""
 MASKS = frozenset(OPERATIONS[6:15]) | {"isfinite"}
@@ -88,24 +128,57 @@ KINEMATICS = ("qpos", "qvel", "tool", "pose", "jacobian", "jacobian_rate", "mass
 the tool are results.
 """
 LAW = (
-    *("pose", "jacobian", "jacobian_rate", "mass_matrix", "bias", "chain"),
-    *("setpoint", "qpos", "qvel", "twist", "acceleration", "wrench", "feedforward"),
-    *("damping", "added_inertia", "left", "posture", "integral"),
-    *("kp", "kd", "c", "acceleration_share", "ki_dt", "ki_dt2", "posture_kp", "posture_kd"),
-    *("limit_kp", "limit_kd", "limit_margin", "limit_low", "limit_high", "integral_limit"),
-    *("position_error_limit", "rotation_error_limit", "smallest_eigenvalue", "axes", "force_axes"),
-    *("effort_min", "effort_max", "turns"),
-    *(
-        "effort",
-        "next_integral",
-        "limited",
-        "error",
-        "force",
-        "task",
-        "posture_effort",
-        "unsaturated",
-    ),
-    *("task_share", "posture_share", "near_singular"),
+    "pose",
+    "jacobian",
+    "jacobian_rate",
+    "mass_matrix",
+    "bias",
+    "chain",
+    "setpoint",
+    "qpos",
+    "qvel",
+    "twist",
+    "acceleration",
+    "wrench",
+    "feedforward",
+    "damping",
+    "added_inertia",
+    "left",
+    "posture",
+    "integral",
+    "kp",
+    "kd",
+    "c",
+    "acceleration_share",
+    "ki_dt",
+    "ki_dt2",
+    "posture_kp",
+    "posture_kd",
+    "limit_kp",
+    "limit_kd",
+    "limit_margin",
+    "limit_low",
+    "limit_high",
+    "integral_limit",
+    "position_error_limit",
+    "rotation_error_limit",
+    "smallest_eigenvalue",
+    "axes",
+    "force_axes",
+    "effort_min",
+    "effort_max",
+    "turns",
+    "effort",
+    "next_integral",
+    "limited",
+    "error",
+    "force",
+    "task",
+    "posture_effort",
+    "unsaturated",
+    "task_share",
+    "posture_share",
+    "near_singular",
 )
 """Arrays of ``law``: dynamics, inputs and state, coefficients, and results from the effort on."""
 
@@ -133,7 +206,7 @@ EXTENSIONS = {"_program": PROGRAM, "_task_space": TASK_SPACE}
 
 
 @cache
-def load(extension: Extension) -> Any:
+def load(extension: Extension) -> ModuleType:
     """Return the module of an extension.
 
     Raises
@@ -152,6 +225,7 @@ def load(extension: Extension) -> Any:
         raise StaleExtensionError(
             f"{name} cannot be loaded ({error}); {_remedy(extension)}"
         ) from error
+    # The digests were compiled in: a file that has changed since makes the extension stale.
     built = getattr(module, "sources", "").split()
     if changed := [
         digest.partition("=")[0] for digest in extension.digests() if digest not in built

@@ -21,17 +21,17 @@ from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_kinematics import prepared, read_point
 
 _RESULTS = {
-    **{
-        "effort": 0,
-        "integral": 6,
-        "limited": 0,
-        "error": 6,
-        "wrench": 6,
-        "task": 0,
-        "posture": 0,
-        "unsaturated": 0,
-    },
-    **{"task_share": 1, "posture_share": 1, "near_singular": 1},
+    "effort": 0,
+    "integral": 6,
+    "limited": 0,
+    "error": 6,
+    "wrench": 6,
+    "task": 0,
+    "posture": 0,
+    "unsaturated": 0,
+    "task_share": 1,
+    "posture_share": 1,
+    "near_singular": 1,
 }
 """Terms and state in the order of the results in LAW, and their columns; 0 for one per joint."""
 _WITHOUT_TREE = None, -1, None

@@ -177,13 +177,6 @@ class RigidTree:
             )
         # Gravity belongs to the world, and to no link or joint.
         tables["gravity"] = _array("gravity", self.gravity, (3,))
-        for name, table in tables.items():
-            # An infinite limit of position counts as no limit.
-            finite = np.isfinite(table).reshape(len(table), -1).all(1) | (
-                name in ("lower", "upper")
-            )
-            of = {count: links, len(moving): moving}.get(len(table)) if name != "gravity" else "xyz"
-            entries(name, np.where(finite, 0.0, np.nan), finite, "is not finite", of, kind="entry")
         entries("mass", tables["mass"], tables["mass"] >= 0, "must be >= 0", links, kind="entry")
         entries("armature", tables["armature"], tables["armature"] >= 0, "must be >= 0", moving)
         # A quaternion must be a unit one; an axis only needs a direction.
@@ -291,7 +284,8 @@ class RigidTree:
 
     def positions(self, qpos: Float64) -> Float64:
         """Return ``qpos`` (..., dof) with the followers moved to match their leaders."""
-        return self.coupling.positions(qpos)
+        positions: Float64 = self.coupling.positions(qpos)
+        return positions
 
     def rates(self, qvel: Array) -> Array:
         """Return ``qvel`` (..., dof) with the rates of followers computed from their leaders'."""
@@ -305,7 +299,8 @@ class RigidTree:
         """Return the mask (dof,) of the joints between the base and ``link``, and of joints coupled
         to them.
         """
-        return self.chains[self.link_bodies[self.index(link)]] > 0
+        carried: NDArray[np.bool_] = self.chains[self.link_bodies[self.index(link)]] > 0
+        return carried
 
     @cached_property
     def chains(self) -> Float64:
@@ -315,7 +310,7 @@ class RigidTree:
         The last row, body -1, is the base.
         """
         # A joint that is coupled to one of the chain moves the tool, too.
-        rows = np.concatenate([self.bodies.moves, np.zeros((1, self.dof))])
+        rows: Float64 = np.concatenate([self.bodies.moves, np.zeros((1, self.dof))])
         rows = (rows @ (self.coupling.leader[:, None] == self.coupling.leader) > 0).astype(
             np.float64
         )
@@ -489,4 +484,7 @@ def _array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
         raise InvalidArgumentError(
             name, problem, remedy="give one row for each link, or one entry for each joint"
         )
+    # An infinite limit of position counts as no limit.
+    if name not in ("lower", "upper") and not np.isfinite(table).all():
+        raise InvalidArgumentError(name, "is not finite", remedy="pass finite numbers")
     return table

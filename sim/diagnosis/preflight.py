@@ -17,7 +17,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.diagnosis.loop_stability import stability_report
+from batchpid.sim.diagnosis.loop_stability import slow_oscillation, stability_report
 from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
 from batchpid.sim.robot.inertia import DENSITY, triangle_excess
@@ -27,6 +27,8 @@ from batchpid.sim.robot.urdf import GIVE_RANGE
 
 # of the triangle inequality of principal moments, above which it is reported; less is rounding
 EXCESS = 0.01
+# damping ratio below which gains are reported: more than a quarter is left after each period
+RINGING = 0.2
 # share of the stability range above which gains are reported: other poses may have less inertia
 NEAR_BOUND = 0.5
 
@@ -228,10 +230,12 @@ class _Preflight:
             )
 
     def check_stability(self, params: bp.PIDParams, start: Float64, timestep: float) -> None:
-        """Report gains near or beyond the stability bound."""
+        """Report gains near or beyond the stability bound, and gains that ring."""
         robot = self.robot
         report = stability_report(robot, params, start, timestep, robot.actuators)
         ratio = report.robot_ratio
+        if ratio < 1:
+            self._check_ringing(params, start, timestep, report.env)
         if ratio >= NEAR_BOUND and params.discretization is not None:
             text = f"the implicit law diverges where the model has {1 / ratio:.3g} times the"
             remedy = "lower its kp and kd if the model may be as far off"
@@ -245,6 +249,21 @@ class _Preflight:
             else:
                 text = f"{text}: it may diverge in other poses"
                 self._note("near-unstable", text, report.remedy)
+
+    def _check_ringing(
+        self, params: bp.PIDParams, start: Float64, timestep: float, env: int
+    ) -> None:
+        slow = slow_oscillation(self.robot, params, start, timestep, env)
+        zeta = float(slow.damping_ratio)
+        if zeta >= RINGING:
+            return
+        rest = math.exp(-2 * math.pi * zeta / math.sqrt(1 - zeta**2))
+        text = f"the PID loop rings at {slow.frequency:.2g} Hz with a damping ratio of {zeta:.2g}"
+        text = f"{text} at the start pose: after each period {100 * rest:.0f} % of the amplitude"
+        joint = self.robot.joint_names[int(np.argmax(slow.participation))]
+        report = self._note if zeta > 0 else self._warn
+        remedy = "raise its kd, lower its ki, or use robot.designed()"
+        report("ringing", f"{text} is left", remedy, joint)
 
     def check_params(self, params: bp.PIDParams, control: str) -> None:
         """Report params that disagree with the joints, or have no effect under ``control``."""

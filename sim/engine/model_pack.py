@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Bool, DType, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
@@ -97,10 +97,10 @@ class ModelPack(EnginePack, SingleOwner):
     def _passive_force(self) -> Callable[..., Float64]:
         return passive_force_of(self, self.steps_natively)
 
-    def _model_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
+    def _model_force(self, gravity: bool, coriolis: bool) -> Float64:
         """Return the passive force, computed from the model."""
         state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
-        return self._passive_force(*state).astype(dtype)
+        return self._passive_force(*state)
 
     @property
     def _constraint_address(self) -> int | None:

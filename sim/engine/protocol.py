@@ -17,9 +17,7 @@ from importlib.util import find_spec
 from sys import modules
 from typing import Any, Literal, Protocol
 
-import numpy as np
-
-from batchpid.arrays.array_types import Bool, DType, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.motors import Actuators
@@ -108,13 +106,13 @@ class EnginePack(Protocol):
     def rigid_tree(self) -> RigidTree:
         """Tree of the robots of ``spec`` as the engine has them, all joints independent."""
 
-    def read_qpos(self, dtype: DType = np.float64) -> Rows:
+    def read_qpos(self) -> Float64:
         """Return the joint positions [rad or m]."""
 
-    def read_qvel(self, dtype: DType = np.float64) -> Rows:
+    def read_qvel(self) -> Float64:
         """Return the joint velocities [rad/s or m/s]."""
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N].
 
         They come from the model of ``spec`` at the present state, without the pack's variation. On

@@ -104,7 +104,10 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        self.robot = robot if isinstance(robot, Robot) else Robot.load(robot)
+        if isinstance(robot, Robot):
+            self.robot = robot
+        else:
+            self.robot = Robot.load(robot)
         self.num_envs = checked_option("num_envs", num_envs)
         self.terminate_on_success = flag("terminate_on_success", terminate_on_success)
         self.max_episode_steps = max_episode_steps
@@ -322,7 +325,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._observe(observed)
         begins = self._done.copy()
         self._steps += 1
-        observation, success = self._observation, self._success
+        observation = self._observation
+        success = self._success
         count = (self.num_envs,)
         reward = self._returned("reward", self.reward(observation, success), count)
         ends = self._returned("terminated", self.terminated(observation, success), count)

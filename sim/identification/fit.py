@@ -313,7 +313,8 @@ class Problem:
         rows = zip(self.windows, evaluation.residuals, strict=True)
         errors = np.abs(np.concatenate([residual[window.fitted] for window, residual in rows]))
         errors = np.minimum(errors, np.quantile(errors, 0.9, axis=0))
-        return np.sqrt((errors**2).mean(0)) + 1e-9
+        noise: Float64 = np.sqrt((errors**2).mean(0)) + 1e-9
+        return noise
 
     def error(self, point: Float64, free_states: bool = True) -> Float64:
         """Return the root mean square (joints,) of the position error at the held-out rows; at all
@@ -324,7 +325,8 @@ class Problem:
         rows = []
         for window, residual in zip(self.windows, residuals, strict=True):
             rows.append(residual[~window.fitted] if judged else residual)
-        return np.sqrt((np.concatenate(rows) ** 2).mean(0))
+        deviations: Float64 = np.sqrt((np.concatenate(rows) ** 2).mean(0))
+        return deviations
 
     def intervals(self, solution: Solution) -> Intervals:
         """Return the intervals at a solution, from derivatives by the values: their

@@ -243,7 +243,7 @@ def _moves(robot: Robot, logs: list[Log]) -> Bool:
     """
     joints = logs[0].joints
     spread = np.concatenate([log.qpos for log in logs]).std(0)
-    moves = spread > [STILL[robot.units[joint]] for joint in joints]
+    moves: Bool = spread > [STILL[robot.units[joint]] for joint in joints]
     if logs[0].kind == "setpoint":
         moves &= spread > FOLLOWS * np.concatenate([log.command for log in logs]).std(0)
     still = [robot.joint_names[joint] for joint in np.array(joints)[~moves]]

@@ -18,8 +18,8 @@ from batchpid.io import documents
 from batchpid.sim.identification.fit import INTERVAL, STEP, Fit, Problem, Solution
 from batchpid.sim.identification.simulator import LogControl, changed_params
 from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknown, Unknowns
-from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_options import load_robot_actuators
 from batchpid.sim.robot.urdf_export import to_urdf
 
 if TYPE_CHECKING:
@@ -89,7 +89,8 @@ class Identification:
     @property
     def values(self) -> Float64:
         """Values of the unknowns (unknowns,)."""
-        return self.unknowns.values(self.fit.solution.point[None])[0]
+        values: Float64 = self.unknowns.values(self.fit.solution.point[None])[0]
+        return values
 
     @property
     def held_out_error(self) -> tuple[float, float]:

@@ -184,7 +184,8 @@ class Unknowns:
     @property
     def start(self) -> Float64:
         """Point at the start of a fit."""
-        return self.points(np.array([[entry.start for entry in self.entries]]))[0]
+        start: Float64 = self.points(np.array([[entry.start for entry in self.entries]]))[0]
+        return start
 
     @property
     def prior(self) -> Float64:

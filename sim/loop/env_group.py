@@ -326,7 +326,7 @@ class EnvGroup:
         """Write observation and faults into these envs' rows."""
         observation, last = rows.observation, self._last
         observation.qpos[...] = self._executor.qpos()
-        observation.qvel[...] = self.pack.read_qvel(np.float32)
+        observation.qvel[...] = self.pack.read_qvel()
         for name in _RESULTS:
             getattr(observation, name)[...] = getattr(last, name)
         if observation.base_pose is not None and observation.base_twist is not None:

@@ -40,9 +40,9 @@ from batchpid.sim.loop.step_values import (
     StepState,
 )
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION
+from batchpid.sim.robot.robot_options import BAND, known_joints
 
 
 class Setup(NamedTuple):

@@ -44,10 +44,9 @@ from batchpid.sim.options.groups import (
     option,
 )
 from batchpid.sim.randomization.checks import check_params, prepared_actuators
-from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.setpoint_limits import fit_guard
+from batchpid.sim.robot.robot_options import fit_actuators, fit_guard, known_joints
 from batchpid.sim.signals.quantities import (
     CommandSpec,
     Observation,
@@ -218,6 +217,7 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def derived(self) -> dict[str, Callable[[Observation], Rows]]:
         """Functions from what the loop observed to further quantities, by name."""
+        # The loop observes joints; the pose of the tool follows from them.
         if not isinstance(self.control, OperationalSpace):
             return {}
         tool_pose = self.control.tool_pose
@@ -245,6 +245,7 @@ class RunnerOptions(RunnerKeywords):
         """
         robot = self.robot
         instance("params", params, bp.PIDParams, "build them with robot.params() or make_params()")
+        # Units of gains are a matter of the law, which other controls do not have.
         if params.gain_units is not None and self.control != "pid":
             problem = f"have no meaning under control {self.control_name!r}"
             remedy = "use control 'pid', or params with gain_units 'effort'"
@@ -260,7 +261,7 @@ class RunnerOptions(RunnerKeywords):
         return frozen(params)
 
     def check_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
-        """Return ``actuators`` as :func:`batchpid.sim.robot.actuator_checks.fit_actuators` does;
+        """Return ``actuators`` as :func:`batchpid.sim.robot.robot_options.fit_actuators` does;
         None if every effect is off.
 
         None selects the robot's own actuators; control "drive" uses only their friction and
@@ -279,6 +280,7 @@ class RunnerOptions(RunnerKeywords):
         fitted: bp.Actuators | None = fit_actuators(
             actuators, self.robot, self.num_envs, self.control
         )
+        # Actuators without effect cost time in every sim step.
         if fitted is not None and fitted.is_ideal:
             fitted = None
         if self.randomization is not None:
@@ -298,8 +300,8 @@ class RunnerOptions(RunnerKeywords):
         """
         values = {}
         for name, entry in OPTIONS.items():
-            if place in entry.kept:
-                values[name] = getattr(self, entry.kept[place] or name)
+            if place in entry.places:
+                values[name] = getattr(self, entry.places[place] or name)
         # A recording is read without the classes of the engine and of the randomization.
         if place == "recording":
             values["physics"] = str(self.physics)
@@ -312,7 +314,8 @@ class RunnerOptions(RunnerKeywords):
         """Robot and options that two runners must share to restore each other's snapshots, as plain
         values.
         """
-        robot, command = self.robot, self.own_command
+        robot = self.robot
+        command = self.own_command
         options = {name: _plain(value) for name, value in self.values_for("snapshot").items()}
         return options | {
             **robot.describe(),
@@ -340,6 +343,7 @@ def default_params(
     InvalidArgumentError
         The robot ships no gains and none can be designed: its mass matrix is not positive definite.
     """
+    # Other controls need the effort limits alone.
     if control not in ("pid", "drive"):
         return robot.params(kp=0.0, ki=0.0, kd=0.0)
     settings = robot.settings

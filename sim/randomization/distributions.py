@@ -195,7 +195,10 @@ def read_distribution(name: str, value: object) -> Distribution:
     InvalidArgumentError
         It describes none.
     """
-    options = dict(value) if isinstance(value, Mapping) else {}
+    if isinstance(value, Mapping):
+        options = dict(value)
+    else:
+        options = {}
     problem = "is not a distribution"
     for kind, distribution in KINDS.items():
         if kind not in options:
@@ -301,7 +304,9 @@ def parts(
         yield name, list(range(len(columns))), field
         return
     # A link has a column for each axis of its center of mass.
-    owners = [column[:-2] for column in columns] if name == "center_of_mass" else columns
+    owners = list(columns)
+    if name == "center_of_mass":
+        owners = [column[:-2] for column in columns]
     for element, distribution in field.items():
         choice(name, element, list(dict.fromkeys(owners)))
         chosen = [index for index, owner in enumerate(owners) if owner == element]
@@ -339,7 +344,10 @@ def read_field(name: str, value: object) -> Field:
     """Return the field that a file describes: a distribution, or a mapping of names to
     distributions.
     """
-    names = value if isinstance(value, Mapping) else {}
+    if isinstance(value, Mapping):
+        names = value
+    else:
+        names = {}
     if not names or not all(isinstance(part, Mapping) for part in names.values()):
         return read_distribution(name, value)
     return {str(key): read_distribution(f"{name}.{key}", part) for key, part in names.items()}

@@ -165,7 +165,10 @@ class Randomization:
         for part, chosen, distribution in parts(name, self.distributions[name], columns):
             streams = generators(self.seed, part, episodes, self.per == "env", number)
             # Each env draws from a stream of its own, in the order of the columns.
-            size = 1 if distribution.shared else len(chosen)
+            if distribution.shared:
+                size = 1
+            else:
+                size = len(chosen)
             for row, generator in zip(rows, streams, strict=True):
                 row[chosen] = distribution.sample(generator, size)
         return rows
@@ -238,7 +241,10 @@ class Randomization:
         for name in getattr(self, group):
             rows = self.apply(f"{group}.{name}", getattr(record, name), draws, robot)
             # Followers have no motor.
-            values[name] = rows * robot.independent if name in OF_JOINTS else rows
+            if name in OF_JOINTS:
+                values[name] = rows * robot.independent
+            else:
+                values[name] = rows
         return record._replace(**values)
 
     def start(

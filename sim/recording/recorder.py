@@ -76,7 +76,10 @@ class Recorder(SingleOwner):
         if runner.recorder is not None:
             problem = f"is being recorded already, to {runner.recorder.path}"
             raise InvalidArgumentError("runner", problem, remedy="close that Recorder first")
-        self._mode = "w" if flag("overwrite", overwrite) else "x"
+        if flag("overwrite", overwrite):
+            self._mode = "w"
+        else:
+            self._mode = "x"
         self.path: Path = files.check_path(path, overwrite=overwrite)
         self._runner = runner
         self._info: RunInfo | None = None  # at the first tick
@@ -173,7 +176,8 @@ class Recorder(SingleOwner):
         """
         import h5py
 
-        rows, runner = self._rows, self._runner
+        rows = self._rows
+        runner = self._runner
         try:
             if self._file is None:
                 assert self._info is not None

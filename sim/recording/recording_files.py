@@ -239,7 +239,10 @@ def attributes(info: RunInfo) -> Document:
             if isinstance(value, CommandSpec):
                 value = value.names, value.units
             value = json.dumps(value, default=np.ndarray.tolist)
-        values[name] = list(value) if isinstance(value, tuple) else value
+        if isinstance(value, tuple):
+            values[name] = list(value)
+        else:
+            values[name] = value
     return values
 
 

@@ -188,7 +188,10 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
     if "setpoint_rate" in tables:
         rate = tables["setpoint_rate"]
         return Setpoints(start, position, rate, acceleration, substeps, True, 0)
-    first = robot.start if start is None else start
+    if start is None:
+        first = robot.start
+    else:
+        first = start
     rate, steps = _rates(robot, np.vstack([first, position]), substeps * timestep)
     return Setpoints(start, position, rate, acceleration, substeps, False, steps)
 

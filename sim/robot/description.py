@@ -33,7 +33,6 @@ from batchpid.sim.robot.parts import (
 )
 from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.sim.robot.self_collision import SelfContact, Srdf, self_contact
-from batchpid.sim.robot.setpoint_limits import setpoint_guard
 from batchpid.sim.robot.simulated_links import link_masses, rigid_tree
 from batchpid.sim.robot.tables import Body, Tables
 from batchpid.task_space.rigid_tree import RigidTree
@@ -56,7 +55,8 @@ def suggested_effort_limit(
     """
     still = np.abs(gravity).max(0) + np.asarray(friction)
     inertia = np.abs(mass_matrix).sum(2).max(0)
-    return GRAVITY_MARGIN * still + SPEED * np.asarray(damping) + ACCELERATION * inertia
+    efforts: Float64 = GRAVITY_MARGIN * still + SPEED * np.asarray(damping) + ACCELERATION * inertia
+    return efforts
 
 
 LIMIT_TOLERANCE = 1e-6  # rad or m
@@ -197,28 +197,6 @@ class RobotDescription:
             * DISSIPATION[self.dissipation].modelled
         )
 
-    def guard(
-        self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None
-    ) -> bp.Guard:
-        """Return the limits of setpoints: positions, and soft limits of ``safety_controller``, as
-        in the URDF.
-
-        Followers have none: they move with their leaders.
-
-        Parameters
-        ----------
-        rate
-            Largest rate, scalar or (dof,) [rad/s or m/s]; default the URDF's velocity limits.
-        acceleration
-            Largest acceleration, scalar or (dof,) [rad/s^2 or m/s^2]; default none.
-
-        Raises
-        ------
-        InvalidArgumentError
-            A limit is not positive.
-        """
-        return setpoint_guard(self.joints, rate, acceleration)
-
     @cached_property
     def coupling(self) -> Coupling:
         """Coupling of the mimic joints to their leaders; the identity without mimic joints."""
@@ -231,7 +209,8 @@ class RobotDescription:
 
     def coupled(self, qpos: ArrayLike) -> Float64:
         """Return ``qpos`` (..., dof) with the followers moved to match their leaders."""
-        return self.coupling.positions(np.asarray(qpos, np.float64))
+        positions: Float64 = self.coupling.positions(np.asarray(qpos, np.float64))
+        return positions
 
     @property
     def start(self) -> Float64:
@@ -315,7 +294,10 @@ class RobotDescription:
         followers.
         """
         still = np.zeros_like(qpos)
-        return self.coupling.efforts(self.dynamics().inverse_dynamics(qpos, still, still))
+        efforts: Float64 = self.coupling.efforts(
+            self.dynamics().inverse_dynamics(qpos, still, still)
+        )
+        return efforts
 
     def dynamics(self, ground: bool | None = None) -> RobotModel:
         """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed

@@ -15,8 +15,9 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.checks.validate import array, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.run_checks import SetpointCheck
+from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.faults import FARTHEST, ORIGIN
+from batchpid.sim.loop.faults import ORIGIN
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot_model import base_start
 from batchpid.sim.runner.runner_state import Motion, RunnerState
@@ -152,23 +153,24 @@ def base_rows(
     :func:`batchpid.sim.robot.robot_model.base_start`.
     """
     robot = options.robot
+    if robot.fixed_base:
+        for name, value in inputs.items():
+            if value is not None:
+                problem = "is for a floating base, and this one is fixed"
+                remedy = "leave it out, or load the robot with fixed_base=False"
+                raise InvalidArgumentError(name, problem, remedy=remedy)
+        return None
     rows = np.tile(ORIGIN, (options.num_envs, 1))
     pose = rows[:, :7]
     parts = (pose, POSE_UNITS), (rows[:, 7:], TWIST_UNITS)
     for (name, value), (part, units) in zip(inputs.items(), parts, strict=True):
         if value is None:
             continue
-        if robot.fixed_base:
-            problem = "is for a floating base, and this one is fixed"
-            remedy = "leave it out, or load the robot with fixed_base=False"
-            raise InvalidArgumentError(name, problem, remedy=remedy)
         columns = tuple(units)
         part[...] = array(name, value, part.shape, columns, kind="entry")
         # As near as positions and velocities of joints.
         near = np.abs(part) <= FARTHEST
         entries(name, part, near, f"is beyond +-{FARTHEST:g}", columns, kind="entry")
-    if robot.fixed_base:
-        return None
     if inputs["base_pose"] is None:
         # An MJCF file may have a ground at another height.
         ground = options.ground and options.mjcf is None

@@ -95,6 +95,7 @@ def own_command(control: object) -> CommandSpec | None:
     InvalidArgumentError
         The attribute is neither a CommandSpec nor a sequence of names.
     """
+    # A control that is a word has no attribute of this name.
     command = getattr(control, "command", None)
     if command is None or isinstance(command, CommandSpec):
         return command
@@ -128,9 +129,13 @@ class Quantity(NamedTuple):
         """
         if self.columns is None:
             return joints
-        rows = () if self.links is None else (len(self.links),)
-        columns = (len(self.columns),) if self.columns else ()
-        return (*joints[:-1], *rows, *columns)
+        # Links stand between the envs and the columns.
+        shape = joints[:-1]
+        if self.links is not None:
+            shape += (len(self.links),)
+        if self.columns:
+            shape += (len(self.columns),)
+        return shape
 
     def unit_for(self, position: str) -> str:
         """Return the unit for a joint whose position is in ``position``, "rad" or "m"."""
@@ -263,10 +268,8 @@ def untouched(num_envs: int, observed: Mapping[str, Quantity]) -> dict[str, Rows
 
 def failed_envs(ok: Bool) -> str:
     """Return in words how many envs failed in ``ok`` (..., envs)."""
-    if ok.size:
-        failed = int((~ok.reshape(-1, ok.shape[-1]).all(0)).sum())
-    else:
-        failed = 0
+    # Rows are ticks: an env that failed in one of them counts once.
+    failed = int((~ok.reshape(-1, ok.shape[-1])).any(0).sum())
     if failed:
         return f"{failed} failed"
     return "all ok"

@@ -152,10 +152,11 @@ class RunInfo:
     @property
     def sets_positions(self) -> bool:
         """True if setpoints are joint positions."""
-        own = self.own_command
-        if own is None:
+        command = self.own_command
+        if command is None:
             return self.control != "effort"
-        return (own.names, own.units) == (self.joint_names, self.units)
+        # A controller may declare the joints by name.
+        return (command.names, command.units) == (self.joint_names, self.units)
 
     @property
     def recorded(self) -> dict[str, Quantity]:
@@ -213,6 +214,7 @@ class RunInfo:
         """Return the info of the ticks between two times [s], where the first begins at the
         positions ``start``.
         """
+        # Episodes that began before these ticks are those of the start.
         earlier = [redraw for redraw in self.redraws if redraw.time <= begin]
         episodes = self.episodes
         if episodes is not None and earlier:
@@ -265,6 +267,7 @@ class Rollout:
 
     def __getattr__(self, name: str) -> Rows:
         if name not in QUANTITIES:
+            # Only names that are no fields come here.
             names = ", ".join(QUANTITIES)
             raise AttributeError(
                 f"a Rollout has no {name!r}; it has time, setpoint, tick, info, {names}"
@@ -300,7 +303,8 @@ class Rollout:
         info = self.info
         if len(numbers):
             first = numbers[0]
-            start, begin = info.start, -np.inf
+            start = info.start
+            begin = -np.inf
             # A later part starts where the ticks before it ended.
             if first:
                 start = self.qpos[first - 1]
@@ -342,7 +346,10 @@ class Rollout:
 
     def __repr__(self) -> str:
         ticks, envs, dof = self.qpos.shape
-        end = f"up to {self.time[-1]:g} s" if ticks else "empty"
+        if ticks:
+            end = f"up to {self.time[-1]:g} s"
+        else:
+            end = "empty"
         return f"Rollout({ticks} ticks {end}, {envs} envs, {dof} joints, {failed_envs(self.ok)})"
 
     def findings(self, robot: Any = None) -> Any:
@@ -362,9 +369,13 @@ class Rollout:
         InvalidArgumentError
             The robot is not known, or has other joints than the run.
         """
+        # Rooms above load where they are used.
         from batchpid.sim.diagnosis.causes import unsettled_findings
 
-        robot = self.info.description if robot is None else robot
+        if robot is None:
+            robot = self.info.description
+        else:
+            robot = robot
         if robot is None:
             problem = "of this run is not known"
             remedy = "pass it: rollout.findings(Robot.load(...))"

@@ -192,12 +192,15 @@ def encode(
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=messages
         )
-        # The pipe breaks where ffmpeg has ended, with a message. At an exception it is closed, and
-        # ffmpeg ends, too.
-        with process, suppress(BrokenPipeError), cast("IO[bytes]", process.stdin) as pipe:
-            for picture in pictures:
-                pipe.write(picture.tobytes())
-        if process.returncode:
+        try:
+            # The pipe breaks where ffmpeg has ended, with a message.
+            with suppress(BrokenPipeError), cast("IO[bytes]", process.stdin) as pipe:
+                for picture in pictures:
+                    pipe.write(picture.tobytes())
+        finally:
+            # Its input is closed, so ffmpeg ends, also after Ctrl-C.
+            status = process.wait()
+        if status:
             messages.seek(0)
             text = messages.read().decode(errors="replace").strip()
             raise BatchPIDError(f"{path}: ffmpeg: {text}")

@@ -112,7 +112,7 @@ def check(ours, theirs, before=None):
             refusal, (found, places) = None, go_on(other)
     if refusal is not None:
         assert refusal.argument == "snapshot"
-        kept = [name for name in changed(ours, theirs) if "snapshot" in DECLARED[name].kept]
+        kept = [name for name in changed(ours, theirs) if "snapshot" in DECLARED[name].places]
         assert kept, "these options belong to no snapshot"
         assert "robot" in kept or any(name in str(refusal) for name in kept), "the option is named"
         return
@@ -134,7 +134,7 @@ def panda():
 def test_every_option_is_kept_or_has_a_role_apart():
     reasons = {"snapshot", "restored", "processes", "next commands"}
     for option in fields(RunnerOptions):
-        assert len(reasons & DECLARED[option.name].kept.keys()) == 1, option.name
+        assert len(reasons & DECLARED[option.name].places.keys()) == 1, option.name
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Bool, DType, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ORIGIN, ModelPack
@@ -101,7 +101,8 @@ class MujocoPack(ModelPack):
     @property
     def data(self) -> list[Any]:
         """``mujoco.MjData`` of each robot, in its state."""
-        return self._pool.take(self.models, self.rows)
+        data: list[Any] = self._pool.take(self.models, self.rows)
+        return data
 
     def _update(self, rows: Iterable[int]) -> None:
         """Compute all that follows from the states of robots ``rows``, after a change of models."""
@@ -125,16 +126,16 @@ class MujocoPack(ModelPack):
     # -- reading
     # ----------------------------------------------------------------------------------------------
 
-    def read_qpos(self, dtype: DType = np.float64) -> Rows:
-        return np.array([data.qpos[self._at] for data in self.data], dtype)
+    def read_qpos(self) -> Float64:
+        return np.array([data.qpos[self._at] for data in self.data])
 
-    def read_qvel(self, dtype: DType = np.float64) -> Rows:
-        return np.array([data.qvel[self._moves] for data in self.data], dtype)
+    def read_qvel(self) -> Float64:
+        return np.array([data.qvel[self._moves] for data in self.data])
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         if self.steps_read_force(gravity, coriolis):
-            return np.array([data.qfrc_bias[self._moves] for data in self.data], dtype)
-        return self._model_force(gravity, coriolis, dtype)
+            return np.array([data.qfrc_bias[self._moves] for data in self.data])
+        return self._model_force(gravity, coriolis)
 
     @cached_property
     def _bias_model(self) -> NativeModel:

@@ -19,10 +19,10 @@ from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.collision_groups import Words, link_groups
 from batchpid.sim.robot.collision_shapes import hull, mesh_file
 from batchpid.sim.robot.meshes import note_meshes
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
+from batchpid.sim.robot.self_collision import Words, link_groups
 from batchpid.sim.robot.simulated_links import rigid_tree
 from batchpid.sim.robot.tables import Body, Shape, Tables
 from batchpid.task_space.frames import SpatialInertia, from_rpy, matrix_of

@@ -9,7 +9,7 @@ of SAPIEN's types, which SAPIEN does not guarantee: see
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import sapien
 
-from batchpid.arrays.array_types import Bool, DType, Float32, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import SWITCH, extension
 from batchpid.sim.engine.native.interface import STATUS, SYMBOLS
@@ -85,20 +85,23 @@ class PythonCalls:
         self._set_qf = [(robot.set_qf, row) for robot, row, skipped in rows if not skipped]
         self._steps = [system.step for system in systems]
 
-    def qpos(self, dtype: DType) -> Rows:
+    def qpos(self) -> Float64:
         """Return the joint positions, a new array."""
-        return np.concatenate([get() for get in self._get_qpos], dtype=dtype).reshape(self._shape)
+        return self._table(get() for get in self._get_qpos)
 
-    def qvel(self, dtype: DType) -> Rows:
+    def qvel(self) -> Float64:
         """Return the joint velocities, a new array."""
-        return np.concatenate([get() for get in self._get_qvel], dtype=dtype).reshape(self._shape)
+        return self._table(get() for get in self._get_qvel)
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new
         array.
         """
-        forces = [compute(gravity, coriolis) for compute in self._passive_force]
-        return np.concatenate(forces, dtype=dtype).reshape(self._shape)
+        return self._table(compute(gravity, coriolis) for compute in self._passive_force)
+
+    def _table(self, rows: Iterable[Float32]) -> Float64:
+        # After close() there are no rows.
+        return np.array([*rows], np.float64).reshape(self._shape)
 
     def write_qf(self) -> None:
         """Apply the efforts in ``qf``."""
@@ -148,23 +151,23 @@ class NativeCalls:
         # The pack's own arrays, which native code reads at each call.
         self.qf, self.skip = qf, skip
 
-    def qpos(self, dtype: DType) -> Rows:
+    def qpos(self) -> Float64:
         """Return the joint positions, a new array."""
-        rows = np.empty(self.qf.shape, dtype)
+        rows = np.empty(self.qf.shape)
         self._native.read_qpos(self.gateway, rows)
         return rows
 
-    def qvel(self, dtype: DType) -> Rows:
+    def qvel(self) -> Float64:
         """Return the joint velocities, a new array."""
-        rows = np.empty(self.qf.shape, dtype)
+        rows = np.empty(self.qf.shape)
         self._native.read_qvel(self.gateway, rows)
         return rows
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new
         array.
         """
-        rows = np.empty(self.qf.shape, dtype)
+        rows = np.empty(self.qf.shape)
         self._native.passive_force(self.gateway, rows, gravity, coriolis)
         return rows
 
@@ -197,7 +200,8 @@ def pointer(wrapper: Any, kind: str) -> int:
         raise RuntimeError(
             f"{problem}; install SAPIEN from PyPI, or set {SWITCH}=0 for Python calls"
         )
-    return _capsule_pointer(capsule, _capsule_name(capsule))
+    address: int = _capsule_pointer(capsule, _capsule_name(capsule))
+    return address
 
 
 _SENSE = 1 << STATUS.index("sense")

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from sapien import Pose, physx
 
-from batchpid.arrays.array_types import Bool, DType, Float32, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ORIGIN, ModelPack
@@ -155,8 +155,8 @@ class Pack(ModelPack):
     def step(self) -> None:
         """Do one sim step of every scene, with constraint efforts on coupled joints."""
         if self._constraint is not None:
-            qpos = self._calls.qpos(np.float64)
-            qvel = self._calls.qvel(np.float64)
+            qpos = self._calls.qpos()
+            qvel = self._calls.qvel()
             self._joint_qf[...] = self._constraint.apply(self.qf, qpos, qvel)
             self._calls.write_qf()
         self._stepped[...] = True
@@ -190,10 +190,8 @@ class Pack(ModelPack):
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
         if self._constraint is not None:
-            passive = self._calls.passive_force(True, True, np.float64)
-            self._constraint.update(
-                self.joint_mass_matrix, self._calls.qpos(np.float64), passive, rows
-            )
+            passive = self._calls.passive_force(True, True)
+            self._constraint.update(self.joint_mass_matrix, self._calls.qpos(), passive, rows)
 
     @cached_property
     def rigid_tree(self) -> RigidTree:
@@ -237,16 +235,16 @@ class Pack(ModelPack):
         self._stepped[rows] = False
         self._bind()
 
-    def read_qpos(self, dtype: DType = np.float64) -> Rows:
-        return self._calls.qpos(dtype)
+    def read_qpos(self) -> Float64:
+        return self._calls.qpos()
 
-    def read_qvel(self, dtype: DType = np.float64) -> Rows:
-        return self._calls.qvel(dtype)
+    def read_qvel(self) -> Float64:
+        return self._calls.qvel()
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         if self.steps_read_force(gravity, coriolis):
-            return self._calls.passive_force(gravity, coriolis, dtype)
-        return self._model_force(gravity, coriolis, dtype)
+            return self._calls.passive_force(gravity, coriolis)
+        return self._model_force(gravity, coriolis)
 
     def write_qf(self, effort: Rows) -> None:
         self.qf[...] = effort

@@ -11,7 +11,7 @@ import pytest
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 import batchpid as bp
-from batchpid.sim import Finding, Robot
+from batchpid.sim import Finding, Robot, Runner
 
 COLLISION = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
 GAINS = {"kp": 1.0, "ki": 0.0, "kd": 0.1}
@@ -161,6 +161,28 @@ def test_the_tutorials_gains_are_unstable_on_the_jaco2s_light_links(jaco2):
         finding.code for finding in jaco2.check(params=jaco2.params(kp=0.01, ki=0.0, kd=1e-5))
     ]
     assert "unstable" not in slower
+
+
+def test_gains_that_ring_are_found_with_frequency_and_damping(panda):
+    """The tutorial's gains on the panda: the simulated motion has the reported period and decay."""
+    (found,) = (
+        finding for finding in panda.check(params=panda.params()) if finding.code == "ringing"
+    )
+    assert (found.severity, found.joint) == ("note", "panda_joint2")
+    assert "rings at 0.54 Hz with a damping ratio of 0.068" in found.text
+    assert "65 % of the amplitude" in found.text
+    target = panda.start + np.where(np.arange(9) == 1, 0.1, 0.0)
+    with Runner(
+        panda, 1, workers=0, params=panda.params(), collisions=False, substeps=20
+    ) as runner:
+        rollout = runner.rollout(np.broadcast_to(target, (500, 9)))
+    error = rollout.qpos[:, 0, 1] - target[1]
+    peaks = 1 + np.flatnonzero(
+        (error[1:-1] > error[:-2]) & (error[1:-1] >= error[2:]) & (error[1:-1] > 0.01)
+    )
+    assert len(peaks) >= 2
+    assert rollout.time[peaks[1]] - rollout.time[peaks[0]] == pytest.approx(1 / 0.54, rel=0.05)
+    assert error[peaks[1]] / error[peaks[0]] == pytest.approx(0.65, abs=0.05)
 
 
 def test_an_effort_limit_below_gravity_is_found(tmp_path):

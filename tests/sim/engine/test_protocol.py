@@ -72,14 +72,14 @@ class DoubleIntegrators:
         self.rigid_tree = sliders(spec)
         self._state, self._moves = np.zeros((2, size, self.dof)), np.ones((size, 1))
 
-    def read_qpos(self, dtype=np.float64):
-        return self._state[0].astype(dtype)
+    def read_qpos(self):
+        return self._state[0].copy()
 
-    def read_qvel(self, dtype=np.float64):
-        return self._state[1].astype(dtype)
+    def read_qvel(self):
+        return self._state[1].copy()
 
-    def passive_force(self, gravity, coriolis, dtype=np.float64):
-        return np.zeros_like(self.qf, dtype)
+    def passive_force(self, gravity, coriolis):
+        return np.zeros_like(self.qf)
 
     def joint_mass_matrix(self, qpos):
         return np.tile(np.eye(qpos.shape[1]), (len(qpos), 1, 1))
