@@ -16,7 +16,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.elementwise import TURN
-from batchpid.checks.warn import warn
+from batchpid.errors import warn
 from batchpid.sim.recording.setpoint_files import error
 from batchpid.sim.robot.robot import Robot
 
