@@ -25,8 +25,6 @@ if REQUIRED not in ("0", "1"):
     )
 MODULES = (
     "batchpid.native.extensions",
-    "batchpid.native.operations",
-    "batchpid.native.task_space_extension",
     "batchpid.sim.engine.native.interface",
 )
 """Definitions of the extensions, each after those that it imports."""
@@ -83,7 +81,7 @@ class Build(build_ext):
 
 
 modules = [load(name) for name in MODULES] if os.environ.get("BATCHPID_NATIVE") != "0" else []
-extensions = [extension for module in modules[1:] for extension in module.EXTENSIONS.values()]
+extensions = [extension for module in modules for extension in module.EXTENSIONS.values()]
 setup(
     cmdclass={"build_ext": Build},
     # The longest to compile come first.

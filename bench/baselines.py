@@ -16,8 +16,7 @@ from tutorial import TutorialLoop
 from workload import Case, Workload
 
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.workers.placement import pinned_cores
-from batchpid.sim.workers.worker import ONE_THREAD
+from batchpid.sim.workers.worker import ONE_THREAD, pinned_cores
 
 TUTORIALS = ("tutorial", "tutorial, a process a core")
 """The tutorial's loop as written: one robot in one process, and one in each of the processes."""

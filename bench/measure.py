@@ -156,8 +156,9 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     """
     share = max(1, workload.num_envs // workload.processes)
     robot = workload.simulated_robot()
-    shared = SharedArrays(Arrays.layout(1, share, robot.dof))
     options = RunnerOptions(robot, share, physics=workload.physics)
+    layout = Arrays.layout(1, share, robot.dof, robot.dof, options.observed)
+    shared = SharedArrays(layout)
     with ExitStack() as stack:
         for module in (env_group, numpy_executor):  # in NumPy, with a call for each phase
             stack.enter_context(patch.object(module, "steps_natively", return_value=False))

@@ -12,18 +12,16 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
+import mujoco.batch as mujoco_batch
 import numpy as np
 import psutil
 import pytest
 from workload import Workload
 
-pytest.importorskip("mujoco")
-mujoco_batch = pytest.importorskip("mujoco.batch")
-
-from batchpid.sim import MujocoSolver, Robot, Runner  # noqa: E402
-from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
-from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
-from batchpid.sim.options.options import default_params  # noqa: E402
+from batchpid.sim import MujocoSolver, Robot, Runner
+from batchpid.sim.engine.mujoco.model_builder import robot_model
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.options.options import default_params
 
 TICKS, ROUNDS, SUBSTEPS = 20, 5, 20
 GAINS = ("tutorial", "tuned")

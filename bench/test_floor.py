@@ -16,16 +16,15 @@ import statistics
 import time
 from pathlib import Path
 
+import mujoco.batch as mujoco_batch
 import numpy as np
 import pytest
 
-mujoco_batch = pytest.importorskip("mujoco.batch")
-
-from batchpid import PIDParams  # noqa: E402
-from batchpid.sim import MujocoSolver, Robot, Runner  # noqa: E402
-from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf  # noqa: E402
-from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
-from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
+from batchpid import PIDParams
+from batchpid.sim import MujocoSolver, Robot, Runner
+from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+from batchpid.sim.engine.mujoco.model_builder import robot_model
+from batchpid.sim.engine.scene_spec import SceneSpec
 
 NUM_ENVS, TICKS, ROUNDS, SUBSTEPS = 16, 20, 5, 20
 SHAKE = 0.02

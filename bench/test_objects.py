@@ -12,18 +12,15 @@ import time
 from pathlib import Path
 from typing import Any
 
+import mujoco.batch as mujoco_batch
 import numpy as np
-import pytest
 from lxml import etree
 from numpy.typing import NDArray
 
-pytest.importorskip("mujoco")
-mujoco_batch = pytest.importorskip("mujoco.batch")
-
-from batchpid.sim import MujocoSolver, Robot, Runner  # noqa: E402
-from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf  # noqa: E402
-from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
-from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
+from batchpid.sim import MujocoSolver, Robot, Runner
+from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+from batchpid.sim.engine.mujoco.model_builder import robot_model
+from batchpid.sim.engine.scene_spec import SceneSpec
 
 TICKS, ROUNDS, SUBSTEPS, NUM_ENVS = 20, 5, 20, 64
 CUBE = (

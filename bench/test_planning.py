@@ -26,7 +26,6 @@ CASES = {
 @pytest.mark.benchmark(group="plans of 64 rollouts of 0.3 s")
 @pytest.mark.parametrize("case", CASES)
 def test_plans(benchmark, most, case):
-    pytest.importorskip("mujoco")
     timestep, substeps, gains, goal = CASES[case]
     robot, samples = Robot.load("panda"), int(min(SAMPLES, most.envs))
     options = {

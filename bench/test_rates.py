@@ -18,8 +18,6 @@ from batchpid.sim import Robot, Runner
 @pytest.mark.benchmark(group="setpoint rates")
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 def test_rates_cost_little(benchmark, report, compare, most, engine):
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
     robot, num_envs = Robot.load("panda"), int(min(64, most.envs))
     ticks, rounds = int(min(50, most.ticks)), int(min(7, most.rounds))
     setpoints = np.broadcast_to(robot.target, (ticks, num_envs, robot.dof))

@@ -128,8 +128,6 @@ def test_search(benchmark, compare, most, num_envs):
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 def test_closed_loop(benchmark, report, compare, most, engine, num_envs):
     """One env alone has no floor: the law computes four at once."""
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
     robot, num_envs = Robot.load("panda"), int(min(num_envs, most.envs))
     ticks, rounds = int(min(40 if num_envs == 1 else 20, most.ticks)), int(min(7, most.rounds))
     work = Workload(robot, num_envs, workers=0, ticks=ticks)

@@ -76,7 +76,7 @@ def options() -> str:
     texts = [text for group in (RunnerKeywords, *GROUPS) for text in attributes(group)]
     for (name,), text in texts:
         kept, flag = (
-            OPTIONS[name].kept,
+            OPTIONS[name].places,
             f"`--{'no-' * (defaults[name] is True)}{name}`" if OPTIONS[name].flag else "",
         )
         default = "" if defaults[name] in (MISSING, DEFAULT_ENGINE) else f"`{defaults[name]}`"
@@ -117,7 +117,7 @@ def tables() -> dict[tuple[str, str], str]:
         ("law.md", "params"): table(numpydoc(bp.make_params), PARAMS, without),
         ("actuators.md", "actuators"): table(numpydoc(bp.make_actuators), ACTUATORS, without),
         ("randomization.md", "randomization"): table(
-            attributes(Randomization), PHYSICAL | START | EVENTS, ("seed", "each"), off=False
+            attributes(Randomization), PHYSICAL | START | EVENTS, ("seed", "per"), off=False
         ),
         ("runner.md", "options"): options(),
     }

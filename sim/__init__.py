@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.diagnosis.run_checks import MovingSetpointWarning, SetpointWarning
-from batchpid.sim.loop.faults import Fault, FaultWarning
+from batchpid.sim.loop.faults import Fault, FaultWarning, MissedContact, MissedContactWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import Controller, Ray
 from batchpid.sim.options.options import RunnerKeywords, RunnerOptions
@@ -22,11 +22,9 @@ from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
 from batchpid.sim.robot.findings import Finding, RepairWarning
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.command import CommandSpec
-from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.quantities import CommandSpec, Observation
 from batchpid.sim.signals.rollout import Rollout, RunInfo
-from batchpid.sim.tool_space.osc_controller import OperationalSpace
-from batchpid.sim.workers.contact_log import MissedContact, MissedContactWarning
+from batchpid.sim.tool_space import OperationalSpace
 
 if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf

@@ -18,9 +18,7 @@ from setuptools import find_packages
 from setuptools.config.expand import read_attr
 
 import batchpid
-from batchpid.sim.cli import main
-from batchpid.sim.engine import native
-from batchpid.sim.engine.native.library import TESTED
+from batchpid.sim.engine.sapien.calls import TESTED
 
 ROOT = Path(__file__).parents[1]
 LIMITED_API = "cp311"
@@ -81,23 +79,6 @@ def test_the_version_has_one_definition_which_the_package_knows():
     assert re.fullmatch(r"\d+\.\d+\.\d+", batchpid.__version__)
 
 
-def test_the_changelog_has_the_sections_of_keep_a_changelog():
-    kinds = ("Added", "Changed", "Deprecated", "Removed", "Fixed", "Security")
-    text = (ROOT / "CHANGELOG.md").read_text()
-    assert "\n## [Unreleased]\n" in text
-    for release in re.split(r"^## ", text, flags=re.MULTILINE)[1:]:
-        assert re.match(r"\[(Unreleased\]|\d+\.\d+\.\d+\] - \d{4}-\d\d-\d\d)\n", release)
-        found = re.findall(r"^### (.*)$", release, re.MULTILINE)
-        assert set(found) <= set(kinds)
-        assert len(found) == len(set(found))
-
-
-def test_classifiers_name_the_versions_of_python_that_it_runs_on():
-    listed = re.findall(r":: Python :: 3\.(\d+)", "\n".join(PROJECT["project"]["classifiers"]))
-    assert list(map(int, listed)) == [11, 12, 13]
-    assert PROJECT["project"]["requires-python"] == ">=3.11"
-
-
 def test_the_command_checks_the_packages_before_it_imports_them():
     assert PROJECT["project"]["scripts"] == {"batchpid": "batchpid.__main__:main"}
 
@@ -138,15 +119,6 @@ def test_the_tests_run_with_every_sapien_that_native_code_calls():
     workflow = yaml.safe_load((ROOT / ".github/workflows/wheels.yml").read_text())
     assert workflow["jobs"]["tests"]["strategy"]["matrix"]["sapien"] == list(TESTED)
     assert "tests/sim/test_conformance.py" in str(workflow["jobs"]["tests"]["steps"])
-
-
-def test_a_wheel_is_tried_for_the_text_that_the_command_prints(capsys, tmp_path, monkeypatch):
-    places = [(ROOT / name).read_text() for name in ("Makefile", ".github/workflows/wheels.yml")]
-    command = r'demo --num-envs 2 --seconds 1.5 --force \| grep "(.*)"'
-    (text,) = {found for place in places for found in re.findall(command, place)}
-    monkeypatch.chdir(tmp_path)
-    assert main(["demo", "--num-envs", "2", "--seconds", "1.5"]) == 0
-    assert (text in capsys.readouterr().out) == (not native.obstacle())
 
 
 @pytest.mark.slow
@@ -211,15 +183,3 @@ assert sim.joints() == 3
         env=os.environ | {"PYTHONPATH": str(site)},
         check=True,
     )
-
-
-def test_a_step_of_the_installation_is_one_line_and_shows_its_output_if_it_fails():
-    def run(script):
-        words = [sys.executable, ROOT / ".ci/step.py", "installing", "sh", "-c", script]
-        return subprocess.run(words, capture_output=True, text=True)
-
-    done = run("echo Collecting a; echo building b")
-    assert re.fullmatch(r"installing \.\.\.\ninstalling: \d+ s\n", done.stdout)
-    assert (done.returncode, done.stderr) == (0, "")
-    failed = run("echo Collecting a; echo no space left >&2; exit 3")
-    assert (failed.returncode, failed.stderr) == (3, "\nCollecting a\nno space left\n")

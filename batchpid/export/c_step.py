@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Array
-from batchpid.native.operations import OPERATIONS
+from batchpid.native.extensions import OPERATIONS
 from batchpid.native.tracing import Trace
 
 _EXPRESSIONS = {
@@ -163,6 +163,7 @@ def _unrolled(
     operations: list[tuple[str, int, list[int]]] = []
 
     def unroll(part: Trace, first: list[int]) -> list[int]:
+        # Registers are reused; in C each value has a variable.
         values = first + [0] * part.registers  # the value in each register
         rows = np.frombuffer(part.operations, np.int32).reshape(-1, 5).tolist()
         for code, out, *operands in rows:

@@ -120,15 +120,12 @@ def _gains(law: Differences, at: int) -> Document:
     gains["i_clamp_max"] = max(gains["i_clamp_max"], 0.0)
     strategy = strategies(params)[at]
     tracks = strategy == "back_calculation"
-    is_conditional = strategy == "conditional"
-    if is_conditional:
-        gains["antiwindup_strategy"] = "conditional_integration"
-    else:
-        gains["antiwindup_strategy"] = strategy
+    if strategy == "conditional":
+        strategy = "conditional_integration"
+    gains["antiwindup_strategy"] = strategy
+    gains["tracking_time_constant"] = 0.0
     if tracks:
         gains["tracking_time_constant"] = documents.plain(params.tracking_time[:, at])
-    else:
-        gains["tracking_time_constant"] = 0.0
     weight = params.setpoint_weight_derivative
     gains["ff_velocity_scale"] = 0.0
     if weight is not None:

@@ -24,14 +24,17 @@ from batchpid.motors.actuator_dynamics import (
     measure,
     measurement_noise,
 )
-from batchpid.motors.actuator_files import (
+from batchpid.motors.actuators import (
+    DRIVEN,
+    JOINT_SIDE,
+    Actuators,
+    ActuatorState,
     dumps_actuators,
     load_actuators,
     loads_actuators,
+    make_actuators,
     save_actuators,
 )
-from batchpid.motors.actuator_state import ActuatorState
-from batchpid.motors.actuators import DRIVEN, JOINT_SIDE, Actuators, make_actuators
 from batchpid.motors.coupling import Coupling, Follower
 
 __all__ = [

@@ -25,7 +25,7 @@ A new effect is, in :mod:`batchpid.motors.actuators`, a field of :class:`Actuato
 the table of docs/actuators.md (``python docs/tables.py``) take it from there. Here it is a field of
 :class:`MotorCoefficients`, a value in :func:`discretise`, and a term in ``_delivered`` (motor),
 ``_play`` or ``_encode`` (sensor). An effect that changes the limits of commands has a term in
-:func:`command_limits`, too. Terms may use the operations of :mod:`batchpid.native.operations` only,
+:func:`command_limits`, too. Terms may use the operations of :mod:`batchpid.native.extensions` only,
 so that they also run in JAX and in native code.
 """
 
@@ -41,8 +41,7 @@ from batchpid.arrays.elementwise import TURN, clip, in_dtype_of, namespace, push
 from batchpid.checks.validate import check_time_step
 from batchpid.motors import delay
 from batchpid.motors import sensor_noise as noise
-from batchpid.motors.actuator_state import ActuatorState
-from batchpid.motors.actuators import Actuators
+from batchpid.motors.actuators import Actuators, ActuatorState
 from batchpid.motors.envelope import Envelope, command_envelope, envelope, limits
 
 _ONE = np.uint32(1)
@@ -129,8 +128,6 @@ def init(
     if actuators.max_delay is not None:
         if samples is None:
             samples = delay.samples_of(actuators.max_delay, dt)
-        else:
-            samples = samples
         if actuators.command_delay is not None:
             command = delay.start(requested, samples)
         if actuators.sensor_delay is not None:
@@ -342,8 +339,6 @@ def advance_measurement(
     if key is not None:
         if drawn is None:
             drawn = measurement_noise(k, key, step, qpos, xp)
-        else:
-            drawn = drawn
         step = step + _ONE
     qpos, qvel = _encode(k, qpos, qvel, *(drawn or (None, None)))
     return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel

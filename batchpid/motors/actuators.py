@@ -1,7 +1,16 @@
-"""Parameters of actuators and sensors: build, broadcast, validate.
+"""Parameters and state of actuators and sensors: build, broadcast, validate, save.
 
 An effect that is off is ``None``: it is not a leaf and costs nothing. Every effect is declared
 once, with its unit, bounds and group, as a field of :class:`Actuators`.
+
+A file in YAML or JSON has one entry per joint, with the options of :func:`make_actuators`; a joint
+that is left out has ideal actuators (:class:`batchpid.io.documents.RecordFile`)::
+
+    format: batchpid-actuators-1
+    about: {robot: arm, log: chirp.csv}
+    joints:
+      shoulder: {command_delay: 0.0037, strength: 0.92, coulomb: 0.4, viscous: 1.1, armature: 0.02}
+      elbow: {strength: 0.95}
 """
 
 from __future__ import annotations
@@ -18,6 +27,7 @@ from batchpid.arrays.field_tables import Field, declared, in_group
 from batchpid.arrays.records import LeafBuilder, Record, with_fields
 from batchpid.checks.validate import entries, integer, is_traced, number
 from batchpid.errors import InvalidArgumentError
+from batchpid.io.documents import RecordFile
 
 MAX_DELAY = 1.0
 """Longest delay [s]."""
@@ -131,6 +141,7 @@ class Actuators(Record, _ActuatorsFields):
         present = self.options()
         if not options.keys().isdisjoint(DELAYS):
             present.pop("max_delay", None)
+        # Traced numbers bring a dtype of their own.
         if any(is_traced(value) for value in options.values()):
             present.pop("dtype", None)
         if not self.num_joints and "joints" not in options:
@@ -274,3 +285,72 @@ def _longest_delay(leaves: Document, max_delay: float | None) -> float | None:
     if delays:
         return longest
     return None
+
+
+class _ActuatorStateFields(NamedTuple):
+    command: Array = None
+    """Efforts asked for, latest first (envs, samples, joints) [N m or N]."""
+    effort: Array = None
+    """Effort behind the lag (envs, joints) [N m or N]."""
+    sensor: Array = None
+    """Positions that the sensor was at, and its velocities, latest first (envs, samples, 2
+    joints).
+    """
+    encoder: Array = None
+    """Position of the sensor's side of the play (envs, joints) [rad or m]."""
+    key: Array = None
+    """Key of the noise, a hash of seed, env and episode (envs, 2) uint32."""
+    step: Array = None
+    """Measurements since the reset (envs,) uint32."""
+
+
+class ActuatorState(Record, _ActuatorStateFields):
+    """State of actuators and sensors; None where no effect needs it. Every array has the envs as
+    its first axis.
+    """
+
+    __slots__ = ()
+    NAME = "state"
+
+    def __repr__(self) -> str:
+        return array_summary(self._replace(key=None, step=None), "envs", "joints")
+
+    def matched_to(self, fresh: ActuatorState) -> ActuatorState:
+        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the
+        others dropped.
+
+        A history that is longer there is continued by its oldest sample. The key is taken from
+        ``fresh``.
+        """
+        matched = super().matched_to(fresh)
+        histories = {
+            name: _resized(leaf, getattr(fresh, name)) for name, leaf in matched.leaves().items()
+        }
+        return matched._replace(**histories | {"key": fresh.key})
+
+
+def _resized(old: Array, new: Array) -> Array:
+    """Return a history of the length of another; other arrays as they are."""
+    if old.ndim < 3 or old.shape == new.shape:
+        return old
+    xp = old.__array_namespace__()
+    samples = new.shape[1]
+    if samples < old.shape[1]:
+        return old[:, :samples].copy()
+    # Before its oldest sample a signal is taken as constant.
+    oldest = xp.broadcast_to(old[:, -1:], (old.shape[0], samples - old.shape[1], old.shape[2]))
+    return xp.concatenate((old, oldest), axis=1)
+
+
+ACTUATORS = RecordFile(
+    "batchpid-actuators-1",
+    Actuators,
+    make_actuators,
+    ("seed", "max_delay"),
+    {**FIELDS, "continuous": Field(neutral=False)},
+    partial=True,
+)
+dumps_actuators = ACTUATORS.dumps
+loads_actuators = ACTUATORS.loads
+save_actuators = ACTUATORS.save
+load_actuators = ACTUATORS.load

@@ -87,6 +87,7 @@ class Coupling(NamedTuple):
         multipliers = np.ones(joints)
         offsets = np.zeros(joints)
         direct = {follower.joint: follower for follower in followers}
+        # A chain of followers is multiplied out, down to its leader.
         for joint in direct:
             multiplier = 1.0
             offset = 0.0
@@ -102,6 +103,7 @@ class Coupling(NamedTuple):
             multipliers[joint] = multiplier
             offsets[joint] = offset
         independent = np.array([joint not in direct for joint in range(joints)], bool)
+        # Sums over followers have a fixed order: the first of each leader, then the second.
         of_leader = [
             [item for item in sorted(direct) if leaders[item] == joint] for joint in range(joints)
         ]

@@ -64,10 +64,12 @@ def discretise(delay: Array, dt: Array, history: Array, begin: int = 0) -> Delay
     whole = xp.rint(steps)
     steps = xp.where(xp.abs(steps - whole) < _NEAR, whole, steps)
     steps = xp.minimum(steps, samples - 1) + xp.zeros((envs, 1), steps.dtype)
+    # One sample is left for the older neighbour of the interpolation.
     floor = xp.minimum(xp.floor(steps), samples - 2)
     fraction = steps - floor
     first = xp.arange(envs)[:, None] * (samples * numbers) + begin + xp.arange(delay.shape[1])[None]
     later = first + floor.astype(int) * numbers
+    # Delays of whole steps need no interpolation.
     if not is_traced(fraction) and not fraction.any():
         return Delay(later[None], None)
     return Delay(xp.stack((later, later + numbers)), fraction)

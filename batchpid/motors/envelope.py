@@ -43,6 +43,7 @@ def envelope(actuators: Actuators) -> Envelope:
     k = Envelope(limit=limit, least=None if limit is None else -limit)
     if stall is None:
         return k
+    # A motor without a stall effort has no line, so its slope is 0.
     finite = xp.isfinite(stall)
     slope = xp.where(finite, xp.where(finite, stall, 0.0) / actuators.no_load_speed, 0.0)
     return k._replace(stall=stall, reverse=-stall, slope=slope)

@@ -169,6 +169,7 @@ def refresh(
     implicit = xp.zeros_like(state.effort) + implicit
     diagonal = implicit[:, :, None] * xp.eye(implicit.shape[-1], dtype=implicit.dtype)[None]
     inverse = xp.linalg.inv(mass_matrix + dt * diagonal)
+    # The diagonal is what each joint shows while the others are free.
     mobility = xp.einsum("ejj->ej", inverse)
     scale = xp.sqrt(mobility)
     # Coupled joints share the gain, by Gershgorin: see above.

@@ -96,13 +96,9 @@ def make_guard(
     low, high = build.limits("", "lower", "upper", limits)
     if mask is not None:
         xp = namespace(mask)
-        if low is None:
-            low = None
-        else:
+        if low is not None:
             low = xp.where(mask > 0, -math.inf, low)
-        if high is None:
-            high = None
-        else:
+        if high is not None:
             high = xp.where(mask > 0, math.inf, high)
     rates = {name: FIELDS[name] for name in ("rate", "acceleration")}
     return Guard(

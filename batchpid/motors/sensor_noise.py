@@ -30,6 +30,7 @@ def quantiles(dtype: DType) -> Rows:
     inverse = NormalDist().inv_cdf
     upper = np.array([inverse((i + 0.5) / 2**16) for i in range(2**15, 2**16)])
     upper /= np.sqrt((upper**2).mean())
+    # One half is the mirror of the other, so the mean is 0.
     table = np.concatenate((-upper[::-1], upper)).astype(dtype)
     table.setflags(write=False)
     return table

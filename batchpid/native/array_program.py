@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import DType, Rows
-from batchpid.native.extensions import StaleExtensionError, load
-from batchpid.native.operations import PROGRAM
+from batchpid.native.extensions import PROGRAM, StaleExtensionError, load
 from batchpid.native.tracing import Trace
 
 NUMBERS_PER_THREAD = 2**17
@@ -33,6 +32,7 @@ def interpreter() -> Any:
     """
     native = load(PROGRAM)
     native.use(np.ndarray, np.empty)
+    # Two kinds of arrays, writable and read-only, that a program meets.
     rows = np.empty((2, 3))
     fixed = np.empty((4, 1), np.float32)
     fixed.flags.writeable = False
@@ -54,6 +54,7 @@ def threads_for(numbers: int, threads: int | None = None) -> int:
     most = numbers // NUMBERS_PER_THREAD
     if most < 2:
         return 1
+    # The process may be bound to fewer cores than the machine has.
     if threads is None:
         if hasattr(os, "sched_getaffinity"):
             threads = len(os.sched_getaffinity(0))
@@ -84,6 +85,7 @@ class ArrayProgram:
         self.dtype = np.dtype(dtype)
         self.masks = trace.masks
         prepared = [np.ascontiguousarray(entry, dtype) for entry in (*constants, *trace.literals)]
+        # What depends on constants alone is computed once, not at every call.
         if trace.prelude is not None:
             rows = max((entry.shape[0] for entry in prepared if entry.ndim == 2), default=1)
             result = ArrayProgram(trace.prelude, (), len(prepared), (rows, shape[1]), dtype)(

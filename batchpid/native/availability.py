@@ -7,9 +7,7 @@ from functools import cache
 
 from batchpid.checks.warn import warn
 from batchpid.native.array_program import interpreter
-from batchpid.native.extensions import Extension, StaleExtensionError, load
-from batchpid.native.operations import PROGRAM
-from batchpid.native.task_space_extension import TASK_SPACE
+from batchpid.native.extensions import PROGRAM, TASK_SPACE, Extension, StaleExtensionError, load
 
 SWITCH = "BATCHPID_NATIVE"
 """Environment variable: "0" switches native code off."""

@@ -55,6 +55,7 @@ class CompiledLaw:
         """Return the program for a state and inputs like these, and the state indices that it
         returns.
         """
+        # Inputs that are left out make another program.
         key = tuple([leaf is None for leaf in (*state, *inputs)])
         if key not in self._programs:
             dtype = self._k.kp.dtype
@@ -93,6 +94,7 @@ class CompiledLaw:
             for entry in arguments
         ]
         program(*fixed, *read, out=(*written, *shown, effort))
+        # Terms are new arrays at each step, so there is no fast function for them.
         if self._terms:
             return state, effort, Terms(*shown)._replace(effort=effort), None
         bits = sum((entry is not None) << at for at, entry in enumerate(inputs))

@@ -1,4 +1,5 @@
-"""Native extensions: their files, and loading of those that were built from the present files.
+"""Native extensions: their files and tables, and loading of those that were built from the present
+files.
 
 C++ code repeats tables of the Python code, so an extension works only with the files that it was
 built from. ``setup.py`` compiles a digest of each file into the extension, and :func:`load`
@@ -17,13 +18,24 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).parents[2]
 NOT_BUILT = "the extension was not built: it needs a C++ compiler when batchpid is installed"
 ROUNDED = (
-    *("-std=c++17", "-O3", "-g0", "-fvisibility=hidden"),
-    *("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
+    "-std=c++17",
+    "-O3",
+    "-g0",
+    "-fvisibility=hidden",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fno-trapping-math",
 )
 """Compiler flags under which each operation is rounded as in NumPy: operations are not fused."""
 LANES_ONLY = (
-    *("-fno-tree-loop-vectorize", "-fno-unswitch-loops", "-fno-split-loops", "-fno-ipa-cp-clone"),
-    *("-fno-peel-loops", "-fno-tree-loop-distribute-patterns", "-fno-split-paths", "-fno-gcse"),
+    "-fno-tree-loop-vectorize",
+    "-fno-unswitch-loops",
+    "-fno-split-loops",
+    "-fno-ipa-cp-clone",
+    "-fno-peel-loops",
+    "-fno-tree-loop-distribute-patterns",
+    "-fno-split-paths",
+    "-fno-gcse",
     "-Wno-psabi",
 )
 """Flags for code that computes on Lanes (lanes.h), which are vectors already: half to compile,
@@ -61,6 +73,137 @@ class Extension(NamedTuple):
         ]
 
 
+OPERATIONS = (
+    "add",
+    "subtract",
+    "multiply",
+    "divide",
+    "maximum",
+    "minimum",
+    "greater",
+    "greater_equal",
+    "less",
+    "less_equal",
+    "equal",
+    "not_equal",
+    "and",
+    "or",
+    "not",
+    "negative",
+    "absolute",
+    "rint",
+    "ceil",
+    "floor",
+    "sqrt",
+    "sign",
+    "isfinite",
+    "where",
+    "row_minimum",
+    "matrix_vector",
+    "multiply_add",
+    "add_subtract",
+    "subtract_multiply",
+    "clip",
+    "push",
+    "take",
+    "gather",
+)
+"""Operations of programs, as Code in program.h."""
+MASKS = frozenset(OPERATIONS[6:15]) | {"isfinite"}
+"""Operations whose results are masks."""
+MOST_SUMMED = 128
+"""Largest number of terms for which a sum has NumPy's order."""
+
+
+_FILES = ("make_program.h", "extension.h", "program.h", "extensions.py")
+PROGRAMS = tuple(f"batchpid/native/{name}" for name in _FILES)
+"""Headers and tables of programs, for extensions that include them."""
+PROGRAM = Extension(
+    "batchpid.native._program", ("batchpid/native/program.cpp", *PROGRAMS), (*ROUNDED, "-pthread")
+)
+
+KINEMATICS = ("qpos", "qvel", "tool", "pose", "jacobian", "jacobian_rate", "mass_matrix", "bias")
+"""Arrays of ``kinematics`` in task_space.cpp, after the tree and the body of the tool; those after
+the tool are results.
+"""
+LAW = (
+    "pose",
+    "jacobian",
+    "jacobian_rate",
+    "mass_matrix",
+    "bias",
+    "chain",
+    "setpoint",
+    "qpos",
+    "qvel",
+    "twist",
+    "acceleration",
+    "wrench",
+    "feedforward",
+    "damping",
+    "added_inertia",
+    "left",
+    "posture",
+    "integral",
+    "kp",
+    "kd",
+    "c",
+    "acceleration_share",
+    "ki_dt",
+    "ki_dt2",
+    "posture_kp",
+    "posture_kd",
+    "limit_kp",
+    "limit_kd",
+    "limit_margin",
+    "limit_low",
+    "limit_high",
+    "integral_limit",
+    "position_error_limit",
+    "rotation_error_limit",
+    "smallest_eigenvalue",
+    "axes",
+    "force_axes",
+    "effort_min",
+    "effort_max",
+    "turns",
+    "effort",
+    "next_integral",
+    "limited",
+    "error",
+    "force",
+    "task",
+    "posture_effort",
+    "unsaturated",
+    "task_share",
+    "posture_share",
+    "near_singular",
+)
+"""Arrays of ``law``: dynamics, inputs and state, coefficients, and results from the effort on."""
+
+RIGID_BODIES = (
+    "batchpid/native/lanes.h",
+    "batchpid/native/rigid_body.h",
+    "batchpid/native/extensions.py",
+)
+_TASK_SPACE_FILES = (
+    "task_space.cpp",
+    "extension.h",
+    "mobility.h",
+    "osc_law.h",
+    "pose_search.h",
+    "tables.h",
+    "tool.h",
+)
+
+TASK_SPACE = Extension(
+    "batchpid.native._task_space",
+    (*(f"batchpid/native/{name}" for name in _TASK_SPACE_FILES), *RIGID_BODIES),
+    (*ROUNDED, *LANES_ONLY),
+)
+EXTENSIONS = {"_program": PROGRAM, "_task_space": TASK_SPACE}
+
+
 @cache
 def load(extension: Extension) -> Any:
     """Return the module of an extension.
@@ -81,6 +224,7 @@ def load(extension: Extension) -> Any:
         raise StaleExtensionError(
             f"{name} cannot be loaded ({error}); {_remedy(extension)}"
         ) from error
+    # The digests were compiled in: a file that has changed since makes the extension stale.
     built = getattr(module, "sources", "").split()
     if changed := [
         digest.partition("=")[0] for digest in extension.digests() if digest not in built

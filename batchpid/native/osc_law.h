@@ -1,5 +1,5 @@
 // Law of operational-space control for WIDTH robots, and its compensation of friction. The equations stand in
-// batchpid/task_space: operational_space.py and projections.py; and in sim/tool_space/osc_controller.py.
+// batchpid/task_space: operational_space.py and projections.py; and in sim/tool_space.py.
 
 #pragma once
 
@@ -16,11 +16,11 @@
 
 namespace batchpid {
 
-// Arrays of `law`: LAW in task_space_extension.py.
+// Arrays of `law`: LAW in extensions.py.
 enum Law {
   TASK_POSE, TASK_JACOBIAN, TASK_RATE, TASK_MASS, TASK_BIAS, CHAIN,
   SETPOINT, LAW_QPOS, LAW_QVEL, TWIST, ACCELERATION, WRENCH, FEEDFORWARD,
-  DAMPING, ADDED_INERTIA, POSTURE, INTEGRAL,
+  DAMPING, ADDED_INERTIA, LEFT, POSTURE, INTEGRAL,
   KP, KD, C, ACCELERATION_SHARE, KI_DT, KI_DT2, POSTURE_KP, POSTURE_KD,  // coefficients: fields of OSCCoefficients
   LIMIT_KP, LIMIT_KD, LIMIT_MARGIN, LIMIT_LOW, LIMIT_HIGH, INTEGRAL_LIMIT,
   POSITION_LIMIT, ROTATION_LIMIT, SMALLEST, SELECTED, FORCE_AXES,
@@ -126,8 +126,29 @@ class OSCLaw {
     if (!table[TASK_BIAS]) given_.set(TASK_BIAS, dynamics->bias.data());
   }
 
-  // Load WIDTH rows.
-  void load(std::int64_t first) { given_.load(first); }
+  // Load WIDTH rows, with setpoints at the present moment of the tick: `_carried` in sim/tool_space.py.
+  void load(std::int64_t first) {
+    given_.load(first);
+    if (given_[LEFT] == nullptr) return;
+    Lanes *twist = given_[TWIST], *pose = given_[SETPOINT], *q = pose + 3, step[AXES], cosine, sine;
+    for (int axis = 0; axis < AXES; ++axis) {
+      Lanes const change = given_[ACCELERATION] ? *given_[LEFT] * given_[ACCELERATION][axis] : Lanes{};
+      step[axis] = -*given_[LEFT] * (twist[axis] - 0.5 * change);
+      twist[axis] -= change;
+    }
+    Lanes const angle = length_of(step + 3);
+    for (int k = 0; k < WIDTH; ++k) {
+      cosine.of[k] = std::cos(0.5 * angle.of[k]);
+      sine.of[k] = angle.of[k] > 0 ? std::sin(0.5 * angle.of[k]) / angle.of[k] : 0.5;
+    }
+    Lanes const w = q[0], a = q[1], b = q[2], c = q[3];
+    Lanes const x = sine * step[3], y = sine * step[4], z = sine * step[5];
+    for (int k = 0; k < 3; ++k) pose[k] += step[k];
+    q[0] = cosine * w - x * a - y * b - z * c;
+    q[1] = cosine * a + x * w + y * c - z * b;
+    q[2] = cosine * b - x * c + y * w + z * a;
+    q[3] = cosine * c + x * b - y * a + z * w;
+  }
   Lanes const *qpos() const { return given_[LAW_QPOS]; }
   Lanes const *qvel() const { return given_[LAW_QVEL]; }
   Given &given() { return given_; }

@@ -16,7 +16,7 @@
 
 namespace batchpid {
 
-// Arrays of `search`: SEARCH in task_space_extension.py.
+// Arrays of `search`; those from FOUND on are results, and begin with the starts.
 enum Search { GOAL, TOOL_FRAME, LOWER, UPPER, LARGEST, FOUND, ERRORS, STEPS, SEARCH };
 
 // Searches of WIDTH robots. Each lane takes the next row when its search has ended.

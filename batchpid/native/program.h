@@ -28,7 +28,7 @@ namespace batchpid {
 
 using Index = std::ptrdiff_t;
 
-// OPERATIONS in operations.py. Masks are 1 and 0.
+// OPERATIONS in extensions.py. Masks are 1 and 0.
 enum Code : std::int32_t {
   ADD, SUBTRACT, MULTIPLY, DIVIDE, MAXIMUM, MINIMUM, GREATER, GREATER_EQUAL, LESS, LESS_EQUAL, EQUAL, NOT_EQUAL, AND, OR,
   NOT, NEGATIVE, ABSOLUTE, RINT, CEIL, FLOOR, SQRT, SIGN, FINITE, WHERE, ROW_MINIMUM, MATRIX_VECTOR,

@@ -43,7 +43,7 @@ struct BodyInertia {
   T mass, center[3], tensor[3][3];
 };
 
-// Constants of one body and its joint, a row of 25 numbers: BODY in task_space_extension.py.
+// Constants of one body and its joint, a row of 25 numbers.
 template <class T>
 struct BodyRow {
   T rotation[3][3], position[3];

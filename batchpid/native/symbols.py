@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from batchpid.arrays.array_types import Array, DType
-from batchpid.native.operations import MASKS, OPERATIONS
+from batchpid.native.extensions import MASKS, OPERATIONS
 
 _NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
 """Operations that have another name in NumPy."""

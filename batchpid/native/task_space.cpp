@@ -41,7 +41,7 @@ PyObject *make_tree(PyObject *, PyObject *arguments) {
   return capsule_of(std::move(made));
 }
 
-// Arrays of `kinematics`: KINEMATICS in task_space_extension.py.
+// Arrays of `kinematics`: KINEMATICS in extensions.py.
 enum Kinematics { QPOS, QVEL, TOOL, TOOL_POSE, JACOBIAN, JACOBIAN_RATE, MASS_MATRIX, BIAS, KINEMATICS };
 
 // Write results that are asked for; `body` is the body of the tool, or -1 for the base.
@@ -84,7 +84,7 @@ PyObject *kinematics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
 
 // Columns of an array of `law`.
 std::int64_t law_columns(int array, std::int64_t dof) {
-  constexpr int ONE[] = {POSITION_LIMIT, ROTATION_LIMIT, SMALLEST, TASK_SHARE, POSTURE_SHARE, NEAR_SINGULAR};
+  constexpr int ONE[] = {LEFT, POSITION_LIMIT, ROTATION_LIMIT, SMALLEST, TASK_SHARE, POSTURE_SHARE, NEAR_SINGULAR};
   constexpr int SIX[] = {TASK_RATE, TWIST, ACCELERATION, WRENCH, INTEGRAL, KP, KD, C, ACCELERATION_SHARE, KI_DT, KI_DT2,
                          INTEGRAL_LIMIT, SELECTED, FORCE_AXES, NEXT_INTEGRAL, TASK_ERROR, FORCE};
   if (array == TASK_POSE || array == SETPOINT) return POSE;
@@ -233,7 +233,7 @@ PyObject *search(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
-// Arrays of `move`: MOVE in task_space_extension.py; the first two are changed.
+// Arrays of `move`; the first two are changed.
 enum Move { AT, RATE, INERTIA, PUSH, ADDED, LOWER_END, UPPER_END, MOVE };
 
 // Step joints: sim/identification/simulator.py.

@@ -12,7 +12,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import DType
 from batchpid.arrays.trees import filled, leaves
-from batchpid.native.operations import OPERATIONS
+from batchpid.native.extensions import OPERATIONS
 from batchpid.native.symbols import Namespace, Symbol
 
 _Operation = tuple[str, tuple[Symbol, ...], Symbol]
@@ -95,6 +95,7 @@ def _needed(noted: Iterable[_Operation], results: list[Symbol]) -> list[_Operati
     """Return the operations that ``results`` depend on."""
     needed = set(results)
     operations = list[_Operation]()
+    # Backwards: a result is known to be needed before its operands are looked at.
     for name, operands, result in reversed([*noted]):
         if result in needed:
             needed.update(operands)
@@ -121,6 +122,7 @@ def _fused(operations: list[_Operation], results: list[Symbol]) -> list[_Operati
     fused: dict[Symbol, _Operation] = {}
     for name, operands, result in operations:
         fused[result] = (name, operands, result)
+        # Operands of sums and products may be exchanged, others not.
         for at in range(2 if name in ("add", "multiply") else 1):
             before = fused.get(operands[at])
             if before is None or uses[operands[at]] > 1:
@@ -155,6 +157,7 @@ def _assembled(
     rows = list[list[int]]()
     lasting = {*order, *results}
     for at, (name, operands, result) in enumerate(operations):
+        # A history is changed in place; other results take a free register.
         if name == "push":
             places[result] = places[operands[0]]
             lasting.add(result)
@@ -165,6 +168,7 @@ def _assembled(
             places[result] = free.pop()
         numbers = [places[operand] for operand in operands]
         rows.append([OPERATIONS.index(name), places[result], *numbers, *(2 * numbers[:1])][:5])
+        # Freed last, so that no result takes a register of its own operands.
         free += {places[one] for one in operands if last_use[one] == at and one not in lasting}
     table = np.array(rows, np.int32)
     ends = np.array([places[result] for result in results], np.int32)

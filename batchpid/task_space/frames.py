@@ -1,17 +1,22 @@
-"""Frames and rotations, batched over any leading axes, for NumPy and JAX arrays.
+"""Frames, rotations and spatial inertias, with any leading axes, for NumPy and JAX arrays.
 
 A frame is a matrix (..., 3, 4): the axes of the frame as columns, and its position. A pose (..., 7)
 is a position and a unit quaternion (w, x, y, z), the order that SAPIEN and viser use. Functions of
-quaternions that follow :func:`pose_error` are for NumPy alone. Products are written as sums of elementwise
+quaternions that follow :func:`compose` are for NumPy alone. Products are written as sums of elementwise
 products: their rounding does not depend on the number of rows, as a library's does.
+
+Spatial inertias: R. Featherstone, Rigid Body Dynamics Algorithms (2008), section 2.13.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Array, Rows
+from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.arrays.elementwise import namespace
 
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
@@ -101,12 +106,9 @@ def wxyz_of(turn: Array) -> Array:
         [wy, xy, squares[2], yz],
         [wz, xz, yz, squares[3]],
     ]
-    q = xp.stack(rows[0], axis=-1)
-    best = squares[0]
-    for square, row in zip(squares[1:], rows[1:], strict=True):
-        better = square > best
-        q = xp.where(better[..., None], xp.stack(row, axis=-1), q)
-        best = xp.where(better, square, best)
+    table = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    best = xp.stack(squares, axis=-1).argmax(-1)
+    q = xp.take_along_axis(table, best[..., None, None], axis=-2)[..., 0, :]
     q = q / xp.sqrt((q * q).sum(-1, keepdims=True))
     return xp.where(q[..., :1] < 0, -q, q)
 
@@ -146,7 +148,20 @@ def pose_error(goal: Array, pose: Array) -> Array:
     return namespace(goal, pose).concatenate([goal[..., :3] - pose[..., :3], turn], axis=-1)
 
 
-def compose(a: Rows, b: Rows) -> Rows:
+def moved(pose: Array, step: Array) -> Array:
+    """Return poses (..., 7) shifted and turned by ``step`` (..., 6) [m, rad], in the axes of the
+    world.
+    """
+    xp = namespace(pose, step)
+    half = 0.5 * step[..., 3:]
+    angle = xp.sqrt((half * half).sum(-1, keepdims=True))
+    # sinc(x) is sin(pi x) / (pi x): without a turn it is 1.
+    turn = xp.concatenate([xp.cos(angle), xp.sinc(angle / np.pi) * half], axis=-1)
+    wxyz = compose(turn, pose[..., 3:])
+    return xp.concatenate([pose[..., :3] + step[..., :3], wxyz], axis=-1)
+
+
+def compose(a: Array, b: Array) -> Array:
     """Return the rotation b followed by a: Hamilton's product of (..., 4) and (..., 4)."""
     aw, ax, ay, az = (a[..., k] for k in range(4))
     bw, bx, by, bz = (b[..., k] for k in range(4))
@@ -154,7 +169,7 @@ def compose(a: Rows, b: Rows) -> Rows:
     x = aw * bx + ax * bw + ay * bz - az * by
     y = aw * by - ax * bz + ay * bw + az * bx
     z = aw * bz + ax * by - ay * bx + az * bw
-    return np.stack([w, x, y, z], axis=-1)
+    return namespace(a, b).stack([w, x, y, z], axis=-1)
 
 
 def inverse(q: Rows) -> Rows:
@@ -198,3 +213,87 @@ def to_rpy(q: Rows) -> NDArray[np.float64]:
     return np.array(
         [np.arctan2(s * r02 - c * r12, c * r11 - s * r01), np.arctan2(-r20, c * r00 + s * r10), yaw]
     )
+
+
+class SpatialInertia(NamedTuple):
+    """Mass [kg], center of mass (3,) [m] and inertia tensor about it (3, 3) [kg m^2], in the axes
+    of one frame.
+    """
+
+    mass: float
+    center: Float64
+    tensor: Float64
+
+    def moved(self, position: Float64, wxyz: Float64) -> SpatialInertia:
+        """Return the inertia as seen from a frame in which its own has this position and rotation:
+        c' = p + R c.
+
+        The tensor about the center of mass turns with the axes: I' = R I R^T.
+        """
+        matrix = matrix_of(wxyz)
+        return SpatialInertia(
+            self.mass, position + matrix @ self.center, matrix @ self.tensor @ matrix.T
+        )
+
+
+def spatial_matrix(inertia: SpatialInertia) -> Float64:
+    """Return the matrix S (6, 6) of the kinetic energy 1/2 (v, w)^T S (v, w), with v the velocity
+    of the origin.
+
+    S = [[m 1, -m C], [m C, I - m C C]] with C a = c x a.
+    """
+    mass = inertia.mass
+    # The origin moves with v; the center of mass with v + w x c.
+    cross = _cross_matrix(inertia.center)
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = mass * np.eye(3)
+    matrix[:3, 3:] = -mass * cross
+    matrix[3:, :3] = mass * cross
+    matrix[3:, 3:] = inertia.tensor - mass * cross @ cross
+    return matrix
+
+
+def moved_matrix(matrix: Float64, place: Float64) -> Float64:
+    """Return spatial matrices (..., 6, 6) in the frame in which their own has the homogeneous pose
+    ``place`` (4, 4).
+    """
+    turn = np.zeros(
+        (6, 6)
+    )  # velocity (v, w) in the matrices' frame, from the velocity in the other one
+    turn[:3, :3] = turn[3:, 3:] = place[:3, :3].T
+    turn[:3, 3:] = -place[:3, :3].T @ _cross_matrix(place[:3, 3])
+    return turn.T @ matrix @ turn
+
+
+def inertia_rows(matrices: Float64) -> Float64:
+    """Return mass, center and inertia tensor, a row for each spatial matrix (n, 6, 6): (n, 13)."""
+    mass = matrices[:, 0, 0, None]
+    # The block m C holds the center of mass thrice; one entry of each is read.
+    center = matrices[:, [5, 3, 4], [1, 2, 0]] / mass
+    cross = _cross_matrix(center)
+    tensor = matrices[:, 3:, 3:] + mass[:, :, None] * cross @ cross
+    return np.hstack([mass, center, tensor.reshape(-1, 9)])
+
+
+def _cross_matrix(vector: Float64) -> Float64:
+    """Return C (..., 3, 3) with C a = c x a for vectors c (..., 3)."""
+    x, y, z = np.moveaxis(vector, -1, 0)
+    zero = np.zeros_like(x)
+    return np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), (0, 1), (-2, -1))
+
+
+def total(parts: Sequence[SpatialInertia]) -> SpatialInertia:
+    """Return the inertia of ``parts``, given in one frame, as one body (Huygens and Steiner).
+
+    m = sum m_i, c = sum m_i c_i / m, I = sum (I_i + m_i (d_i.d_i 1 - d_i d_i^T)) with d_i = c_i -
+    c. A body without mass is at its first part.
+    """
+    mass = sum(part.mass for part in parts)
+    center = parts[0].center
+    if mass > 0:
+        center = sum((part.mass * part.center for part in parts), start=np.zeros(3)) / mass
+    tensor = np.zeros((3, 3))
+    for part in parts:
+        d = part.center - center
+        tensor += part.tensor + part.mass * (d @ d * np.eye(3) - np.outer(d, d))
+    return SpatialInertia(mass, center, tensor)

@@ -14,8 +14,7 @@ Sethna, "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-s
 minimization", arXiv:1201.5885 (2012): geodesic acceleration, which takes the curvature of the
 tool's path into account. An active set keeps the joint limits: joints that v would move past a
 limit stop at it, and the other joints take over the remaining error. If a search does not reach the
-pose, further searches begin at other poses. In these, a joint with a full turn between its limits
-passes them, and is turned back at the end.
+pose, further searches begin at other poses.
 """
 
 from __future__ import annotations
@@ -35,6 +34,7 @@ from batchpid.task_space.frames import pose_error, pose_of
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.symmetric import gram, product, quiet, whitened
 from batchpid.task_space.tree_kinematics import (
+    Motions,
     jacobian_at,
     motions_of,
     rate_at,
@@ -46,7 +46,6 @@ from batchpid.task_space.tree_kinematics import (
 ON_FAILURE = ("warn", "raise", "return")
 _DAMPING, _DAMPING_PER_ERROR = 1e-8, 0.1
 _LARGEST_ACCELERATION = 0.75  # relative to the velocity
-_FULL_TURN = 2 * np.pi - 1e-6  # [rad]; limits are often rounded
 _PASSES = 4  # of the active set; joints that pass a limit after the last are clipped
 
 
@@ -134,7 +133,7 @@ def inverse_kinematics(
     shares = np.random.default_rng(seed).uniform(size=(starts - 1, tree.dof))
     number = np.zeros(len(goal), np.intp)
     with quiet():
-        best = search.solve(goal, rows, search.limits)
+        best = search.solve(goal, rows)
         # Most poses are reached from one of the first five starts.
         for first, last in ((0, 4), (4, starts - 1)):
             left = np.flatnonzero(~search.reached(best))
@@ -142,7 +141,7 @@ def inverse_kinematics(
             if not len(left) or not len(drawn):
                 continue
             began = np.concatenate([search.drawn(rows[left], share) for share in drawn])
-            results = search.solve_past_limits(np.tile(goal[left], (len(drawn), 1)), began)
+            results = search.solve(np.tile(goal[left], (len(drawn), 1)), began)
             for at in range(len(drawn)):
                 part = results.rows(slice(at * len(left), (at + 1) * len(left)))
                 present = best.rows(left)
@@ -214,32 +213,10 @@ class _Search(NamedTuple):
         chain = self.tree.chain(self.tree.links[self.link])
         return self.tree.positions(np.where(chain, low + share * (high - low), rows))
 
-    def solve_past_limits(self, goal: Float64, qpos: Float64) -> _Found:
-        """Return the results of searches in which joints with a full turn between their limits pass
-        these.
-        """
-        low, high = self.limits
-        chain = self.tree.chain(self.tree.links[self.link])
-        full = chain & _wholly_turning(self.tree) & (high - low > _FULL_TURN)
-        full &= np.isfinite(high - low)
-        free = np.where(full, -np.inf, low), np.where(full, np.inf, high)
-        # Without limits a search passes a full turn, and is turned back afterwards.
-        nearest = self.solve(goal, qpos, free)
-        over = np.where(full, np.maximum(nearest.qpos - high, 0), 0.0)
-        under = np.where(full, np.maximum(low - nearest.qpos, 0), 0.0)
-        back = 2 * np.pi * (np.ceil(under / (2 * np.pi)) - np.ceil(over / (2 * np.pi)))
-        past = np.flatnonzero(back.any(axis=1))
-        if len(past):
-            # A joint between two turns is clipped to its limits, so search again from there.
-            turned = np.clip(nearest.qpos[past] + back[past], low, high)
-            within = self.solve(goal[past], turned, self.limits)
-            nearest.write(past, within._replace(steps=within.steps + nearest.steps[past]))
-        return nearest
-
-    def solve(self, goal: Float64, qpos: Float64, limits: tuple[Float64, Float64]) -> _Found:
-        """Return the results of searches that begin at ``qpos`` (n, dof), within ``limits``."""
+    def solve(self, goal: Float64, qpos: Float64) -> _Found:
+        """Return the results of searches that begin at ``qpos`` (n, dof), within the limits."""
         tool = self.tree, self.link, self.point
-        native = native_rows.search(*tool, limits, goal, qpos, self.tolerance, self.iterations)
+        native = native_rows.search(*tool, self.limits, goal, qpos, self.tolerance, self.iterations)
         if native is not None:
             return _Found(*native)
         # The same search in NumPy: the definition of the native one.
@@ -249,62 +226,47 @@ class _Search(NamedTuple):
         going = np.arange(count)
         q = qpos
         for step in range(self.iterations + 1):
-            at = _At(*tool, q)
-            error = pose_error(goal[going], at.pose)
+            motions = motions_of(self.tree, self.tree.bodies, q, np)
+            frame = tool_frame(self.tree, self.tree.bodies, motions.frames, *tool[1:])
+            error = pose_error(goal[going], pose_of(frame))
             lengths = np.sqrt((error * error).reshape(-1, 2, 3).sum(-1))
             nearest = _Found(q, lengths, np.full((len(q), 1), float(step)))
             better = self.size(nearest) < self.size(best.rows(going))
             best.write(going[better], nearest.rows(better))
             stay = ~self.reached(nearest)
             going = going[stay]
-            q = self.tree.positions(_stepped(limits, at, q, error))[stay]
+            q = self.tree.positions(self._stepped(motions, frame[..., 3], q, error))[stay]
             if not len(going):
                 break
         return best
 
-
-class _At:
-    """Tool at given positions (n, dof)."""
-
-    def __init__(self, tree: RigidTree, index: int, point: Float64 | None, qpos: Float64) -> None:
-        self._tree = tree
-        self._index = index
-        self._motions = motions_of(tree, tree.bodies, qpos, np)
-        tool = tool_frame(tree, tree.bodies, self._motions.frames, index, point)
-        self.pose = pose_of(tool)
-        self._place = tool[..., 3]
-        self.jacobian = jacobian_at(tree, tree.bodies, self._motions, index, self._place)
-
-    def rate(self, qvel: Float64) -> Float64:
-        """Return J' q' (n, 6)."""
-        velocities = velocities_of(self._tree, self._motions, self._tree.rates(qvel), np)
-        return rate_at(self._tree, velocities, self._index, self._place)
-
-
-def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Float64) -> Float64:
-    """Return the positions (n, dof) after a step within the limits."""
-    # Damping grows with the error: far away the steps are short and safe, near by quadratic.
-    damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
-    # Joints that would pass a limit stop there, and the others take over their share.
-    free = np.ones(qpos.shape, bool)
-    move = np.zeros_like(qpos)
-    for _ in range(_PASSES):
-        part = np.where(free[:, None], at.jacobian, 0.0)
-        rest = error - product(at.jacobian, np.where(free, 0.0, move))
-        move = np.where(free, _damped(part, damping, rest), move)
-        target = qpos + move
-        within = np.clip(target, *limits)
-        beyond = free & (target != within)
-        move = np.where(beyond, within - qpos, move)
-        free = free & ~beyond
-        if not beyond.any():
-            break
-    # Geodesic acceleration: the curvature of the path of the tool.
-    acceleration = -_damped(part, damping, at.rate(move))
-    size = np.sqrt((acceleration * acceleration).sum(-1, keepdims=True))
-    most = _LARGEST_ACCELERATION * np.sqrt((move * move).sum(-1, keepdims=True))
-    share = np.where(size > most, most / size, 1.0) / 2
-    return np.clip(qpos + move + np.where(free, share * acceleration, 0.0), *limits)
+    def _stepped(self, motions: Motions, place: Float64, qpos: Float64, error: Float64) -> Float64:
+        """Return the positions (n, dof) after a step within the limits, of a tool at ``place`` (n, 3)."""
+        tree = self.tree
+        jacobian = jacobian_at(tree, tree.bodies, motions, self.link, place)
+        # Damping grows with the error: far away the steps are short and safe, near by quadratic.
+        damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
+        # Joints that would pass a limit stop there, and the others take over their share.
+        free = np.ones(qpos.shape, bool)
+        move = np.zeros_like(qpos)
+        for _ in range(_PASSES):
+            part = np.where(free[:, None], jacobian, 0.0)
+            rest = error - product(jacobian, np.where(free, 0.0, move))
+            move = np.where(free, _damped(part, damping, rest), move)
+            target = qpos + move
+            within = np.clip(target, *self.limits)
+            beyond = free & (target != within)
+            move = np.where(beyond, within - qpos, move)
+            free = free & ~beyond
+            if not beyond.any():
+                break
+        # Geodesic acceleration: the curvature of the path of the tool.
+        velocities = velocities_of(tree, motions, tree.rates(move), np)
+        acceleration = -_damped(part, damping, rate_at(tree, velocities, self.link, place))
+        size = np.sqrt((acceleration * acceleration).sum(-1, keepdims=True))
+        most = _LARGEST_ACCELERATION * np.sqrt((move * move).sum(-1, keepdims=True))
+        share = np.where(size > most, most / size, 1.0) / 2
+        return np.clip(qpos + move + np.where(free, share * acceleration, 0.0), *self.limits)
 
 
 def _damped(part: Float64, damping: Float64, vector: Float64) -> Float64:
@@ -334,16 +296,6 @@ def _goals_and_starts(
     entries("pose", length, unit, problem, ["qw"], kind="entry", remedy=remedy)
     goal[:, 3:] /= length
     return goal, tree.positions(np.clip(rows, tree.lower, tree.upper))
-
-
-def _wholly_turning(tree: RigidTree) -> NDArray[np.bool_]:
-    """Return the joints (dof,) that a whole turn brings back to the same pose of all links."""
-    turning = tree.bodies.slides[:, 0] == 0
-    pitch = np.where(
-        turning, tree.coupling.multiplier % 1, tree.coupling.multiplier
-    )  # 0 if the follower is back, too
-    back = np.bincount(tree.coupling.leader, pitch != 0, minlength=tree.dof) == 0
-    return turning & back & tree.independent
 
 
 def _report(result: IKResult, on_failure: str) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Document, Float64
-from batchpid.native.task_space_extension import LAW
+from batchpid.native.extensions import LAW
 from batchpid.task_space import native_rows
 from batchpid.task_space.osc_coefficients import OSCCoefficients
 from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDynamics, Tool
@@ -21,17 +21,17 @@ from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_kinematics import prepared, read_point
 
 _RESULTS = {
-    **{
-        "effort": 0,
-        "integral": 6,
-        "limited": 0,
-        "error": 6,
-        "wrench": 6,
-        "task": 0,
-        "posture": 0,
-        "unsaturated": 0,
-    },
-    **{"task_share": 1, "posture_share": 1, "near_singular": 1},
+    "effort": 0,
+    "integral": 6,
+    "limited": 0,
+    "error": 6,
+    "wrench": 6,
+    "task": 0,
+    "posture": 0,
+    "unsaturated": 0,
+    "task_share": 1,
+    "posture_share": 1,
+    "near_singular": 1,
 }
 """Terms and state in the order of the results in LAW, and their columns; 0 for one per joint."""
 _WITHOUT_TREE = None, -1, None
@@ -57,7 +57,7 @@ def law(
         (qpos, qvel), *_ = prepared(tool.tree, qpos=inputs.qpos, qvel=inputs.qvel)
         inputs = inputs._replace(qpos=qpos, qvel=qvel)
         dynamics_arrays = (read_point(qpos, tool.point),)
-    arrays = (*inputs, None, None, *state, *k[:-1])
+    arrays = (*inputs, None, None, None, *state, *k[:-1])
     if (native := native_rows.for_rows(inputs.qpos, *dynamics_arrays, *arrays)) is None:
         return None
     rows, dof = inputs.qpos.shape
@@ -103,10 +103,10 @@ def _of_tree(
     """Return the arguments of ``law`` and ``bind`` between sizes and arrays, and the chain to the
     tool (dof,).
     """
-    constants = native_rows.native_tree(native, tree)
     index = tree.index(link)
     body = tree.link_bodies[index]
-    fixed = k.frame is not None, constants.tree, body, native_rows.tool(constants, index, point)
+    capsule = native_rows.native_tree(native, tree)
+    fixed = k.frame is not None, capsule, body, native_rows.tool(tree, index, point)
     return fixed, np.array(tree.chains[body], np.float64)
 
 
@@ -135,6 +135,7 @@ class BoundOSC:
         friction: tuple[Float64, Float64] | None,
         timestep: float,
         reading: tuple[Float64, Float64, Float64],
+        left: Float64,
     ) -> None:
         qpos, qvel, bias = reading
         (rows, dof), native = qpos.shape, native_rows.in_use()
@@ -144,6 +145,8 @@ class BoundOSC:
         self._given = {
             name: np.zeros((rows, part.stop - part.start)) for name, part in self._parts.items()
         }
+        if "twist" in parts:  # the pose moves within the tick
+            self._given["left"] = left.reshape(1, 1)
         self._posture = np.zeros_like(qpos)
         # The call keeps the addresses of these arrays: they are written in place from now on.
         self.state = {"posture": np.zeros_like(qpos)}

@@ -12,15 +12,14 @@ import math
 import os
 from collections.abc import Callable
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Float64
 from batchpid.native.availability import SWITCH, obstacle
-from batchpid.native.extensions import load
-from batchpid.native.task_space_extension import KINEMATICS, TASK_SPACE
+from batchpid.native.extensions import KINEMATICS, TASK_SPACE, load
 from batchpid.task_space.rigid_tree import RigidTree
 
 _SIZES = {
@@ -36,14 +35,7 @@ _DYNAMICS = {"mass_matrix", "bias"}
 """Results that the extension computes on a fixed base alone."""
 
 
-class _NativeTree(NamedTuple):
-    tree: Any
-    """Capsule of the extension."""
-    tools: Float64
-    """Frames of the links in their bodies (links, 3, 4)."""
-
-
-_trees: WeakKeyDictionary[RigidTree, _NativeTree] = WeakKeyDictionary()
+_trees: WeakKeyDictionary[RigidTree, Any] = WeakKeyDictionary()
 
 
 def in_use() -> Array:
@@ -111,15 +103,14 @@ def _arguments(
     native: Any, tree: RigidTree, outputs: dict[str, Float64], inputs: Any, index: int, point: Array
 ) -> list[Any]:
     """Return the arguments of ``kinematics`` in task_space.cpp."""
-    constants = native_tree(native, tree)
     rows = len(inputs[0])
     results = [outputs.get(name) for name in KINEMATICS[3:]]
     return [
-        constants.tree,
+        native_tree(native, tree),
         tree.link_bodies[index],
         rows,
         *inputs,
-        tool(constants, index, point),
+        tool(tree, index, point),
         *results,
     ]
 
@@ -148,47 +139,48 @@ def search(
     """
     if (native := in_use()) is None:
         return None
-    constants = native_tree(native, tree)
     rows = len(start)
     outputs = [start.copy(), np.full((rows, 2), np.inf), np.zeros((rows, 1))]
     arrays = (
         goal,
-        tool(constants, index, point),
+        tool(tree, index, point),
         *(limit[None] for limit in limits),
         tolerance[None],
     )
     call(
-        native.search, constants.tree, tree.link_bodies[index], rows, iterations, *arrays, *outputs
+        native.search,
+        native_tree(native, tree),
+        tree.link_bodies[index],
+        rows,
+        iterations,
+        *arrays,
+        *outputs,
     )
     # A search moves leaders alone; their followers are set at the end.
     outputs[0] = tree.positions(outputs[0])
     return outputs
 
 
-def tool(constants: _NativeTree, index: int, point: Array) -> Float64:
+def tool(tree: RigidTree, index: int, point: Array) -> Float64:
     """Return the frames (1 | rows, 12) of a link in its body, with the origin at a ``point`` (3,)
     or (..., 3).
     """
-    tool = constants.tools[index]
+    tool = tree.bodies.link_frames[index]
     if point is not None:
         tool = np.broadcast_to(tool, (*point.shape[:-1], 3, 4)).copy()
         tool[..., 3] += (tool[..., :3] * point[..., None, :]).sum(-1)
     return tool.reshape(-1, 12)
 
 
-def native_tree(native: Any, tree: RigidTree) -> _NativeTree:
-    """Return the constants of a tree for the extension."""
-    # Tables of a tree are built once, and go when the tree goes.
-    if (constants := _trees.get(tree)) is not None:
-        return constants
-    bodies, (kinds, rows) = tree.bodies, tree.tables
-    arguments = kinds, rows, np.array(bodies.armature), tuple(bodies.gravity.tolist())
-    coupling = tree.coupling
-    laws = coupling.leader.astype(np.int32), coupling.multiplier, coupling.offset
-    _trees[tree] = constants = _NativeTree(
-        native.tree(tree.dof, *arguments, *laws), bodies.link_frames
-    )
-    return constants
+def native_tree(native: Any, tree: RigidTree) -> Any:
+    """Return the capsule of the extension with the constants of a tree."""
+    if tree not in _trees:
+        bodies, (kinds, rows) = tree.bodies, tree.tables
+        arguments = kinds, rows, np.array(bodies.armature), tuple(bodies.gravity.tolist())
+        coupling = tree.coupling
+        laws = coupling.leader.astype(np.int32), coupling.multiplier, coupling.offset
+        _trees[tree] = native.tree(tree.dof, *arguments, *laws)
+    return _trees[tree]
 
 
 def for_rows(like: Array, *arrays: Array) -> Array:

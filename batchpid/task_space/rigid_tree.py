@@ -10,7 +10,6 @@ the base, which is fixed or floats.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
@@ -26,12 +25,15 @@ from batchpid.arrays.read_only import read_only
 from batchpid.checks.validate import choice, entries, names, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
-from batchpid.task_space.frames import matrix_of, turned, wxyz_of
-from batchpid.task_space.spatial_inertia import (
+from batchpid.task_space.frames import (
     SpatialInertia,
     inertia_rows,
+    matrix_of,
     moved_matrix,
     spatial_matrix,
+    total,
+    turned,
+    wxyz_of,
 )
 
 JOINT_TYPES = ("fixed", "revolute", "prismatic")
@@ -175,13 +177,6 @@ class RigidTree:
             )
         # Gravity belongs to the world, and to no link or joint.
         tables["gravity"] = _array("gravity", self.gravity, (3,))
-        for name, table in tables.items():
-            # An infinite limit of position counts as no limit.
-            finite = np.isfinite(table).reshape(len(table), -1).all(1) | (
-                name in ("lower", "upper")
-            )
-            of = {count: links, len(moving): moving}.get(len(table)) if name != "gravity" else "xyz"
-            entries(name, np.where(finite, 0.0, np.nan), finite, "is not finite", of, kind="entry")
         entries("mass", tables["mass"], tables["mass"] >= 0, "must be >= 0", links, kind="entry")
         entries("armature", tables["armature"], tables["armature"] >= 0, "must be >= 0", moving)
         # A quaternion must be a unit one; an axis only needs a direction.
@@ -226,13 +221,9 @@ class RigidTree:
         Raises
         ------
         InvalidArgumentError
-            The link is unknown; the message names the nearest.
+            The link is unknown.
         """
-        if isinstance(link, str) and link in self.links:
-            return self.links.index(link)
-        near = difflib.get_close_matches(str(link), self.links, 1)
-        remedy = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(self.links)}"
-        raise InvalidArgumentError("link", "unknown link", value=link, remedy=remedy)
+        return self.links.index(choice("link", link, self.links))
 
     @cached_property
     def tool(self) -> str:
@@ -255,15 +246,11 @@ class RigidTree:
             link = int(self.parent[link])
         return self.links[tip]
 
-    @property
+    @cached_property
     def held(self) -> RigidTree:
         """Same tree on a fixed base, with all joints independent."""
         if self.fixed_base and self.coupling.is_identity:
             return self
-        return self._held
-
-    @cached_property
-    def _held(self) -> RigidTree:
         return replace(self, fixed_base=True, coupling=Coupling.of(self.dof))
 
     def fixed_at(self, qpos: Float64, moves: NDArray[np.bool_]) -> RigidTree:
@@ -402,7 +389,7 @@ class RigidTree:
     @cached_property
     def tables(self) -> tuple[NDArray[np.int32], Float64]:
         """The bodies for native code: the joint above each, or -1, and 1 if it slides (dof, 2); and
-        rows of numbers (dof, 25), :data:`batchpid.native.task_space_extension.BODY`.
+        rows of numbers (dof, 25): rotation, position, mass, center, tensor.
         """
         bodies = self.bodies
         slides = bodies.slides[:, 0].astype(np.int32)
@@ -464,23 +451,15 @@ class RigidTree:
         """Return mass, center of mass and inertia tensor of the bodies with these links, in their
         frames.
         """
-        count = len(links_of)
-        masses = np.zeros((count, 1))
-        centers = np.zeros((count, 3))
-        tensors = np.zeros((count, 3, 3))
-        # Huygens and Steiner about the common center of mass; a body without mass keeps a place.
-        for joint, links in enumerate(links_of):
+        bodies = []
+        for links in links_of:
             turn = frames[links, :, :3]
-            shift = frames[links, :, 3]
-            mass = self.mass[links]
-            at = shift + (turn @ self.center[links][..., None])[..., 0]
-            masses[joint] = mass.sum()
-            centers[joint] = mass @ at / mass.sum() if mass.sum() else at[0]
-            d = at - centers[joint]
-            spread = (d * d).sum(1)[:, None, None] * np.eye(3) - d[:, :, None] * d[:, None, :]
+            center = frames[links, :, 3] + (turn @ self.center[links][..., None])[..., 0]
             tensor = turn @ self.inertia[links] @ turn.transpose(0, 2, 1)
-            tensors[joint] = (tensor + mass[:, None, None] * spread).sum(0)
-        return masses, centers, tensors
+            parts = map(SpatialInertia, self.mass[links].tolist(), center, tensor)
+            bodies.append(total(list(parts)))
+        masses, centers, tensors = map(np.array, zip(*bodies, strict=True))
+        return masses[:, None], centers, tensors
 
 
 _ABOUT_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -503,4 +482,7 @@ def _array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
         raise InvalidArgumentError(
             name, problem, remedy="give one row for each link, or one entry for each joint"
         )
+    # An infinite limit of position counts as no limit.
+    if name not in ("lower", "upper") and not np.isfinite(table).all():
+        raise InvalidArgumentError(name, "is not finite", remedy="pass finite numbers")
     return table

@@ -22,7 +22,6 @@ import batchpid
 from batchpid.errors import BatchPIDError
 from batchpid.sim.cli.commands import COMMANDS, execute
 from batchpid.sim.cli.flags import check
-from batchpid.sim.cli.outputs import close_bars
 
 INPUT_ERROR = 2
 
@@ -34,8 +33,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     settled. 130: Ctrl-C. 141: the reader of stdout closed it, as in ``| head``. 2 and 130 come with
     one line on stderr.
     """
+    arguments = sys.argv[1:] if argv is None else argv
     try:
-        status = _run(list(sys.argv[1:] if argv is None else argv))
+        status = _run(list(arguments))
+        # A closed pipe shows when the rest of the text is written.
         sys.stdout.flush()
         return status
     except BatchPIDError as error:
@@ -96,8 +97,10 @@ def _run(arguments: list[str]) -> int:
 
 def _fail(status: int, message: str) -> int:
     """Print a message in one line, and return the status."""
-    close_bars()
-    print("batchpid:", " ".join(message.splitlines()), file=sys.stderr)
+    from tqdm import tqdm
+
+    # An error may leave a bar behind, which tqdm moves out of the way of the message.
+    tqdm.write(f"batchpid: {' '.join(message.splitlines())}", file=sys.stderr)
     return status
 
 
@@ -106,4 +109,4 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 
 def _nothing() -> None:
-    """Take the place of a command in the overview."""
+    """Stand for a command in the overview."""

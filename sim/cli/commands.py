@@ -1,35 +1,48 @@
-"""Table of the commands, and the execution of one: inputs, outputs, report."""
+"""Table of the commands, and the execution of one: inputs, outputs, report.
+
+No file is replaced without ``--force``, and no input at all.
+"""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from functools import cache
+import json
+import math
+import os
+import shlex
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from batchpid.arrays.array_types import Document
+from batchpid.checks.validate import file_path
+from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
+from batchpid.sim.cli.drawing import plot, view
 from batchpid.sim.cli.excite import excite_joints
 from batchpid.sim.cli.export import ENDINGS, export
 from batchpid.sim.cli.identify import identify_logs
 from batchpid.sim.cli.inspect import inspect_robot
-from batchpid.sim.cli.outputs import OutputFiles, bar, write_figures
-from batchpid.sim.cli.plot import plot
 from batchpid.sim.cli.rollout import demo, rollout
-from batchpid.sim.cli.view import view
 from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.tuning.comparison import compare, default_sets
-from batchpid.sim.tuning.evaluation import tuning_engine
-from batchpid.sim.tuning.gain_sets import default_gains
-from batchpid.sim.tuning.randomization_files import load_randomization
+from batchpid.sim.tuning.comparison import compare, default_gains, default_sets
+from batchpid.sim.tuning.evaluation import load_randomization
 from batchpid.sim.tuning.search import tune
 
 PICTURES = (".png", ".svg")
 DOCUMENTS = (".yaml", ".yml", ".json")
+DEFAULT_ROBOT = "panda"
+FOLDER = Path("out")
+"""Folder of default outputs, which is made when a file is written; other folders have to exist."""
+SWITCH: dict[Any, bool] = {"on": True, "off": False, "fixed": True, "free": False}
+"""Values of flags with two words."""
+COUNTS = {"num_envs": "robots", "moves": "random moves", "population": "candidates at once"}
+"""Flags that are counts, with nouns for the first line."""
 
 
 class Output(NamedTuple):
@@ -38,19 +51,17 @@ class Output(NamedTuple):
     content: str
     suffixes: tuple[str, ...]
     default: str = ""
-    """Template of the default name from the flags and the stems ``{robot}``, ``{out}`` and
-    ``{recording}``; "" for none.
+    """Default name with stems of other files and with words, as in :func:`_default_path`; "" for
+    none.
     """
 
     @property
     def help(self) -> str:
         """Help of the flag."""
-        names = {"{robot}": "ROBOT", "{out}": "NAME", "{recording}": "NAME", "{kind}": "KIND"}
-        default = self.default
-        for name, word in names.items():
-            default = default.replace(name, word)
-        suffixes = " or ".join(self.suffixes)
-        return f"{self.content} to write: {suffixes}.{f' Default: {default}.' if default else ''}"
+        text = f"{self.content} to write: {' or '.join(self.suffixes)}."
+        if self.default:
+            text += f" Default: {self.default.replace('{', '').replace('}', '')}."
+        return text
 
 
 class CommandFunction(NamedTuple):
@@ -65,7 +76,8 @@ class CommandFunction(NamedTuple):
 
     def record(self) -> type[Any]:
         """Return the record of the flags."""
-        return _record(self.function, self.options, self.loading, tuple(self.outputs.items()))
+        outputs = {name: output.help for name, output in self.outputs.items()}
+        return flags.record_of(self.function, self.options, self.loading, outputs)
 
 
 FIGURES = Output("Figures", (".json",))
@@ -73,9 +85,8 @@ PICTURE = Output("Picture", PICTURES)
 COMMANDS = {
     "demo": CommandFunction(
         demo,
-        {"picture": PICTURE._replace(default="out/{robot}-demo.png")},
+        {"picture": PICTURE._replace(default="out/{ROBOT}-demo.png")},
         ("engine", "workers"),
-        (),
     ),
     "rollout": CommandFunction(
         rollout,
@@ -86,8 +97,8 @@ COMMANDS = {
     "tune": CommandFunction(
         tune,
         {
-            "out": Output("Params file", DOCUMENTS, "out/{robot}.tuned.yaml"),
-            "picture": PICTURE._replace(default="{out}-tune.png"),
+            "out": Output("Params file", DOCUMENTS, "out/{ROBOT}.tuned.yaml"),
+            "picture": PICTURE._replace(default="{NAME}-tune.png"),
         },
         loading=("base", "actuators"),
     ),
@@ -95,22 +106,21 @@ COMMANDS = {
         compare, {"picture": PICTURE, "json": FIGURES}, loading=("base", "actuators")
     ),
     "excite": CommandFunction(
-        excite_joints, {"out": Output("Setpoints", (".csv",), "out/{robot}.excite.csv")}, (), ()
+        excite_joints, {"out": Output("Setpoints", (".csv",), "out/{ROBOT}.excite.csv")}
     ),
     "identify": CommandFunction(
         identify_logs,
         {
-            "out": Output("Actuators file", DOCUMENTS, "out/{robot}.actuators.yaml"),
-            "picture": PICTURE._replace(default="{out}-fit.png"),
+            "out": Output("Actuators file", DOCUMENTS, "out/{ROBOT}.actuators.yaml"),
+            "picture": PICTURE._replace(default="{NAME}-fit.png"),
             "json": FIGURES,
-            "corrected_urdf": Output("URDF with the masses that were found", (".urdf",)),
+            "corrected_urdf": Output("URDF with the identified masses", (".urdf",)),
         },
-        loading=(),
     ),
     "export": CommandFunction(
         export,
-        {"out": Output("File", (".h", ".yaml", ".xml", ".urdf"), "out/{robot}{ending}")},
-        loading=("actuators",),
+        {"out": Output("File", (".h", ".yaml", ".xml", ".urdf"), "out/{ROBOT}-{ENDING}")},
+        loading=("base", "actuators"),
     ),
     "inspect": CommandFunction(inspect_robot, {"json": FIGURES}),
     "plot": CommandFunction(
@@ -119,7 +129,7 @@ COMMANDS = {
             "picture": Output(
                 "Picture, or film of the first 16 envs,",
                 (*PICTURES, ".mp4", ".gif"),
-                "{recording}-{kind}.png",
+                "{NAME}-{KIND}.png",
             )
         },
         loading=(),
@@ -131,12 +141,7 @@ COMMANDS = {
 def execute(command: CommandFunction, values: Document) -> int:
     """Run a command with the values of its flags, and return its exit status."""
     # A run may take hours: its output files are checked first.
-    files = OutputFiles(values, command.outputs)
-    paths: dict[str, Path] = {}
-    for name, output in command.outputs.items():
-        path = values[name] or _default(output.default, values | paths)
-        if path is not None:
-            paths[name] = files.path(name, path, output.suffixes)
+    paths = _output_paths(command, values)
     arguments = _arguments(command, values)
     result = command.function(**arguments)
     # The view has run already, and leaves nothing to report.
@@ -151,16 +156,35 @@ def execute(command: CommandFunction, values: Document) -> int:
     return getattr(result, "status", 0)
 
 
-@cache
-def _record(
-    function: Callable[..., Any],
-    options: tuple[str, ...],
-    loading: tuple[str, ...],
-    outputs: tuple[tuple[str, Output], ...],
-) -> type[Any]:
-    return flags.record_of(
-        function, options, loading, {name: output.help for name, output in outputs}
-    )
+def _output_paths(command: CommandFunction, values: Document) -> dict[str, Path]:
+    """Return the paths of the output files, checked; the outputs without a name are left out."""
+    inputs = []
+    for name, value in values.items():
+        if name not in command.outputs:
+            names = value if isinstance(value, tuple) else (value,)
+            inputs += [Path(text) for text in names if isinstance(text, str | Path)]
+    inputs = [path for path in inputs if path.is_file()]
+    paths: dict[str, Path] = {}
+    for name, output in command.outputs.items():
+        path = values[name]
+        if path is None and output.default:
+            path = _default_path(output.default, values | paths)
+        if path is not None:
+            file_path(name, path, output.suffixes)
+            check_output(name, path, inputs, paths.values(), values["force"])
+            paths[name] = path
+    return paths
+
+
+def _default_path(template: str, values: Document) -> Path:
+    """Return the default path of an output file."""
+    words = {"KIND": values.get("kind"), "ENDING": ENDINGS.get(values.get("to", ""))}
+    words["ROBOT"] = Path(values["robot"] or DEFAULT_ROBOT).stem
+    # A picture has the name of the file that it shows.
+    for name in ("out", "recording"):
+        if values.get(name) is not None:
+            words["NAME"] = values[name].parent / values[name].stem
+    return Path(template.format_map(words))
 
 
 def _arguments(command: CommandFunction, values: Document) -> Document:
@@ -173,19 +197,21 @@ def _arguments(command: CommandFunction, values: Document) -> Document:
     for name in command.options:
         # On and off are switches; one that is left out is left to the Runner.
         if values[name] is not None:
-            arguments[name] = {"on": True, "off": False}.get(values[name], values[name])
-    # A recording may stand in place of a robot.
-    if values.get("robot") is not None:
-        loading: Document = {}
-        if values.get("base") is not None:
-            loading["fixed_base"] = values["base"] == "fixed"
-        if values.get("actuators") is not None:
-            loading["actuators"] = values["actuators"]
-        arguments["robot"] = robot = Robot.load(values["robot"], **loading)
+            arguments[name] = SWITCH.get(values[name], values[name])
+    # A recording has a robot already.
+    is_recorded = values.get("recording", values.get("play")) is not None
+    if "robot" in values and (values["robot"] or not is_recorded):
+        robot = Robot.load(
+            values["robot"] or DEFAULT_ROBOT,
+            fixed_base=SWITCH.get(values.get("base")),
+            actuators=values.get("actuators"),
+        )
+        arguments["robot"] = robot
         # Distributions are checked against the joints and links of the robot.
         if values.get("randomize") is not None:
             arguments["randomization"] = load_randomization(values["randomize"], robot)
-        print(_heading(robot, values), flush=True)
+        if not is_recorded:
+            print(f"{robot.name}: {', '.join(_settings(robot, values))}", flush=True)
         if values.get("engine") == "sapien":
             print("MuJoCo is several times as fast, with other contacts: --engine mujoco")
     if "progress" in accepted:
@@ -193,43 +219,35 @@ def _arguments(command: CommandFunction, values: Document) -> Document:
     return arguments
 
 
-def _heading(robot: Robot, values: Document) -> str:
-    """Return a line with robot, engine, gains, rate and number of robots."""
-    parts = []
-    # A search leaves the engine out, a comparison may have both.
+def _settings(robot: Robot, values: Document) -> Iterator[str]:
+    """Yield the words of the first line: base, joints, engine, gains, rate and number of robots."""
+    if not robot.fixed_base:
+        yield "free base"
+    yield f"{robot.dof} joints"
     if "engine" in values:
-        names = values["engine"] or tuning_engine(None)
-        names = (names,) if isinstance(names, str) else names
-        parts.append(" and ".join(load_engine(name).title for name in names))
-    if "gains" in values:
-        names = values["gains"] or (
-            default_sets(robot) if "moves" in values else default_gains(robot)
-        )
-        parts.append(f"gains {names if isinstance(names, str) else ', '.join(names)}")
-    if values.get("control", "pid") != "pid":
-        parts.append(f"control {values['control']}")
-    if "timestep" in values or "engine" in values:
-        parts.append(f"{1 / (values.get('timestep') or RunnerOptions.timestep):g} Hz")
-    if "num_envs" in values:
-        parts.append(f"{values['num_envs']} robots")
-    if "moves" in values:
-        parts.append(f"{values['moves']} random moves")
-    base = "" if robot.fixed_base else "free base, "
-    return f"{robot.name}: {base}{', '.join(parts) or f'{robot.dof} joints'}"
-
-
-def _default(template: str, values: Document) -> Path | None:
-    """Return the default name of an output file."""
-    if not template:
-        return None
-    # A template may use every flag: {kind} of plot, and these.
-    stems: Document = {"ending": ENDINGS.get(values.get("to", ""))}
-    for name in ("out", "recording"):
-        if values.get(name) is not None:
-            stems[name] = values[name].parent / values[name].stem
-    if values.get("robot") is not None:
-        stems["robot"] = Path(values["robot"]).stem
-    return Path(template.format_map(values | stems))
+        # A comparison may have two engines.
+        engines = values["engine"] or ("mujoco",)
+        names = (engines,) if isinstance(engines, str) else engines
+        yield " and ".join(load_engine(name).title for name in names)
+    gains = values.get("gains")
+    if gains:
+        yield f"gains {gains if isinstance(gains, str) else ', '.join(gains)}"
+    # Drives and tools have other gains.
+    elif values.get("control", "pid") != "pid":
+        yield f"control {values['control']}"
+    elif "moves" in values:
+        yield f"gains {', '.join(default_sets(robot))}"
+    elif "generations" in values:
+        yield "gains designed"
+    # Logs have the gains that drove their robot.
+    elif "gains" in values and "logs" not in values:
+        yield f"gains {default_gains(robot)}"
+    timestep = values.get("timestep", RunnerOptions.timestep if "engine" in values else None)
+    if timestep is not None:
+        yield f"{1 / timestep:g} Hz"
+    for name, noun in COUNTS.items():
+        if name in values:
+            yield f"{values[name]} {noun}"
 
 
 def _write(name: str, result: Any, path: Path) -> None:
@@ -246,3 +264,63 @@ def _write(name: str, result: Any, path: Path) -> None:
         plots.save(result.figure(), path)
     else:
         result.film(path, progress=bar("filming", unit="frame"))
+
+
+def check_output(
+    argument: str, path: Path, inputs: Iterable[Path], outputs: Iterable[Path], force: bool
+) -> None:
+    """Check that a file may be written at ``path``.
+
+    Raises InvalidArgumentError if the command reads it (one of ``inputs``) or writes it as another
+    one of its ``outputs``, its folder neither exists nor is :data:`FOLDER`, or it exists and may
+    not be replaced by ``force``.
+    """
+    remedy = "choose another file"
+    # Links count as the file that they lead to, so that none is read and replaced at once.
+    if path.exists() and any(path.samefile(source) for source in inputs):
+        problem = "is a file to read"
+    elif path.resolve() in [other.resolve() for other in outputs]:
+        problem = "is another output of this run"
+    elif not path.parent.exists() and path.parent != FOLDER:
+        problem = f"has no folder {str(path.parent)!r}"
+        remedy = f"make it: mkdir -p {shlex.quote(str(path.parent))}"
+    elif os.path.lexists(path) and not force:
+        problem = "exists already"
+        remedy = "add --force to replace it, or choose another name"
+    else:
+        return
+    raise InvalidArgumentError(argument, problem, value=str(path), remedy=remedy)
+
+
+def write_figures(path: Path, figures: Any) -> None:
+    """Write figures as JSON: arrays as lists, named tuples and mappings as objects, null for NaN
+    and infinity.
+    """
+    write_atomically(path, json.dumps(_plain(figures), indent=1, allow_nan=False) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    # Named tuples keep their names; JSON has no NaN.
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    elif hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {name: _plain(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
+    """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; ``options``
+    go to tqdm.
+
+    A file as stderr gets no bar.
+    """
+    from tqdm import tqdm
+
+    shown = {"delay": 1.0, "leave": False, "dynamic_ncols": True, **options}
+    return partial(tqdm, desc=label, disable=not sys.stderr.isatty(), **shown)

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from batchpid.export import Exported
 
 ENDINGS = {
-    "c": "-pid.h",
-    "ros2_control": "-controllers.yaml",
-    "mjcf": "-pid.xml",
-    "urdf": "-repaired.urdf",
+    "c": "pid.h",
+    "ros2_control": "controllers.yaml",
+    "mjcf": "pid.xml",
+    "urdf": "repaired.urdf",
 }
 """End of the default file name of each target."""
 USED = {
@@ -51,29 +51,23 @@ class ExportedFile:
         """Return a line for each difference."""
         # The folder decides only how meshes are named.
         differences = self.make(Path.cwd()).differences
-        return (
-            "\n".join(f"differs: {text}" for text in differences) or "The file differs in nothing."
-        )
+        if not differences:
+            return "The file has no differences."
+        return "\n".join(f"differs: {text}" for text in differences)
 
     def save(self, path: Path) -> None:
-        """Write the file, with a comment for each difference that it does not hold yet."""
+        """Write the file, with a comment at its end for each difference that it does not name."""
         from batchpid.io.files import write_atomically
 
         file_path("out", path, (Path(ENDINGS[self.target]).suffix,))
         text, differences = self.make(path.absolute().parent)
         comment = COMMENTS.get(self.target, "# {}")
-        lines = []
         for difference in differences:
             # Two hyphens would end a comment of XML, and */ one of C.
             sentence = " ".join(difference.split()).replace("--", "- -").replace("*/", "* /")
             if sentence not in text:
-                lines.append(comment.format(f"differs: {sentence}") + "\n")
-        # The declaration of an XML file stays its first line.
-        declaration = ""
-        if text.startswith("<?xml"):
-            declaration, _, text = text.partition("?>\n")
-            declaration += "?>\n"
-        write_atomically(path, declaration + "".join(lines) + text)
+                text += comment.format(f"differs: {sentence}") + "\n"
+        write_atomically(path, text)
 
 
 def export(
@@ -125,7 +119,7 @@ def export(
     if motors:
         if gains is not None or limits:
             remedy = "leave out --gains and --limits"
-            raise InvalidArgumentError("motors", "are written without a law", remedy=remedy)
+            raise InvalidArgumentError("motors", "exclude gains and limits", remedy=remedy)
         exported = _mjcf(robot, None, timestep, False)
     else:
         params = _gains(robot, gains)
@@ -140,12 +134,12 @@ def export(
 
 def _gains(robot: Robot, gains: str | None) -> bp.PIDParams:
     """Return the gains of the law by name."""
-    from batchpid.sim.tuning.gain_sets import gain_set
+    from batchpid.sim.tuning.comparison import gain_set
 
     chosen = gain_set(robot, gains)
     if chosen.control != "pid":
         remedy = "choose gains of the law: tuned, designed, sapien-tutorial, or a file"
-        problem = "are a drive's, which has no file"
+        problem = "belong to a drive, which is not exported"
         raise InvalidArgumentError("gains", problem, value=chosen.name, remedy=remedy)
     return chosen.params
 
@@ -164,7 +158,7 @@ def _c_header(
         prefix=prefix,
         tree=robot.kinematic_tree() if dynamics else None,
     )
-    return _with_followers(robot, exported, "joints of their own in the file; ignore their efforts")
+    return _with_followers(robot, exported, "separate joints in the file; ignore their efforts")
 
 
 def _controllers(

@@ -24,7 +24,7 @@ from batchpid.sim.options.options import KINDS, OPTIONS, RunnerKeywords
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 
-PLAIN = (NoneType, bool, int, float, str, Path)
+PLAIN = (NoneType, bool, int, float, str, Path, Ellipsis)
 OPTIONS_WITH_FLAG = {
     entry.name: entry.default for entry in fields(RunnerKeywords) if OPTIONS[entry.name].flag
 }
@@ -43,13 +43,16 @@ LOADING = {
     ),
 }
 """Arguments of :meth:`Robot.load` that are flags, with their types and help."""
-ROBOT = "Bundled robot (panda, jaco2 or quadruped), or path of a URDF or MJCF file."
+ROBOT = (
+    "Bundled robot (panda, jaco2 or quadruped), or path of a URDF or MJCF file. Default: panda, or"
+    " the robot of a recording."
+)
 METAVARS = {
     "gains": "NAME|FILE",
+    "engine": "sapien|mujoco",
     "control": None,
     "tool": "LINK",
     "ground": "on|off",
-    "joints": "NAME [NAME ...]",
     "setpoint": "FLOAT [FLOAT ...]",
 }
 """Words for the values of flags, where the type does not give them."""
@@ -70,30 +73,26 @@ def record_of(
     hints = get_type_hints(function, include_extras=True)
     rows = []
     for name, parameter in inspect.signature(function).parameters.items():
-        # What has no plain type, or no text, is an argument for Python alone.
+        # A parameter without a plain type, or without text, is an argument for Python alone.
         kind = _plain_part(hints[name])
-        default = parameter.default
         if Robot in (hints[name], *get_args(hints[name])):
-            # A recording has a robot already.
-            name_or_none = default is None
-            word: Kind = str | None if name_or_none else str
-            word = Annotated[word, tyro.conf.Positional]
-            rows.append(_flag("robot", word, None if name_or_none else "panda", ROBOT))
+            rows.append(_flag("robot", Annotated[str | None, tyro.conf.Positional], None, ROBOT))
         elif Randomization in get_args(hints[name]):
             rows.append(_flag("randomize", Path | None, None, texts[name]))
         elif kind is not None and name in texts:
-            rows.append(_flag(name, kind, default, texts[name]))
+            rows.append(_flag(name, kind, parameter.default, texts[name]))
     for name in options:
-        kind = _plain_part(get_args(KINDS[name])[0])
+        kind = get_args(KINDS[name])[0]
         default = OPTIONS_WITH_FLAG[name]
-        # A switch that is left out is left to the Runner: three values.
-        if default is None and bool in get_args(kind):
+        # A switch has three values: one that is left out is left to the Runner.
+        if bool in get_args(kind):
             kind = Literal["on", "off"] | None
         rows.append(_flag(name, Annotated[kind, BOUNDS.get(name)], default, OPTIONS[name].flag))
-    rows += [_flag(name, LOADING[name][0], None, LOADING[name][1]) for name in loading]
-    for name, text in (outputs or {}).items():
-        rows.append(_flag(name, Path | None, None, text))
+    for name in loading:
+        kind, text = LOADING[name]
+        rows.append(_flag(name, kind, None, text))
     if outputs:
+        rows += [_flag(name, Path | None, None, text) for name, text in outputs.items()]
         rows.append(_flag("force", bool, False, "Replace output files that exist."))
     # A field without a default stands first.
     rows.sort(key=lambda row: row[2].default is not MISSING)
@@ -105,7 +104,7 @@ def record_of(
 def sections(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
     """Return the description in a function's docstring, and the text of each parameter."""
     about, _, rest = inspect.getdoc(function).partition("\n\nParameters\n")  # type: ignore[union-attr]
-    parameters = rest.partition("\n\nRaises\n")[0].partition("\n\nReturns\n")[0]
+    parameters = re.split("\n\n(?:Raises|Returns)\n", rest)[0]
     texts = {}
     for names, text in re.findall(r"^(\w[\w, ]*)\n((?:    .*\n?|\n)+)", parameters, re.MULTILINE):
         for name in names.split(", "):
@@ -131,39 +130,34 @@ def _flag(name: str, kind: Kind, default: Any, text: str) -> tuple[str, Any, Any
             return ""
         return f"(default: {default})"
 
+    options = {}
     if name in METAVARS:
-        options = {"metavar": METAVARS[name]}
-    else:
-        options = {}
+        options["metavar"] = METAVARS[name]
     if default is None and Path in get_args(kind):
-        options = {"metavar": "FILE"}
+        options["metavar"] = "FILE"
     described = Annotated[kind, tyro.conf.arg(help=text, help_behavior_hint=hint, **options)]
     if default is inspect.Parameter.empty:
-        made = field()
-    else:
-        made = field(default=default)
-    return name, described, made
+        return name, described, field()
+    return name, described, field(default=default)
 
 
 def _plain_part(kind: Kind) -> Any:
     """Return the part of a type that has plain values; None if it has none besides None."""
-    # Ranges and marks for tyro stay with the type.
-    if get_origin(kind) is Annotated:
-        inner, *notes = get_args(kind)
-        part = _plain_part(inner)
-        if part is None:
-            return None
-        return Annotated[(part, *notes)]
+    # A union may have members for Python beside those for the command line.
     if get_origin(kind) in (Union, UnionType):
-        members = [member for member in get_args(kind) if _plain_part(member) or member is NoneType]
-        return None if members in ([], [NoneType]) else Union[tuple(members)]  # noqa: UP007
-    if get_origin(kind) is tuple:
-        if get_args(kind)[0] in PLAIN or _plain_part(get_args(kind)[0]):
-            return kind
+        kind = Union[tuple(filter(_is_plain, get_args(kind)))]  # noqa: UP007
+    if kind is NoneType or not _is_plain(kind):
         return None
-    if (kind in PLAIN and kind is not NoneType) or get_origin(kind) is Literal:
-        return kind
-    return None
+    return kind
+
+
+def _is_plain(kind: Kind) -> bool:
+    """Return whether all values of a type can be written on the command line."""
+    if get_origin(kind) is Annotated:
+        return _is_plain(get_args(kind)[0])
+    if get_origin(kind) is Literal or kind in PLAIN:
+        return True
+    return bool(get_args(kind)) and all(map(_is_plain, get_args(kind)))
 
 
 def _words(text: str) -> str:

@@ -12,10 +12,9 @@ from dataclasses import asdict, dataclass
 from batchpid.arrays.array_types import Document
 from batchpid.sim import Finding, Robot
 from batchpid.sim.robot.findings import summary
-from batchpid.sim.robot.link_repair import DENSITY
+from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.parts import HEADERS, joint_rows
-from batchpid.sim.tuning.comparison import table
-from batchpid.sim.tuning.gain_sets import gain_set
+from batchpid.sim.tuning.comparison import gain_set, table
 
 SOURCES = {
     "inertial": "<inertial>",
@@ -30,17 +29,6 @@ NO_GROUND = "No ground: links other than the fixed base reach it at the start po
 LEGS = "A robot with legs? Its base is fixed: --base free, or fixed_base=False, puts it on a floor."
 LIMB = 3
 """Joints of the shortest limb."""
-IN_JSON = (
-    "type",
-    "unit",
-    "lower",
-    "upper",
-    "effort_limit",
-    "velocity_limit",
-    "damping",
-    "friction",
-)
-"""Figures of a joint for --json."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +42,6 @@ class Inspection:
     of_gains: list[Finding]
     """Findings about the gains."""
     all: bool
-    strict: bool
-
-    @property
-    def status(self) -> int:
-        """Exit status: with ``strict`` 1 if a finding is worse than a note."""
-        findings = self.findings + self.of_gains
-        return int(self.strict and any(finding.severity != "note" for finding in findings))
 
     def report(self) -> str:
         """Return the findings, and tables of joints and links."""
@@ -121,17 +102,13 @@ class Inspection:
     def document(self) -> Document:
         """Return findings, joints and links."""
         masses = self.robot.link_masses
-        joints = {}
-        for joint in self.robot.joints:
-            joints[joint.name] = {name: getattr(joint, name) for name in IN_JSON}
+        joints = {joint.name: {"unit": joint.unit} | asdict(joint) for joint in self.robot.joints}
         return {
             "robot": self.robot.name,
             "mass": sum(link.mass for link in masses.values()),
             "findings": [asdict(finding) for finding in self.findings + self.of_gains],
             "joints": joints,
-            "links": {
-                name: {"mass": link.mass, "source": link.source} for name, link in masses.items()
-            },
+            "links": masses,
         }
 
 
@@ -139,7 +116,6 @@ def inspect_robot(
     robot: Robot,
     gains: str | None = None,
     all: bool = False,
-    strict: bool = False,
 ) -> Inspection:
     """List findings about a robot and gains, its joints in the order of qpos, and the masses of its
     links.
@@ -150,17 +126,15 @@ def inspect_robot(
         Gains to check, as for `batchpid rollout`. Default: tuned where the robot has them.
     all
         List fixed joints, light links, and pairs of links that do not collide, too.
-    strict
-        Exit with status 1 if a finding is worse than a note.
     """
     findings = robot.check(setpoint=robot.target, control="drive")  # without gains
     if gains is None and not robot.has_tuned:
         # Designed gains keep the stability bound.
-        return Inspection(robot, findings, None, [], all, strict)
+        return Inspection(robot, findings, None, [], all)
     chosen = gain_set(robot, gains)
     checked = robot.check(params=chosen.params, setpoint=robot.target, control=chosen.control)
     of_gains = [finding for finding in checked if finding not in findings]
-    return Inspection(robot, findings, chosen.name, of_gains, all, strict)
+    return Inspection(robot, findings, chosen.name, of_gains, all)
 
 
 def limbs(robot: Robot) -> int:
@@ -169,7 +143,8 @@ def limbs(robot: Robot) -> int:
     sizes = Counter[str]()
     # Of each joint, the first moving joint on the way from the root.
     for joint in robot.joints:
-        first, link = joint.name, joint.parent_link
+        first = joint.name
+        link = joint.parent_link
         while link in above:
             first = above[link].name if above[link].moves else first
             link = above[link].parent_link

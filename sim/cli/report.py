@@ -58,7 +58,7 @@ class RunReport:
     timestep: float
     wall: float
     """Time that the run took [s]."""
-    backend: str = ""
+    backend: str
     """Library of the law, and kind of the calls into the engine."""
     notes: Sequence[str] = ()
     is_held: bool = True
@@ -77,12 +77,11 @@ class RunReport:
         """
         if not self.is_held:
             return 0
-        is_short = self.seconds < SHORTEST
-        if is_short:
-            settled = self.rollout.ok.all(0)
+        if self.seconds < SHORTEST:
+            good = self.rollout.ok.all(0)
         else:
-            settled = settled_envs(self.rollout, self.robot)
-        if settled.any():
+            good = settled_envs(self.rollout, self.robot)
+        if good.any():
             return 0
         return NOT_SETTLED
 
@@ -94,9 +93,9 @@ class RunReport:
         The figures are errors of a tool's pose, following errors of setpoints that move, or metrics
         of steps.
         """
-        robot, rollout = self.robot, self.rollout
-        ticks = len(rollout.time)
-        ends = slice(-max(1, ticks // 10), None)
+        robot = self.robot
+        rollout = self.rollout
+        ends = slice(-max(1, len(rollout.time) // 10), None)
         # Poses of a tool have six errors, whatever the joints do.
         if rollout.tool_pose is not None:
             error = np.abs(pose_error(rollout.setpoint[..., :7], rollout.tool_pose.astype(float)))
@@ -104,7 +103,7 @@ class RunReport:
             return list(AXES), list(AXES.values()), figures
         has_effort = rollout.info.control != "drive"
         # A setpoint that moves is followed; one that is held is a step, with a settling time.
-        if ticks < 2 or (rollout.setpoint != rollout.setpoint[0]).any():
+        if not self.is_held:
             figures = {
                 "following_error": following_error(robot, rollout),
                 "final_error": following_error(robot, rollout.for_ticks(ends)),
@@ -112,32 +111,26 @@ class RunReport:
             if has_effort:
                 figures["saturation_share"] = rollout.saturated.mean(0)
             return robot.joint_names, robot.units, figures
-        if rollout.info.start is None:
-            start = robot.start
-        else:
+        start = robot.start
+        if rollout.info.start is not None:
             start = rollout.info.start.astype(float)
         metrics = step_response_metrics(robot, rollout, start, with_effort=has_effort)
-        return (
-            robot.joint_names,
-            robot.units,
-            metrics._asdict()
-            | {"overshoot": overshoot_of_settled(metrics.overshoot, metrics.settling_time)},
-        )
+        overshoot = overshoot_of_settled(metrics.overshoot, metrics.settling_time)
+        return robot.joint_names, robot.units, metrics._asdict() | {"overshoot": overshoot}
 
     def report(self) -> str:
         """Return the speed, a table of the joints, failed and unsettled envs, and causes."""
         names, units, figures = self.columns
-        shown = {name: COLUMNS[name] for name in COLUMNS if name in figures}
+        shown = [column for column in COLUMNS if column in figures]
         rows = []
         for joint, (name, unit) in enumerate(zip(names, units, strict=True)):
             cells = [
-                median_and_worst(figures[column][:, joint], style)
-                for column, (_, style) in shown.items()
+                median_and_worst(figures[column][:, joint], COLUMNS[column][1]) for column in shown
             ]
             rows.append([f"{name} [{unit}]", *cells])
-        headers = ["median / worst env", *(header for header, _ in shown.values())]
+        headers = ["median / worst env", *(COLUMNS[column][0] for column in shown)]
         lines = [
-            *([self.backend] if self.backend else []),
+            self.backend,
             speed_line(self.rollout.num_envs, self.seconds, self.timestep, self.wall) + "\n",
             table(rows, headers, "l" + "r" * len(shown)),
             ABOUT,
@@ -154,37 +147,27 @@ class RunReport:
         failed = np.flatnonzero(~rollout.ok.all(0))
         if failed.size:
             first = rollout.tick * (1 + np.argmin(rollout.ok.all(1)))
-            if failed.size > LISTED:
-                more = f" and {failed.size - LISTED} more"
-            else:
-                more = ""
             envs = ", ".join(map(str, failed[:LISTED]))
             lines.append(
                 f"FAILED: {failed.size} of {rollout.num_envs} envs, the first after {first:.3g} s:"
-                f" env {envs}{more}."
+                f" env {envs}{', ...' if failed.size > LISTED else ''}."
             )
+        # A trajectory ends where it ends: its last setpoint need not be reached.
+        if not self.is_held:
+            return lines
         settling = self.columns[2].get("settling_time")
         if settling is not None:
             # Followers do what their leaders do.
             counts = np.isinf(settling[rollout.ok.all(0)]).sum(0) * self.robot.independent
-            joints = [
-                f"{name} ({count})"
-                for name, count in zip(self.robot.joint_names, counts, strict=True)
-                if count
-            ]
+            named = zip(self.robot.joint_names, counts, strict=True)
+            joints = [f"{name} ({count})" for name, count in named if count]
+            within = f"within {self.seconds:g} s to 2 % of"
             if joints:
                 lines.append(
-                    f"NOT SETTLED within {self.seconds:g} s to 2 % of the move, with the number of"
-                    f" envs: {', '.join(joints)}."
+                    f"NOT SETTLED {within} the move, with the number of envs: {', '.join(joints)}."
                 )
             elif not failed.size:
-                lines.append(
-                    f"Every joint of every env settled within {self.seconds:g} s to 2 % of its"
-                    " move."
-                )
-        # A trajectory ends where it ends: its last setpoint need not be reached.
-        if "following_error" in self.columns[2]:
-            return lines
+                lines.append(f"Every joint of every env settled {within} its move.")
         return lines + list(cause_lines(rollout.findings(self.robot)))
 
     def document(self) -> Document:

@@ -22,8 +22,8 @@ from batchpid.sim.cli.flags import BOUNDS
 from batchpid.sim.cli.report import RunReport
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.tool_space.osc_controller import default_tool
-from batchpid.sim.tuning.gain_sets import gain_set
+from batchpid.sim.tool_space import default_tool
+from batchpid.sim.tuning.comparison import gain_set
 
 NumEnvs = Annotated[int, BOUNDS["num_envs"]]
 SECONDS = Field("simulated time, s", low=1e-6, high=1e6)
@@ -149,7 +149,7 @@ def rollout(
         from batchpid.sim.recording.setpoint_files import read_setpoints
 
         for name, value in {"setpoint": setpoint, "seconds": seconds, "substeps": substeps}.items():
-            _refuse(name, value, "is as --trajectory says")
+            _refuse(name, value, "is given by the trajectory")
         motion = read_setpoints(robot, trajectory, timestep)
         setpoints = motion.position
         options["substeps"] = motion.substeps
@@ -163,7 +163,7 @@ def rollout(
         notes.append(f"Rates of the setpoints: {source if rates else 'not given'}.")
         if motion.steps and rates:
             notes.append(
-                f"{motion.steps} changes are too fast for the velocity limits: steps, with rate 0."
+                f"{motion.steps} steps of the setpoints exceed the velocity limits; their rate is 0."
             )
     else:
         goal = goal if setpoint is None else setpoint

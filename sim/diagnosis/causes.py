@@ -85,17 +85,13 @@ def _finding(
     rows = rows[np.argsort(times, kind="stable")]
     first = rows[0]
     name = None
+    detail = run.pressed[first]
     if rule.names_joint:
         name = run.robot.joint_names[joint]
         detail = f"{run.error[-1, first, joint]:.2g} {run.robot.units[joint]} remain"
-    elif run.failed[first]:
-        faults = [fault for fault in run.info.faults if fault.env == first]
-        if faults:
-            detail = f"{faults[-1].joint}: {faults[-1].cause}"
-        else:
-            detail = ""
-    else:
-        detail = run.pressed[first]
+    for fault in run.info.faults:
+        if run.failed[first] and fault.env == first:
+            detail = f"{fault.joint}: {fault.cause}"
     numbers = tuple(envs[rows].tolist())
     time = times.min()
     return Finding("warning", rule.code, rule.text, rule.remedy, name, None, detail, numbers, time)
@@ -133,12 +129,14 @@ class _Run:
     def _find_goal(self) -> Float64:
         command = self.info.own_command
         end = self.qpos[-1]
-        if command is None:
-            is_known = self.info.control != "effort"
-            if is_known:
-                return self.robot.coupled(self.rollout.setpoint[-1])
-            return end
-        if command.size != 7 or self.info.tool is None or not self.robot.fixed_base:
+        if command is None and self.info.control != "effort":
+            return self.robot.coupled(self.rollout.setpoint[-1])
+        if (
+            command is None
+            or command.size != 7
+            or self.info.tool is None
+            or not self.robot.fixed_base
+        ):
             return end
         pose = self.rollout.setpoint[-1, :, :7].copy()
         pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
@@ -163,11 +161,10 @@ class _Run:
         effort = self.rollout.effort.astype(np.float64)
         params = self.info.params
         if self.info.control == "drive" and params is not None:
-            if params.kd is None:
-                rate = 0.0
-            else:
-                rate = params.kd * self.rollout.qvel
-            effort += np.clip(params.kp * self.error - rate, -self.limit, self.limit)
+            law = params.kp * self.error
+            if params.kd is not None:
+                law = law - params.kd * self.rollout.qvel
+            effort += np.clip(law, -self.limit, self.limit)
         return effort
 
     @cached_property
@@ -210,36 +207,27 @@ class _Run:
         return self.rollout.time[ticks]
 
     def _distances(self, qpos: Float64) -> dict[str, float]:
-        """Return the distances [m] below TOUCH of links to each other and to the ground, the
-        nearest last.
-        """
+        """Return the distances [m] below TOUCH of links to each other and to the ground."""
         # A floating base stands on its ground.
-        if self.robot.fixed_base:
-            ground = self.info.ground
-        else:
-            ground = False
+        ground = bool(self.info.ground and self.robot.fixed_base)
         near = self.robot.dynamics(ground).contacts.near(qpos, TOUCH)
+        # Of two links with several shapes the nearest, which is last.
         pairs = sorted(near, key=itemgetter(2), reverse=True)
         return {f"{link} on {other or 'the ground'}": distance for link, other, distance in pairs}
 
-    def _pressed_links(self, env: int) -> str:
-        """Return the nearest links that a step of the unsettled joints brings nearer still; "" if
-        there are none.
-        """
-        most = 20 * absolute_band(self.robot)
-        step = np.clip(self.error[-1, env], -most, most) * self.unsettled[env]
-        before = self._distances(self.qpos[-1, env])
-        after = self._distances(self.robot.coupled(self.qpos[-1, env] + step))
-        pressed = [links for links in before if after.get(links, TOUCH) < before[links] - 1e-4]
-        return min(pressed, key=before.__getitem__, default="")
-
     @cached_property
     def pressed(self) -> list[str]:
-        """Links that are pressed together at the end, per env; "" if there are none."""
+        """Nearest links at the end, per env, that a step of the unsettled joints brings nearer
+        still; "" if there are none.
+        """
         links = [""] * len(self.failed)
-        for env in np.flatnonzero(~self.failed):
-            if self.info.collisions is not False:
-                links[env] = self._pressed_links(int(env))
+        most = 20 * absolute_band(self.robot)
+        steps = np.clip(self.error[-1], -most, most) * self.unsettled
+        for env in np.flatnonzero(~self.failed & (self.info.collisions is not False)):
+            before = self._distances(self.qpos[-1, env])
+            after = self._distances(self.robot.coupled(self.qpos[-1, env] + steps[env]))
+            pressed = [pair for pair in before if after.get(pair, TOUCH) < before[pair] - 1e-4]
+            links[env] = min(pressed, key=before.__getitem__, default="")
         return links
 
 

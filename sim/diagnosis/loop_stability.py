@@ -21,9 +21,9 @@ from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.gains.stability import Oscillation, oscillation
 from batchpid.law.implicit import as_explicit
-from batchpid.sim.robot.actuator_checks import known_joints
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.parts import DISSIPATION
+from batchpid.sim.robot.robot_options import known_joints
 
 
 class StabilityReport(NamedTuple):
@@ -60,29 +60,24 @@ def _loop(
     motors = actuators or bp.Actuators()
     coupling = robot.coupling
 
-    def column(leaf: Array, neutral: float = 0.0) -> Float64:
+    def table(leaf: Array, neutral: float = 0.0) -> Float64:
         if leaf is None:
-            rows = np.full((1, robot.dof), neutral)
-        else:
-            rows = np.asarray(leaf, np.float64)
-        return np.broadcast_to(rows, (len(rows), robot.dof))[:, coupling.independent]
+            return np.full((1, robot.dof), neutral)
+        rows = np.atleast_2d(np.asarray(leaf, np.float64))
+        return np.broadcast_to(rows, (len(rows), robot.dof))
+
+    def column(leaf: Array, neutral: float = 0.0) -> Float64:
+        return table(leaf, neutral)[:, coupling.independent]
 
     def matrix(armature: Array) -> Float64:
-        if armature is None:
-            rows = np.zeros(robot.dof)
-        else:
-            rows = np.asarray(armature, np.float64)
-        inertia = np.atleast_2d(rows)[:, None] * np.eye(robot.dof)
+        inertia = table(armature)[:, None] * np.eye(robot.dof)
         return coupling.reduced(robot.mass_matrix(qpos) + inertia)
 
     loop: Document = {name: column(getattr(params, name)) for name in ("kp", "ki", "kd")}
     eye = np.eye(loop["kp"].shape[1])
     strength = column(motors.strength, 1.0)
-    if motors.viscous is None:
-        viscous = np.zeros((1, robot.dof))
-    else:
-        viscous = motors.viscous
-    damping = np.stack([coupling.reduced_damping(robot.damping + row) for row in viscous])
+    viscous = robot.damping + table(motors.viscous)
+    damping = np.stack([coupling.reduced_damping(row) for row in viscous])
     if params.gain_units is None:
         loop = {name: strength * gain for name, gain in loop.items()}
         loop |= {"mass_matrix": matrix(motors.armature), "damping": damping}
@@ -122,10 +117,7 @@ def stability_report(
     worst = int(np.argmax(bound.ratio))
     ratio = float(bound.ratio[worst])
     effect = "efforts alternate from step to step, and the joint chatters or diverges"
-    if ratio:
-        remedy = f"use at most {0.5 / ratio:.1g} times these gains"
-    else:
-        remedy = ""
+    remedy = f"use at most {0.5 / max(ratio, 1e-9):.1g} times these gains"
     if np.isinf(ratio):
         remedy = "use a kd that is larger than kp times the delay and lag"
     if loop["delay"].any() or loop["lag"].any():
@@ -190,7 +182,6 @@ class StabilityCheck:
             motors = actuators.for_envs(slice(0, MOST))
         if params.num_envs > 1 and motors is not None:
             params = params.for_envs(slice(0, MOST))
-        rows = max(params.num_envs, 1 if motors is None else motors.num_envs)
         start = self._robot.start
         try:
             report = stability_report(self._robot, params, start, self._timestep, motors)
@@ -200,7 +191,9 @@ class StabilityCheck:
         is_beyond = report.robot_ratio >= 1
         if is_beyond and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
-            env = f", env {report.env}" if rows > 1 else ""
+            env = ""
+            if report.env:
+                env = f", env {report.env}"
             warn(
                 f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the"
                 f" sampled PID loop, mostly of joint {joint!r}{env}, at the start pose with a time"

@@ -20,10 +20,10 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import slow_oscillation, stability_report
 from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
-from batchpid.sim.robot.joint_repair import GIVE_RANGE
-from batchpid.sim.robot.link_repair import DENSITY, triangle_excess
+from batchpid.sim.robot.inertia import DENSITY, triangle_excess
 from batchpid.sim.robot.parts import Joint
 from batchpid.sim.robot.plausibility import implausible_figures
+from batchpid.sim.robot.urdf import GIVE_RANGE
 
 # of the triangle inequality of principal moments, above which it is reported; less is rounding
 EXCESS = 0.01
@@ -117,7 +117,10 @@ class _Preflight:
                 loaded.add(bodies[joint.parent_link])
         for link in robot.links:
             body = bodies[link.name]
-            excess = triangle_excess(link.inertia) if link.mass else 0.0
+            if link.mass:
+                excess = triangle_excess(link.inertia)
+            else:
+                excess = 0.0
             if excess > EXCESS:
                 self._note(
                     "inertia",

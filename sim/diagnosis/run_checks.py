@@ -110,11 +110,13 @@ class MovingSetpointCheck:
             return
         # Rates tell the law where the setpoint goes.
         if rated:
-            self._last, self._moved = None, 0.0
+            self._last = None
+            self._moved = 0.0
             return
         reduce = np.logical_or.reduce  # methods of arrays take calls of Python
         for rows in setpoints:
-            last, self._last = self._last, rows
+            last = self._last
+            self._last = rows
             if last is None:
                 continue
             if not reduce(rows != last, None):

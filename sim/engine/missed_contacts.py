@@ -4,19 +4,72 @@ ends of ticks.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Rows
-from batchpid.sim.engine.scene_model import contacts_of
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.parts import Joint
 
 DEPTH = 1e-3
 """Smallest depth [m] of an overlap that counts as a contact: bodies at rest on each other may
 overlap by less.
 """
 _LONGEST = 10.0
-"""Travel of a sliding joint without limits [m]."""
+"""Largest position of a sliding joint in which bounds of speeds hold [m]."""
+_BEYOND = 0.01
+"""Distance beyond the limits of a sliding joint up to which they hold [m]: limits are soft."""
+
+
+def speed_bounds(
+    joints: Sequence[Joint],
+    parents: Sequence[int],
+    offsets: Float64,
+    axes: Float64,
+    body: NDArray[np.intp],
+    balls: Float64,
+) -> tuple[Float64, Float64]:
+    """Return bounds of the speed that a unit speed of each joint, and last of a turning base, gives
+    to any shape (dof + 1,) [m or 1], and the joint positions in which they hold (2, dof).
+
+    Parameters
+    ----------
+    joints
+        A body for each, parents first.
+    parents, offsets, axes
+        Parent of each body, -1 for the base; its origin in the frame of the parent (dof, 3) [m];
+        and the joint's axis in its own frame, through its origin (dof, 3).
+    body, balls
+        Body of each shape (shapes,), and a ball around the shape in the frame of the body (shapes,
+        4): center and radius [m].
+    """
+    arms = np.ones(len(joints) + 1)
+    travel = np.tile([[-np.inf], [np.inf]], (1, len(joints)))
+    carried: list[list[Any]] = [[] for _ in arms]
+    for at, ball in zip(body, balls, strict=True):
+        carried[at].append(ball)
+    # From the last body to the base, which is last in the lists: a ball around the origin of a body
+    # contains all that it carries at any pose, and is carried by its parent.
+    for at in reversed(range(-1, len(joints))):
+        points = np.reshape(carried[at], (-1, 4))
+        distance = np.linalg.norm(points[:, :3], axis=1)
+        farthest = (distance + points[:, 3]).max(initial=0.0)
+        if at < 0:
+            arms[at] = farthest
+            break
+        if joints[at].unit == "m":
+            limits = np.clip([joints[at].lower, joints[at].upper], -_LONGEST, _LONGEST)
+            travel[:, at] = limits + np.array([-_BEYOND, _BEYOND])
+            farthest += np.abs(travel[:, at]).max()
+        else:
+            # A hinge moves a point by its distance from the axis.
+            across = np.linalg.norm(np.cross(points[:, :3], axes[at]), axis=1)
+            arms[at] = (across + points[:, 3]).max(initial=0.0)
+        carried[parents[at]].append([*offsets[at], farthest])
+    return arms, travel
 
 
 class MissedContacts:
@@ -29,28 +82,17 @@ class MissedContacts:
     """
 
     def __init__(self, spec: SceneSpec, size: int, ground: bool) -> None:
-        self._contacts, tree = contacts_of(spec, ground), spec.rigid_tree.held
-        slides = tree.bodies.slides.ravel() > 0
-        parents = tree.body_parents
-        body, balls = self._contacts.balls
-        # From the origin of each body to the end of its last child; the base is last.
-        farthest = np.zeros(tree.dof + 1)
-        np.maximum.at(farthest, body, np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3])
-        for joint in reversed(range(tree.dof)):
-            limits = spec.joints[joint].lower, spec.joints[joint].upper
-            if slides[joint]:
-                travel = np.abs(np.clip(limits, -_LONGEST, _LONGEST)).max()
-            else:
-                travel = 0.0
-            offset = np.linalg.norm(tree.bodies.at_zero[joint][:, 3])
-            farthest[parents[joint]] = max(
-                farthest[parents[joint]], offset + travel + farthest[joint]
-            )
+        self._contacts = spec.contact_model(ground)
+        tree = spec.rigid_tree
+        axes = np.tile([1.0, 0.0, 0.0], (tree.dof, 1))
+        offsets = tree.bodies.at_zero[:, :, 3]
+        bounds, _ = speed_bounds(
+            spec.joints, tree.body_parents, offsets, axes, *self._contacts.balls
+        )
         moves = np.vstack([tree.bodies.moves, np.zeros(tree.dof)])
         first, second = self._contacts.body_pairs.T
         # A joint that moves both bodies of a pair, or none, leaves their distance.
-        moves_one = moves[first] != moves[second]
-        self._arms = np.where(moves_one, np.where(slides, 1.0, farthest[:-1]), 0.0)
+        self._arms = np.where(moves[first] != moves[second], bounds[:-1], 0.0)
         self._centers = np.zeros((size, tree.dof))
         self._margins = np.zeros((size, len(first)))
 
@@ -70,23 +112,19 @@ class MissedContacts:
         The step of the first one of a robot is written into ``first`` (size,), where that is 0,
         and into the rows of ``tables`` (ticks, size) from there on.
         """
-        rows = np.flatnonzero(first == 0)
-        ticks = np.zeros(len(rows), np.intp)
-        while rows.size:
-            # Most robots move too little in all ticks together, which is seen at once.
-            moved = np.abs(qpos[:, rows] - self._centers[rows])
-            may_close = (moved.max(axis=0) @ self._arms.T >= self._margins[rows]).any(axis=1)
-            rows, ticks = rows[may_close], ticks[may_close]
-            closes = (moved[:, may_close] @ self._arms.T >= self._margins[rows]).any(axis=2)
-            closes &= np.arange(len(qpos))[:, None] >= ticks
-            may_close = closes.any(axis=0)
-            rows, ticks = rows[may_close], closes.argmax(axis=0)[may_close]
+        # Most robots move too little in all ticks together, which is seen at once.
+        moved = np.abs(qpos - self._centers).max(axis=0)
+        if not (moved @ self._arms.T >= self._margins).any():
+            return
+        for tick, pose in enumerate(qpos):
+            rows = np.flatnonzero(first == 0)
+            moved = np.abs(pose[rows] - self._centers[rows])
+            rows = rows[(moved @ self._arms.T >= self._margins[rows]).any(axis=1)]
             if rows.size:
-                self._search(qpos[ticks, rows], rows)
-            missed = (self._margins[rows] < 0).any(axis=1)
-            for row, tick in zip(rows[missed].tolist(), ticks[missed].tolist(), strict=True):
-                first[row] = tables[tick:, row] = steps[tick]
-            rows, ticks = rows[~missed], ticks[~missed] + 1
+                self._search(pose[rows], rows)
+                missed = rows[(self._margins[rows] < 0).any(axis=1)]
+                first[missed] = steps[tick]
+                tables[tick:, missed] = steps[tick]
 
     def _search(self, qpos: Rows, rows: NDArray[np.intp]) -> None:
         """Compute the distances that motion of robots ``rows`` to ``qpos`` (rows, dof) can have

@@ -15,6 +15,7 @@ from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.native_model import NativeModel, passive_force_of
+from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.engine.scene_spec import (
     SceneSpec,
     Variation,
@@ -24,8 +25,11 @@ from batchpid.sim.engine.scene_spec import (
 )
 from batchpid.task_space.rigid_tree import RigidTree
 
+ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
+"""Pose and twist of a base at rest at the origin."""
 
-class ModelPack(SingleOwner):
+
+class ModelPack(EnginePack, SingleOwner):
     """Pack of ``size`` robots of ``spec``, numbered from ``first_env``, with mass matrices and
     forces from its model.
 
@@ -92,6 +96,15 @@ class ModelPack(SingleOwner):
     @cached_property
     def _passive_force(self) -> Callable[..., Float64]:
         return passive_force_of(self, self.steps_natively)
+
+    def _model_force(self, gravity: bool, coriolis: bool) -> Float64:
+        """Return the passive force, computed from the model."""
+        state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
+        return self._passive_force(*state)
+
+    @property
+    def _constraint_address(self) -> int | None:
+        return None if self._constraint is None else self._constraint.address
 
     def _change(self, rows: Sequence[int], variation: Variation) -> None:
         """Set the differences of the robots ``rows`` from the model, in the fields that vary."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -20,20 +20,39 @@ from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import BASES, STATUS, Group, ModelStruct, Refresh
-from batchpid.sim.engine.protocol import CompiledModel
-from batchpid.sim.engine.scene_model import passive_force
-from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine.protocol import CompiledModel, EnginePack
 from batchpid.task_space.rigid_tree import RigidTree
 
 
-class Described(Protocol):
-    """Pack, as far as a model of its robots needs it."""
+def passive_force(
+    tree: RigidTree,
+    qpos: Float64,
+    qvel: Float64,
+    gravity: bool,
+    coriolis: bool,
+    base: Float64 | None = None,
+) -> Float64:
+    """Return the gravity part of :func:`batchpid.task_space.bias` (n, dof), its velocity part, or
+    both.
 
-    spec: SceneSpec
-
-    @property
-    def rigid_tree(self) -> RigidTree:
-        """As :attr:`batchpid.sim.engine.protocol.EnginePack.rigid_tree`."""
+    ``base`` (n, 6) are gravity and the rate at which the base turns, in its own axes, of one that
+    floats, or with a tree on a fixed base of one that is held where it is. The gravity part of a
+    floating base is 0.
+    """
+    zero = np.zeros_like(np.asarray(qpos, np.float64))
+    turning = None
+    bodies = None
+    if base is not None:
+        turning = base[:, 3:]
+        bodies = tree.bodies._replace(gravity=base[:, None, :3])
+    force = zero
+    if coriolis or gravity:
+        force = ts.bias(
+            tree, qpos, qvel if coriolis else zero, turning if coriolis else None, bodies=bodies
+        )
+    if coriolis and not gravity:
+        force = force - ts.bias(tree, qpos, zero, bodies=bodies)
+    return np.asarray(force, np.float64)
 
 
 class NativeModel:
@@ -41,7 +60,7 @@ class NativeModel:
     :data:`BASES`.
     """
 
-    def __init__(self, pack: Described, base: str = "fixed") -> None:
+    def __init__(self, pack: EnginePack, base: str = "fixed") -> None:
         # The pack's tree is read at the first use: SAPIEN has to build a robot for it.
         self._pack = pack
         self._base = base
@@ -73,7 +92,7 @@ class NativeModel:
         """Add spatial inertias (size, 6, 6) to links, by name, of the robots ``rows`` of ``size``
         in place.
 
-        They are :func:`batchpid.task_space.spatial_inertia.spatial_matrix`, in the axes of the
+        They are :func:`batchpid.task_space.frames.spatial_matrix`, in the axes of the
         links.
         """
         tree = self._pack.rigid_tree
@@ -228,7 +247,7 @@ class NativeStep:
         return bool(status)
 
 
-def mass_matrix_of(pack: Described, natively: bool) -> Callable[[Float64], Float64]:
+def mass_matrix_of(pack: EnginePack, natively: bool) -> Callable[[Float64], Float64]:
     """Return the function of positions that computes the mass matrices of a pack's model, on a
     fixed base.
 
@@ -240,7 +259,7 @@ def mass_matrix_of(pack: Described, natively: bool) -> Callable[[Float64], Float
     return lambda qpos: ts.mass_matrix(pack.rigid_tree.held, qpos)
 
 
-def passive_force_of(pack: Described, natively: bool) -> Callable[..., Float64]:
+def passive_force_of(pack: EnginePack, natively: bool) -> Callable[..., Float64]:
     """Return the function of positions, velocities, gravity, coriolis and base that computes the
     passive forces of a pack's model.
 

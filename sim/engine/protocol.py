@@ -17,9 +17,7 @@ from importlib.util import find_spec
 from sys import modules
 from typing import Any, Literal, Protocol
 
-import numpy as np
-
-from batchpid.arrays.array_types import Bool, DType, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.motors import Actuators
@@ -27,17 +25,42 @@ from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.task_space.rigid_tree import RigidTree
 
-Capability = Literal[
-    "drive", "build", "compiled_steps", "partial_force", "base_state", "sapien_dissipation"
-]
+Capability = Literal["build", "partial_force", "base_state", "sapien_dissipation"]
 """
-- ``"drive"``: packs are :class:`DrivenPack`, for the control "drive";
 - ``"build"``: the user's function ``build`` adds content to scenes;
-- ``"compiled_steps"``: packs are :class:`CompiledPack`, for programs of XLA;
 - ``"partial_force"``: compiled steps read gravity or Coriolis forces alone;
 - ``"base_state"``: compiled steps read state and passive force of robots on a floating base;
 - ``"sapien_dissipation"``: SAPIEN's own friction and damping in place of the URDF's.
 """
+
+
+class CompiledStep(Protocol):
+    """Sim step of a pack as one native call, also from XLA
+    (:func:`batchpid.sim.engine.native.xla.sim_step`).
+    """
+
+    def prepare(self) -> int:
+        """Return the address of the native group for the next steps."""
+
+    def __call__(self, *arrays: Float64) -> int:
+        """Do one sim step on the arrays effort, qpos, qvel and passive force (envs, dof); return
+        the status.
+        """
+
+    def may_have_failed(self, status: int) -> bool:
+        """Return whether an env may have failed in the last sim step, which had this status.
+
+        The sensors of links are read here, where native code does not. RuntimeError if the engine
+        has failed.
+        """
+
+
+class CompiledModel(Protocol):
+    """Rigid-body model of robots in native code."""
+
+    @property
+    def address(self) -> int:
+        """Address of the model, for structures of the extension."""
 
 
 class EnginePack(Protocol):
@@ -62,6 +85,8 @@ class EnginePack(Protocol):
     armature
         Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg], not included in
         :meth:`joint_mass_matrix`.
+    steps_natively
+        Whether native code does the sim steps, by :meth:`compiled_step`.
     state_is_complete
         Whether :meth:`read_state` holds everything that later steps depend on, so that a pack in
         use can be restored.
@@ -75,18 +100,19 @@ class EnginePack(Protocol):
     state_is_complete: bool
     friction: Friction
     armature: Float64
+    steps_natively: bool
 
     @property
     def rigid_tree(self) -> RigidTree:
         """Tree of the robots of ``spec`` as the engine has them, all joints independent."""
 
-    def read_qpos(self, dtype: DType = np.float64) -> Rows:
+    def read_qpos(self) -> Float64:
         """Return the joint positions [rad or m]."""
 
-    def read_qvel(self, dtype: DType = np.float64) -> Rows:
+    def read_qvel(self) -> Float64:
         """Return the joint velocities [rad/s or m/s]."""
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N].
 
         They come from the model of ``spec`` at the present state, without the pack's variation. On
@@ -204,12 +230,7 @@ class EnginePack(Protocol):
         beyond FARTHEST.
         """
 
-    def close(self) -> None:
-        """Free the envs. The pack cannot be used afterwards."""
-
-
-class DrivenPack(EnginePack, Protocol):
-    """Pack whose joints have drives: PD control that the engine integrates implicitly."""
+    # The drives of the joints: PD control that the engine integrates implicitly.
 
     def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
         """Set the drive of every joint; each argument broadcasts to (M, dof) [N m/rad, N m s/rad, N
@@ -219,46 +240,7 @@ class DrivenPack(EnginePack, Protocol):
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
 
-
-class CompiledStep(Protocol):
-    """Sim step of a pack as one native call, also from XLA
-    (:func:`batchpid.sim.engine.native.xla.sim_step`).
-    """
-
-    def prepare(self) -> int:
-        """Return the address of the native group for the next steps."""
-
-    def __call__(self, *arrays: Float64) -> int:
-        """Do one sim step on the arrays effort, qpos, qvel and passive force (envs, dof); return
-        the status.
-        """
-
-    def may_have_failed(self, status: int) -> bool:
-        """Return whether an env may have failed in the last sim step, which had this status.
-
-        The sensors of links are read here, where native code does not. RuntimeError if the engine
-        has failed.
-        """
-
-
-class CompiledModel(Protocol):
-    """Rigid-body model of robots in native code."""
-
-    @property
-    def address(self) -> int:
-        """Address of the model, for structures of the extension."""
-
-
-class CompiledPack(EnginePack, Protocol):
-    """Pack whose sim steps can run in native code and in programs of XLA.
-
-    Attributes
-    ----------
-    steps_natively
-        Whether :meth:`compiled_step` can be used.
-    """
-
-    steps_natively: bool
+    # Sim steps in native code and in programs of XLA, where they are native.
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether a compiled step reads this part of the passive force; otherwise call
@@ -297,6 +279,9 @@ class CompiledPack(EnginePack, Protocol):
         this force.
         """
 
+    def close(self) -> None:
+        """Free the envs. The pack cannot be used afterwards."""
+
 
 @dataclass
 class Engine:
@@ -333,20 +318,17 @@ class Engine:
 
 
 def require(engine: Engine, capability: Capability, argument: str) -> None:
-    """Raise InvalidArgumentError for ``argument`` if ``engine`` lacks ``capability``."""
+    """Raise InvalidArgumentError for ``argument`` if ``engine`` lacks a ``capability`` of
+    SAPIEN's.
+    """
     if capability not in engine.capabilities:
-        problem = (
-            f"needs an engine with the capability {capability!r}, which {engine.name!r} does not"
-            " have"
-        )
-        raise InvalidArgumentError(
-            argument, problem, remedy="omit it, or use the engine 'sapien', which has all"
-        )
+        problem = f"needs the capability {capability!r}, which engine {engine.name!r} does not have"
+        raise InvalidArgumentError(argument, problem, remedy="omit it, or use the engine 'sapien'")
 
 
 MODULES = {
-    "sapien": "batchpid.sim.engine.sapien.sapien_engine",
-    "mujoco": "batchpid.sim.engine.mujoco.mujoco_engine",
+    "sapien": "batchpid.sim.engine.sapien.pack",
+    "mujoco": "batchpid.sim.engine.mujoco.mujoco_pack",
 }
 """Module of each engine by name. Its constant ENGINE is the :class:`Engine`."""
 

@@ -16,13 +16,14 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
+from batchpid.sim.robot.contacts import Contacts
 from batchpid.sim.robot.merging import merge_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
 from batchpid.sim.robot.simulated_links import BodyParts, rigid_tree, varied_bodies
 from batchpid.sim.robot.tables import Tables
+from batchpid.task_space.frames import SpatialInertia, spatial_matrix, total
 from batchpid.task_space.rigid_tree import GRAVITY, RigidTree
-from batchpid.task_space.spatial_inertia import SpatialInertia, spatial_matrix, total
 
 Build = Callable[[Any, int], Any]
 """``build(scene, env)`` adds content to the engine's scene of env ``env``; returns objects whose
@@ -78,6 +79,13 @@ class SceneSpec:
         measured.
         """
         return self.wrenches or ()
+
+    def contact_model(self, ground: bool) -> Contacts:
+        """Return distances of the robot's links, even of one simulated without shapes; ``ground``
+        is at height 0.
+        """
+        ignored = {frozenset(pair) for pair in self.ignored}
+        return Contacts(self.rigid_tree, self.simulated.shapes, ignored, ground)
 
     @property
     def is_alone(self) -> bool:
@@ -189,13 +197,19 @@ def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
     """Return ``own`` friction and damping plus the actuators' friction and damping."""
     added = Actuators() if actuators is None else actuators
     static, load = added.static, added.load_friction
-    both = zip(own[:2], (added.coulomb, added.viscous), strict=True)
-    coulomb, viscous = (
-        one if more is None else more if one is None else one + more for one, more in both
-    )
+    coulomb = _sum(own.coulomb, added.coulomb)
+    viscous = _sum(own.viscous, added.viscous)
     if static is not None and own.coulomb is not None:
         static = static + own.coulomb
     if coulomb is None and (rubs := Friction(None, None, static, load=load).most) is not None:
         # Friction of the other kinds alone still needs an array of Coulomb friction.
         coulomb = np.zeros_like(rubs)
     return Friction(coulomb, viscous, static, added.stribeck, load)
+
+
+def _sum(first: Float64 | None, second: Float64 | None) -> Float64 | None:
+    if first is None:
+        return second
+    if second is None:
+        return first
+    return first + second

@@ -11,37 +11,37 @@ from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.arrays.elementwise import TURN, wrap
-from batchpid.checks.validate import array, choice, entries, number
+from batchpid.checks.validate import array, choice, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.gym.joint_space import MAX_SPEED, JointSpace
 from batchpid.sim.gym.robot_env import RobotEnv
 from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
 from batchpid.sim.robot.description import LIMIT_TOLERANCE
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.command import CommandSpec, own_command
-from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.quantities import Observation
 
-ACTIONS = ("setpoint", "increment")
 SPREAD = 0.1
 """Largest distance of a joint from the robot's start pose at the beginning of an episode [rad or
 m].
 """
 MARGIN = 0.05
 """Share of a joint's range, at each limit, in which no goal is drawn."""
+MAX_SPEED = 100.0
+"""Joint speed that PhysX allows, and bound of the observed one [rad/s or m/s]."""
+FARTHEST = 1000.0
+"""Bound of the observed position of a floating base [m]."""
 
 
 class ReachVectorEnv(RobotVectorEnv):
     """N robots, each with a joint pose to reach.
 
     Joints are the independent ones (:attr:`batchpid.sim.Robot.independent`): followers move with
-    their leaders. A setpoint has one number for each of them. A :class:`batchpid.sim.Controller`
-    may define another command, within the bounds of its :class:`batchpid.sim.CommandSpec`.
+    their leaders. A setpoint has one number for each of them.
 
     - *Observation* (envs, 3 joints): qpos, qvel, goal [rad or m, and per second], clipped to the
-      space.
-    - *Action* (envs, size) in [-1, 1]: the setpoint within its limits, or an increment of the
+      space. On a floating base its pose and twist (13) stand before the goal.
+    - *Action* (envs, joints) in [-1, 1]: the setpoint within its limits, or an increment of the
       setpoint, which moves during the step. An episode begins with the setpoint at the joints'
-      pose, or with the ``neutral`` one of the command.
+      pose.
     - *Reward*: minus the mean over joints of |goal - qpos| / range, plus 1 where every joint is
       within ``tolerance``. A joint without a range counts as 0.
     - *Terminated*: the env diverged (``info["diverged"]``), or reached its goal if
@@ -61,9 +61,8 @@ class ReachVectorEnv(RobotVectorEnv):
     actions
         ``"setpoint"`` or ``"increment"``.
     max_increment
-        Change of the setpoint by an increment of 1, scalar or (size,) [rad or m]; default the
-        velocity limit times the time of a step. No default for a controller that defines its
-        command.
+        Change of the setpoint by an increment of 1, scalar or (joints,) [rad or m]; default the
+        velocity limit times the time of a step.
     tolerance
         Largest error of a reached goal [rad or m].
     options
@@ -86,110 +85,85 @@ class ReachVectorEnv(RobotVectorEnv):
         tolerance: float = 0.02,
         **options: Any,
     ) -> None:
-        self.actions = choice("actions", actions, ACTIONS)
+        self.actions = choice("actions", actions, ("setpoint", "increment"))
         self.tolerance = number("tolerance", tolerance, 0.0, 1e3, "rad or m")
         self._max_increment = max_increment
-        self._spec = own_command(options.get("control"))
         super().__init__(num_envs, robot, **options)
-        if self.runner.control == "pid":
-            law = self.runner.params.continuous
-        else:
-            law = None
-        if law is None:
-            turns = np.zeros(self.robot.dof)
-        else:
-            turns = np.asarray(law, np.float64).min(0) / TURN
-        joint_turns = np.minimum(self._joints.turns, turns[self._joints.index])
-        if self._spec is None:
-            self._setpoint_turns = joint_turns
-        else:
-            self._setpoint_turns = np.zeros(len(self.action_names))
+        if self.runner.options.own_command is not None:
+            self.close()
+            problem = "has setpoints that are not of joints"
+            raise InvalidArgumentError("control", problem, remedy="write a task for it")
+        # Only a law that takes errors the short way round follows a setpoint past pi.
+        self._setpoint_turns = np.zeros(len(self.joint_names))
+        if self.runner.control == "pid" and self.runner.params.continuous is not None:
+            continuous = np.asarray(self.runner.params.continuous, np.float64).min(0)
+            self._setpoint_turns = np.minimum(self._turns, continuous[self._index] / TURN)
         self._goal = np.zeros((self.num_envs, len(self.joint_names)))
 
     def spaces(self) -> tuple[spaces.Box, spaces.Box]:
-        """Return the spaces for the joint limits, or the bounds of the command."""
-        self._joints = joints = JointSpace(self.robot)
-        self.joint_names = joints.names
-        self.low = joints.low
-        self.high = joints.high
+        """Return the spaces for the joint limits."""
+        robot = self.robot
+        self._index = index = np.flatnonzero(robot.independent)
+        self.joint_names = tuple(robot.joint_names[joint] for joint in index)
+        continuous = robot.continuous[index]
+        # Periods for wrap: 1 / (2 pi) for continuous joints, else 0.
+        self._turns = np.where(continuous, 1 / TURN, 0.0)
+        self._start = wrap(robot.start[index], self._turns, np)
+        # Every joint has a finite range: a space needs bounds.
+        middle = np.where(continuous, 0.0, self._start)
+        lower = robot.lower[index]
+        upper = robot.upper[index]
+        self.low = np.where(np.isfinite(lower), lower, middle - np.pi)
+        self.high = np.where(np.isfinite(upper), upper, middle + np.pi)
         span = self.high - self.low
         self._span = np.where(span > LIMIT_TOLERANCE, span, np.inf)
-        self._margin = np.where(joints.continuous, 0.0, MARGIN * span)
-        spec = self._spec
-        self.action_names = self.joint_names
-        self._setpoint_low = self.low
-        self._setpoint_high = self.high
-        if spec is not None:
-            self.action_names = spec.names
-            self._setpoint_low, self._setpoint_high = _finite_bounds(spec)
+        self._margin = np.where(continuous, 0.0, MARGIN * span)
         max_increment = self._max_increment
         if max_increment is None:
-            if spec is not None and self.actions == "increment":
-                remedy = f"give one number for each of {', '.join(spec.names)}"
-                raise InvalidArgumentError(
-                    "max_increment", "is needed for the command of this control", remedy=remedy
-                )
-            fastest = self.robot.velocity_limit[joints.index]
-            if spec is not None:
-                max_increment = 0.0
-            else:
-                max_increment = np.minimum(fastest, MAX_SPEED) * self.step_seconds
-        names = self.action_names
-        kind: Any = "joint" if spec is None else "entry"
-        self.max_increment = array(
-            "max_increment", max_increment, (1, len(names)), names, kind=kind
-        )[0]
-        low, high = joints.bounds()
-        observation = spaces.Box(
-            np.concatenate([low, self.low]).astype(np.float32),
-            np.concatenate([high, self.high]).astype(np.float32),
-        )
+            fastest = np.minimum(robot.velocity_limit[index], MAX_SPEED)
+            max_increment = fastest * self.step_seconds
+        names = self.joint_names
+        self.max_increment = array("max_increment", max_increment, (1, len(names)), names)[0]
+        # Observed positions may be pi beyond a limit: physics is no clip.
+        beyond = np.where(continuous, 0.0, np.pi)
+        speed = np.full(len(names), MAX_SPEED)
+        base = np.zeros(0)
+        if not robot.fixed_base:
+            base = np.repeat([FARTHEST, 1.0, MAX_SPEED], [3, 4, 6])
+        low = np.concatenate([self.low - beyond, -speed, -base, self.low])
+        high = np.concatenate([self.high + beyond, speed, base, self.high])
+        observation = spaces.Box(low.astype(np.float32), high.astype(np.float32))
         return observation, spaces.Box(-1.0, 1.0, (len(names),), np.float32)
 
     def draw(self, env: int, random: np.random.Generator) -> Float64:
         """Draw a start near the robot's start pose, and a goal within the joint limits."""
-        joints = self._joints
-        drawn = joints.start + random.uniform(-SPREAD, SPREAD, len(joints.names))
+        start = self._start + random.uniform(-SPREAD, SPREAD, len(self._start))
         self._goal[env] = random.uniform(self.low + self._margin, self.high - self._margin)
-        return joints.of_robot(np.clip(wrap(drawn, joints.turns, np), self.low, self.high))
+        return self._of_robot(np.clip(wrap(start, self._turns, np), self.low, self.high))
 
     def command(self, action: Float64, setpoint: Float64) -> Float64:
         """Return the setpoints for actions in [-1, 1]."""
-        low, high = self._setpoint_low, self._setpoint_high
         if self.actions == "setpoint":
-            chosen = low + (action + 1) / 2 * (high - low)
-        else:
-            if self._spec is not None:
-                last = setpoint
-            else:
-                last = setpoint[:, self._joints.index]
-            chosen = np.clip(
-                wrap(last + action * self.max_increment, self._setpoint_turns, np), low, high
-            )
-        if self._spec is None:
-            return self._joints.of_robot(chosen)
-        return chosen
+            return self._of_robot(self.low + (action + 1) / 2 * (self.high - self.low))
+        moved = setpoint[:, self._index] + action * self.max_increment
+        return self._of_robot(np.clip(wrap(moved, self._setpoint_turns, np), self.low, self.high))
 
     def rate(self, setpoint: Float64, last: Float64) -> Float64 | None:
         """Return the rates of increments, the short way round on continuous joints; None for other
         actions.
         """
-        if self.actions == "setpoint" or self._spec is not None:
+        if self.actions == "setpoint":
             return None
-        rate, index = (
-            np.zeros_like(setpoint),
-            self._joints.index,
-        )  # the runner gives followers their leaders' rates
-        rate[:, index] = (
-            wrap((setpoint - last)[:, index], self._setpoint_turns, np) / self.step_seconds
-        )
-        return rate
+        change = wrap((setpoint - last)[:, self._index], self._setpoint_turns, np)
+        return self._of_robot(change / self.step_seconds)
 
     def observe(self, observed: Observation) -> Float32:
         """Return qpos, qvel, pose and twist of a floating base, and goal."""
-        return np.concatenate([self._joints.observe(observed), self._goal], axis=1).astype(
-            np.float32
-        )
+        qpos = wrap(observed.qpos[:, self._index].astype(np.float64), self._turns, np)
+        rows = [qpos, observed.qvel[:, self._index]]
+        if observed.base_pose is not None:
+            rows += [observed.base_pose, observed.base_twist]
+        return np.concatenate([*rows, self._goal], axis=1).astype(np.float32)
 
     def success(self, observation: Float32) -> Bool:
         """Return whether every joint is within the tolerance."""
@@ -207,22 +181,18 @@ class ReachVectorEnv(RobotVectorEnv):
 
     def _error(self, observation: Float32) -> Float64:
         """Return |goal - qpos| (envs, joints) [rad or m], the short way round."""
-        return np.abs(
-            wrap(self._goal - observation[:, : len(self.joint_names)], self._joints.turns, np)
-        )
+        error = self._goal - observation[:, : len(self.joint_names)]
+        return np.abs(wrap(error, self._turns, np))
+
+    def _of_robot(self, values: Float64) -> Float64:
+        """Return values (..., joints) for all joints of the robot (..., dof)."""
+        # The runner gives followers the values of their leaders.
+        rows = np.zeros((*values.shape[:-1], self.robot.dof))
+        rows[..., self._index] = values
+        return rows
 
 
 class ReachEnv(RobotEnv):
     """One robot of :class:`ReachVectorEnv`."""
 
     task = ReachVectorEnv
-
-
-def _finite_bounds(command: CommandSpec) -> tuple[Float64, Float64]:
-    """Return the bounds of a command; raise InvalidArgumentError if one is infinite."""
-    low = np.asarray(command.lower)
-    high = np.asarray(command.upper)
-    good = np.isfinite(low) & np.isfinite(high)
-    remedy = "let its command be a batchpid.sim.CommandSpec with lower= and upper="
-    entries("control", low, good, "has no bounds", command.names, kind="entry", remedy=remedy)
-    return low, high

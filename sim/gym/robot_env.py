@@ -11,11 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Document, Float32
 from batchpid.checks.single_owner import SingleOwner
-from batchpid.checks.validate import check_keywords
-from batchpid.sim.gym.robot_vector_env import RobotVectorEnv, arguments_of
+from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
 from batchpid.sim.robot.robot import Robot
-
-_FIXED = ("num_envs", "max_episode_steps", "autoreset_mode")
 
 
 class RobotEnv(SingleOwner, gymnasium.Env):
@@ -34,15 +31,17 @@ class RobotEnv(SingleOwner, gymnasium.Env):
     def __init__(
         self, robot: str | Robot | None = None, *, render_mode: str | None = None, **options: Any
     ) -> None:
-        check_keywords(
-            type(self).__name__,
-            options,
-            [name for name in arguments_of(self.task) if name not in _FIXED],
-        )
-        options |= {"workers": options.get("workers", 0), "autoreset_mode": AutoresetMode.DISABLED}
         if robot is not None:
             options["robot"] = robot
-        self._envs = self.task(1, max_episode_steps=None, render_mode=render_mode, **options)
+        options.setdefault("workers", 0)
+        # gymnasium.make adds the time limit and the resets.
+        self._envs = self.task(
+            1,
+            max_episode_steps=None,
+            autoreset_mode=AutoresetMode.DISABLED,
+            render_mode=render_mode,
+            **options,
+        )
         self.runner = self._envs.runner
         self.render_mode = render_mode
         self.metadata = self._envs.metadata  # type: ignore[misc]

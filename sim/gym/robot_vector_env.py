@@ -7,7 +7,6 @@ task.
 
 from __future__ import annotations
 
-import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -18,18 +17,15 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Bool, Document, DType, Float32, Float64, Rows
+from batchpid.arrays.array_types import Bool, Document, Float32, Float64, Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import array, check_keywords, choice, env_mask, flag, integer, number
 from batchpid.errors import CallOrderError, InvalidArgumentError
-from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
+from batchpid.sim.options.options import RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import LARGEST
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
-from batchpid.sim.signals.observation import Observation
-
-RUNNER_OPTIONS = tuple(OPTIONS.keys() - {"robot", "num_envs", "substeps"})
-"""Options of the runner, without ``substeps``, which follow from ``rate_hz``."""
+from batchpid.sim.signals.quantities import Observation
 
 
 class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
@@ -84,8 +80,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
 
     instead = "make another env with the same arguments"
     metadata: ClassVar[Document] = {"render_modes": ["rgb_array"]}  # type: ignore[misc]
-    picture_size: ClassVar[tuple[int, int]] = (640, 480)
-    """Width and height of a picture of :meth:`render` [pixels]."""
 
     robot: Robot
     """Robot of every env."""
@@ -97,10 +91,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     """Last action (envs, size), within the action space."""
     observed: Observation
     """Last observation of the runner: joint positions, velocities, efforts, ..."""
-    action_names: tuple[str, ...]
-    """Names of an action's entries, for errors; a task may set them in :meth:`spaces`. Default:
-    numbers.
-    """
 
     def __init__(
         self,
@@ -114,64 +104,50 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        name = type(self).__name__
-        check_keywords(name, options, arguments_of(type(self)))
         if isinstance(robot, Robot):
             self.robot = robot
         else:
             self.robot = Robot.load(robot)
         self.num_envs = checked_option("num_envs", num_envs)
         self.terminate_on_success = flag("terminate_on_success", terminate_on_success)
-        if max_episode_steps is None:
-            self.max_episode_steps = None
-        else:
-            self.max_episode_steps = integer("max_episode_steps", max_episode_steps, 1, 10**9)
-        modes = {mode.value: mode for mode in AutoresetMode}
-        if isinstance(autoreset_mode, AutoresetMode):
-            mode = autoreset_mode.value
-        else:
-            mode = autoreset_mode
-        self.autoreset_mode = modes[choice("autoreset_mode", mode, modes)]
+        self.max_episode_steps = max_episode_steps
+        if max_episode_steps is not None:
+            integer("max_episode_steps", max_episode_steps, 1, 10**9)
+        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        modes = [mode.value for mode in AutoresetMode]
+        self.autoreset_mode = AutoresetMode(choice("autoreset_mode", mode, modes))
+        self.render_mode = render_mode
+        if render_mode is not None:
+            choice("render_mode", render_mode, self.metadata["render_modes"])
+        # A step is a whole number of sim steps.
         timestep = checked_option("timestep", options.get("timestep", RunnerOptions.timestep))
-        substeps = round(
-            1 / (number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second") * timestep)
-        )
+        rate = number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second")
+        substeps = round(1 / (rate * timestep))
         self.step_seconds = substeps * timestep
-        chosen = dict(self.runner_options())
-        for option in options:
-            if option in chosen:
-                raise InvalidArgumentError(
-                    option, f"is chosen by {name}", remedy=f"leave it out, or subclass {name}"
-                )
-        self._options = options | chosen
+        chosen = {"substeps": substeps, **self.runner_options()}
+        for option in options.keys() & chosen.keys():
+            problem = f"is chosen by {type(self).__name__}"
+            raise InvalidArgumentError(option, problem, remedy="leave it out, or make a subclass")
+        # Spaces come first: an invalid one is an error before any process starts.
         self.single_observation_space, self.single_action_space = self.spaces()
-        size: int = self.single_action_space.shape[0]
-        self.action_names = getattr(self, "action_names", tuple(map(str, range(size))))
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        if render_mode is None:
-            self.render_mode = None
-        else:
-            self.render_mode = choice("render_mode", render_mode, ("rgb_array",))
         self.metadata = {  # type: ignore[misc]
             **type(self).metadata,
             "render_fps": 1 / self.step_seconds,
             "autoreset_mode": self.autoreset_mode,
         }
-
-        self.runner = Runner(self.robot, self.num_envs, substeps=substeps, **self._options)
+        self.runner = Runner(self.robot, self.num_envs, **options, **chosen)
         self._generators = np.random.default_rng().spawn(self.num_envs)
         self._starts = np.tile(self.robot.start, (self.num_envs, 1))
         self._setpoint = np.zeros((self.num_envs, self.runner.command.size))
-        self.action = np.zeros((self.num_envs, size))
-        self._observation = np.zeros(
-            (self.num_envs, *self.single_observation_space.shape), np.float32
-        )
-        self._success = self._diverged = np.zeros(self.num_envs, bool)
+        self.action = np.zeros(self.action_space.shape or ())
+        self._observation = np.zeros(self.observation_space.shape or (), np.float32)
+        self._success = np.zeros(self.num_envs, bool)
+        self._diverged = np.zeros(self.num_envs, bool)
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done = np.ones(self.num_envs, bool)
         self._is_stepping = False
-        self._received: Observation | None = None
 
     # -- hooks
     # ----------------------------------------------------------------------------------------------
@@ -204,7 +180,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         dof).
 
         Default: ``qpos`` where setpoints are joint positions, else the neutral setpoint of the
-            command.
+        command.
         """
         if self.runner.options.sets_positions:
             return qpos
@@ -261,13 +237,12 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     # ------------------------------------------------------------------------------------
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: Document | None = None
+        self, *, seed: int | Sequence[int] | None = None, options: Document | None = None
     ) -> tuple[Float32, Document]:
         """Begin new episodes, in the envs of ``options["reset_mask"]`` (envs,) or in all.
 
-        An int ``seed`` gives env k the seed + k; a sequence has one for each env, or None to go on
-        with the last. What an env draws depends on its own seed alone, which is the stream of a
-        ``randomization``, too.
+        An int ``seed`` gives env k the seed + k; a sequence has one for each env. What an env draws
+        depends on its own seed alone, which is the stream of a ``randomization``, too.
 
         Raises
         ------
@@ -277,36 +252,25 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             A seed is negative or no int, or an option is unknown.
         """
         self._expect_no_step("reset")
-        check_keywords("reset(options=)", options or {}, ("reset_mask",))
+        options = options or {}
+        check_keywords("reset(options=)", options, ("reset_mask",))
         mask = np.ones(self.num_envs, bool)
-        if options and "reset_mask" in options:
+        if "reset_mask" in options:
             mask = env_mask("options['reset_mask']", options["reset_mask"], self.num_envs)
         if not mask.any():
-            raise InvalidArgumentError(
-                "options['reset_mask']",
-                "selects no env",
-                remedy="use e.g. mask = terminated | truncated",
-            )
-        seeds: Sequence[int | None] | None = None
-        if isinstance(seed, Sequence | np.ndarray):
-            seeds = [
-                None if entry is None else integer("seed", entry, 0, LARGEST) for entry in seed
-            ]
-        elif seed is not None:
-            first = integer("seed", seed, 0, LARGEST - self.num_envs)
-            seeds = range(first, first + self.num_envs)
-        if seeds is not None and len(seeds) != self.num_envs:
-            raise InvalidArgumentError(
-                "seed",
-                f"has {len(seeds)} entries for {self.num_envs} envs",
-                remedy="give an int, or one for each env",
-            )
-        streams: dict[int, int] = {}
-        for env in np.flatnonzero(mask).tolist():
-            if seeds is not None and (stream := seeds[env]) is not None:
-                self._generators[env] = np.random.default_rng(stream)
-                streams[env] = stream
-        self._begin(mask, streams)
+            remedy = "use e.g. mask = terminated | truncated"
+            raise InvalidArgumentError("options['reset_mask']", "selects no env", remedy=remedy)
+        seeds: list[int] | None = None
+        if seed is not None:
+            if np.ndim(seed) == 0:
+                first = integer("seed", seed, 0, LARGEST - self.num_envs)
+                seed = range(first, first + self.num_envs)
+            seeds = [integer("seed", entry, 0, LARGEST) for entry in seed]  # type: ignore[union-attr]
+            if len(seeds) != self.num_envs:
+                problem = f"has {len(seeds)} entries for {self.num_envs} envs"
+                remedy = "give an int, or one for each env"
+                raise InvalidArgumentError("seed", problem, remedy=remedy)
+        self._begin(mask, seeds)
         return self._observation.copy(), self._info(mask)
 
     def step(self, actions: ArrayLike) -> tuple[Float32, Float64, Bool, Bool, Document]:
@@ -327,21 +291,19 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """
         self._expect_no_step("step_async")
         space: Any = self.single_action_space
-        kind: Any = "joint" if set(self.action_names) <= set(self.robot.joint_names) else "entry"
-        action = array("actions", actions, self.action.shape, self.action_names, kind=kind)
+        names = [str(column) for column in range(space.shape[0])]
+        action = array("actions", actions, self.action.shape, names, kind="entry")
         action = np.clip(action, space.low, space.high)
         begins = self._done.copy()
         if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             raise error.ResetNeeded(f"reset env {int(np.argmax(begins))} before the next step")
-        setpoint = self._returned(
-            "command", self.command(action, self._setpoint), self._setpoint.shape, np.float64
-        )
-        setpoint = np.where(begins[:, None], self._setpoint, setpoint)
-        rate = self.rate(setpoint, self._setpoint)
+        # In next-step mode an ended env holds its setpoint: step_wait begins its next episode.
+        last = self._setpoint
+        setpoint = self._returned("command", self.command(action, last), last.shape)
+        setpoint = np.where(begins[:, None], last, setpoint)
+        rate = self.rate(setpoint, last)
         if rate is not None:
-            rate = np.where(
-                begins[:, None], 0.0, self._returned("rate", rate, self._setpoint.shape, np.float64)
-            )
+            rate = np.where(begins[:, None], 0.0, self._returned("rate", rate, last.shape))
         self.runner.send(setpoint, setpoint_rate=rate)
         self.action = action
         self._setpoint = setpoint
@@ -357,51 +319,37 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """
         if not self._is_stepping:
             raise CallOrderError("step_wait: no step is under way; call step_async(actions) first")
-        try:
-            if self._received is None:
-                self._received = self.runner.recv()
-            else:
-                self._received = self._received
-            self._observe(self._received)
-        except (
-            Exception
-        ):  # the step has ended; after an interrupt, in contrast, the call can be repeated
-            self._is_stepping, self._received = False, None
-            raise
-        self._is_stepping, self._received = False, None
+        observed = self.runner.recv()
+        # From here on the step has ended, even if a hook of the task raises.
+        self._is_stepping = False
+        self._observe(observed)
         begins = self._done.copy()
         self._steps += 1
-
+        observation = self._observation
+        success = self._success
         count = (self.num_envs,)
-        reward = self._returned(
-            "reward", self.reward(self._observation, self._success), count, np.float64
-        )
-        ends = self._returned(
-            "terminated", self.terminated(self._observation, self._success), count, np.bool_
-        )
-        terminated = self._diverged | ends
-        truncated = self._steps >= (
-            np.inf if self.max_episode_steps is None else self.max_episode_steps
-        )
-        if begins.any():  # in next-step mode this step begins the next episode
+        reward = self._returned("reward", self.reward(observation, success), count)
+        ends = self._returned("terminated", self.terminated(observation, success), count)
+        terminated = self._diverged | ends.astype(bool)
+        truncated = np.zeros(count, bool)
+        if self.max_episode_steps is not None:
+            truncated = self._steps >= self.max_episode_steps
+        if begins.any():
+            # In next-step mode this step began the next episode: it has no result.
             self._begin(begins)
             reward = np.where(begins, 0.0, reward)
             terminated = terminated & ~begins
             truncated = truncated & ~begins
-        self._done = terminated | truncated
-        everywhere = np.ones(self.num_envs, bool)
+        self._done = done = terminated | truncated
+        everywhere = np.ones(count, bool)
         info = self._info(everywhere)
-        if self._done.any() and self.autoreset_mode is AutoresetMode.SAME_STEP:
-            done = self._done
-            final = np.full(self.num_envs, None, object)
+        if done.any() and self.autoreset_mode is AutoresetMode.SAME_STEP:
+            # Results of the ended episodes, before the next ones begin.
+            final = np.full(count, None, object)
             for env in np.flatnonzero(done):
                 final[env] = self._observation[env].copy()
-            info = {
-                "final_obs": final,
-                "_final_obs": done,
-                "final_info": self._info(done),
-                "_final_info": done,
-            }
+            info = {"final_obs": final, "_final_obs": done}
+            info |= {"final_info": self._info(done), "_final_info": done}
             self._begin(done)
             info |= self._info(everywhere)
         return self._observation.copy(), reward, terminated, truncated, info
@@ -421,7 +369,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._expect_no_step("render")
         from batchpid.sim.view.film import Painter
 
-        painter = Painter(self.robot, 1, self.runner.options.ground, self.picture_size)
+        painter = Painter(self.robot, 1, self.runner.options.ground, (640, 480))
         observed = self.runner.observe()
         pictures = []
         for env in range(self.num_envs):
@@ -436,33 +384,26 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     # -- episodes
     # ----------------------------------------------------------------------------------------------
 
-    def _begin(self, mask: Bool, streams: Mapping[int, int] | None = None) -> None:
-        """Draw episodes for the masked envs, and place their robots; ``streams`` are new ones of
-        some envs.
+    def _begin(self, mask: Bool, seeds: Sequence[int] | None = None) -> None:
+        """Draw episodes for the masked envs, of new ``seeds`` if there are any, and place their
+        robots.
         """
         dof = (self.robot.dof,)
         for env in np.flatnonzero(mask).tolist():
+            if seeds is not None:
+                self._generators[env] = np.random.default_rng(seeds[env])
             drawn = self.draw(env, self._generators[env])
-            self._starts[env] = self._returned("draw", drawn, dof, np.float64)
+            self._starts[env] = self._returned("draw", drawn, dof)
         self._steps[mask] = 0
         self._done = self._done & ~mask
-        seeds = np.zeros(self.num_envs, np.int64)
-        rest = mask
         randomization = self.runner.options.randomization
-        observed = None
-        if streams and randomization is not None:
-            seeded = np.isin(np.arange(self.num_envs), list(streams))
-            seeds[list(streams)] = list(streams.values())
-            observed = self.runner.reset(self._starts, mask=seeded, seed=seeds)
-            rest = mask & ~seeded
-        if rest.any():
-            observed = self.runner.reset(self._starts, mask=rest)
-        assert observed is not None
-        if (
-            randomization is not None and randomization.qpos is not None
-        ):  # the setpoint belongs to the drawn pose
+        if randomization is None:
+            seeds = None
+        observed = self.runner.reset(self._starts, mask=mask, seed=seeds)
+        # The setpoint belongs to the pose that a randomization drew.
+        if randomization is not None and randomization.qpos is not None:
             self._starts = np.where(mask[:, None], observed.qpos, self._starts)
-        first = np.broadcast_to(np.asarray(self.first_setpoint(self._starts)), self._setpoint.shape)
+        first = self.first_setpoint(self._starts)
         self._setpoint = np.where(mask[:, None], first, self._setpoint)
         self._observe(observed)
 
@@ -472,44 +413,30 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """
         space: Any = self.single_observation_space
         self.observed = observed
-        rows = self._returned(
-            "observe", self.observe(observed), self._observation.shape, np.float32, observed.ok
-        )
         self._diverged = ~observed.ok
-        rows = np.clip(rows, space.low, space.high)
+        rows = np.array(self.observe(observed))
+        rows[self._diverged] = 0.0
+        rows = self._returned("observe", rows, self._observation.shape)
+        rows = np.clip(rows.astype(np.float32), space.low, space.high)
         self._observation = np.where(observed.ok[:, None], rows, self._observation)
-        success = self._returned(
-            "success", self.success(self._observation), (self.num_envs,), np.bool_
-        )
-        self._success = observed.ok & success
+        success = self.success(self._observation)
+        success = self._returned("success", success, observed.ok.shape)
+        self._success = observed.ok & success.astype(bool)
 
-    def _returned(
-        self,
-        hook: str,
-        value: ArrayLike,
-        shape: tuple[int, ...],
-        dtype: DType,
-        ok: Bool | None = None,
-    ) -> Rows:
+    def _returned(self, hook: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
         """Return a hook's value as an array; raise InvalidArgumentError for another shape, NaN or
         infinity.
-
-        Where ``ok`` (envs,) is given, the rows of other envs are not checked.
         """
-        rows = np.asarray(value)
+        rows = np.asarray(value, np.float64)
         name = f"{type(self).__name__}.{hook}"
         if rows.shape != shape:
             problem = f"returned an array of shape {rows.shape}"
             raise InvalidArgumentError(name, problem, remedy=f"return one of shape {shape}")
-        finite = np.isfinite(rows)
-        bad = ~finite if ok is None else ~finite & ok[:, None]
-        if bad.any():
-            at = tuple(int(index[0]) for index in np.nonzero(bad))
-            problem = f"returned a number that is not finite, at index {at}"
-            raise InvalidArgumentError(
-                name, problem, value=rows[at], remedy="return finite numbers"
-            )
-        return rows.astype(dtype, copy=False)
+        if not np.isfinite(rows).all():
+            index = tuple(np.argwhere(~np.isfinite(rows))[0].tolist())
+            problem = f"returned a number that is not finite, at index {index}"
+            raise InvalidArgumentError(name, problem, remedy="return finite numbers")
+        return rows
 
     def _expect_no_step(self, call: str) -> None:
         """Raise CallOrderError if a step has begun and has not been waited for."""
@@ -520,23 +447,10 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """Return the info of the masked envs in Gymnasium's vector style: each key and, as _key,
         the mask.
         """
-        further = {
-            key: self._returned("info", value, (self.num_envs,), value.dtype)
-            for key, value in self.info(self._observation).items()
-        }
-        values = {"success": self._success, **further, "diverged": self._diverged}
-        info = {key: np.where(mask, value, np.zeros_like(value)) for key, value in values.items()}
-        return info | {f"_{key}": mask.copy() for key in values}
-
-
-def arguments_of(task: type[RobotVectorEnv]) -> tuple[str, ...]:
-    """Return the names of a task's arguments: its parameters, its bases' parameters, and the
-    options of the runner.
-    """
-    bases = task.__mro__[: task.__mro__.index(RobotVectorEnv) + 1]
-    names: dict[str, None] = {}
-    for base in bases:
-        for name, parameter in inspect.signature(base).parameters.items():
-            if parameter.kind is not parameter.VAR_KEYWORD:
-                names[name] = None
-    return (*names, *RUNNER_OPTIONS)
+        info: Document = {}
+        values = {"success": self._success, **self.info(self._observation)}
+        for key, value in (values | {"diverged": self._diverged}).items():
+            self._returned("info", value, mask.shape)
+            info[key] = np.where(mask, value, np.zeros_like(value))
+            info[f"_{key}"] = mask.copy()
+        return info

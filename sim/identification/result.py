@@ -19,8 +19,8 @@ from batchpid.io import documents
 from batchpid.sim.identification.fit import INTERVAL, STEP, Fit
 from batchpid.sim.identification.simulator import LogControl, changed_params
 from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknown, Unknowns
-from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_options import load_robot_actuators
 from batchpid.sim.robot.urdf_export import to_urdf
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ class Identification:
             tables.append(problem.evaluate(point, still, free_states=False, held_out=True))
         errors = []
         for window, first, last in zip(windows, *tables, strict=True):
-            errors.append(plots.FitErrors(window.time, window.fitted, first[..., 0], last[..., 0]))
+            errors.append((window.time, window.fitted, first[..., 0], last[..., 0]))
         names = [self.robot.joint_names[joint] for joint in self.joints]
         units = [self.robot.units[joint] for joint in self.joints]
         title = f"{self.robot.name}: position error, shaded where it was not fitted"

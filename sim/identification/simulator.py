@@ -37,8 +37,15 @@ from batchpid.native.availability import obstacle
 from batchpid.native.tracing import Trace, trace_trees
 from batchpid.sim.engine.scene_spec import added_friction
 from batchpid.sim.loop.control_step import REFRESH_STEPS, control_step
-from batchpid.sim.loop.pid_law import PIDLaw
-from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Step, StepState
+from batchpid.sim.loop.step_values import (
+    Constants,
+    Layout,
+    Measured,
+    Model,
+    PIDLaw,
+    Step,
+    StepState,
+)
 from batchpid.sim.robot.robot import Robot
 from batchpid.task_space import native_rows
 from batchpid.task_space.rigid_tree import RigidTree

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from itertools import repeat
 from operator import is_not, itemgetter
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Rows
-from batchpid.sim.signals.observation import OBSERVED, Observation, Quantity
+from batchpid.sim.signals.quantities import Observation, Quantity
 
 Layout = dict[str, tuple[tuple[int, ...], Any]]
 """Name -> (shape, dtype)."""
@@ -75,18 +74,15 @@ class Arrays(NamedTuple):
         ticks: int,
         num_envs: int,
         dof: int,
-        command_size: int | None = None,
-        observed: Mapping[str, Quantity] = OBSERVED,
+        command_size: int,
+        observed: Mapping[str, Quantity],
     ) -> Layout:
         """Return the layout of all fields, for :meth:`from_fields`; a setpoint has ``command_size``
-        (dof) numbers.
+        numbers.
         """
         row = (ticks, num_envs)
         table = (ticks, num_envs, dof)
-        if command_size is None:
-            setpoint = table
-        else:
-            setpoint = (*row, command_size)
+        setpoint = (*row, command_size)
         sizes = Command(setpoint, setpoint, setpoint, table)
         layout: Layout = {
             f"command.{name}": (shape, np.float64) for name, shape in sizes._asdict().items()
@@ -116,45 +112,3 @@ class Arrays(NamedTuple):
             self.observation.map(part),
             FaultArrays._make(map(part, self.fault)),
         )
-
-
-class StateRows(ABC):
-    """State of M envs that a snapshot holds as arrays by name."""
-
-    @property
-    @abstractmethod
-    def state(self) -> dict[str, Rows]:
-        """Arrays of the state (M, ...)."""
-
-    def read(self) -> dict[str, Rows]:
-        """Return copies of the arrays, for :meth:`write`."""
-        return {name: rows.copy() for name, rows in self.state.items()}
-
-    def write(self, state: Mapping[str, Rows]) -> None:
-        """Set the state that :meth:`read` returned."""
-        for name, rows in self.state.items():
-            rows[...] = state[name]
-
-
-class Ticks:
-    """Views of :class:`Arrays` (ticks, envs, ...) at each tick, made when first used."""
-
-    def __init__(self, arrays: Arrays) -> None:
-        self.arrays = arrays
-        self.made = list[Arrays]()
-        """Views that were made, of the first ticks."""
-
-    def __len__(self) -> int:
-        return len(self.arrays.observation.ok)
-
-    def __getitem__(self, tick: int) -> Arrays:
-        """Return the views at a tick, 0 or more."""
-        if tick < len(self.made):
-            return self.made[tick]
-        return self.first(tick + 1)[tick]
-
-    def first(self, count: int) -> list[Arrays]:
-        """Return the views at the first ``count`` ticks."""
-        while len(self.made) < count:
-            self.made.append(self.arrays.at(len(self.made)))
-        return self.made[:count]

@@ -4,10 +4,10 @@ why.
 
 from __future__ import annotations
 
-from batchpid.native.operations import MOST_SUMMED
+from batchpid.native.extensions import MOST_SUMMED
 from batchpid.sim.engine import native
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.tool_space.osc_controller import OperationalSpace
+from batchpid.sim.tool_space import OperationalSpace
 
 
 def native_obstacle(options: RunnerOptions) -> str:
@@ -20,10 +20,7 @@ def native_obstacle(options: RunnerOptions) -> str:
         return "the controller is one of Python"
     if options.robot.dof > MOST_SUMMED:
         return f"more than {MOST_SUMMED} joints"
-    engine = options.load_engine()
-    if "compiled_steps" in engine.capabilities:
-        return ""
-    return f"the sim steps of {engine.name!r} are calls of Python"
+    return ""
 
 
 def describe(options: RunnerOptions) -> str:

@@ -39,7 +39,6 @@ from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
 from batchpid.motors.friction import FrictionState
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.pid_law import half_way
 from batchpid.sim.loop.step_values import (
     Constants,
     Layout,
@@ -48,6 +47,7 @@ from batchpid.sim.loop.step_values import (
     Step,
     StepState,
     Values,
+    half_way,
 )
 
 REFRESH_STEPS = 64
@@ -229,8 +229,8 @@ def _feedforward(layout: Layout, constants: Constants, values: Values) -> Values
 
 def _controller(layout: Layout, constants: Constants, values: Values) -> Values:
     """The caller's own controller; the feedforward is one of its inputs."""
-    setpoint = values.command.setpoint
-    law, returned, *limited = layout.model.controller(values.state.law, setpoint, *values.seen)
+    inputs = values.command.setpoint, *values.seen, values.step.left
+    law, returned, *limited = layout.model.controller(values.state.law, *inputs)
     return values._replace(
         state=values.state._replace(law=law),
         limited=limited[0] if limited else None,

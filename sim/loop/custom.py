@@ -20,7 +20,7 @@ from batchpid.arrays.read_only import read_only
 from batchpid.arrays.trees import flatten, unflatten
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.tool_space.osc_controller import OperationalSpace
+from batchpid.sim.tool_space import OperationalSpace
 
 
 class OwnController:
@@ -37,8 +37,10 @@ class OwnController:
         self.name = type(options.control).__name__
         if isinstance(options.control, OperationalSpace):
             self._reporting = options.control.reporting
+            self.implicit = options.control.params.discretization is not None
         else:
             self._reporting = None
+            self.implicit = False
         self._structure: Any = None
 
     def init(self, envs: int) -> dict[str, Rows]:
@@ -70,8 +72,8 @@ class OwnController:
         return rows
 
     def __call__(self, state: Mapping[str, Any], *inputs: Float64) -> tuple[Array, ...]:
-        """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel and passive
-        force.
+        """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel, passive
+        force, and the time to the end of the tick, which only operational-space control takes.
 
         Operational-space control limits efforts itself; a third result are the joints with limited
         efforts (M, dof).
@@ -85,14 +87,13 @@ class OwnController:
         new, returned, *limited = self._called(unflatten(self._structure, state), *copies)
         # Copies again: the controller may change its own arrays at any time.
         leaves = _like(state, flatten(new, read=np.array))
-        effort = np.array(returned, np.float64)
-        _check_effort(effort, inputs[1])
+        effort = _like({"effort": inputs[1]}, {"effort": np.array(returned, np.float64)})["effort"]
         return leaves, effort, *limited
 
     def _called(self, *arguments: Any) -> tuple[Array, ...]:
         if self._reporting is not None:
             return self._reporting(*arguments)
-        state, effort = self._controller(*arguments)
+        state, effort = self._controller(*arguments[:-1])
         return state, effort
 
     def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[Array, ...]:
@@ -107,22 +108,21 @@ class OwnController:
         try:
             state, returned, *limited = self._called(unflatten(self._structure, leaves), *inputs)
             new = _like(leaves, flatten(state, read=jax.numpy.asarray))
-            effort = jax.numpy.asarray(returned, qpos.dtype)
+            efforts = {"effort": jax.numpy.asarray(returned, qpos.dtype)}
         except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
             raise InvalidArgumentError(
                 "control",
                 f"cannot be traced by JAX: {str(error).splitlines()[0]}",
                 remedy="write it in jax.numpy, or use backend='numpy'",
             ) from error
-        _check_effort(effort, qpos)
-        return new, effort, *limited
+        return new, _like({"effort": qpos}, efforts)["effort"], *limited
 
 
-def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, Rows]:
-    """Return the initial state of the control of all envs, as arrays by name."""
-    if not isinstance(options.control, str):
-        return flatten(_begin(options, options.num_envs))
-    return bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32)).leaves()
+def initial_state(options: RunnerOptions, params: bp.PIDParams) -> Any:
+    """Return the initial state of the law of all envs."""
+    if isinstance(options.control, str):
+        return bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32))
+    return flatten(_begin(options, options.num_envs))
 
 
 @contextmanager
@@ -152,26 +152,12 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
         return unflatten(state := start(), flatten(state))
 
 
-def _check_effort(effort: Array, qpos: Array) -> None:
-    if effort.shape != qpos.shape:
-        # The number of rows depends on the groups.
-        has_rows = effort.shape[:1] == qpos.shape[:1]
-        if has_rows:
-            shape = ("envs", *effort.shape[1:])
-        else:
-            shape = effort.shape
-        problem = f"returned an effort of shape {shape}, not (envs, {qpos.shape[1]})"
-        raise InvalidArgumentError(
-            "control", problem, remedy="return (state, effort), effort of shape (envs, dof)"
-        )
-
-
 def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
-    """Return the arrays of a controller's state in the dtypes of ``before``.
+    """Return the arrays that a controller returned in the dtypes of ``before``.
 
     Raises InvalidArgumentError if names or shapes differ, or a dtype cannot be cast.
     """
-    for name in dict.fromkeys([*before, *leaves]):
+    for name in {**before, **leaves}:
         old: Any = before.get(name)
         new: Any = leaves.get(name)
         is_fit = old is not None and new is not None and new.shape == old.shape
@@ -182,7 +168,7 @@ def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
         ]
         raise InvalidArgumentError(
             "control",
-            "returned a state {!r} of {}, not {}".format(name, *kinds),
-            remedy="return a state as init does",
+            "returned {!r} of {}, not {}".format(name, *kinds),
+            remedy="return (state, effort): a state as init does, an effort of shape (envs, dof)",
         )
     return {name: leaf.astype(before[name].dtype, copy=False) for name, leaf in leaves.items()}

@@ -6,31 +6,30 @@ command that is not finite, a push, the sensors of links, a reset, new params or
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.arrays.elementwise import clip
-from batchpid.arrays.trees import flatten, leaves, structure
+from batchpid.arrays.trees import flatten, leaves, structure, unflatten
 from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.sim.engine.missed_contacts import MissedContacts
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.acting_draws import ActingDraws, variation
-from batchpid.sim.loop.arrays import Arrays, Command, Ticks
+from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.loop.env_parts import ActingDraws, LinkSensors, Pushes, variation
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
-from batchpid.sim.loop.model_functions import steps_natively
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
 from batchpid.sim.loop.native_program import Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
-from batchpid.sim.loop.pushes import Pushes
-from batchpid.sim.loop.sensed import LinkSensors
-from batchpid.sim.loop.snapshot import EnvStates
 from batchpid.sim.loop.step_setup import (
     Setup,
+    empty_state,
     init_motors,
     make_setup,
     reset_friction,
@@ -39,7 +38,7 @@ from batchpid.sim.loop.step_setup import (
     with_matrix,
     with_params,
 )
-from batchpid.sim.loop.step_values import StepState, state_of
+from batchpid.sim.loop.step_values import StepState
 from batchpid.sim.loop.xla_executor import XLAExecutor
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
@@ -62,7 +61,7 @@ class EnvGroup:
         params: bp.PIDParams,
         options: RunnerOptions,
         controller: OwnController | None,
-        ticks: Ticks,
+        arrays: Arrays,
     ) -> None:
         self.pack = pack
         self.envs = envs
@@ -74,7 +73,8 @@ class EnvGroup:
         self._runs_whole = False  # whether the native code runs whole ticks
         self._options = options
         self._controller = controller
-        self._ticks = ticks
+        self._arrays = arrays
+        self._at = cache(arrays.at)  # views at a tick
         self.acting = ActingDraws(options, params)
         self._faults = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._sensors = LinkSensors(options, pack.size)
@@ -86,7 +86,7 @@ class EnvGroup:
         # Results of the last sim step, which outlive executors: native code writes them in each tick.
         shape = (pack.size, pack.dof)
         last = np.zeros(shape, np.float32), np.zeros(shape, bool), np.zeros(shape, bool)
-        self._last = Table(ticks.arrays, *last, self._faults.rows)
+        self._last = Table(arrays, *last, self._faults.rows)
         reads_base = "base_state" in options.load_engine().capabilities and pack.spec.mjcf is None
         is_read = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
         has_parts = bool(self._sensors.values or self._pushes.counts)
@@ -113,7 +113,7 @@ class EnvGroup:
         self._executor: NumPyExecutor | NativeExecutor | XLAExecutor
         if self._options.backend == "jax":
             self._executor = XLAExecutor(setup, state)
-        elif steps_natively(self.pack) and runs_natively(setup):
+        elif self.pack.steps_natively and runs_natively(setup):
             self._executor = NativeExecutor(setup, state, self._last)
         else:
             self._executor = NumPyExecutor(setup, state)
@@ -266,7 +266,7 @@ class EnvGroup:
     def _run_tick(self, substeps: int) -> None:
         """Run the present tick, or the rest of it, and observe it."""
         executor = self._executor
-        rows = self._ticks[self.tick]
+        rows = self._at(self.tick)
         done = self._step
         before = self._steps + self.tick * substeps
         command = rows.command
@@ -316,7 +316,7 @@ class EnvGroup:
         """
         if self._contacts is None or first == until:
             return
-        _, observation, fault = self._ticks.arrays.at(slice(first, until))
+        _, observation, fault = self._arrays.at(slice(first, until))
         steps = self._steps + substeps * np.arange(first + 1, until + 1)
         self._contacts.look(
             observation.qpos, steps, self._faults.missed_contact, fault.missed_contact
@@ -326,7 +326,7 @@ class EnvGroup:
         """Write observation and faults into these envs' rows."""
         observation, last = rows.observation, self._last
         observation.qpos[...] = self._executor.qpos()
-        observation.qvel[...] = self.pack.read_qvel(np.float32)
+        observation.qvel[...] = self.pack.read_qvel()
         for name in _RESULTS:
             getattr(observation, name)[...] = getattr(last, name)
         if observation.base_pose is not None and observation.base_twist is not None:
@@ -339,40 +339,52 @@ class EnvGroup:
 
     def observe_first(self) -> None:
         """Write observation and faults into the first tick, after a change between runs."""
-        self.observe(self._ticks[0])
+        self.observe(self._at(0))
 
     # -- snapshots
 
-    def read(self) -> EnvStates:
-        """Return the state of these envs, physics and controller."""
-        last = self._last
+    def read(self) -> dict[str, Rows]:
+        """Return the state of these envs, physics and controller, as arrays by name (M, ...).
+
+        ``engine`` are robots and content, of which only the engine knows the meaning
+        (:meth:`batchpid.sim.engine.protocol.EnginePack.read_state`). ``control/...`` are the arrays
+        of :class:`batchpid.sim.loop.step_values.StepState`.
+        """
         # Each tick begins with a new mass matrix.
         control = self._executor.read_state()._replace(matrix=None)
-        return EnvStates(
-            engine=self.pack.read_state(),
-            **{name: getattr(last, name).copy() for name in _RESULTS},
-            episode=self._episode.copy(),
-            control=flatten(control),
-            containment=self._faults.read(),
-            sensors=self._sensors.read(),
-            pushes=self._pushes.read(),
-        )
+        tree = {"engine": self.pack.read_state(), "control": control} | self._parts()
+        return flatten(tree, read=np.array)
+
+    def _parts(self) -> Document:
+        """Return the arrays outside engine and control that a snapshot holds: results of the last
+        sim step, episodes of the motors' noise, and those of faults, sensors and pushes.
+        """
+        last = self._last
+        return {
+            "effort": last.effort,
+            "saturated": last.saturated,
+            "guarded": last.guarded,
+            "episode": self._episode,
+            "containment": self._faults.state,
+            "sensors": self._sensors.values,
+            "pushes": self._pushes.counts,
+        }
 
     def write(
         self,
         pack: EnginePack,
-        states: EnvStates,
+        rows: Mapping[str, Rows],
         params: bp.PIDParams,
         actuators: bp.Actuators | None,
         draws: Draws | None,
     ) -> None:
-        """Continue with ``pack`` in the given state, with the params, actuators and draws of a
-        snapshot.
+        """Continue with ``pack`` in a state that :meth:`read` returned, with the params, actuators
+        and draws of a snapshot.
         """
-        acting, last = self.acting, self._last
+        acting = self.acting
+        is_custom = self._controller is not None
         # The control step stays where nothing of it can have changed, since a new one takes time.
-        stays = pack is self.pack and self._controller is None
-        stays = stays and self._options.randomization is None
+        stays = pack is self.pack and not is_custom and self._options.randomization is None
         stays = stays and _are_equal((params, actuators), (acting.params, acting.actuators))
         self.pack = pack
         acting.draws = draws
@@ -382,18 +394,18 @@ class EnvGroup:
             if actuators is not None or acting.actuators is not None:
                 self._with_actuators(self._executor.read_state(), actuators)
         # Placing robots clears efforts and suspension, so these follow.
-        pack.write_state_rows(states.engine)
-        self._faults.write(states.containment)
+        pack.write_state_rows(rows["engine"])
+        for name, array in flatten(self._parts()).items():
+            array[...] = rows[name]
         pack.suspend(self._faults.suspended)
-        pack.write_qf(states.effort)
-        for name in _RESULTS:
-            getattr(last, name)[...] = getattr(states, name)
-        self._episode[...] = states.episode
-        self._sensors.write(states.sensors)
-        self._pushes.write(states.pushes)
-        is_custom = self._controller is not None
-        state = state_of(states.control, is_custom, acting.motors is not None)
+        pack.write_qf(self._last.effort)
         executor = self._executor
+        like = executor.read_state()
+        if not stays:
+            law = like.law if is_custom else bp.init(acting.acting_params, pack.read_qpos())
+            slips = pack.friction.coulomb is not None
+            like = empty_state(self._options, law, acting.motors, slips, pack.size)
+        state = unflatten(like._replace(matrix=None), rows, name="control")
         if stays:
             executor.failed = False
             executor.measure()

@@ -1,5 +1,5 @@
 """Faults of single envs: detected, reported, and contained, while the other envs are bit-identical
-to a run without.
+to a run without; and contacts that robots without collision shapes would have had.
 
 Envs that share a pack are not influenced by one whose state is NaN. So containment is to notice a
 fault in time, and to put that env into a state from which it can be simulated.
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.arrays import Arrays, FaultArrays, StateRows
+from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.options.groups import FaultAction
 
 CAUSES = (
@@ -37,7 +37,7 @@ COMMAND_CAUSES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
 ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
 """Pose and twist (13,) of a base at rest at the origin."""
 LONGEST = 10_000
-"""Largest number of faults in a log."""
+"""Largest number of events in a log."""
 
 
 class Fault(NamedTuple):
@@ -82,57 +82,71 @@ class FaultWarning(UserWarning):
     """
 
 
-class FaultLog:
-    """Last :data:`LONGEST` faults of a runner's envs. Immutable; methods return a modified copy."""
+class MissedContactWarning(UserWarning):
+    """Robots that are simulated without collisions would have touched something."""
+
+
+class MissedContact(NamedTuple):
+    """First contact that an env's robot would have had since its reset."""
+
+    env: int
+    time: float
+    """End of the tick in which it was found [s]."""
+    links: tuple[str, ...]
+    """Names of the two links; of one if it is with the ground."""
+
+    def __str__(self) -> str:
+        if len(self.links) == 1:
+            place = f"{self.links[0]!r} and the ground"
+        else:
+            place = " and ".join(map(repr, self.links))
+        return f"env {self.env}: {place} at {self.time:g} s"
+
+
+class EventLog:
+    """Last :data:`LONGEST` faults or missed contacts of a runner's envs. Immutable; methods return
+    a modified copy.
+
+    ``field`` of :class:`batchpid.sim.loop.arrays.FaultArrays` holds the sim step of each env's last
+    event, or ``none``. ``read`` returns the event of an env in the arrays of a tick.
+    """
 
     def __init__(
-        self,
-        num_envs: int,
-        joint_names: Sequence[str],
-        timestep: float,
-        action: str,
-        command_names: Sequence[str] | None = None,
+        self, num_envs: int, field: str, none: int, read: Callable[[int, Arrays], Any]
     ) -> None:
-        self.faults: tuple[Fault, ...] = ()
+        self.events: tuple[Any, ...] = ()
         """Latest last."""
-        self._timestep, self._action = timestep, action
-        self._places = {cause: ("joint", joint_names) for cause in CAUSES}
-        if command_names is not None:
-            self._places |= dict.fromkeys(COMMAND_CAUSES, ("entry", command_names))
-        self._steps = np.full(num_envs, -1)
+        self._field = field
+        self._none = none
+        self._read = read
+        self._steps: Rows = np.full(num_envs, none)
 
-    def without(self, mask: Bool) -> FaultLog:
-        """Return a log that knows no last fault of the envs of ``mask`` (envs,), which were
+    def without(self, mask: Bool) -> EventLog:
+        """Return a log that knows no last event of the envs of ``mask`` (envs,), which were
         reset.
         """
-        return self.restored(np.where(mask, -1, self._steps))
+        return self.restored(np.where(mask, self._none, self._steps))
 
-    def restored(self, steps: Rows) -> FaultLog:
-        """Return a log that knows the steps of the envs' last faults (envs,)."""
+    def restored(self, steps: Rows) -> EventLog:
+        """Return a log that knows the steps of the envs' last events (envs,)."""
         log = copy.copy(self)
         log._steps = steps.copy()
         return log
 
-    def with_faults(self, arrays: Arrays) -> FaultLog:
-        """Return a log with the faults of ``arrays`` that this one does not know."""
-        if np.logical_and.reduce(arrays.observation.ok):  # ok.all() takes a call of Python
+    def with_events(self, arrays: Arrays) -> EventLog:
+        """Return a log with the events of ``arrays`` that this one does not know."""
+        steps = getattr(arrays.fault, self._field)
+        # An event is new if it has another step than the env's last one.
+        new = np.flatnonzero((steps != self._none) & (steps != self._steps)).tolist()
+        if not new:
             return self
-        fault = arrays.fault
-        # A fault is new if it has another step than the env's last fault.
-        log = self.restored(fault.step)
-        new = list[Fault]()
-        for env in np.flatnonzero((log._steps >= 0) & (log._steps != self._steps)).tolist():
-            step = int(log._steps[env])
-            cause = CAUSES[fault.cause[env]]
-            kind, names = self._places[cause]
-            joint = names[fault.joint[env]]
-            new.append(Fault(env, step, step * self._timestep, joint, cause, self._action, kind))
-        if new:
-            log.faults = (*self.faults, *new)[-LONGEST:]
+        log = self.restored(steps)
+        events = [self._read(env, arrays) for env in new]
+        log.events = (*self.events, *events)[-LONGEST:]
         return log
 
 
-class FaultContainment(StateRows):
+class FaultContainment:
     """Last fault of each of M envs, and the state in which a failed env goes on.
 
     Attributes
@@ -208,16 +222,13 @@ class FaultContainment(StateRows):
         qpos = pack.read_qpos()
         qvel = pack.read_qvel()
         bad = ~(np.abs(qpos) <= FARTHEST) | ~np.isfinite(qvel) | pack.strays()[:, None]
-        # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first
-        # joint.
         failed = bad.any(1, keepdims=True)
-        source = ~np.isfinite(pack.qf) & failed
         if returned is not None:
-            wrong = ~np.isfinite(returned) & failed
-            # Actuators may have delayed it.
-            wrong = np.where(wrong.any(1, keepdims=True), wrong, source)
-            self.fail(wrong, "effort", step, before)
-        self.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, before)
+            # One step after a NaN effort at one joint, all joints are NaN. Actuators may have
+            # delayed it.
+            wrong = ~np.isfinite(returned) | ~np.isfinite(pack.qf)
+            self.fail(wrong & failed, "effort", step, before)
+        self.fail(bad, "state", step, before)
         if speed_limit is not None:
             self.fail((np.abs(qvel) > speed_limit) & ~failed, "speed", step, before)
 
@@ -244,7 +255,7 @@ class FaultContainment(StateRows):
 
     @property
     def state(self) -> dict[str, Rows]:
-        """Arrays of the state (M, ...), by name."""
+        """Arrays that a snapshot holds (M, ...), by name."""
         names = "suspended", "failed", "start_qpos", "start_qvel", "start_base", "suspended_qpos"
         return {name: getattr(self, name) for name in names} | self.rows._asdict()
 

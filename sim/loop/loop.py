@@ -8,6 +8,7 @@ grouped.
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,20 +17,84 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Rows
-from batchpid.errors import ControllerError
+from batchpid.errors import BatchPIDError, ControllerError, WorkerError
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.loop.acting_draws import make_pack
-from batchpid.sim.loop.arrays import Arrays, Ticks
+from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.backend import native_obstacle
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_group import EnvGroup
-from batchpid.sim.loop.failure import Failure, RunError, order
+from batchpid.sim.loop.env_parts import make_pack
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks
-from batchpid.sim.loop.snapshot import EnvStates, Snapshot
+from batchpid.sim.loop.snapshot import Snapshot, join_rows
 from batchpid.sim.loop.xla_executor import ROWS
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
+
+
+class Failure(Exception):
+    """Error of a loop during a request. Whole ticks before it are valid; the state of the loop
+    after it is undefined.
+
+    It does not depend on how envs are divided among workers: of several failures, the first by
+    :func:`order` is reported.
+
+    Attributes
+    ----------
+    step
+        Sim step since the start of the runner; the first one of the tick if it is not known.
+    env
+        First env of the group that failed.
+    ticks
+        Ticks of the request that were completed before the error.
+    error
+        The error.
+    """
+
+    def __init__(self, step: int, env: int, ticks: int, error: Exception) -> None:
+        super().__init__(step, env, ticks, error)
+        self.step = step
+        self.env = env
+        self.ticks = ticks
+        self.error = error
+
+    @classmethod
+    def of(cls, error: Exception) -> Failure:
+        """Return an exception of a loop, if it is another one as a failure at step 0."""
+        if isinstance(error, Failure):
+            return error
+        return cls(0, 0, 0, error)
+
+    def portable(self) -> Failure:
+        """Return the failure with an error class of this project, which another process can raise,
+        and the traceback.
+
+        :meth:`of_worker` puts the name of the worker in front of the message of a WorkerError.
+        """
+        error = self.error
+        text = "".join(traceback.format_exception(error))
+        if isinstance(error, ControllerError):
+            # A node of a cluster passes on the failure of its worker, which has its note.
+            if not hasattr(error, "__notes__"):
+                error.add_note(text)
+        elif not isinstance(error, BatchPIDError):
+            error = WorkerError(f"raised:\n{text}")
+        return Failure(self.step, self.env, self.ticks, error)
+
+    def of_worker(self, name: str) -> Failure:
+        """Return the failure with the name of its worker in front of the message of a
+        WorkerError.
+        """
+        if type(self.error) is WorkerError:
+            self.error = WorkerError(f"{name} {self.error}")
+        return self
+
+
+def order(failure: Failure) -> tuple[int, int]:
+    """Return the key by which failures are sorted: the earliest sim step first, then the lowest
+    env.
+    """
+    return failure.step, failure.env
 
 
 class Loop:
@@ -76,9 +141,9 @@ class Loop:
         # Each group has its own scenes; nothing else in the loop depends on the grouping.
         for first in range(0, count, size):
             rows = slice(first, min(first + size, count))
-            ticks = Ticks(arrays.at((slice(None), rows)))
+            part = arrays.at((slice(None), rows))
             own_params = params.for_envs(rows)
-            group = EnvGroup(self._build(rows), rows, own_params, options, controller, ticks)
+            group = EnvGroup(self._build(rows), rows, own_params, options, controller, part)
             self.groups.append(group)
         self.set_actuators(None if options.actuators is None else options.actuators.for_envs(envs))
         # Packs that share working memory cannot run in one native call.
@@ -130,7 +195,7 @@ class Loop:
         seconds it took.
 
         ``given`` says which arrays of the commands are given
-        (:attr:`batchpid.sim.loop.arrays.Command.given`); the others are set to 0. Raises RunError
+        (:attr:`batchpid.sim.loop.arrays.Command.given`); the others are set to 0. Raises Failure
         if a group failed. The other groups complete the run, so that the first failure does not
         depend on grouping.
         """
@@ -154,7 +219,7 @@ class Loop:
                 except Exception as error:  # of a controller, or of the engine
                     failures.append(self._failure(error, group, substeps))
         if failures:
-            raise RunError(min(failures, key=order))
+            raise min(failures, key=order)
         self._steps += ticks * substeps
         return time.perf_counter() - began
 
@@ -167,15 +232,15 @@ class Loop:
             error = error.at(step, self.options.timestep)
         return Failure(step, self._first_env + group.envs.start, group.tick, error)
 
-    def snapshot(self) -> EnvStates:
-        """Return the state of every env. It is a barrier: the loop goes on as if restored from
-        it.
+    def snapshot(self) -> dict[str, Rows]:
+        """Return the state of every env, arrays by name. It is a barrier: the loop goes on as if
+        restored from it.
         """
-        states = EnvStates.join([group.read() for group in self.groups])
-        for group in self.groups:
+        parts = [group.read() for group in self.groups]
+        for group, rows in zip(self.groups, parts, strict=True):
             acting = group.acting
-            self._restore(group, states, acting.params, acting.actuators, acting.draws)
-        return states
+            self._restore(group, rows, acting.params, acting.actuators, acting.draws)
+        return join_rows(parts)
 
     def restore(self, snapshot: Snapshot, draws: Draws) -> None:
         """Put every env into its state in ``snapshot``, with its params and ``draws``."""
@@ -184,13 +249,14 @@ class Loop:
             envs, motors = group.envs, snapshot.actuators
             motors = None if motors is None else motors.for_envs(envs)
             params = snapshot.params.for_envs(envs)
-            self._restore(group, snapshot.states, params, motors, draws.for_envs(envs))
+            rows = {name: array[envs] for name, array in snapshot.rows.items()}
+            self._restore(group, rows, params, motors, draws.for_envs(envs))
             group.observe_first()
 
     def _restore(
         self,
         group: EnvGroup,
-        states: EnvStates,
+        rows: dict[str, Rows],
         params: bp.PIDParams,
         actuators: bp.Actuators | None,
         draws: Draws | None,
@@ -203,11 +269,11 @@ class Loop:
         if varies or not pack.state_is_complete:
             pack.close()
             pack = self._build(group.envs, draws)
-        group.write(pack, states.for_envs(group.envs), params, actuators, draws)
+        group.write(pack, rows, params, actuators, draws)
 
-    def state_sizes(self) -> list[int]:
-        """Return the number of values in the engine's state of each env."""
-        return [size for group in self.groups for size in group.pack.state_sizes()]
+    def read(self) -> dict[str, Rows]:
+        """Return the state of every env, arrays by name."""
+        return join_rows([group.read() for group in self.groups])
 
     def poses(self, names: Sequence[str] | None = None) -> list[Rows]:
         """Return the poses of the entities that ``build`` returned for each env, or of bodies

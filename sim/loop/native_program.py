@@ -23,13 +23,11 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
 from batchpid.sim.loop.control_step import COUPLING_STEPS, STAGES, SimStage
-from batchpid.sim.loop.model_functions import steps_natively
 from batchpid.sim.loop.step_setup import Setup, moves_drives
 from batchpid.sim.loop.step_values import (
     Layout,
     Measured,
     Model,
-    Outputs,
     Step,
     StepState,
     Values,
@@ -81,7 +79,6 @@ class TickProgram:
         self, setup: Setup, buffers: Buffers, table: Table, noise: Any, reads_force: bool
     ) -> None:
         _, pack, layout, constants, _ = setup
-        assert steps_natively(pack)
         self._setup, self._buffers = setup, buffers
         self._native = native.extension("_gateway")
         self._programs, self._stages = list[Any](), list[interface.Stage]()
@@ -96,8 +93,8 @@ class TickProgram:
             gravity=layout.gravity,
             coriolis=layout.coriolis,
         )
-        left = np.zeros(()) if layout.moves else None
-        self._place(**buffers.measured._asdict(), before=buffers.before, left=left)
+        self._left = np.zeros(())
+        self._place(**buffers.measured._asdict(), before=buffers.before, left=self._left)
         # SAPIEN knows neither measured states nor the model of varied robots.
         if layout.gravity and (layout.measures or not reads_force):
             if layout.measures:
@@ -114,7 +111,7 @@ class TickProgram:
             state=state._replace(law=law, age=None),
             command=buffers.command,
             measured=buffers.measured,
-            step=Step(0, 1, left),
+            step=Step(0, 1, self._left if layout.moves else None),
             seen=buffers.measured,
             noise=noise,
         )
@@ -149,44 +146,45 @@ class TickProgram:
         outputs = self.outputs
         measured = self._buffers.measured
         none = np.zeros(measured.qpos.shape, bool)
-        copies: list[tuple[str, Rows, Rows]] = [
-            *[
-                ("read", rows, row)
-                for rows, row in zip(command, self._buffers.command, strict=True)
-            ],
-            ("write_floats", seen.qpos, measured.qpos),
-            ("write_floats", seen.qvel, measured.qvel),
-            ("write_floats", seen.effort, outputs.motor),
-            ("write_bytes", seen.ok, np.ones(len(none), bool)),
+        copies: list[tuple[Rows, Rows]] = [
+            (seen.qpos, measured.qpos),
+            (seen.qvel, measured.qvel),
+            (seen.effort, outputs.motor),
+            (seen.ok, np.ones(len(none), bool)),
             # One row, which each tick overwrites.
-            ("write_floats", table.effort[None], outputs.motor),
-            *[("write_bytes", rows, row) for rows, row in zip(fault, table.fault, strict=True)],
+            (table.effort[None], outputs.motor),
+            *zip(fault, table.fault, strict=True),
         ]
         for name in ("saturated", "guarded"):
             mask = getattr(outputs, name)
             if mask is None:
                 mask = none
-            copies.append(("write_bytes", getattr(seen, name), mask))
-            copies.append(("write_bytes", getattr(table, name)[None], mask))
+            copies.append((getattr(seen, name), mask))
+            copies.append((getattr(table, name)[None], mask))
         if seen.base_pose is not None and seen.base_twist is not None:
             pose = np.zeros((len(none), 7))
             twist = np.zeros((len(none), 6))
             self._place(base_pose=pose, base_twist=twist)
-            copies.append(("write_floats", seen.base_pose, pose))
-            copies.append(("write_floats", seen.base_twist, twist))
-        transfers = [
-            self._transfer(kind, rows, row) for kind, rows, row in copies if row is not None
-        ]
+            copies += (seen.base_pose, pose), (seen.base_twist, twist)
+        transfers = [self._transfer(rows, row) for rows, row in copies]
+        for rows, row in zip(command, self._buffers.command, strict=True):
+            if row is not None:
+                transfers.append(self._transfer(rows, row))
         return (interface.Transfer * len(transfers))(*transfers)
 
-    def _transfer(self, kind: str, table: Rows, row: Rows) -> interface.Transfer:
+    def _transfer(self, table: Rows, row: Rows) -> interface.Transfer:
         """Return a copy between a row (M, ...) and the first of the ticks of ``table``."""
-        dtype = {"read": np.float64, "write_floats": np.float32}.get(kind, row.dtype)
+        # Of arrays of numbers only commands have tables in double precision.
+        kind, size = "write_bytes", row.nbytes
+        if row.dtype == np.float64:
+            kind, size = "write_floats", row.size
+            if table.dtype == np.float64:
+                kind = "read"
         return interface.Transfer(
-            table=self._address(table[0], dtype),
+            table=self._address(table[0], table.dtype),
             row=self._address(row, row.dtype),
             stride=0 if len(table) == 1 else table.strides[0],
-            size=row.nbytes if kind == "write_bytes" else row.size,
+            size=size,
             kind=interface.TRANSFERS.index(kind),
         )
 
@@ -228,10 +226,11 @@ class TickProgram:
         # Arrays for the results: the state's own, and new ones for the others.
         outputs = [np.zeros(shape, bool if is_mask else float) for is_mask in traced.program.masks]
         for array, place in zip(state, traced.places, strict=False):  # the state comes first
-            if place.is_result:
-                outputs[place.number] = array
-        arrays = ((outputs if place.is_result else inputs)[place.number] for place in traced.places)
-        after = values._replace(**filled(traced.values, arrays)._asdict(), noise=None)
+            if place >= len(inputs):
+                outputs[place - len(inputs)] = array
+        arrays = [*inputs, *outputs]
+        changed = filled(traced.changed, iter([arrays[place] for place in traced.places]))
+        after = values._replace(**dict(zip(_CHANGED, changed, strict=True)), noise=None)
         if outputs:
             program = ArrayProgram(traced.program, leaves(constants), len(inputs), shape)
             pairs = tuple([(array, _row_size(array)) for array in inputs])
@@ -270,7 +269,7 @@ class TickProgram:
 
     def _add_controller(self, values: Values) -> Values:
         controller: Any = self._setup.options.control
-        self.control = controller.bound(*values.seen)
+        self.control = controller.bound(*values.seen, self._left)
         self.control.set_state(self._buffers.state.law)
         self.tick.control = self.control.address
         outputs = values.outputs._replace(returned=self.control.effort)
@@ -299,30 +298,20 @@ _TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
 """Dtypes of arrays that are not float64."""
 
 
-class _Changed(NamedTuple):
-    """Values that programs change."""
-
-    state: StepState
-    seen: Measured
-    outputs: Outputs
-
-
-class _Place(NamedTuple):
-    """Place of an array of the values after a program."""
-
-    is_result: bool
-    """Whether the program computes it; otherwise it is one of its inputs."""
-    number: int
+_CHANGED = ("state", "seen", "outputs")
+"""Values that programs change."""
 
 
 class _Traced(NamedTuple):
     """Program of some stages."""
 
     program: Trace
-    values: Pytree
-    """Structure of the :class:`_Changed` values after it."""
-    places: tuple[_Place, ...]
-    """Places of the arrays in these."""
+    changed: Pytree
+    """Structure of the values :data:`_CHANGED` after it."""
+    places: tuple[int, ...]
+    """Places of the arrays in these, among the inputs of the program and, after them, its
+    results.
+    """
 
 
 @lru_cache(maxsize=64)
@@ -349,21 +338,21 @@ def _trace(
         for stage in stages:
             assert stage.function is not None
             values = stage.function(layout, k, values)
-        changed = _Changed(values.state, values.seen, values.outputs)
+        changed = tuple([getattr(values, name) for name in _CHANGED])
         numbers = {symbol: number for number, symbol in enumerate(symbols[first:])}
-        outputs = set(map(id, leaves(changed.outputs)))
+        outputs = set(map(id, leaves(values.outputs)))
         results = list[Any]()
-        places = list[_Place]()
+        places = list[int]()
         for at, leaf in enumerate(leaves(changed)):
             is_state = at < len(histories)
             number = numbers.get(leaf)
             if is_state and (number == at or histories[at]):
-                places.append(_Place(False, at))
+                places.append(at)
             # An output that is an input is copied, since the next sim step changes the input.
             elif number is not None and not is_state and id(leaf) not in outputs:
-                places.append(_Place(False, number))
+                places.append(number)
             else:
-                places.append(_Place(True, len(results)))
+                places.append(count + len(results))
                 results.append(leaf)
         result_parts[:] = structure(changed), tuple(places)
         return results

@@ -14,7 +14,6 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import COUPLING_STEPS, sim_step
 from batchpid.sim.loop.custom import controller_errors
 from batchpid.sim.loop.faults import is_near
-from batchpid.sim.loop.model_functions import steps_natively
 from batchpid.sim.loop.step_setup import Setup, moves_drives
 from batchpid.sim.loop.step_values import (
     Constants,
@@ -134,11 +133,10 @@ class EngineSteps:
         self.reads_force = layout.gravity and not layout.measures
         """Whether a reading has the passive force, which is otherwise 0."""
         self._parts = layout.gravity, layout.coriolis
-        self._is_native = steps_natively(setup.pack)
+        self._is_native = setup.pack.steps_natively
         self.native_force = False
         """Whether the native sim step reads the passive force."""
-        # Not isinstance, which would make the pack's native models.
-        if hasattr(setup.pack, "steps_read_force"):
+        if self._is_native:
             self.native_force = self.reads_force and setup.pack.steps_read_force(*self._parts)
         self._step: CompiledStep | None = None
         self._bound: object = None
@@ -157,7 +155,7 @@ class EngineSteps:
             self._pack.write_qf(qf)
             self._pack.step()
             measured = self.measure()
-            limit = self._setup.speed_limit
+            limit = self._setup.options.speed_limit
             is_slow = limit is None or bool((np.abs(measured.qvel) <= limit).all())
             return measured, not (is_near(measured.qpos) and is_slow)
         step = self.compiled()
@@ -169,7 +167,7 @@ class EngineSteps:
 
     def compiled(self) -> CompiledStep:
         """Return the native sim step of the present robots."""
-        pack: Any = self._setup.pack  # a CompiledPack, which takes long to check
+        pack = self._pack
         if self._step is None or self._bound is not pack.calls:
             if self.native_force:
                 parts = self._parts
@@ -177,7 +175,7 @@ class EngineSteps:
                 parts = (False, False)
             drives = self._setup.layout.control == "drive"
             self._bound = pack.calls
-            self._step = pack.compiled_step(*parts, True, self._setup.speed_limit, drives)
+            self._step = pack.compiled_step(*parts, True, self._setup.options.speed_limit, drives)
         return self._step
 
     def _passive_force(self, like: Float64) -> Float64:

@@ -1,9 +1,14 @@
 """Layout, constants and state of the control step of a group of envs, from its options, params and
-robots.
+robots; and the functions of the robots' model that it calls.
+
+Mass matrices, passive force and noise of sensors are natively compiled where the engine's steps
+are, for every executor alike, since NumPy's results differ in the last bits.
 """
 
 from __future__ import annotations
 
+from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,23 +18,31 @@ import batchpid as bp
 from batchpid import motors as actuator_model
 from batchpid.arrays.array_types import Array, Bool, Float64
 from batchpid.arrays.elementwise import TURN, replace_envs
+from batchpid.arrays.trees import mapped
 from batchpid.law.coefficients import spread
 from batchpid.law.computed_torque import convert_integral
-from batchpid.motors import ActuatorState
+from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
 from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import FrictionState
+from batchpid.motors.guard import GuardState
+from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.control_step import REFRESH_STEPS, mass_matrix, refreshed, uses_mass_matrix
 from batchpid.sim.loop.custom import OwnController
-from batchpid.sim.loop.model_functions import model_functions
-from batchpid.sim.loop.pid_law import PIDLaw
-from batchpid.sim.loop.step_values import Constants, Layout, ModelledFriction, StepState
+from batchpid.sim.loop.step_values import (
+    Constants,
+    Layout,
+    Model,
+    ModelledFriction,
+    PIDLaw,
+    StepState,
+)
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION
+from batchpid.sim.robot.robot_options import BAND, known_joints
 
 
 class Setup(NamedTuple):
@@ -40,14 +53,6 @@ class Setup(NamedTuple):
     layout: Layout
     constants: Constants
     controller: OwnController | None
-
-    @property
-    def speed_limit(self) -> Array:
-        """Speed beyond which a joint has failed (dof,); None for no limit."""
-        limit = self.options.speed_limit
-        if limit is None:
-            return None
-        return np.asarray(limit)
 
 
 def make_setup(
@@ -64,10 +69,11 @@ def make_setup(
     ``motors``, their state, are None without an effect on efforts or measurements.
     """
     parts = options.compensate.split("+")
-    is_pid = options.control == "pid"
+    law = PIDLaw.of(params) if options.control == "pid" else None
     layout = Layout(
         control=options.control if isinstance(options.control, str) else "custom",
-        law=PIDLaw.of(params) if is_pid else None,
+        law=law,
+        implicit=any(part is not None and part.implicit for part in (law, controller)),
         measures=actuators is not None and actuators.measures,
         gravity="gravity" in parts,
         coriolis="coriolis" in parts,
@@ -167,6 +173,24 @@ def _turns(pack: EnginePack) -> Array:
     return None
 
 
+def empty_state(
+    options: RunnerOptions, law: Any, actuators: bp.Actuators | None, stiction: bool, envs: int
+) -> StepState:
+    """Return a state of the control of ``envs`` envs with this part of the law, in the structure
+    that it has with ``actuators`` (None: without an effect), and with Coulomb friction or without.
+    """
+    rows = np.zeros((envs, options.robot.dof))
+    state = StepState(law)
+    if actuators is not None:
+        state = state._replace(motors=bp.motors.init(actuators, rows, options.timestep))
+    if stiction:
+        friction = FrictionState(*[rows] * len(FrictionState._fields))
+        state = state._replace(friction=friction, age=np.zeros(envs, np.int64))
+    if options.guard is not None:
+        state = state._replace(guard=GuardState(rows, rows))
+    return state
+
+
 def reset_friction(setup: Setup, state: StepState, mask: Bool) -> StepState:
     """Return ``state`` with the friction model of the envs of ``mask`` (M,) restarted at the
     robots' present state.
@@ -243,3 +267,81 @@ def init_motors(
     """Return the state of actuators that start at ``qpos``: :func:`batchpid.motors.init`."""
     envs = np.arange(pack.first_env, pack.first_env + pack.size)
     return bp.motors.init(actuators, qpos, pack.spec.timestep, envs=envs, episode=episode, **since)
+
+
+# -- functions of the model
+# --------------------------------------------------------------------------------------------------
+
+
+def model_functions(
+    pack: EnginePack, layout: Layout, constants: Constants, controller: OwnController | None
+) -> Model:
+    """Return the functions for NumPy arrays of the robots of ``pack``."""
+    native = pack.steps_natively
+    model = Model(
+        mass_matrix=mass_matrix_of(pack, native),
+        joint_mass_matrix=partial(_joint_mass_matrix, pack),
+        controller=controller,
+        noise=NoiseBlocks(),
+    )
+    if layout.gravity:
+        force = passive_force_of(pack, native)
+        parts = layout.gravity, layout.coriolis
+        model = model._replace(
+            passive_force=lambda qpos, qvel: force(qpos, qvel, *parts, pack.read_base_motion())
+        )
+    if native and constants.friction.coulomb is not None:
+        inputs = constants.friction, constants.drive, constants.coupling, constants.timestep
+        refresh = NativeRefresh(pack.joint_model, pack.size, pack.armature, *inputs, REFRESH_STEPS)
+        model = model._replace(refresh=refresh)
+    return model
+
+
+def _joint_mass_matrix(pack: EnginePack, qpos: Float64) -> Float64:
+    """Return the effective mass matrix of the joints, armature of the motors included."""
+    matrix = pack.joint_mass_matrix(qpos)
+    if pack.armature.any():
+        return matrix + pack.armature[:, None] * np.eye(pack.dof)
+    return matrix
+
+
+BLOCK = 64
+"""Sim steps of a block."""
+
+
+class NoiseBlocks:
+    """:func:`batchpid.motors.measurement_noise` at the step of a state, from blocks of consecutive
+    steps.
+    """
+
+    def __init__(self) -> None:
+        self._key: Any = None
+        self._first = 0
+        self._block: tuple[Array, Array] = (None, None)
+
+    def __call__(
+        self, k: MotorCoefficients, state: ActuatorState, like: Float64
+    ) -> tuple[Array, Array]:
+        """Return the noise of positions and velocities; None for a sensor without noise."""
+        noise: tuple[Array, Array] = mapped(itemgetter(0), self.from_step(k, state, like))
+        return noise
+
+    def from_step(
+        self, k: MotorCoefficients, state: ActuatorState, like: Float64
+    ) -> tuple[Array, Array]:
+        """Return the noise of the step of a state and the next ones (steps, M, dof), as far as it
+        has been drawn.
+
+        A reset replaces the key. While the key is the same, all envs advance by the same number of
+        steps.
+        """
+        if state.key is None:
+            return None, None
+        step = int(state.step[0])
+        if state.key is not self._key or not 0 <= step - self._first < BLOCK:
+            steps = state.step + np.arange(BLOCK, dtype=np.uint32)[:, None]
+            self._block = measurement_noise(k, state.key, steps, np.zeros_like(like), np)
+            self._key = state.key
+            self._first = step
+        rest: tuple[Array, Array] = mapped(itemgetter(slice(step - self._first, None)), self._block)
+        return rest

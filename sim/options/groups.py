@@ -29,8 +29,8 @@ from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.command import own_command
-from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
+from batchpid.sim.signals.quantities import own_command
+from batchpid.sim.tool_space import OperationalSpace, default_tool
 
 EngineName = Literal["sapien", "mujoco"]
 DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
@@ -59,7 +59,7 @@ another value of it.
 class Option(NamedTuple):
     """Where an argument of a Runner is kept and shown, by :func:`option`."""
 
-    kept: Mapping[str, str]
+    places: Mapping[str, str]
     """Attribute of :class:`batchpid.sim.RunnerOptions` that each :data:`Place` keeps; "" for the
     attribute of the argument's name.
     """
@@ -67,11 +67,11 @@ class Option(NamedTuple):
     """Help of the flag of `batchpid rollout` with the argument's name; "" for no flag."""
 
 
-def option(*kept: Place, flag: str = "", **kept_as: str) -> Option:
-    """Return the option that the places ``kept`` keep; ``kept_as`` are further places and the
-    attributes they keep.
+def option(*places: Place, flag: str = "", **attributes: str) -> Option:
+    """Return the option that ``places`` keep; ``attributes`` are further places, with the attribute
+    that each keeps.
     """
-    return Option(dict.fromkeys(kept, "") | kept_as, flag)
+    return Option(dict.fromkeys(places, "") | attributes, flag)
 
 
 def check_plain(record: object) -> None:
@@ -98,6 +98,7 @@ class OptionGroup:
 
     def changed(self, **values: Any) -> Self:
         """Return the options with other ``values``."""
+        # Without the checks of __post_init__: these values have passed them.
         made = object.__new__(type(self))
         vars(made).update(vars(self) | values)
         return made
@@ -213,6 +214,7 @@ class Scene(OptionGroup):
             choice("physics", self.physics, engine.physics)
         if robot.dissipation == "sapien":
             require(engine, "sapien_dissipation", "robot")
+        # MuJoCo compiles a scene as a whole: it has no content of the caller's own.
         if self.build is not None:
             require(engine, "build", "build")
             if not callable(self.build):
@@ -248,7 +250,11 @@ class Scene(OptionGroup):
     def _check_without_collisions(self, robot: Robot) -> None:
         """Raise InvalidArgumentError for what needs the collisions that are off."""
         file = self.file_of(robot)
-        falling = [] if file is None else [*file.falling]
+        # A robot that nothing holds would fall for ever.
+        if file is None:
+            falling = []
+        else:
+            falling = [*file.falling]
         if not robot.fixed_base:
             falling.append("the floating base")
         if falling:
@@ -266,9 +272,12 @@ class Scene(OptionGroup):
 
         Raises InvalidArgumentError for a link that is unknown, or has no sensor of this kind.
         """
-        links = () if value is None else tuple(names(argument, value))
+        if value is None:
+            return None
+        links = tuple(names(argument, value))
         if not links:
             return None
+        # SAPIEN reports its damping of links among the contacts.
         if self.engine == "sapien" and robot.dissipation == "sapien":
             problem = "need a robot without SAPIEN's link damping, which acts like a contact"
             remedy = "load the robot with dissipation='urdf'"
@@ -339,10 +348,9 @@ class Controller(Protocol):
         """Return the new state, and the joint efforts [N m or N], which the runner clips to the
         params' limits.
 
-        An env that has failed is given the ``neutral`` setpoint of the command, by default zeros
-        within its bounds. ``passive`` is the passive force that the runner's ``compensate``
-        selects, plus the caller's feedforward. The arrays are read-only copies, which the
-        controller may keep.
+        An env that has failed is given the ``neutral`` setpoint of the command, by default zeros.
+        ``passive`` is the passive force that the runner's ``compensate`` selects, plus the caller's
+        feedforward. The arrays are read-only copies, which the controller may keep.
         """
 
 
@@ -404,7 +412,8 @@ class Control(OptionGroup):
     """
 
     def fit(self, robot: Robot) -> Self:
-        control, tool = self.control, self.tool
+        control = self.control
+        tool = self.tool
         if control == "osc":
             if not robot.fixed_base:
                 problem = f"'osc' needs a fixed base, which {robot.name!r} does not have"
@@ -418,7 +427,10 @@ class Control(OptionGroup):
             own_command(control)  # raises for an invalid command
         else:
             choice("control", control, (*get_args(ControlMode), "osc"))
-        link = control.link if isinstance(control, OperationalSpace) else None
+        if isinstance(control, OperationalSpace):
+            link = control.link
+        else:
+            link = None
         if tool not in (None, link):
             problem = "is for control 'osc'"
             raise InvalidArgumentError("tool", problem, value=tool, remedy="leave it out")
@@ -458,6 +470,7 @@ class Faults(OptionGroup):
     def fit(self, robot: Robot) -> Self:
         if self.speed_limit is None:
             return self
+        # A copy: the caller may change the array later.
         limit = joint_speeds("speed_limit", self.speed_limit, robot.joint_names)
         return self.changed(speed_limit=read_only(limit.copy()))
 
@@ -483,18 +496,17 @@ class Ray:
     """Largest number of machines. Default: all that have enough CPUs."""
     cpus_per_node: Annotated[int | None, Field(low=1, high=100_000)] = None
     """Workers on each machine, each on one CPU of Ray's count. Machines with fewer CPUs are not
-    used. Default: all CPUs that Ray counts.
+    used. Default: the CPUs of the smallest one.
     """
     runtime_env: Document | None = None
     """Ray's ``runtime_env`` of the processes on the machines, such as ``{"working_dir": "."}``."""
 
     def __post_init__(self) -> None:
         check_plain(self)
-        if "://" in instance("address", self.address or "", str, "pass HOST:PORT"):
+        if "://" in (self.address or ""):
             problem = "must be HOST:PORT, 'auto' or 'local'"
             remedy = "leave out the protocol"
             raise InvalidArgumentError("address", problem, value=self.address, remedy=remedy)
-        instance("runtime_env", self.runtime_env or {}, dict, "pass a dict as for ray.init")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -537,7 +549,11 @@ class Workers(OptionGroup):
             return self.changed(
                 workers=len(os.sched_getaffinity(0)) if workers is None else workers
             )
-        cluster = Ray() if self.cluster == "ray" else self.cluster
+        if self.cluster == "ray":
+            cluster = Ray()
+        else:
+            cluster = self.cluster
+        # Each machine of a cluster has its own number of workers.
         if self.workers is not None:
             problem = "is not for a cluster"
             remedy = "pass cluster=Ray(cpus_per_node=...)"

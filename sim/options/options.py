@@ -29,7 +29,6 @@ from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.native import xla
-from batchpid.sim.engine.protocol import require
 from batchpid.sim.engine.scene_spec import added_friction
 from batchpid.sim.options.groups import (
     Control,
@@ -45,14 +44,18 @@ from batchpid.sim.options.groups import (
     option,
 )
 from batchpid.sim.randomization.checks import check_params, prepared_actuators
-from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.setpoint_limits import fit_guard
-from batchpid.sim.signals.command import CommandSpec, joint_command, own_command
-from batchpid.sim.signals.observation import Observation, Quantity, observed
-from batchpid.sim.signals.rollout import RunInfo
-from batchpid.sim.tool_space.osc_controller import OperationalSpace
+from batchpid.sim.robot.robot_options import fit_actuators, fit_guard, known_joints
+from batchpid.sim.signals.quantities import (
+    CommandSpec,
+    Observation,
+    Quantity,
+    joint_command,
+    observed,
+    own_command,
+)
+from batchpid.sim.tool_space import OperationalSpace
 
 P = ParamSpec("P")
 IDEAL = bp.Actuators()
@@ -115,8 +118,6 @@ class RunnerOptions(RunnerKeywords):
             options = group(**{entry.name: values[entry.name] for entry in fields(group)})
             values.update(vars(options.fit(robot)))
         # What follows takes options of several groups, in an order in which each is fitted once.
-        if self.control == "drive":
-            require(self.load_engine(), "drive", "control")
         if isinstance(self.control, OperationalSpace):
             self._check_tree("control", self.control, "control the joints")
             values["control"] = self.control.in_runner(self.timestep, self.compensate)
@@ -137,27 +138,22 @@ class RunnerOptions(RunnerKeywords):
         require_jax()
         engine = self.load_engine()
         robot = self.robot
-        reads_force = robot.fixed_base or "base_state" in engine.capabilities
+        floats = not robot.fixed_base
+        # The program takes the passive force from the engine.
+        lacks_force = floats and "base_state" not in engine.capabilities
         if "coriolis" not in self.compensate and "partial_force" not in engine.capabilities:
-            reads_force = False
-        obstacle = f"{engine.title} has no compiled sim steps"
-        if "compiled_steps" in engine.capabilities:
-            obstacle = engine.native_obstacle() or xla.obstacle()
-        floats_with_friction = not robot.fixed_base and robot.friction.any()
-        lacking = {
-            "backend": obstacle and f"is 'jax'; {obstacle}",
-            "control": self.control == "drive" and "has no law to compile",
-            "compensate": "gravity" in self.compensate
-            and not reads_force
-            and "needs a passive force of NumPy",
-            "randomization": self.randomization is not None and "is given",
-            "guard": self.guard is not None and "is given",
-            "robot": (not robot.coupling.is_identity and "has coupled joints")
-            or (floats_with_friction and "has a floating base, and joints with friction")
-            or (robot.actuators is not None and "has actuators"),
-        }
-        for argument, problem in lacking.items():
-            if problem:
+            lacks_force = True
+        obstacle = engine.native_obstacle() or xla.obstacle()
+        for argument, problem, is_lacking in (
+            ("backend", f"is 'jax'; {obstacle}", obstacle),
+            ("control", "has no law to compile", self.control == "drive"),
+            ("compensate", "needs NumPy's force", lacks_force and "gravity" in self.compensate),
+            ("randomization", "is given", self.randomization is not None),
+            ("guard", "is given", self.guard is not None),
+            ("robot", "has coupled joints", not robot.coupling.is_identity),
+            ("robot", "floats, and has friction", floats and robot.friction.any()),
+        ):
+            if is_lacking:
                 raise _not_in_program(argument, problem)
 
     def _check_tree(self, argument: str, value: object, remedy: str) -> None:
@@ -184,8 +180,7 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def observed(self) -> dict[str, Quantity]:
         """Quantities that the loop observes."""
-        quantities = observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
-        return {name: quantity for name, quantity in quantities.items() if quantity.derive is None}
+        return observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
 
     @property
     def misses_contacts(self) -> bool:
@@ -222,14 +217,11 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def derived(self) -> dict[str, Callable[[Observation], Rows]]:
         """Functions from what the loop observed to further quantities, by name."""
-        derived = {}
-        for name, quantity in observed(self.robot.fixed_base).items():
-            if quantity.derive is not None:
-                derived[name] = quantity.derive
-        if isinstance(self.control, OperationalSpace):
-            tool_pose = self.control.tool_pose
-            derived["tool_pose"] = lambda seen: tool_pose(seen.qpos)
-        return derived
+        # The loop observes joints; the pose of the tool follows from them.
+        if not isinstance(self.control, OperationalSpace):
+            return {}
+        tool_pose = self.control.tool_pose
+        return {"tool_pose": lambda seen: tool_pose(seen.qpos)}
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
@@ -253,6 +245,7 @@ class RunnerOptions(RunnerKeywords):
         """
         robot = self.robot
         instance("params", params, bp.PIDParams, "build them with robot.params() or make_params()")
+        # Units of gains are a matter of the law, which other controls do not have.
         if params.gain_units is not None and self.control != "pid":
             problem = f"have no meaning under control {self.control_name!r}"
             remedy = "use control 'pid', or params with gain_units 'effort'"
@@ -268,7 +261,7 @@ class RunnerOptions(RunnerKeywords):
         return frozen(params)
 
     def check_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
-        """Return ``actuators`` as :func:`batchpid.sim.robot.actuator_checks.fit_actuators` does;
+        """Return ``actuators`` as :func:`batchpid.sim.robot.robot_options.fit_actuators` does;
         None if every effect is off.
 
         None selects the robot's own actuators; control "drive" uses only their friction and
@@ -287,6 +280,7 @@ class RunnerOptions(RunnerKeywords):
         fitted: bp.Actuators | None = fit_actuators(
             actuators, self.robot, self.num_envs, self.control
         )
+        # Actuators without effect cost time in every sim step.
         if fitted is not None and fitted.is_ideal:
             fitted = None
         if self.randomization is not None:
@@ -301,21 +295,18 @@ class RunnerOptions(RunnerKeywords):
         """Return the options that are marked with ``place``, by name.
 
         - "snapshot": values that two runners must share to restore each other's snapshots;
-        - "recording": fields of :class:`batchpid.sim.RunInfo`, and in its field "options" the
-          values without a field;
+        - "recording": fields of :class:`batchpid.sim.RunInfo`;
         - "scene": fields of :class:`batchpid.sim.engine.scene_spec.SceneSpec`.
         """
         values = {}
         for name, entry in OPTIONS.items():
-            if place in entry.kept:
-                values[name] = getattr(self, entry.kept[place] or name)
+            if place in entry.places:
+                values[name] = getattr(self, entry.places[place] or name)
         # A recording is read without the classes of the engine and of the randomization.
         if place == "recording":
             values["physics"] = str(self.physics)
             if self.randomization is not None:
                 values["randomization"] = self.randomization.to_dict()
-            if further := sorted(values.keys() - RunInfo.__annotations__):
-                values["options"] = {name: values.pop(name) for name in further}
         return values
 
     @cached_property
@@ -323,7 +314,8 @@ class RunnerOptions(RunnerKeywords):
         """Robot and options that two runners must share to restore each other's snapshots, as plain
         values.
         """
-        robot, command = self.robot, self.own_command
+        robot = self.robot
+        command = self.own_command
         options = {name: _plain(value) for name, value in self.values_for("snapshot").items()}
         return options | {
             **robot.describe(),
@@ -351,6 +343,7 @@ def default_params(
     InvalidArgumentError
         The robot ships no gains and none can be designed: its mass matrix is not positive definite.
     """
+    # Other controls need the effort limits alone.
     if control not in ("pid", "drive"):
         return robot.params(kp=0.0, ki=0.0, kd=0.0)
     settings = robot.settings

@@ -2,7 +2,6 @@
 
 from batchpid.sim.plots.figures import (
     FORMATS,
-    FitErrors,
     comparison,
     efforts,
     fit_errors,
@@ -13,7 +12,6 @@ from batchpid.sim.plots.figures import (
 
 __all__ = [
     "FORMATS",
-    "FitErrors",
     "comparison",
     "efforts",
     "fit_errors",

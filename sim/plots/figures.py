@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,7 +26,7 @@ from batchpid.arrays.array_types import Float64, Rows
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.sim.signals.observation import OBSERVED
+from batchpid.sim.signals.quantities import OBSERVED
 from batchpid.sim.signals.rollout import Rollout
 
 FORMATS = (".png", ".svg")
@@ -82,16 +82,11 @@ def step_responses(
         The robot has no such joint.
     """
     run = _blank_failed(rollout)
-    if run.info.sets_positions:
-        command = None
-    else:
-        command = run.info.own_command
-    if command is None:
-        labels = []
-    else:
+    command = run.info.own_command
+    labels = []
+    if command is not None and not run.info.sets_positions:
         labels = [f"setpoint {label}" for label in command.labels]
-    chosen, names = _chosen(run, joints)
-    figure, blocks = _grid(names + labels, 2, title, run.time[-1])
+    figure, chosen, blocks = _joint_axes([run], joints, 2, title, labels)
     # Joints come first, entries of another command after them.
     for joint, (above, below) in zip(chosen, blocks, strict=False):
         _draw_limits(above, run.info.lower[joint], run.info.upper[joint])
@@ -102,8 +97,9 @@ def step_responses(
     pose = run.tool_pose
     if pose is not None:
         # Of the two quaternions of an orientation, the one that is nearer to the setpoint's.
-        sign = np.where((pose[..., 3:] * rollout.setpoint[..., 3:7]).sum(-1) < 0, -1.0, 1.0)
-        pose = np.concatenate([pose[..., :3], sign[..., None] * pose[..., 3:]], axis=-1)
+        products = (pose[..., 3:] * rollout.setpoint[..., 3:7]).sum(-1, keepdims=True)
+        turned = np.where(products < 0, -pose[..., 3:], pose[..., 3:])
+        pose = np.concatenate([pose[..., :3], turned], axis=-1)
     for entry, (above, below) in enumerate(blocks[len(chosen) :]):
         _draw_line(above, run.time, rollout.setpoint[..., entry])
         if pose is not None and entry < pose.shape[-1]:
@@ -113,35 +109,31 @@ def step_responses(
     return figure
 
 
-def efforts(
-    rollout: Rollout, *, joints: Joints = None, mark: int | None = None, title: str = ""
-) -> Figure:
+def efforts(rollout: Rollout, *, joints: Joints = None) -> Figure:
     """Draw, for each joint, efforts against their limit.
 
     Parameters as in :func:`step_responses`.
     """
     run = _blank_failed(rollout)
-    chosen, names = _chosen(run, joints)
-    figure, blocks = _grid(names, 1, title, run.time[-1])
+    figure, chosen, blocks = _joint_axes([run], joints, 1)
     for joint, (axes,) in zip(chosen, blocks, strict=True):
-        _draw_efforts(axes, run, joint, mark)
+        _draw_efforts(axes, run, joint, None)
     _add_legend(figure)
     return figure
 
 
-def following_errors(rollout: Rollout, *, joints: Joints = None, title: str = "") -> Figure:
+def following_errors(rollout: Rollout, *, joints: Joints = None) -> Figure:
     """Draw, for each joint, position minus setpoint at the ends of the ticks, where a setpoint
     holds.
 
     Parameters as in :func:`step_responses`.
     """
     run = _blank_failed(rollout)
-    chosen, names = _chosen(run, joints)
-    figure, blocks = _grid(names, 1, title, run.time[-1])
+    figure, chosen, blocks = _joint_axes([run], joints, 1)
     for joint, (axes,) in zip(chosen, blocks, strict=True):
         error = run.qpos[..., joint] - run.setpoint[..., joint]
         _draw_fan(axes, run.time, error, None)
-        _show(axes, error[np.isfinite(error)], run.info.units[joint])
+        _show(axes, error, run.info.units[joint])
     _add_legend(figure)
     return figure
 
@@ -151,7 +143,6 @@ def comparison(
     second: Rollout,
     *,
     labels: tuple[str, str] = ("first", "second"),
-    joints: Joints = None,
     title: str = "",
 ) -> Figure:
     """Draw median and 10 to 90 % of the envs of two runs of the same joints, positions above
@@ -160,22 +151,21 @@ def comparison(
     Raises
     ------
     InvalidArgumentError
-        The runs have different joints, or the robot has no such joint.
+        The runs have different joints.
     """
     info = first.info
     if info.joint_names != second.info.joint_names:
-        theirs = ", ".join(second.info.joint_names)
-        problem = f"has the joints {theirs}, the first run {', '.join(info.joint_names)}"
-        raise InvalidArgumentError("second", problem, remedy="compare runs of the same robot")
+        problem = f"has the joints {', '.join(second.info.joint_names)}"
+        remedy = f"compare runs with the joints {', '.join(info.joint_names)}"
+        raise InvalidArgumentError("second", problem, remedy=remedy)
     runs = [_blank_failed(first), _blank_failed(second)]
-    chosen, names = _chosen(first, joints)
-    figure, blocks = _grid(names, 2, title, max(first.time[-1], second.time[-1]))
+    figure, chosen, blocks = _joint_axes(runs, None, 2, title)
     for joint, (above, below) in zip(chosen, blocks, strict=True):
         for run, colour, label in zip(runs, (ENV, SECOND), labels, strict=True):
             _draw_band(above, run.time, run.qpos[..., joint], colour, label)
             _draw_band(below, run.time, run.effort[..., joint], colour, label)
         _draw_limits(above, info.lower[joint], info.upper[joint])
-        _draw_setpoint(above, runs[0], joint, None)
+        _draw_line(above, first.time, runs[0].setpoint[..., joint])
         _draw_limits(below, -info.effort_limit[joint], info.effort_limit[joint])
         _show_positions(above, runs, joint)
         _show_efforts(below, runs, joint)
@@ -183,41 +173,36 @@ def comparison(
     return figure
 
 
-class FitErrors(NamedTuple):
-    """Position errors along a simulated stretch of a log: measured less simulated positions."""
-
-    time: Float64
-    """Times (rows,) [s]."""
-    fitted: NDArray[np.bool_]
-    """Rows that were fitted; the others were kept to judge (rows,)."""
-    before: Float64
-    """Of the robot as its description says (rows, joints) [rad or m]."""
-    after: Float64
-    """Of the robot as identified."""
-
-
 def fit_errors(
-    fits: Sequence[FitErrors], names: Sequence[str], units: Sequence[str], title: str
+    fits: Sequence[tuple[Float64, NDArray[np.bool_], Float64, Float64]],
+    names: Sequence[str],
+    units: Sequence[str],
+    title: str,
 ) -> Figure:
-    """Draw the position errors of the joints ``names`` along the stretches of one log, before and
-    after.
+    """Draw the position errors of an identification along stretches of one log.
 
     The part that was kept to judge is shaded.
+
+    Parameters
+    ----------
+    fits
+        For each stretch its times (rows,) [s], which of its rows were fitted (rows,), and the
+        errors before and after the fit (rows, joints) [rad or m].
+    names, units
+        Of the joints.
     """
-    figure, blocks = _grid(names, 1, title, fits[-1].time[-1])
+    figure, blocks = _grid(names, 1, title, fits[-1][0][-1])
     for joint, (axes,) in enumerate(blocks):
-        for fit in fits:
-            for errors, colour, label in (
-                (fit.before, SECOND, "before"),
-                (fit.after, ENV, "after"),
-            ):
-                # An error of 0 has no place on a logarithmic axis.
-                size = np.abs(errors[:, joint])
-                axes.semilogy(fit.time, np.maximum(size, 1e-9), color=colour, lw=0.8, label=label)
-            held_out = fit.time[~fit.fitted]
+        axes.set_ylabel(units[joint], fontsize=SMALL)
+        for time, fitted, before, after in fits:
+            # An error of 0 has no place on a logarithmic axis.
+            first = np.maximum(np.abs(before[:, joint]), 1e-9)
+            second = np.maximum(np.abs(after[:, joint]), 1e-9)
+            axes.semilogy(time, first, color=SECOND, lw=0.8, label="before")
+            axes.semilogy(time, second, color=ENV, lw=0.8, label="after")
+            held_out = time[~fitted]
             if len(held_out):
                 axes.axvspan(held_out[0], held_out[-1], color=SETPOINT, alpha=0.15, lw=0)
-        axes.set_ylabel(units[joint], fontsize=SMALL)
     _add_legend(figure)
     return figure
 
@@ -243,18 +228,40 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
 # -- parts of a figure
 
 
+def _joint_axes(
+    runs: Sequence[Rollout],
+    joints: Joints,
+    rows: int,
+    title: str = "",
+    labels: Sequence[str] = (),
+) -> tuple[Figure, list[int], list[list[Axes]]]:
+    """Return a figure, the indices of the chosen joints, and the axes of each, and of each of
+    ``labels``.
+    """
+    names = runs[0].info.joint_names
+    chosen = []
+    for joint in joints or names:
+        index = names.index(joint) if joint in names else joint
+        if index not in range(len(names)):
+            remedy = f"use {', '.join(names)}"
+            raise InvalidArgumentError("joints", "no such joint", value=joint, remedy=remedy)
+        chosen.append(int(index))
+    titles = [*(names[index] for index in chosen), *labels]
+    figure, blocks = _grid(titles, rows, title, max(run.time[-1] for run in runs))
+    return figure, chosen, blocks
+
+
 def _grid(
     names: Sequence[str], rows: int, title: str, end: float
 ) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure, and for each of ``names`` a column of ``rows`` axes, positions above
     efforts, up to the time ``end`` [s].
     """
-    columns = min(len(names), 3 if len(names) <= 9 else 4)
+    columns = min(len(names), 3)
     lines = math.ceil(len(names) / columns)
     heights = (1.7, 0.85)[:rows]
     figure = Picture(figsize=(4.0 * columns, sum(heights) * lines + 0.8), layout="constrained")
-    if title:
-        figure.suptitle(title, fontsize=11)
+    figure.suptitle(title, fontsize=11)
     grid = figure.add_gridspec(lines * rows, columns, height_ratios=heights * lines)
     blocks = []
     for place, name in enumerate(names):
@@ -266,6 +273,7 @@ def _grid(
             axes.set_xlim(0, end)
             axes.yaxis.set_major_locator(MaxNLocator(4))
         block[0].set_title(name, fontsize=8, loc="left", pad=3, fontweight="bold")
+        # The lowest axes of a column have the unit of time.
         if place + columns >= len(names):
             block[-1].set_xlabel("time [s]", fontsize=SMALL)
         blocks.append(block)
@@ -278,12 +286,11 @@ def _add_legend(figure: Figure) -> None:
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    columns = max(1, int(figure.get_figwidth() / 2))
     figure.legend(
         entries.values(),
         entries.keys(),
         loc="outside lower center",
-        ncols=columns,
+        ncols=max(1, int(figure.get_figwidth() / 2)),
         fontsize=7.5,
         frameon=False,
     )
@@ -293,12 +300,15 @@ def _draw_fan(axes: Axes, time: Rows, values: Rows, mark: int | None) -> None:
     """Draw each env of ``values`` (ticks, envs) as a thin line, their median as a bold one, env
     ``mark`` in colour.
     """
-    lines = np.empty((values.shape[1], len(time), 2))
-    lines[..., 0], lines[..., 1] = time, values.T
-    alpha = min(0.9, max(0.08, 12.0 / len(lines)))
+    lines = [np.stack([time, value], axis=1) for value in values.T]
     # As one bitmap: an SVG of 64 envs by 9 joints would hold half a million points.
     fan = LineCollection(
-        list(lines), colors=ENV, linewidths=0.6, alpha=alpha, rasterized=True, label="each env"
+        lines,
+        colors=ENV,
+        linewidths=0.6,
+        alpha=min(0.9, max(0.08, 12.0 / len(lines))),
+        rasterized=True,
+        label="each env",
     )
     axes.add_collection(fan, autolim=False)
     (median,) = _quantiles(values, 0.5)
@@ -314,36 +324,34 @@ def _draw_band(axes: Axes, time: Rows, values: Rows, colour: str, label: str) ->
     axes.plot(time, median, color=colour, lw=1.4, label=f"{label}: median, 10 to 90 %")
 
 
-def _draw_setpoint(axes: Axes, run: Rollout, joint: int, band: float | None) -> None:
+def _draw_setpoint(axes: Axes, run: Rollout, joint: int, band: float) -> None:
     """Draw the setpoint of a joint, and the settling band around its last value."""
     setpoint = run.setpoint[..., joint]
     _draw_line(axes, run.time, setpoint)
-    move = np.abs(setpoint[-1] - run.qpos[0, :, joint])
+    last = setpoint[-1]
+    move = np.abs(last - run.qpos[0, :, joint])
     move = move[np.isfinite(move)]
-    if band is not None and move.size and np.ptp(setpoint[-1]) == 0:
+    # Envs with different setpoints have no common band.
+    if move.size and np.ptp(last) == 0:
         half = band * float(np.median(move))
-        low = setpoint[-1, 0] - half
-        high = setpoint[-1, 0] + half
         label = f"settling band, {band:.0%} of the move"
-        axes.axhspan(low, high, color=SETPOINT, alpha=0.2, lw=0, label=label)
+        axes.axhspan(last[0] - half, last[0] + half, color=SETPOINT, alpha=0.2, lw=0, label=label)
 
 
 def _draw_line(axes: Axes, time: Rows, values: Rows) -> None:
     """Draw one number of the setpoints (ticks, envs), as one line where all envs share it."""
-    # One label for all lines: a legend names the setpoint once.
-    shared = (values == values[:, :1]).all()
-    shown = np.where(np.isfinite(values), values, np.nan)[:, : 1 if shared else None]
+    if (values == values[:, :1]).all():
+        values = values[:, :1]
+    shown = np.where(np.isfinite(values), values, np.nan)
     lines = axes.plot(time, shown, color=SETPOINT, lw=1.1, ls="--", zorder=3)
+    # One label for all lines: a legend names the setpoint once.
     lines[0].set_label("setpoint")
 
 
 def _draw_limits(axes: Axes, low: float, high: float) -> None:
-    """Draw a line at each finite limit, and hatching beyond it."""
-    for limit, sign in ((low, -1), (high, 1)):
+    """Draw a line at each finite limit."""
+    for limit in (low, high):
         if math.isfinite(limit):
-            far = limit + sign * 1e3 * max(1.0, abs(limit))
-            # Far, but finite: the range of the axes is set by the data.
-            axes.axhspan(limit, far, fc="none", ec=LIMIT, alpha=0.25, hatch="////", lw=0, zorder=0)
             axes.axhline(limit, color=LIMIT, lw=0.9, zorder=2, label="limit")
 
 
@@ -366,37 +374,37 @@ def _show_positions(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
     low = info.lower[joint]
     high = info.upper[joint]
     margin = 0.15 * (high - low)
-    setpoints = _finite(runs[:1], "setpoint", joint)
+    setpoints = _finite(runs[0].setpoint[..., joint])
     # Setpoints outside the limits are worth seeing, a run that diverges is not.
     far = np.append(setpoints, [low - margin, high + margin])
-    positions = np.clip(_finite(runs, "qpos", joint), far.min(), far.max())
-    _show(axes, np.append(positions, setpoints), info.units[joint])
+    positions = [np.clip(_finite(run.qpos[..., joint]), far.min(), far.max()) for run in runs]
+    _show(axes, np.concatenate([setpoints, *positions]), info.units[joint])
 
 
 def _show_efforts(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
     """Show all efforts, and the limit of the first run unless it is more than five times as far."""
-    values = _finite(runs, "effort", joint)
-    limit = float(runs[0].info.effort_limit[joint])
+    info = runs[0].info
+    values = np.concatenate([_finite(run.effort[..., joint]) for run in runs])
+    limit = float(info.effort_limit[joint])
     # A limit far away would flatten the curve.
-    is_near = math.isfinite(limit) and np.abs(values).max(initial=0.0) > 0.2 * limit
-    further = [0.0, limit, -limit] if is_near else [0.0]
-    unit = OBSERVED["effort"].unit_for(runs[0].info.units[joint])
-    _show(axes, np.append(values, further), unit)
+    if np.abs(values).max(initial=0.0) > 0.2 * limit:
+        values = np.append(values, [limit, -limit])
+    _show(axes, np.append(values, 0.0), OBSERVED["effort"].unit_for(info.units[joint]))
 
 
 def _show(axes: Axes, values: Rows, unit: str) -> None:
-    """Set the range of the axes so that it holds ``values``, and their unit."""
+    """Set the range of the axes so that it holds the finite ``values``, and their unit."""
     axes.set_ylabel(unit, fontsize=SMALL)
-    if values.size:
-        low = float(values.min())
-        high = float(values.max())
+    finite = _finite(values)
+    if finite.size:
+        low = float(finite.min())
+        high = float(finite.max())
         margin = 0.08 * (high - low) or 0.05 * max(abs(high), 1e-3)
         axes.set_ylim(low - margin, high + margin)
 
 
-def _finite(runs: Sequence[Rollout], name: str, joint: int) -> Rows:
-    """Return the finite values of a joint in some runs."""
-    values = np.concatenate([getattr(run, name)[..., joint].ravel() for run in runs])
+def _finite(values: Rows) -> Rows:
+    """Return the finite values, in one row."""
     return values[np.isfinite(values)]
 
 
@@ -416,30 +424,13 @@ def _blank_failed(rollout: Rollout) -> Rollout:
     positions.
     """
     alive = rollout.ok[..., None]
-    seen = rollout.observation
-    blank = seen._replace(
-        qpos=np.where(alive, seen.qpos, np.nan),
-        effort=np.where(alive, seen.effort, np.nan),
-        tool_pose=None if seen.tool_pose is None else np.where(alive, seen.tool_pose, np.nan),
-    )
-    setpoint = np.full(seen.qpos.shape, np.nan)
+    blank = {}
+    for name in ("qpos", "effort", "tool_pose"):
+        values = getattr(rollout, name)
+        if values is not None:
+            blank[name] = np.where(alive, values, np.nan)
+    setpoint = np.full(rollout.qpos.shape, np.nan)
     if rollout.info.sets_positions:
-        setpoint = np.where(np.isfinite(rollout.setpoint), rollout.setpoint, np.nan)
-    return replace(rollout, setpoint=setpoint, observation=blank)
-
-
-def _chosen(run: Rollout, joints: Joints) -> tuple[list[int], list[str]]:
-    """Return indices and names of joints that are given by index or name."""
-    names = run.info.joint_names
-    indices = {name: index for index, name in enumerate(names)}
-    chosen = []
-    for joint in joints or names:
-        if isinstance(joint, str):
-            index = indices.get(joint, joint)
-        else:
-            index = joint
-        if index not in range(len(names)):
-            remedy = f"use {', '.join(names)}"
-            raise InvalidArgumentError("joints", "no such joint", value=joint, remedy=remedy)
-        chosen.append(int(index))
-    return chosen, [names[index] for index in chosen]
+        setpoint = rollout.setpoint
+    observation = rollout.observation._replace(**blank)
+    return replace(rollout, setpoint=setpoint, observation=observation)

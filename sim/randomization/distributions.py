@@ -1,4 +1,6 @@
-"""Distributions of a :class:`batchpid.sim.Randomization`, and the draws from them."""
+"""Distributions of the fields of a :class:`batchpid.sim.Randomization`, the joints, links or axes
+that a field has values for, and the draws.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Document, Float64, Rows
-from batchpid.checks.validate import choice, flag, number
+from batchpid.checks.validate import choice, flag, number, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
+from batchpid.sim.robot.parts import CONTACT_FRICTION, MjcfFile
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.quantities import TWIST_UNITS
 
 Episodes = NDArray[np.int64]
 Operation = Literal["add", "scale", "abs"]
 _UNIT = "in the unit of the field"
+_TINY = float(np.finfo(float).tiny)
 LEAST_SHARE = 0.01
 """Least share of a normal distribution within its bounds."""
 
@@ -42,8 +48,6 @@ class Distribution(ABC):
     """True for one draw for all joints or links of an env."""
     kind: ClassVar[str] = ""
     """Name in a file, where the arguments without default are a list."""
-    least: ClassVar[float] = -math.inf
-    """Least value of low, high and std."""
 
     def __post_init__(self) -> None:
         choice("operation", self.operation, get_args(Operation))
@@ -52,7 +56,7 @@ class Distribution(ABC):
     @property
     def support(self) -> tuple[float, float]:
         """Smallest and largest value that can be drawn."""
-        return float(self.low), float(self.high)  # type: ignore[attr-defined]
+        return self.low, self.high  # type: ignore[attr-defined]
 
     @abstractmethod
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
@@ -66,33 +70,17 @@ class Distribution(ABC):
             return nominal * drawn
         return drawn + np.zeros_like(nominal)
 
-    @classmethod
-    def arguments(cls, keywords: bool) -> list[str]:
-        """Return the names of the arguments without a default, or of the ``keywords``."""
-        return [one.name for one in fields(cls) if one.kw_only is keywords]
-
     def to_dict(self) -> Document:
         """Return it as plain values: ``{"uniform": [low, high], "operation": "scale"}``."""
-        values = [getattr(self, name) for name in self.arguments(keywords=False)]
-        document: Document = {self.kind: values if len(values) > 1 else list(*values)}
-        for one in fields(self):
-            if one.kw_only and getattr(self, one.name) != one.default:
-                document[one.name] = getattr(self, one.name)
+        values: list[object] = []
+        document: Document = {self.kind: values}
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if not entry.kw_only:
+                values.append(value)
+            elif value != entry.default:
+                document[entry.name] = value
         return document
-
-    def _read(self, *names: str, low: float = -math.inf, infinite: bool = False) -> None:
-        """Convert arguments to finite numbers of at least ``low``, or ``infinite`` ones."""
-        for name in names:
-            value = getattr(self, name)
-            if not (infinite and value in (-math.inf, math.inf)):
-                value = number(name, value, low, math.inf, _UNIT)
-            object.__setattr__(self, name, float(value))
-
-    def _check_order(self) -> None:
-        low, high = self.support
-        if low > high:
-            problem = f"is less than low, {low:g}"
-            raise InvalidArgumentError("high", problem, value=high, remedy="swap them")
 
 
 @dataclass(frozen=True)
@@ -102,11 +90,15 @@ class Uniform(Distribution):
     low: float
     high: float
     kind = "uniform"
+    least: ClassVar[float] = -math.inf
+    """Least value of ``low``."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._read("low", "high", low=self.least)
-        self._check_order()
+        low = number("low", self.low, self.least, math.inf, _UNIT)
+        high = number("high", self.high, low, math.inf, _UNIT)
+        # The class is frozen; its __dict__ is not.
+        vars(self).update(low=low, high=high)
 
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
@@ -118,7 +110,7 @@ class LogUniform(Uniform):
     """Distribution on [low, high], both > 0, whose logarithm is uniform."""
 
     kind = "log_uniform"
-    least = float(np.finfo(float).tiny)
+    least = _TINY
 
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
@@ -138,18 +130,18 @@ class Normal(Distribution):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._read("mean")
-        self._read("std", low=LogUniform.least)
-        self._read("low", "high", infinite=True)
-        self._check_order()
+        mean = number("mean", self.mean, -math.inf, math.inf, _UNIT)
+        std = number("std", self.std, _TINY, math.inf, _UNIT)
+        low = float(self.low)
+        high = float(self.high)
         # Draws outside are repeated, which a tail would do for long.
-        scale = math.sqrt(2.0) * self.std
-        below, above = (math.erf((end - self.mean) / scale) for end in self.support)
+        below, above = (math.erf((end - mean) / (math.sqrt(2.0) * std)) for end in (low, high))
         share = 0.5 * (above - below)
-        if share < LEAST_SHARE:
+        if not share >= LEAST_SHARE:
             problem = f"and high leave {share:.2g} of the draws"
             remedy = "use a uniform distribution for a tail"
-            raise InvalidArgumentError("low", problem, value=self.low, remedy=remedy)
+            raise InvalidArgumentError("low", problem, value=low, remedy=remedy)
+        vars(self).update(mean=mean, std=std, low=low, high=high)
 
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
@@ -168,14 +160,11 @@ class Choice(Distribution):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        is_list = isinstance(self.values, Sequence | np.ndarray) and not isinstance(
-            self.values, str
-        )
-        if not is_list or not len(self.values):
+        values = read_array("values", self.values)
+        if values.ndim != 1 or not values.size or not np.isfinite(values).all():
             problem = "must be a list of numbers"
             raise InvalidArgumentError("values", problem, value=self.values, remedy="give one")
-        values = [number("values", value, -math.inf, math.inf, _UNIT) for value in self.values]
-        object.__setattr__(self, "values", tuple(values))
+        vars(self).update(values=tuple(values.astype(float).tolist()))
 
     @property
     def support(self) -> tuple[float, float]:
@@ -186,9 +175,13 @@ class Choice(Distribution):
         """Return independent draws (size,)."""
         return np.array(self.values)[generator.integers(len(self.values), size=size)]
 
+    def to_dict(self) -> Document:
+        """Return it as plain values: ``{"choice": [0, 1]}``."""
+        return super().to_dict() | {self.kind: list(self.values)}
+
 
 KINDS: dict[str, type[Distribution]] = {
-    one.kind: one for one in (Uniform, LogUniform, Normal, Choice)
+    kind.kind: kind for kind in (Uniform, LogUniform, Normal, Choice)
 }
 """Distributions by their name in a file."""
 
@@ -202,24 +195,26 @@ def read_distribution(name: str, value: object) -> Distribution:
     InvalidArgumentError
         It describes none.
     """
-    kinds = [kind for kind in KINDS if isinstance(value, Mapping) and kind in value]
-    if not isinstance(value, Mapping) or len(kinds) != 1:
-        remedy = f"write e.g. {{uniform: [0, 1], operation: add}}; there are {', '.join(KINDS)}"
-        raise InvalidArgumentError(name, "is not a distribution", value=value, remedy=remedy)
-    (kind,) = kinds
-    options = dict(value)
-    arguments = options.pop(kind)
-    if kind == Choice.kind:
-        arguments = [arguments]
-    numbers = KINDS[kind].arguments(keywords=False)
-    if not isinstance(arguments, list | tuple) or len(arguments) != len(numbers):
-        problem = f"is not a distribution: {kind} needs a list of numbers"
-        remedy = f"write {kind}: [{', '.join(numbers)}]"
-        raise InvalidArgumentError(name, problem, value=value, remedy=remedy)
-    for option in options:
-        choice(name, option, KINDS[kind].arguments(keywords=True))
-    with documents.named(name):
-        return KINDS[kind](*arguments, **options)
+    if isinstance(value, Mapping):
+        options = dict(value)
+    else:
+        options = {}
+    problem = "is not a distribution"
+    for kind, distribution in KINDS.items():
+        if kind not in options:
+            continue
+        numbers = options.pop(kind)
+        if kind == Choice.kind:
+            numbers = [numbers]
+        # Python names the argument that is missing, or one too many.
+        try:
+            with documents.named(name):
+                return distribution(*numbers, **options)
+        except TypeError as error:
+            problem = f"is not a distribution: {error}"
+        break
+    remedy = f"write e.g. {{uniform: [0, 1], operation: add}}; there are {', '.join(KINDS)}"
+    raise InvalidArgumentError(name, problem, value=value, remedy=remedy)
 
 
 class Draws(NamedTuple):
@@ -247,9 +242,6 @@ class Draws(NamedTuple):
         episodes[mask] = new.episodes
         return Draws(episodes, values)
 
-    def __repr__(self) -> str:
-        return f"Draws({len(self.episodes)} envs, {', '.join(self.values)})"
-
 
 NOTHING = Draws(np.zeros((0, 2), np.int64), {})
 """Draws of a runner without randomization."""
@@ -266,7 +258,96 @@ def generators(
     state: Any = bits.state
     generator = np.random.Generator(bits)
     numbers = np.broadcast_to(number, len(episodes)).tolist()
-    for (stream, episode), at in zip(episodes.tolist(), numbers, strict=True):
-        state["state"]["counter"][:] = 0, at, 0 if constant else episode, stream
+    for (stream, episode), index in zip(episodes.tolist(), numbers, strict=True):
+        state["state"]["counter"][:] = 0, index, 0 if constant else episode, stream
         bits.state = state  # of a new generator: the buffer is empty
         yield generator
+
+
+# -- fields
+# --------------------------------------------------------------------------------------------------
+
+Field = Distribution | Mapping[str, Distribution]
+"""Distribution for all joints or links, or one for each of those that are named."""
+GROUPS = ("params", "actuators")
+"""Fields that are mappings, by name of a further field."""
+SINGLE = ("payload", "ground_friction", "push_interval")
+"""Fields of one value."""
+_AXES: dict[str, Sequence[str]] = {"gravity": "xyz", "push": tuple(TWIST_UNITS)}
+"""Fields of the world or the base, and their axes."""
+
+
+def elements(name: str, robot: Robot) -> Sequence[str]:
+    """Return the names of a field's values: joints, links, axes of links or of the world, or its
+    own name.
+    """
+    if name in SINGLE:
+        return (name,)
+    if name in _AXES:
+        return _AXES[name]
+    if name not in ("link_mass", "center_of_mass"):
+        return robot.joint_names
+    # A link without a stated mass has that of its shapes.
+    links = [
+        link.name for link in robot.links if link.mass or (link.mass is None and link.num_shapes)
+    ]
+    if name == "link_mass":
+        return links
+    return [f"{link}.{axis}" for link in links for axis in "xyz"]
+
+
+def parts(
+    name: str, field: Field, columns: Sequence[str]
+) -> Iterator[tuple[str, list[int], Distribution]]:
+    """Yield the name of each independent part of a field, its columns and its distribution."""
+    if isinstance(field, Distribution):
+        yield name, list(range(len(columns))), field
+        return
+    # A link has a column for each axis of its center of mass.
+    owners = list(columns)
+    if name == "center_of_mass":
+        owners = [column[:-2] for column in columns]
+    for element, distribution in field.items():
+        choice(name, element, list(dict.fromkeys(owners)))
+        chosen = [index for index, owner in enumerate(owners) if owner == element]
+        yield f"{name}.{element}", chosen, distribution
+
+
+def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None = None) -> Float64:
+    """Return the nominal values of a field of the robot (elements,), 0 for others.
+
+    ``mjcf`` is the file that the engine simulates, with its own friction.
+    """
+    if name == "link_mass":
+        return np.array([robot.link_masses[link].mass for link in elements(name, robot)])
+    if name == "friction":
+        return robot.friction
+    if name == "damping":
+        return robot.damping
+    if name == "gravity":
+        return np.array([0.0, 0.0, -9.81])
+    if name == "ground_friction":
+        return np.array([CONTACT_FRICTION if mjcf is None else mjcf.friction])
+    return np.zeros(len(elements(name, robot)))
+
+
+def mapping(name: str, value: object) -> Mapping[str, object]:
+    """Return ``value`` if it is a mapping; raise InvalidArgumentError if not."""
+    if not isinstance(value, Mapping):
+        problem = "is not a mapping of fields to distributions"
+        remedy = "write field: distribution, e.g. kp: {uniform: [0.9, 1.1], operation: scale}"
+        raise InvalidArgumentError(name, problem, value=value, remedy=remedy)
+    return value
+
+
+def read_field(name: str, value: object) -> Field:
+    """Return the field that a file describes: a distribution, or a mapping of names to
+    distributions.
+    """
+    if isinstance(value, Mapping):
+        names = value
+    else:
+        names = {}
+    if not names or not all(isinstance(part, Mapping) for part in names.values()):
+        return read_distribution(name, value)
+    return {str(key): read_distribution(f"{name}.{key}", part) for key, part in names.items()}

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,21 +22,25 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.arrays.field_tables import Field as Bounds
 from batchpid.arrays.field_tables import declared, in_group
-from batchpid.checks.validate import choice, integer, read_array
+from batchpid.checks.validate import choice, instance, integer, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
-from batchpid.sim.randomization.distributions import Distribution, Draws, Episodes, generators
-from batchpid.sim.randomization.fields import (
+from batchpid.sim.randomization.distributions import (
     GROUPS,
     SINGLE,
+    Distribution,
+    Draws,
+    Episodes,
     Field,
     elements,
+    generators,
     mapping,
     parts,
     read_field,
 )
 from batchpid.sim.robot.robot import Robot
 
+T = TypeVar("T", bp.PIDParams, bp.Actuators | None)
 LARGEST = 2**63 - 1
 OF_JOINTS = ("bias", *JOINT_SIDE)
 """Fields of the actuators that followers do not have."""
@@ -60,7 +65,7 @@ class Randomization:
 
     seed: int = 0
     """Seed of all draws."""
-    each: Literal["episode", "env"] = "episode"
+    per: Literal["episode", "env"] = "episode"
     """Draw for each ``"episode"``, when it begins with a reset, or once for each ``"env"``."""
     payload: Annotated[Distribution | None, Bounds("kg", group="robot")] = None
     """Mass at the center of mass of ``payload_link`` [kg]; nominal 0."""
@@ -109,34 +114,26 @@ class Randomization:
     """
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "seed", integer("seed", self.seed, 0, LARGEST))
-        choice("each", self.each, get_args(Literal["episode", "env"]))
-        for name in (*GROUPS, *FIELDS):
-            object.__setattr__(self, name, _copied(getattr(self, name)))
+        # The class is frozen; its __dict__ is not. Mappings stay as they are now.
+        vars(self).update(deepcopy(vars(self)), seed=integer("seed", self.seed, 0, LARGEST))
+        choice("per", self.per, ("episode", "env"))
         for group in GROUPS:
             mapping(group, getattr(self, group))
-        for name, value in (self.given | self.events).items():
+        for name, value in self.distributions.items():
             distributions: list[object] = [value]
             if isinstance(value, Mapping) and name not in SINGLE:
                 distributions = list(value.values())
-            for part in distributions or [None]:
-                if not isinstance(part, Distribution):
-                    remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to such"
-                    problem = "is not a distribution"
-                    raise InvalidArgumentError(name, problem, value=part, remedy=remedy)
+            for part in distributions:
+                remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to such"
+                instance(name, part, Distribution, remedy)  # type: ignore[type-abstract]
 
     @property
-    def given(self) -> dict[str, Field]:
-        """Given fields by name; fields of a group as "group.name"."""
-        values = {name: getattr(self, name) for name in (*PHYSICAL, *START)}
+    def distributions(self) -> dict[str, Field]:
+        """Fields that are drawn, by name; fields of a group as "group.name"."""
+        values = {name: getattr(self, name) for name in FIELDS}
         for group in GROUPS:
             values |= {f"{group}.{name}": value for name, value in getattr(self, group).items()}
         return {name: value for name, value in values.items() if value is not None}
-
-    @property
-    def events(self) -> dict[str, Field]:
-        """Given fields of events during an episode, by name."""
-        return {name: getattr(self, name) for name in EVENTS if getattr(self, name) is not None}
 
     @property
     def changes_robot(self) -> bool:
@@ -153,22 +150,25 @@ class Randomization:
     def draw(self, robot: Robot, episodes: Rows) -> Draws:
         """Return the draws for envs with these streams and episodes (envs, 2)."""
         episodes = episodes.astype(np.int64)
-        fields = self.given.items()
-        draws = {name: self._draw(name, value, robot, episodes) for name, value in fields}
+        draws = {}
+        for name in self.distributions:
+            if name not in EVENTS:
+                draws[name] = self._draw(name, robot, episodes)
         return Draws(episodes, draws)
 
-    def _draw(
-        self, name: str, value: Field, robot: Robot, episodes: Episodes, number: ArrayLike = 0
-    ) -> Float64:
+    def _draw(self, name: str, robot: Robot, episodes: Episodes, number: ArrayLike = 0) -> Float64:
         """Return draws of a field (envs, elements), NaN where nothing is drawn; see
         :func:`generators`.
         """
         columns = elements(name, robot)
         rows = np.full((len(episodes), len(columns)), np.nan)
-        for part, chosen, distribution in parts(name, value, columns):
-            streams = generators(self.seed, part, episodes, self.each == "env", number)
+        for part, chosen, distribution in parts(name, self.distributions[name], columns):
+            streams = generators(self.seed, part, episodes, self.per == "env", number)
             # Each env draws from a stream of its own, in the order of the columns.
-            size = 1 if distribution.shared else len(chosen)
+            if distribution.shared:
+                size = 1
+            else:
+                size = len(chosen)
             for row, generator in zip(rows, streams, strict=True):
                 row[chosen] = distribution.sample(generator, size)
         return rows
@@ -180,7 +180,7 @@ class Randomization:
         Its ``name`` is "push_interval", the time between the two (n, 1) [s], or "push", the added
         twist (n, 6).
         """
-        return np.nan_to_num(self._draw(name, self.events[name], robot, episodes, number))
+        return np.nan_to_num(self._draw(name, robot, episodes, number))
 
     def first(self, robot: Robot, num_envs: int, first_env: int = 0) -> Draws:
         """Return the draws for the first episode of each env, of the stream of its number, from
@@ -206,19 +206,15 @@ class Randomization:
         InvalidArgumentError
             A seed is negative or not a whole number, or the seeds are not one for each env.
         """
-        num_envs = len(mask)
-        if seed is None:
-            episodes = draws.episodes + np.array([0, 1])
-        elif np.ndim(seed) == 0:
-            first = first_env + integer("seed", seed, 0, LARGEST - first_env - num_envs)
-            episodes = _first_episodes(first + np.arange(num_envs))
-        else:
-            streams = read_array("seed", seed, "iu")
-            is_each_env = streams.shape == (num_envs,)
-            if not is_each_env or not ((streams >= 0) & (streams <= LARGEST)).all():
-                problem = f"must be {num_envs} whole numbers >= 0, one for each env"
-                remedy = "pass these, or an int"
-                raise InvalidArgumentError("seed", problem, value=seed, remedy=remedy)
+        episodes = draws.episodes + np.array([0, 1])
+        if seed is not None:
+            streams = read_array("seed", seed, "iu").astype(np.int64)
+            if streams.ndim == 0:
+                streams = streams + first_env + np.arange(len(mask))
+            # A sum beyond the largest int is negative, too.
+            if streams.shape != mask.shape or streams.min() < 0:
+                problem = f"must be a whole number >= 0, or {len(mask)} of them, one for each env"
+                raise InvalidArgumentError("seed", problem, value=seed, remedy="pass an int")
             episodes = _first_episodes(streams)
         return draws.replaced(mask, self.draw(robot, episodes[mask]))
 
@@ -229,42 +225,27 @@ class Randomization:
         drawn = draws.values[name]
         shape = np.broadcast_shapes(np.shape(nominal), drawn.shape)
         values = np.array(np.broadcast_to(nominal, shape))
-        for _, chosen, distribution in parts(name, self.given[name], elements(name, robot)):
+        for _, chosen, distribution in parts(name, self.distributions[name], elements(name, robot)):
             values[:, chosen] = distribution.apply(values[:, chosen], drawn[:, chosen])
         return values
 
-    def randomized_params(
-        self, params: bp.PIDParams, draws: Draws | None, robot: Robot
-    ) -> bp.PIDParams:
-        """Return ``params`` with the draws applied, one row for each env; the same if nothing is
-        drawn for them.
-        """
-        if draws is None or not self.params:
-            return params
-        drawn: Document = {}
-        for name in self.params:
-            rows = self.apply(f"params.{name}", getattr(params, name), draws, robot)
-            drawn[name] = rows.astype(params.dtype)
-        return params._replace(**drawn)
+    def randomized(self, group: str, record: T, draws: Draws | None, robot: Robot) -> T:
+        """Return params or actuators, the fields of the ``group``, with the draws applied: one row
+        for each env; the same if nothing is drawn for them.
 
-    def randomized_actuators(
-        self, actuators: bp.Actuators | None, draws: Draws | None, robot: Robot
-    ) -> bp.Actuators | None:
-        """Return ``actuators`` with the draws applied, one row for each env; the same if nothing is
-        drawn for them.
-
-        ``actuators`` come from :func:`batchpid.sim.randomization.checks.prepared_actuators`.
+        Actuators come from :func:`batchpid.sim.randomization.checks.prepared_actuators`.
         """
-        if draws is None or actuators is None or not self.actuators:
-            return actuators
-        drawn: Document = {}
-        for name in self.actuators:
-            rows = self.apply(f"actuators.{name}", getattr(actuators, name), draws, robot)
+        if draws is None or record is None:
+            return record
+        values: Document = {}
+        for name in getattr(self, group):
+            rows = self.apply(f"{group}.{name}", getattr(record, name), draws, robot)
+            # Followers have no motor.
             if name in OF_JOINTS:
-                drawn[name] = rows * robot.independent
+                values[name] = rows * robot.independent
             else:
-                drawn[name] = rows
-        return actuators._replace(**drawn)
+                values[name] = rows
+        return record._replace(**values)
 
     def start(
         self, qpos: Float64, qvel: Float64, draws: Draws, robot: Robot
@@ -282,8 +263,8 @@ class Randomization:
     # ----------------------------------------------------------------------------------------------
 
     def to_dict(self) -> Document:
-        """Return the given fields as plain values, for :meth:`from_dict`."""
-        document = {one.name: _plain(getattr(self, one.name)) for one in fields(self)}
+        """Return the fields that are drawn as plain values, for :meth:`from_dict`."""
+        document = {entry.name: _plain(getattr(self, entry.name)) for entry in fields(self)}
         return {name: value for name, value in document.items() if value not in (None, {})}
 
     @classmethod
@@ -296,27 +277,21 @@ class Randomization:
         InvalidArgumentError
             It is not a randomization, or has an unknown field.
         """
-        names = [one.name for one in fields(cls)]
+        names = [entry.name for entry in fields(cls)]
         values: Document = dict(mapping("randomization", document))
-        for name in values:
+        for name, value in values.items():
             choice("randomization", name, names)
             if name in FIELDS:
-                values[name] = read_field(name, values[name])
+                values[name] = read_field(name, value)
             if name in GROUPS:
-                group = mapping(name, values[name]).items()
-                values[name] = {key: read_field(f"{name}.{key}", value) for key, value in group}
+                group = mapping(name, value).items()
+                values[name] = {key: read_field(f"{name}.{key}", part) for key, part in group}
         return cls(**values)
 
 
 def _first_episodes(streams: Rows) -> Episodes:
     """Return the first episodes (envs, 2) of ``streams`` (envs,)."""
-    return np.stack([streams.astype(np.int64), np.zeros(len(streams), np.int64)], 1)
-
-
-def _copied(value: object) -> object:
-    if not isinstance(value, Mapping):
-        return value
-    return {name: _copied(part) for name, part in value.items()}
+    return np.stack([streams, np.zeros_like(streams)], 1)
 
 
 def _plain(value: object) -> object:

@@ -12,18 +12,18 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from batchpid.arrays.array_types import Rows
 from batchpid.checks.single_owner import SingleOwner
-from batchpid.checks.validate import flag, instance, integer
-from batchpid.errors import ClosedError, InUseError, InvalidArgumentError
+from batchpid.checks.validate import flag, instance
+from batchpid.errors import ClosedError, InvalidArgumentError
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import RecordingError
-from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.quantities import Observation
 from batchpid.sim.signals.rollout import Redraw, RunInfo
 
 if TYPE_CHECKING:
@@ -47,8 +47,6 @@ class Recorder(SingleOwner):
         File to write, ending in .h5 or .hdf5.
     runner
         Runner to record. While it is recorded all its ticks have the same length.
-    seed
-        Seed of the run, if it has one; kept in the recording.
     overwrite
         Whether an existing file of that name is replaced.
 
@@ -67,7 +65,6 @@ class Recorder(SingleOwner):
         path: str | os.PathLike[str],
         runner: Runner,
         *,
-        seed: int | None = None,
         overwrite: bool = False,
     ) -> None:
         from batchpid.sim.runner.runner import (
@@ -79,16 +76,15 @@ class Recorder(SingleOwner):
         if runner.recorder is not None:
             problem = f"is being recorded already, to {runner.recorder.path}"
             raise InvalidArgumentError("runner", problem, remedy="close that Recorder first")
-        self._mode = "w" if flag("overwrite", overwrite) else "x"
-        self.path: Path = files.check_path(path, overwrite=overwrite)
-        if seed is None:
-            self._seed = None
+        if flag("overwrite", overwrite):
+            self._mode = "w"
         else:
-            self._seed = integer("seed", seed, 0, 2**63 - 1)
+            self._mode = "x"
+        self.path: Path = files.check_path(path, overwrite=overwrite)
         self._runner = runner
         self._info: RunInfo | None = None  # at the first tick
         self._file: h5py.File | None = None
-        self._rows: list[dict[str, Rows | None]] = []  # not written yet
+        self._rows: list[dict[str, Rows]] = []  # not written yet
         self._count = 0  # of written rows
         self._last_write = time.monotonic()
         self._redraws: list[Redraw] = []
@@ -111,7 +107,7 @@ class Recorder(SingleOwner):
             raise RecordingError(f"{self.path}: cannot be written: {cause}") from self._error
         if self._info is None:
             self._episodes, self._params = self._runner.episodes, self._runner.params
-            self._info = replace(self._runner.info, seed=self._seed, complete=False)
+            self._info = replace(self._runner.info, complete=False)
 
     def append(self, time_: float, command: Command, observation: Observation) -> None:
         """Record the state at ``time_`` [s] after a tick under ``command``. The arrays may change
@@ -123,16 +119,12 @@ class Recorder(SingleOwner):
         self._episodes = episodes
         self._params_changed |= self._runner.params is not self._params
         self._rates |= command.setpoint_rate is not None
-        if command.feedforward is None:
-            feedforward = None
-        else:
-            feedforward = np.array(command.feedforward)
-        inputs = {
-            "time": np.array(time_),
-            "setpoint": np.array(command.setpoint),
-            "feedforward": feedforward,
-        }
-        self._rows.append(inputs | observation._asdict())
+        rows: dict[str, Rows | None] = observation._asdict()
+        rows["time"] = np.array(time_)
+        rows["setpoint"] = np.array(command.setpoint)
+        if command.feedforward is not None:
+            rows["feedforward"] = np.array(command.feedforward)
+        self._rows.append({name: row for name, row in rows.items() if row is not None})
         if time.monotonic() - self._last_write > WRITE_PERIOD:
             with suppress(RecordingError):  # the next tick raises it
                 self._write()
@@ -140,8 +132,7 @@ class Recorder(SingleOwner):
     def close(self, complete: bool = True) -> None:
         """Write the remaining rows and close the file. May be called again, as after an interrupt.
 
-        If the recording is to be ``complete``, a tick whose call was interrupted is completed
-        first.
+        ``complete`` says whether the recording has all ticks of its run.
 
         Raises
         ------
@@ -152,8 +143,6 @@ class Recorder(SingleOwner):
             return
         try:
             if complete:
-                with suppress(InUseError):  # the tick of a call in another thread is not recorded
-                    self._runner.settle()
                 self.prepare()
         finally:
             if self._info is not None and self._error is None:
@@ -171,15 +160,14 @@ class Recorder(SingleOwner):
         """Write the remaining rows and the events of the run, and close the file."""
         self._write()
         if self._file:  # not closed yet
-            runner = self._runner
-            events: dict[str, Any] = {
-                "faults": runner.faults,
-                "redraws": tuple(self._redraws),
-                "rates": self._rates,
-            }
-            events["params_changed"] = self._params_changed
-            values = files.attributes(replace(info, **events))
-            self._file.attrs.update({name: values[name] for name in ("complete", *events)})
+            info = replace(
+                info,
+                faults=self._runner.faults,
+                redraws=tuple(self._redraws),
+                rates=self._rates,
+                params_changed=self._params_changed,
+            )
+            self._file.attrs.update(files.attributes(info))
             self._file.close()
 
     def _write(self) -> None:
@@ -188,11 +176,12 @@ class Recorder(SingleOwner):
         """
         import h5py
 
-        rows, runner = self._rows, self._runner
-        tick = runner.timestep * runner.substeps
+        rows = self._rows
+        runner = self._runner
         try:
             if self._file is None:
                 assert self._info is not None
+                tick = runner.timestep * runner.substeps
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 self._file = h5py.File(self.path, self._mode, libver=files.LIBVER, locking=False)
                 self._datasets = files.create_datasets(
@@ -210,20 +199,14 @@ class Recorder(SingleOwner):
         self._last_write = time.monotonic()
 
 
-def _stacked(rows: list[dict[str, Rows | None]]) -> dict[str, Rows | None]:
-    """Return the arrays of successive ticks, ticks first; None where no tick has one, 0 where some
-    have none.
-    """
-    arrays: dict[str, Rows | None] = {}
-    for name in rows[0]:
-        column = [row[name] for row in rows]
-        present = next((array for array in column if array is not None), None)
-        if present is not None:
-            column = [np.zeros_like(present) if array is None else array for array in column]
-        if present is None:
-            arrays[name] = None
-        else:
-            arrays[name] = np.array(column)
+def _stacked(rows: list[dict[str, Rows]]) -> dict[str, Rows]:
+    """Return the arrays of successive ticks, ticks first; 0 where a tick has none."""
+    arrays = {}
+    # Feedforwards may begin, and end, with any tick.
+    for name in dict.fromkeys(name for row in rows for name in row):
+        present = next(row[name] for row in rows if name in row)
+        zeros = np.zeros_like(present)
+        arrays[name] = np.array([row.get(name, zeros) for row in rows])
     return arrays
 
 

@@ -2,7 +2,7 @@
 ticks first.
 
 Each field of its :class:`batchpid.sim.RunInfo` is an attribute of the file: a number, a text, an
-array of them, or JSON (:data:`CODECS`). Two more are ``num_envs`` and ``tick`` [s]. The dataset
+array of them, or JSON (:data:`READERS`). Two more are ``num_envs`` and ``tick`` [s]. The dataset
 ``feedforward`` is empty where none was given.
 
 A row is valid if its ``time`` is a number: times are written last, and only after the other arrays
@@ -24,13 +24,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import file_path, instance, integer
 from batchpid.errors import BatchPIDError, InvalidArgumentError, RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.loop.faults import Fault
-from batchpid.sim.signals.command import CommandSpec
-from batchpid.sim.signals.observation import Observation, Quantity
+from batchpid.sim.signals.quantities import CommandSpec, Observation
 from batchpid.sim.signals.rollout import Redraw, Rollout, RunInfo
 
 if TYPE_CHECKING:
@@ -54,7 +53,6 @@ def write_recording(
     rollout: Rollout,
     path: str | os.PathLike[str],
     *,
-    seed: int | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write ``rollout`` to ``path`` as a whole or not at all, making its folder, and return the
@@ -64,8 +62,6 @@ def write_recording(
     ----------
     path
         File to write, ending in .h5 or .hdf5.
-    seed
-        Seed of the run, kept in the recording; default: the seed in ``rollout.info``.
     overwrite
         Whether an existing file is replaced.
 
@@ -78,15 +74,12 @@ def write_recording(
     """
     instance("rollout", rollout, Rollout, "pass what runner.rollout() returned")
     path = check_path(path, overwrite=overwrite)
-    if seed is None:
-        info = rollout.info
-    else:
-        info = replace(rollout.info, seed=integer("seed", seed, 0, 2**63 - 1))
     import h5py
 
     content = io.BytesIO()  # on a full disk HDF5 could not close its own file
     with h5py.File(content, "w", libver=LIBVER) as file:
-        write_rows(create_datasets(file, info, rollout.num_envs, rollout.tick), 0, rollout.arrays())
+        datasets = create_datasets(file, rollout.info, rollout.num_envs, rollout.tick)
+        write_rows(datasets, 0, rollout.arrays())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, content.getvalue(), overwrite)
@@ -127,16 +120,16 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
             num_envs = int(file.attrs["num_envs"])
             tick = float(file.attrs["tick"])
             time = file["time"][:]
-            is_written = np.isfinite(time)
-            if is_written.all():
-                count = len(time)
-            else:
-                count = int(is_written.argmin())
+            # The rows of a run that still goes on, or was killed, end at the first without a time.
+            count = int(np.append(np.isfinite(time), False).argmin())
             rows = slice(0, count, every)
             arrays = {"time": time[rows]}
             for name, quantity in info.recorded.items():
+                array = file[name][rows]
                 shape = (len(arrays["time"]), *info.row_shape(name, num_envs))
-                arrays[name] = _read_rows(file[name], rows, shape, quantity)
+                if array.shape != shape:
+                    raise ValueError(f"its {name} has shape {array.shape}, not {shape}")
+                arrays[name] = array.astype(quantity.dtype, casting="same_kind", copy=False)
             if not file["feedforward"].id.get_storage_size():
                 arrays["feedforward"] = None
     except Exception as error:  # a damaged file can make HDF5 raise anything
@@ -145,15 +138,6 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
         ) from error
     inputs = {name: arrays.pop(name) for name in ("time", "setpoint", "feedforward")}
     return Rollout(**inputs, observation=Observation(**arrays), tick=tick * every, info=info)
-
-
-def _read_rows(
-    dataset: h5py.Dataset, rows: slice, shape: tuple[int, ...], quantity: Quantity
-) -> Rows:
-    array: Rows = dataset[rows]
-    if array.shape != shape:
-        raise ValueError(f"its {dataset.name} has shape {array.shape}, not {shape}")
-    return array.astype(quantity.dtype, casting="same_kind", copy=False)
 
 
 def check_path(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
@@ -179,21 +163,19 @@ def create_datasets(
     """
     info = replace(info, urdf=_urdf_of(info))
     file.attrs.update(attributes(info) | {"format": FORMAT, "num_envs": num_envs, "tick": tick})
-    datasets = {
-        "time": file.create_dataset(
-            "time", (0,), "f8", maxshape=(None,), chunks=(4096,), fillvalue=np.nan
-        )
-    }
-    datasets["time"].attrs["unit"] = ["s"]
+    time = file.create_dataset(
+        "time", (0,), "f8", maxshape=(None,), chunks=(4096,), fillvalue=np.nan
+    )
+    time.attrs["unit"] = ["s"]
+    datasets = {"time": time}
     for name, quantity in info.recorded.items():
         row = info.row_shape(name, num_envs)
         dtype = np.dtype(quantity.dtype)
         rows = max(1, CHUNK_BYTES // max(1, int(np.prod(row)) * dtype.itemsize))
-        datasets[name] = file.create_dataset(
+        datasets[name] = dataset = file.create_dataset(
             name, (0, *row), dtype, maxshape=(None, *row), chunks=(rows, *row)
         )
-        if info.units_of(name):
-            datasets[name].attrs["unit"] = list(info.units_of(name))
+        dataset.attrs["unit"] = list(info.units_of(name))
     return datasets
 
 
@@ -217,12 +199,11 @@ def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Mapping
     time = datasets["time"]
     end = first + len(arrays["time"])
     for name, dataset in datasets.items():
-        rows = arrays.get(name)
-        if dataset is not time:
+        if name != "time":
             dataset.resize(end, axis=0)
-            if rows is not None:
-                dataset[first:end] = rows
-    # a row is valid once it has a time, so times follow when the rest is on the disk
+            if arrays.get(name) is not None:
+                dataset[first:end] = arrays[name]
+    # A row is valid once it has a time, so times follow when the rest is on the disk.
     time.file.flush()
     time.resize(end, axis=0)
     time[first:end] = arrays["time"]
@@ -233,53 +214,35 @@ def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Mapping
 # --------------------------------------------------------------------------------------------------
 
 
-Codec = tuple[Callable[[Any, tuple[str, ...]], object], Callable[[Any, tuple[str, ...]], Any]]
-
-
-def _json(write: Callable[[Any], object], read: Callable[[Any], Any]) -> Codec:
-    """Return functions that write a value as JSON of what ``write`` makes of it, and read it."""
-    return (
-        lambda value, joints: json.dumps(write(value)),
-        lambda text, joints: read(json.loads(text)),
-    )
-
-
-CODECS: dict[str, Codec] = {
-    "params": (
-        lambda params, joints: bp.dumps_params(params, joints, format="json"),
-        lambda text, joints: bp.loads_params(text, joints)[0],
-    ),
-    "actuators": (
-        lambda actuators, joints: bp.motors.dumps_actuators(actuators, joints, format="json"),
-        lambda text, joints: bp.motors.loads_actuators(text, joints)[0],
-    ),
-    "own_command": _json(
-        lambda command: [command.names, command.units], lambda entries: CommandSpec(*entries)
-    ),
-    "faults": _json(list, lambda faults: tuple([Fault(*fault) for fault in faults])),
-    "redraws": _json(list, lambda redraws: tuple([Redraw(*redraw) for redraw in redraws])),
-    "draws": _json(
-        lambda draws: {name: rows.tolist() for name, rows in draws.items()},
-        lambda draws: {name: np.array(rows, np.float64) for name, rows in draws.items()},
-    ),
-    "versions": _json(dict, dict),
-    "randomization": _json(dict, dict),
-    "options": _json(dict, dict),
+READERS: dict[str, Callable[[Any], Any]] = {
+    "own_command": lambda entries: CommandSpec(*entries),
+    "faults": lambda faults: tuple([Fault(*fault) for fault in faults]),
+    "redraws": lambda redraws: tuple([Redraw(*redraw) for redraw in redraws]),
+    "draws": lambda draws: {name: np.array(rows, np.float64) for name, rows in draws.items()},
+    "versions": dict,
+    "randomization": dict,
 }
-"""Fields of :class:`RunInfo` that are JSON in a recording: functions (value, joint names) that
-write and read them.
-"""
+"""Fields of :class:`RunInfo` that are JSON in a recording, and how they are read from it."""
 
 
 def attributes(info: RunInfo) -> Document:
     """Return the fields of ``info`` that are not None as texts, numbers, and arrays of them."""
-    values: Document = {name: value for name, value in vars(info).items() if value is not None}
-    values.pop("description", None)
-    for name, value in values.items():
-        if name in CODECS:
-            values[name] = CODECS[name][0](value, info.joint_names)
-        elif isinstance(value, tuple):
+    values: Document = {}
+    for name, value in vars(info).items():
+        if value is None or name == "description":
+            continue
+        if name == "params":
+            value = bp.dumps_params(value, info.joint_names, format="json")
+        elif name == "actuators":
+            value = bp.motors.dumps_actuators(value, info.joint_names, format="json")
+        elif name in READERS:
+            if isinstance(value, CommandSpec):
+                value = value.names, value.units
+            value = json.dumps(value, default=np.ndarray.tolist)
+        if isinstance(value, tuple):
             values[name] = list(value)
+        else:
+            values[name] = value
     return values
 
 
@@ -287,16 +250,19 @@ def read_info(values: Mapping[str, Any]) -> RunInfo:
     """Return the :class:`RunInfo` in the attributes of a recording."""
     joints = tuple(values["joint_names"])
     read: Document = {}
-    for name in {field.name for field in fields(RunInfo)} & set(values):
-        value = values[name]
-        if name in CODECS:
-            read[name] = CODECS[name][1](value, joints)
-        elif isinstance(value, np.ndarray):
-            is_text = value.dtype.kind == "O" or not value.size
-            read[name] = tuple(value) if is_text else value
-        else:
-            if isinstance(value, np.generic):
-                read[name] = value.item()
-            else:
-                read[name] = value
+    for field in fields(RunInfo):
+        if field.name not in values:
+            continue
+        value = values[field.name]
+        if field.name == "params":
+            value = bp.loads_params(value, joints)[0]
+        elif field.name == "actuators":
+            value = bp.motors.loads_actuators(value, joints)[0]
+        elif field.name in READERS:
+            value = READERS[field.name](json.loads(value))
+        elif isinstance(value, np.generic):
+            value = value.item()
+        elif isinstance(value, np.ndarray) and (value.dtype.kind == "O" or not value.size):
+            value = tuple(value)  # of texts
+        read[field.name] = value
     return RunInfo(**read)

@@ -19,10 +19,10 @@ from batchpid.arrays.digest import digest
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import RobotError
 from batchpid.io.files import write_atomically
-from batchpid.sim.robot.link_repair import DENSITY
+from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.meshes import note_meshes, read_mesh
 from batchpid.sim.robot.tables import Shape
-from batchpid.task_space.spatial_inertia import SpatialInertia
+from batchpid.task_space.frames import SpatialInertia
 
 
 def hull(shape: Shape) -> Float64:

@@ -33,7 +33,6 @@ from batchpid.sim.robot.parts import (
 )
 from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.sim.robot.self_collision import SelfContact, Srdf, self_contact
-from batchpid.sim.robot.setpoint_limits import setpoint_guard
 from batchpid.sim.robot.simulated_links import link_masses, rigid_tree
 from batchpid.sim.robot.tables import Body, Tables
 from batchpid.task_space.rigid_tree import RigidTree
@@ -196,28 +195,6 @@ class RobotDescription:
             np.array([joint.friction for joint in self.joints])
             * DISSIPATION[self.dissipation].modelled
         )
-
-    def guard(
-        self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None
-    ) -> bp.Guard:
-        """Return the limits of setpoints: positions, and soft limits of ``safety_controller``, as
-        in the URDF.
-
-        Followers have none: they move with their leaders.
-
-        Parameters
-        ----------
-        rate
-            Largest rate, scalar or (dof,) [rad/s or m/s]; default the URDF's velocity limits.
-        acceleration
-            Largest acceleration, scalar or (dof,) [rad/s^2 or m/s^2]; default none.
-
-        Raises
-        ------
-        InvalidArgumentError
-            A limit is not positive.
-        """
-        return setpoint_guard(self.joints, rate, acceleration)
 
     @cached_property
     def coupling(self) -> Coupling:

@@ -7,8 +7,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lxml import etree
-
 from batchpid.checks.warn import warn
 from batchpid.errors import RobotError
 
@@ -106,23 +104,6 @@ def _sentence(same: Sequence[Finding]) -> str:
         f"{first.severity}: {first.text}; {first.remedy}. {len(names)} {first._kind}s:"
         f" {', '.join(names)}"
     )
-
-
-def finding_of(
-    element: etree._Element, severity: str, code: str, text: str, remedy: str, detail: str = ""
-) -> Finding:
-    """Return a finding of the joint or link that an XML ``element`` is or belongs to, or of the
-    robot.
-    """
-    # An attribute's fault is told with the joint or link that a reader looks for.
-    owner: etree._Element | None = element
-    while owner is not None and owner.tag not in ("joint", "link"):
-        owner = owner.getparent()
-    joint, link = (
-        None if owner is None or owner.tag != tag else owner.get("name")
-        for tag in ("joint", "link")
-    )
-    return Finding(severity, code, text, remedy, joint, link, detail)
 
 
 class RepairWarning(UserWarning):

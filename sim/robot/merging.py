@@ -22,8 +22,7 @@ from batchpid.arrays.read_only import read_only
 from batchpid.sim.robot.collision_shapes import inertia_of
 from batchpid.sim.robot.parts import Joint, Placement
 from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Tables
-from batchpid.task_space.frames import compose, matrix_of, rotate
-from batchpid.task_space.spatial_inertia import SpatialInertia, total
+from batchpid.task_space.frames import SpatialInertia, compose, matrix_of, rotate, total
 
 Separate = tuple[str, ...]
 """Links that are not merged into their parents."""

@@ -37,39 +37,37 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     coupling = coupling_of(joints)
     limits = [(joint.lower, joint.upper) for joint in joints]
     for index in coupling.followers.tolist():
-        leader, multiplier, offset = (
-            column[index] for column in (coupling.leader, coupling.multiplier, coupling.offset)
-        )
-        # Such a follower holds nothing back.
-        if multiplier == 0 or joints[index].continuous:
+        # A follower without end holds nothing back.
+        if joints[index].continuous:
             continue
-        ends = sorted(
-            (end - offset) / multiplier for end in (joints[index].lower, joints[index].upper)
-        )
-        low = max(limits[leader][0], ends[0])
-        high = min(limits[leader][1], ends[1])
+        leader = int(coupling.leader[index])
+        ends = (limits[leader], _on_leader(coupling, index, joints[index]))
+        low = max(low for low, _ in ends)
+        high = min(high for _, high in ends)
         if low < high:
-            limits[leader] = (float(low), float(high))
+            limits[leader] = (low, high)
     # After all leaders are narrowed, followers get the images of their limits.
     for index in coupling.followers.tolist():
-        ends = [_image(coupling, index, end) for end in limits[coupling.leader[index]]]
-        limits[index] = (min(ends), max(ends))
+        multiplier = float(coupling.multiplier[index])
+        offset = float(coupling.offset[index])
+        images = [multiplier * end + offset for end in limits[coupling.leader[index]]]
+        limits[index] = (min(images), max(images))
     share = np.abs(coupling.multiplier)
     friction, damping = np.zeros((2, len(joints)))
     np.add.at(friction, coupling.leader, share * [joint.friction for joint in joints])
     np.add.at(damping, coupling.leader, share**2 * [joint.damping for joint in joints])
-    return tuple(
-        replace(joint, lower=low, upper=high, friction=float(rubs), damping=float(damps))
-        for joint, (low, high), rubs, damps in zip(joints, limits, friction, damping, strict=True)
-    )
+    coupled = []
+    for index, joint in enumerate(joints):
+        low, high = limits[index]
+        rubs = float(friction[index])
+        damps = float(damping[index])
+        coupled.append(replace(joint, lower=low, upper=high, friction=rubs, damping=damps))
+    return tuple(coupled)
 
 
-def _image(coupling: Coupling, index: int, end: float) -> float:
-    """Return the position of follower ``index`` where its leader is at ``end``, which may be
-    infinite.
-    """
-    multiplier = float(coupling.multiplier[index])
+def _on_leader(coupling: Coupling, index: int, joint: Joint) -> tuple[float, float]:
+    """Return the positions of the leader at the limits of its follower ``joint``."""
     offset = float(coupling.offset[index])
-    if multiplier == 0:
-        return offset
-    return multiplier * end + offset
+    multiplier = float(coupling.multiplier[index])
+    ends = [(end - offset) / multiplier for end in (joint.lower, joint.upper)]
+    return min(ends), max(ends)

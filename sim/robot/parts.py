@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Float64
-from batchpid.task_space.spatial_inertia import SpatialInertia
+from batchpid.task_space.frames import SpatialInertia
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 """URDF joint types that SAPIEN turns into degrees of freedom."""
@@ -67,6 +67,23 @@ class Joint:
     def effort_unit(self) -> str:
         """Unit of effort: ``"N"`` for a prismatic joint, else ``"N m"``."""
         return {"rad": "N m", "m": "N"}[self.unit]
+
+
+class DisabledPair(NamedTuple):
+    """Two links that do not collide.
+
+    ``reason`` is one of MoveIt's: "Adjacent" (neighbours), "Default" (in contact at the start
+    pose), "Always" (in nearly every sampled pose), "Never" or "User" (in an .srdf).
+    """
+
+    first: str
+    second: str
+    reason: str
+
+    @property
+    def links(self) -> frozenset[str]:
+        """Names of the links."""
+        return frozenset((self.first, self.second))
 
 
 class LinkMass(NamedTuple):
@@ -132,8 +149,8 @@ class MjcfFile:
     """MJCF file that MuJoCo simulates itself, with everything in it besides the robot.
 
     ``is_whole`` says whether all of it is compiled
-    (:func:`batchpid.sim.robot.mjcf.mjcf_compiler.attempt`), and ``content`` is the digest of the
-    files. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
+    (:func:`batchpid.sim.robot.mjcf_model.compile_scene`), and ``content`` is the digest of the
+    model. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
     other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
     links. ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of
     the world can collide, unless the root is fixed to the origin in place of its free joint.

@@ -18,13 +18,13 @@ from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.read_only import read_only
 from batchpid.checks.validate import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
-from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Findings, report
 from batchpid.sim.robot.mimics import couple
 from batchpid.sim.robot.parts import DISSIPATION, Joint, Settings
-from batchpid.sim.robot.reader import read_robot
+from batchpid.sim.robot.robot_options import load_robot_actuators, setpoint_guard
 from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
+from batchpid.sim.robot.urdf import read_robot
 from batchpid.task_space.rigid_tree import RigidTree
 
 _ASSETS = Path(assets.__file__).parent
@@ -93,8 +93,6 @@ class Robot(RobotDescription):
         RobotError
             The file is neither a usable URDF nor a usable MJCF file; the message names the element
             and the remedy. With ``strict``, it needs repairs, which the message lists.
-        MissingDependencyError
-            The file is MJCF, and the package ``mujoco`` is missing.
         InvalidArgumentError
             An option has none of the values above.
         """
@@ -187,6 +185,28 @@ class Robot(RobotDescription):
         if params is None and self.settings is not None and control == "pid":
             params = self.params()
         return check(self, params, qpos, setpoint, timestep, control)
+
+    def guard(
+        self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None
+    ) -> bp.Guard:
+        """Return the limits of setpoints: positions, and soft limits of ``safety_controller``, as
+        in the URDF.
+
+        Followers have none: they move with their leaders.
+
+        Parameters
+        ----------
+        rate
+            Largest rate, scalar or (dof,) [rad/s or m/s]; default the URDF's velocity limits.
+        acceleration
+            Largest acceleration, scalar or (dof,) [rad/s^2 or m/s^2]; default none.
+
+        Raises
+        ------
+        InvalidArgumentError
+            A limit is not positive.
+        """
+        return setpoint_guard(self.joints, rate, acceleration)
 
     def designed(self, gain_units: str | None = None) -> bp.PIDParams:
         """Return params designed from the robot's inertia alone; a search for gains starts from

@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 from batchpid.sim.robot.collision_shapes import convex_hull
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.link_repair import SHAPES
 from batchpid.sim.robot.meshes import find_mesh, read_mesh
-from batchpid.sim.robot.reader import is_mjcf
 from batchpid.sim.robot.tables import Shape
-from batchpid.sim.robot.urdf import read_origin, read_shape
-from batchpid.sim.robot.xml import numbers, parse_xml
+from batchpid.sim.robot.urdf import SHAPES, is_mjcf, read_origin, read_shape
+from batchpid.sim.robot.xml import parse_xml, read_numbers
 from batchpid.task_space.frames import matrix_of, rotate
 
 Rgba = tuple[float, ...]
@@ -243,4 +241,4 @@ def _default_colour(link: str) -> Rgba:
 
 
 def _rgba(color: etree._Element, where: str) -> Rgba:
-    return numbers(color, "rgba", "0.6 0.6 0.6 1", where)
+    return read_numbers(color, "rgba", "0.6 0.6 0.6 1", where)

@@ -19,9 +19,8 @@ from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.merging import Separate, link_inertias, merge_links, place_links
 from batchpid.sim.robot.parts import LinkMass
 from batchpid.sim.robot.tables import Shape, Tables
-from batchpid.task_space.frames import matrix_of, rotate
+from batchpid.task_space.frames import SpatialInertia, matrix_of, rotate
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.spatial_inertia import SpatialInertia
 
 
 class Part(NamedTuple):

@@ -1,7 +1,7 @@
 """Record of a robot: bodies with their joints, and collision shapes, as rows of arrays and names.
 
 A :class:`Tables` is made once, by the reader of a URDF (:mod:`batchpid.sim.robot.urdf`) or of an
-MJCF file (:mod:`batchpid.sim.robot.mjcf.mjcf_reader`). Everything else reads it: engines, rigid
+MJCF file (:mod:`batchpid.sim.robot.mjcf_reader`). Everything else reads it: engines, rigid
 trees, distances and exports.
 
 :func:`batchpid.sim.robot.merging.merge_links` makes the tables that engines simulate, with one body
@@ -26,9 +26,10 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.arrays.read_only import read_only
-from batchpid.sim.robot.parts import Joint, Placement
-from batchpid.task_space.frames import matrix_of
-from batchpid.task_space.spatial_inertia import SpatialInertia
+from batchpid.motors import Actuators
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.parts import DisabledPair, FileDefaults, Joint, MjcfFile, Placement
+from batchpid.task_space.frames import SpatialInertia, matrix_of
 
 ORIGIN = read_only(np.zeros(3))
 NO_TURN = read_only(np.array([1.0, 0.0, 0.0, 0.0]))
@@ -151,4 +152,25 @@ def breadth_first(bodies: Iterable[Body], shapes: Iterable[Shape]) -> Tables:
         ordered += below[body.name]
     row = {body.name: index for index, body in enumerate(ordered)}
     links = {name: Placement(name, ORIGIN, NO_TURN) for name in row}
-    return Tables(tuple(ordered), tuple(sorted(shapes, key=lambda shape: row[shape.body])), links)
+    of_rows = [shape for shape in shapes if shape.body in row]
+    of_rows.sort(key=lambda shape: row[shape.body])
+    return Tables(tuple(ordered), tuple(of_rows), links)
+
+
+class Source(NamedTuple):
+    """Robot as its file gives it.
+
+    ``repairs`` are findings, one for each change that the simulation needs. ``base_start`` is the
+    pose (7,) at which the file places a floating base.
+    """
+
+    name: str
+    tables: Tables
+    repairs: tuple[Finding, ...]
+    fixed_base: bool
+    base_start: tuple[float, ...] | None
+    mjcf: MjcfFile | None = None
+    pairs: tuple[DisabledPair, ...] = ()
+    """Pairs of links that do not collide."""
+    defaults: FileDefaults | None = None
+    actuators: Actuators | None = None

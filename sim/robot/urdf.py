@@ -1,48 +1,100 @@
-"""URDF reader: repairs the elements, resolves meshes, and reads the tables of the robot."""
+"""Reader of URDF and MJCF files.
+
+A published URDF has faults. All that can be repaired without a guess about the robot's geometry is
+repaired while it is read, with a finding each; the rest is an error.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from lxml import etree
 
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.errors import RobotError
-from batchpid.motors import Actuators
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.joint_repair import ends_of, free_base, free_joint_of
-from batchpid.sim.robot.link_repair import MOMENTS, from_entries
+from batchpid.sim.robot.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
 from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
-from batchpid.sim.robot.parts import FileDefaults, Joint, Mimic, MjcfFile
-from batchpid.sim.robot.repair import repair
-from batchpid.sim.robot.self_collision import DisabledPair
-from batchpid.sim.robot.tables import NO_TURN, Body, Shape, Tables, breadth_first
-from batchpid.sim.robot.xml import number, numbers
+from batchpid.sim.robot.mjcf_reader import read_mjcf
+from batchpid.sim.robot.parts import MOVING_TYPES, Joint, Mimic
+from batchpid.sim.robot.tables import (
+    NO_TURN,
+    ORIGIN,
+    Body,
+    Shape,
+    Source,
+    Tables,
+    breadth_first,
+)
+from batchpid.sim.robot.xml import fault, numbers, parse_xml, read_numbers
 from batchpid.task_space.frames import from_rpy
 
 MOST_READ = 4096  # links and joints of a file
+GIVE_RANGE = "give <limit lower= upper=>"
+"""Remedy for position limits that are missing or unreadable."""
+SMALLEST_SIZE, LARGEST_SIZE = 1e-6, 1e6
+"""Bounds of the sizes of shapes [m] and scales of meshes, by PhysX's limits of the latter."""
+SHAPES = {
+    "box": {"size": "0 0 0"},
+    "sphere": {"radius": "0"},
+    "cylinder": {"radius": "0", "length": "0"},
+    "capsule": {"radius": "0", "length": "0"},
+    "mesh": {"scale": "1 1 1"},
+}
+"""Attributes of each shape, with as many numbers as each has."""
+UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
+"""Elements of a URDF that have no effect here."""
+_READ = {
+    "robot": {"link", "joint"},
+    "link": {"inertial", "collision"},
+    "joint": {
+        "origin",
+        "parent",
+        "child",
+        "axis",
+        "limit",
+        "dynamics",
+        "mimic",
+        "safety_controller",
+    },
+}
+"""Elements that are read, by parent."""
+_EXPAND = "expand it first: xacro FILE.xacro > FILE.urdf"
 
 
-class Source(NamedTuple):
-    """Robot as its file gives it.
+def read_robot(
+    path: Path, fixed_base: bool | None, package_dirs: tuple[Path, ...], missing_meshes: str
+) -> Source:
+    """Return the robot in the URDF or MJCF file at ``path``.
 
-    ``repairs`` are findings, one for each change that the simulation needs. ``base_start`` is the
-    pose (7,) at which the file places a floating base.
+    For the arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError for a file that cannot
+    be read, a structure or number without repair, a bad mesh, or an MJCF file that MuJoCo does not
+    compile.
     """
+    findings: list[Finding] = []
+    root = parse_xml(path, findings)
+    if not is_mjcf(root):
+        return read_urdf(root, path, findings, fixed_base, package_dirs, missing_meshes)
+    # MuJoCo opens the file by its path, and workers do so again.
+    if not path.is_file():
+        raise RobotError(f"{path}: an MJCF file is read several times; save it as a file first")
+    name = root.get("model") or path.stem
+    try:
+        source = read_mjcf(path, name, fixed_base, missing_meshes)
+    except UnicodeDecodeError as error:
+        raise RobotError(
+            f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
+        ) from error
+    return source._replace(repairs=(*findings, *source.repairs))
 
-    name: str
-    tables: Tables
-    repairs: tuple[Finding, ...]
-    fixed_base: bool
-    base_start: tuple[float, ...] | None
-    mjcf: MjcfFile | None = None
-    pairs: tuple[DisabledPair, ...] = ()
-    """Pairs of links that do not collide."""
-    defaults: FileDefaults | None = None
-    actuators: Actuators | None = None
+
+def is_mjcf(root: etree._Element) -> bool:
+    """Return whether a root element is an MJCF file's; MuJoCo ignores a default namespace."""
+    return root.prefix is None and etree.QName(root).localname == "mujoco"
 
 
 def read_urdf(
@@ -55,158 +107,422 @@ def read_urdf(
 ) -> Source:
     """Return the robot of the root element of a URDF, with ``findings`` of reading the file.
 
-    The element is repaired in place. Raises RobotError for a structure or number that SAPIEN cannot
-    build, or a bad mesh.
+    Raises RobotError for a structure or number without repair, and for a bad mesh.
     """
-    free_joint = free_joint_of(root)
-    base = None
+    reader = _Reader(root, path, package_dirs, findings)
+    # The root may be a bare link that says, with its floating joint, that the base is free.
+    start = reader.free_base(fixed_base)
     if fixed_base is None:
-        fixed_base = free_joint is None
-    if free_joint is not None and not fixed_base:
-        base = free_base(root, free_joint)
-    _repair(root, path, findings, package_dirs, missing_meshes)
-    added = [str(finding.link) for finding in findings if finding.code == "missing-link"]
-    tables = _read_tables(root, path, added)
-    name = root.get("name", path.stem)
-    return Source(name, tables, tuple(findings), fixed_base, base)
+        fixed_base = start is None
+    tables = reader.read()
+    reader.report_missing(missing_meshes)
+    name = root.get("name", "").strip() or path.stem
+    return Source(name, tables, tuple(findings), fixed_base, start or None)
 
 
-def _repair(
-    root: etree._Element,
-    path: Path,
-    repairs: list[Finding],
-    package_dirs: tuple[Path, ...],
-    missing_meshes: str,
-) -> None:
-    """Repair the ``<robot>`` of the file at ``path``, and append the repairs."""
-    if root.tag != "robot":
-        problem = f"the root element is <{root.tag}>, not <robot> (URDF) or <mujoco> (MJCF)"
-        raise RobotError(
-            f"{path}: {problem}; is this a robot's file (not SDF, xacro, a part of an MJCF)?"
-        )
-    # Before the repairs and the check of the tree, whose time is the square of the number.
-    if max(len(root.findall(tag)) for tag in ("link", "joint")) > MOST_READ:
-        raise RobotError(
-            f"{path}: has more than {MOST_READ} links or joints; remove what the robot does not"
-            " need"
-        )
-    repairs += repair(root, path)
-    missing = _resolve_meshes(root, path, package_dirs)
-    if missing and missing_meshes == "error":
-        raise RobotError(
-            f"{path}: collision mesh not found or not readable: {', '.join(missing)}; repair the"
-            " file, pass package_dirs=[...] with the folder that holds the package (or name it in"
-            " ROS_PACKAGE_PATH), or missing_meshes='skip' to simulate without"
-        )
-    if missing:
-        text = (
-            f"collision meshes not found or not readable, simulated without: {', '.join(missing)}"
-        )
-        remedy = (
-            "repair the files, or pass package_dirs=[...] to Robot.load, or name their folder in"
-            " ROS_PACKAGE_PATH"
-        )
-        repairs.append(Finding("warning", "missing-mesh", text, remedy))
+class _Reader:
+    """Links and joints of one file, by name."""
 
+    def __init__(
+        self,
+        root: etree._Element,
+        path: Path,
+        package_dirs: tuple[Path, ...],
+        findings: list[Finding],
+    ) -> None:
+        if root.tag != "robot":
+            problem = f"the root element is <{root.tag}>, not <robot> (URDF) or <mujoco> (MJCF)"
+            raise RobotError(
+                f"{path}: {problem}; is this a robot's file (not SDF, xacro, a part of an MJCF)?"
+            )
+        # Some of the checks take time that is the square of the number.
+        if max(len(root.findall(tag)) for tag in ("link", "joint")) > MOST_READ:
+            raise RobotError(
+                f"{path}: has more than {MOST_READ} links or joints; remove what the robot does not"
+                " need"
+            )
+        self._path = path
+        self._package_dirs = package_dirs
+        self._findings = findings
+        self._missing: list[str] = []
+        self._drop_unused(root)
+        self._refuse_xacro(root)
+        self._links = self._name_links(root)
+        self._joints = self._name_joints(root)
+        if not self._joints:
+            remedy = f"a xacro has to be expanded first: {_EXPAND}"
+            raise RobotError(f"{path}: a robot without joints cannot be controlled; {remedy}")
+        self._added = self._match_links()
 
-def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, ...]) -> list[str]:
-    """Make mesh paths absolute; drop the shapes whose file is missing or unreadable; return their
-    names and why.
-    """
-    missing = []
-    for collision in root.findall("link/collision"):
-        mesh = collision.find("geometry/mesh")
-        if mesh is None:
-            continue
-        name = mesh.get("filename", "")
-        file = find_mesh(name, path, package_dirs)
+    def _warn(
+        self,
+        code: str,
+        text: str,
+        remedy: str,
+        joint: str | None = None,
+        link: str | None = None,
+        detail: str = "",
+    ) -> None:
+        self._findings.append(Finding("warning", code, text, remedy, joint, link, detail))
+
+    # -- Structure
+
+    def _drop_unused(self, root: etree._Element) -> None:
+        """Remove elements that are not read, visuals above all."""
+        unknown: Counter[str] = Counter()
+        for parent in (root, *root.findall("link"), *root.findall("joint")):
+            for child in list(parent):
+                if child.tag in _READ[parent.tag]:
+                    continue
+                name = etree.QName(child)
+                if "xacro" in (name.namespace or ""):
+                    unknown[f"xacro:{name.localname}"] += 1
+                elif name.localname not in UNUSED:
+                    unknown[name.localname] += 1
+                parent.remove(child)
+        if unknown:
+            # A robot may lack the parts of a macro that is not expanded.
+            is_xacro = any(tag.startswith("xacro:") for tag in unknown)
+            severity = "warning" if is_xacro else "note"
+            listed = ", ".join(f"{count} <{tag}>" for tag, count in unknown.most_common(8))
+            text = f"elements that the simulation does not use are left out: {listed}"
+            remedy = "remove them, or expand a xacro first"
+            self._findings.append(Finding(severity, "unknown-element", text, remedy))
+
+    def _refuse_xacro(self, root: etree._Element) -> None:
+        for element in root.iter():
+            for key, value in element.items():
+                # find_mesh reads $(find PACKAGE).
+                if "${" in value or ("$(" in value and key != "filename"):
+                    problem = f"<{element.tag} {key}={value!r}> is an expression of xacro"
+                    raise RobotError(f"{self._path}: {problem}; {_EXPAND}")
+
+    def _name_links(self, root: etree._Element) -> dict[str, etree._Element]:
+        """Return the links by name, without those whose name is taken or missing."""
+        links: dict[str, etree._Element] = {}
+        for element in root.findall("link"):
+            name = _text(element, "name")
+            if not name or name in links:
+                text = "has no name, or one that is used twice: left out"
+                remedy = "give every link a name to itself"
+                self._warn("repeated-name", text, remedy, link=name or None)
+                continue
+            links[name] = element
+        return links
+
+    def _name_joints(self, root: etree._Element) -> dict[str, etree._Element]:
+        """Return the joints by name, without copies; other joints of one name get new ones."""
+        joints: dict[str, etree._Element] = {}
+        names = {_text(element, "name") for element in root.findall("joint")}
+        for element in root.findall("joint"):
+            name = _text(element, "name")
+            ends = _ends(element)
+            if name in joints and _ends(joints[name]) == ends:
+                self._warn("repeated-name", "given twice: the first is kept", "remove it", name)
+                continue
+            base = new = name or "{}_to_{}".format(*ends)
+            # The number of a new name is the first that nobody has.
+            number = 2
+            while new in joints or (new != name and new in names):
+                new = f"{base}_{number}"
+                number += 1
+            if new != name:
+                text = f"no name, or one that is used twice: called {new!r}"
+                self._warn("repeated-name", text, "name it in the URDF", name or None)
+            joints[new] = element
+        return joints
+
+    def _match_links(self) -> list[str]:
+        """Add links that only joints name, remove links that no joint names; return the former."""
+        added = []
+        joined = {}
+        for name, element in self._joints.items():
+            ends = _ends(element)
+            if not all(ends):
+                raise RobotError(
+                    f"{self._path}: joint {name!r}: needs <parent link=...> and <child link=...>;"
+                    " add them"
+                )
+            joined.update(dict.fromkeys(ends))
+        for name in joined:
+            if name not in self._links:
+                self._links[name] = etree.Element("link")
+                added.append(name)
+                text = "named by joints, but not in the file: added, without mass and shape"
+                self._warn("missing-link", text, "correct the name, or add the link", link=name)
+        for name in [name for name in self._links if name not in joined]:
+            text = "held by no joint: left out"
+            self._warn("loose-link", text, "join it, or remove it", link=name)
+            del self._links[name]
+        return added
+
+    def free_base(self, fixed_base: bool | None) -> tuple[float, ...] | None:
+        """Remove a floating joint that leads from a link without mass and shapes at the root to all
+        others, with this link, unless the base is to be fixed.
+
+        Return the pose (7,) at which the joint places the base, () if it does not, None without
+        such a joint.
+        """
+        children = {_ends(element)[1] for element in self._joints.values()}
+        at_root = [name for name, joint in self._joints.items() if _ends(joint)[0] not in children]
+        # With a second joint at the root, the link there is a part of the robot.
+        if len(at_root) != 1 or fixed_base:
+            return None
+        (name,) = at_root
+        joint = self._joints[name]
+        link = _ends(joint)[0]
+        if joint.get("type") != "floating" or len(self._links[link]):
+            return None
+        del self._joints[name], self._links[link]
+        if joint.find("origin") is None:
+            return ()
+        position, turn = read_origin(joint, f"{self._path}: joint {name!r}")
+        return (*position.tolist(), *turn.tolist())
+
+    def read(self) -> Tables:
+        """Return the tables.
+
+        Raises RobotError unless the joints make one tree.
+        """
+        joints = {name: self._read_joint(name, element) for name, element in self._joints.items()}
+        self._repair_mimics(joints)
+        parents = Counter(joint.child_link for joint in joints.values())
+        if twice := sorted(name for name, count in parents.items() if count > 1):
+            raise RobotError(
+                f"{self._path}: link with two parents: {', '.join(twice)}; a robot must be a tree"
+            )
+        roots = [name for name in self._links if name not in parents]
+        if len(roots) != 1:
+            remedy = "a robot must be one tree"
+            if self._added:
+                remedy = f"joints name {self._added}, not in the file: correct the names"
+            raise RobotError(
+                f"{self._path}: needs exactly one root link, found {roots or 'a loop'}; {remedy}"
+            )
+        # Siblings are in the order of their joints.
+        shapes: list[Shape] = []
+        bodies = [self._read_link(Body(roots[0], None), shapes)]
+        for joint in joints.values():
+            place = read_origin(self._joints[joint.name], f"{self._path}: joint {joint.name!r}")
+            bodies.append(self._read_link(Body(joint.child_link, joint, *place), shapes))
+        # Links of a loop are below no root, and so left behind.
+        if len(breadth_first(bodies, ()).bodies) != len(bodies):
+            raise RobotError(
+                f"{self._path}: some joints form a loop apart from the root {roots[0]!r}; a robot"
+                " must be one tree"
+            )
+        return breadth_first(bodies, shapes)
+
+    # -- Joints
+
+    def _read_joint(self, name: str, element: etree._Element) -> Joint:
+        parent, child = _ends(element)
+        kind = element.get("type", "").strip().lower()
+        if kind not in (*MOVING_TYPES, "fixed"):
+            text = f"joints of type {kind!r} cannot be simulated by SAPIEN: fixed instead"
+            remedy = "use revolute, continuous or prismatic joints"
+            if kind == "floating":
+                remedy = "load with fixed_base=False for a robot that is free to move"
+            self._warn("joint-type", text, remedy, name)
+            kind = "fixed"
+        # The other elements mean nothing for a fixed joint, and their faults are none.
+        if kind == "fixed":
+            if element.find("mimic") is not None:
+                self._report_mimic(name, element.find("mimic"), "cannot move a fixed joint")
+            return Joint(name, "fixed", parent, child)
+        fields = self._read_limits(name, kind, element)
+        axis = numbers(element.find("axis"), "xyz", "1 0 0")
+        if axis is None or math.hypot(*axis) < 1e-3:
+            text = f"<axis xyz={_text(element.find('axis'), 'xyz')!r}> has no direction: the x"
+            text += " axis is used, the URDF's default"
+            self._warn("axis", text, "correct the axis", name)
+            axis = (1.0, 0.0, 0.0)
+        dynamics = element.find("dynamics")
+        for key in ("damping", "friction"):
+            values = numbers(dynamics, key, "0")
+            # A negative damping would add energy in every step.
+            if values is None or values[0] < 0:
+                text = f"<dynamics {key}={_text(dynamics, key)!r}> must be a number >= 0: 0 is used"
+                self._warn("dynamics", text, "correct the URDF", name)
+                values = (0.0,)
+            fields[key] = values[0]
+        fields["mimic"] = self._read_mimic(name, element.find("mimic"))
+        return Joint(name, kind, parent, child, axis=axis, **fields)
+
+    def _read_limits(self, name: str, kind: str, joint: etree._Element) -> Document:
+        """Return the limits of a joint by field; missing and placeholder limits are infinite."""
+        limit = joint.find("limit")
+        limits: Document = {}
+        placeholders = []
+        for key in ("effort", "velocity"):
+            values = numbers(limit, key, "inf", limit=True)
+            # Exporters write 0 or -1 for "not set".
+            if values is None or values[0] <= 0:
+                placeholders.append(f"{key}={_text(limit, key)!r}")
+                values = (math.inf,)
+            limits[f"{key}_limit"] = values[0]
+        if placeholders:
+            text = f"<limit {' '.join(placeholders)}> is a placeholder and counts as not given"
+            self._warn("placeholder", text, "give <limit effort= velocity=> of the motor", name)
+        is_unknown = all(map(math.isinf, limits.values()))
+        safety = joint.find("safety_controller")
+        if safety is not None:
+            where = f"{self._path}: joint {name!r}"
+            (low,) = read_numbers(safety, "soft_lower_limit", "0", where)
+            (high,) = read_numbers(safety, "soft_upper_limit", "0", where)
+            if low < high:  # both are 0 where they are left out
+                limits |= {"soft_lower": low, "soft_upper": high}
+        if kind == "continuous":
+            return limits
+        ends = []
+        for key, endless in (("lower", -math.inf), ("upper", math.inf)):
+            values = numbers(limit, key, "0", limit=True)
+            if values is None:
+                text = f"<limit {key}={_text(limit, key)!r}> is not a number: no {key} limit"
+                self._warn("limits", text, GIVE_RANGE, name)
+                values = (endless,)
+            ends.append(values[0])
+        lower, upper = ends
+        # The URDF's default of a missing end is 0, which may be on the wrong side. Exporters write
+        # 0 for all four numbers of a joint whose limits they do not know.
+        is_given = bool(_text(limit, "lower") and _text(limit, "upper"))
+        is_placeholder = lower == upper == 0 and is_unknown
+        if is_placeholder or (lower >= upper and not is_given):
+            self._warn("limits", "no position limits: motion without end", GIVE_RANGE, name)
+            lower, upper = -math.inf, math.inf
+        elif lower > upper:
+            detail = f"{lower:g}, {upper:g}"
+            self._warn("limits", "limits are swapped", "swap them", name, detail=detail)
+            lower, upper = upper, lower
+        return limits | {"lower": lower, "upper": upper}
+
+    def _read_mimic(self, name: str, mimic: etree._Element | None) -> Mimic | None:
+        if mimic is None:
+            return None
+        multiplier = numbers(mimic, "multiplier", "1")
+        offset = numbers(mimic, "offset", "0")
+        if multiplier is None or offset is None or multiplier[0] == 0:
+            texts = ", ".join(f"{key} {mimic.get(key)!r}" for key in ("multiplier", "offset"))
+            self._report_mimic(name, mimic, f"with {texts} cannot lead it")
+            return None
+        return Mimic(_text(mimic, "joint"), multiplier[0], offset[0])
+
+    def _repair_mimics(self, joints: dict[str, Joint]) -> None:
+        """Remove mimics of joints that cannot lead."""
+        for name, joint in joints.items():
+            if joint.mimic is None:
+                continue
+            leader = joints.get(joint.mimic.joint)
+            problem = None
+            if leader is None:
+                problem = "is not in the file"
+            elif not leader.moves:
+                problem = "does not move"
+            # A chain of leaders that comes back to the joint is cut there.
+            chain = set[str]()
+            while leader is not None and leader.mimic is not None and leader.name not in chain:
+                chain.add(leader.name)
+                leader = joints.get(leader.mimic.joint)
+            if name in chain:
+                problem = "mimics it in turn"
+            if problem is not None:
+                self._report_mimic(name, self._joints[name].find("mimic"), problem)
+                joints[name] = replace(joint, mimic=None)
+
+    def _report_mimic(self, name: str, mimic: etree._Element, problem: str) -> None:
+        text = f"mimics {mimic.get('joint')!r}, which {problem}: moves independently"
+        self._warn("mimic", text, "correct <mimic joint=>, or remove it", name)
+
+    # -- Links
+
+    def _read_link(self, body: Body, shapes: list[Shape]) -> Body:
+        """Return ``body`` with the inertia of its link, and append the link's shapes."""
+        link = self._links[body.name]
+        for collision in link.findall("collision"):
+            shape = self._read_collision(body.name, collision)
+            shapes += [] if shape is None else [shape]
+        if (inertial := link.find("inertial")) is None:
+            return body
+        mass, inertia = map(inertial.find, ("mass", "inertia"))
+        center, turn = ORIGIN, NO_TURN
+        if problem := _misplaced(inertial):
+            text = f"{problem}: the centre of mass is taken at the origin of the link"
+            self._warn("inertia", text, "correct <inertial><origin>", link=body.name)
+        else:
+            center, turn = read_origin(inertial, "")
+        value = numbers(mass, "value", "0")
+        if value is None or value[0] < 0 or 0 < value[0] < SMALLEST:
+            text = f"<mass value={_text(mass, 'value')!r}> is a mass that PhysX cannot hold"
+            text += ": it counts as not given"
+            self._warn("inertia", text, "give a mass > 0 [kg]", link=body.name)
+            return body
+        if value[0] == 0:
+            return body
+        # One unreadable entry makes the whole tensor unknown.
+        entries = [numbers(inertia, key, "0") for key in MOMENTS]
+        tensor = np.zeros((3, 3))
+        if None not in entries:
+            tensor = from_entries([entry[0] for entry in entries if entry])
+        for problem in filter(None, (fault(inertia, key, "0") for key in MOMENTS)):
+            text = f"{problem}: the inertia tensor counts as not given"
+            self._warn("inertia", text, "correct <inertia>", link=body.name)
+        tensor, repair = possible_inertia(value[0], tensor)
+        if repair is not None:
+            text, detail = repair
+            self._warn("inertia", text, "correct <inertia>", link=body.name, detail=detail)
+        return body._replace(mass=value[0], center=center, inertia=tensor, inertia_wxyz=turn)
+
+    def _read_collision(self, link: str, collision: etree._Element) -> Shape | None:
+        """Return a collision shape, None if PhysX cannot hold it or its mesh is missing."""
+        geometry = next(
+            (part for part in collision.iterfind("geometry/*") if part.tag in SHAPES), None
+        )
+        problem = _misplaced(collision)
+        if geometry is None:
+            problem = f"it has none of {', '.join(SHAPES)}"
+        else:
+            for key, default in SHAPES[geometry.tag].items():
+                text = _text(geometry, key) or default
+                if key == "scale" and len(text.split()) == 1:
+                    geometry.set(key, " ".join([text] * 3))  # one factor for all axes
+                sizes = numbers(geometry, key, default) or (0.0,)
+                # A negative scale mirrors the mesh.
+                smallest = min(map(abs, sizes)) if key == "scale" else min(sizes)
+                if smallest < SMALLEST_SIZE or max(sizes) > LARGEST_SIZE:
+                    problem = f"<{geometry.tag} {key}={text!r}> is not from {SMALLEST_SIZE:g} to"
+                    problem += f" {LARGEST_SIZE:g}"
+        if geometry is None or problem is not None:
+            text = f"a collision shape is left out: {problem}"
+            self._warn("collision", text, "correct <collision>", link=link)
+            return None
+        shape = read_shape(geometry, link, read_origin(collision, ""), "")
+        if shape.kind != "mesh":
+            return shape
+        file = find_mesh(shape.file, self._path, self._package_dirs)
         problem = None if file is None else mesh_problem(file)
         if file is None or problem is not None:
-            missing.append(name if problem is None else f"{name} ({problem})")
-            collision.getparent().remove(collision)
-        else:
-            # SAPIEN would simulate the file that it read before.
-            check_unchanged(file)
-            mesh.set("filename", str(file))
-    return missing
+            self._missing.append(shape.file if problem is None else f"{shape.file} ({problem})")
+            return None
+        # SAPIEN would simulate the file that it read before.
+        check_unchanged(file)
+        return shape._replace(file=str(file))
 
-
-def _read_joint(element: etree._Element, path: Path) -> Joint:
-    """Return a repaired joint."""
-    name = element.get("name", "")
-    kind = element.get("type", "")
-    where = f"{path}: joint {name!r}"
-    parent, child = ends_of(element)
-    if not parent or not child:
-        raise RobotError(f"{where}: needs <parent link=...> and <child link=...>; add them")
-    axis, limit, dynamics, mimic, safety = map(
-        element.find, ("axis", "limit", "dynamics", "mimic", "safety_controller")
-    )
-    fields: Document = {}
-    if axis is not None:
-        fields["axis"] = numbers(axis, "xyz", "1 0 0", where)
-    if limit is not None:
-        for key in ("effort", "velocity"):
-            fields[f"{key}_limit"] = number(limit, key, "inf", where, limit=True)
-        for key in ("lower", "upper") if kind != "continuous" else ():
-            fields[key] = number(limit, key, "0", where, limit=True)
-    if safety is not None:
-        low, high = (number(safety, f"soft_{key}_limit", "0", where) for key in ("lower", "upper"))
-        if low < high:  # both are 0 where they are left out
-            fields |= {"soft_lower": low, "soft_upper": high}
-    for key in ("damping", "friction") if dynamics is not None else ():
-        fields[key] = number(dynamics, key, "0", where)
-    if mimic is not None:
-        multiplier = number(mimic, "multiplier", "1", where)
-        offset = number(mimic, "offset", "0", where)
-        fields["mimic"] = Mimic(mimic.get("joint", ""), multiplier, offset)
-    return Joint(name, kind, parent, child, **fields)
-
-
-def _read_tables(root: etree._Element, path: Path, added: list[str]) -> Tables:
-    """Return the tables of a repaired URDF. ``added`` are links that the file does not hold."""
-    links = root.findall("link")
-    joints = [_read_joint(element, path) for element in root.findall("joint")]
-    _check_tree([link.get("name", "") for link in links], joints, path, added)
-    above = {
-        joint.child_link: (joint, *read_origin(element, f"{path}: joint {joint.name!r}"))
-        for joint, element in zip(joints, root.findall("joint"), strict=True)
-    }
-    # Siblings are in the order of their joints.
-    order = {joint.child_link: number for number, joint in enumerate(joints)}
-    links.sort(key=lambda link: order.get(link.get("name", ""), -1))
-    bodies: list[Body] = []
-    shapes: list[Shape] = []
-    for link in links:
-        name = link.get("name", "")
-        where = f"{path}: link {name!r}"
-        body = Body(name, *above.get(name, (None,)))
-        if (inertial := link.find("inertial")) is not None:
-            center, turn = read_origin(inertial, where)
-            tensor = inertial.find("inertia")
-            entries = [number(tensor, key, "0", where) for key in MOMENTS]
-            body = body._replace(
-                mass=number(inertial.find("mass"), "value", "0", where),
-                center=center,
-                inertia=from_entries(entries),
-                inertia_wxyz=turn,
+    def report_missing(self, missing_meshes: str) -> None:
+        """Report meshes that are missing or cannot be read, or raise RobotError if that is
+        "error".
+        """
+        if not self._missing:
+            return
+        listed = ", ".join(self._missing)
+        remedy = "repair the files, pass package_dirs=[...] with the folder that holds the package"
+        remedy += ", or name it in ROS_PACKAGE_PATH"
+        if missing_meshes == "error":
+            problem = f"collision mesh not found or not readable: {listed}"
+            raise RobotError(
+                f"{self._path}: {problem}; {remedy}, or missing_meshes='skip' to simulate without"
             )
-        bodies.append(body)
-        for collision in link.findall("collision"):
-            place = read_origin(collision, where)
-            shapes += [
-                read_shape(geometry, name, place, where)
-                for geometry in collision.iterfind("geometry/*")
-            ]
-    # Links of a loop are below no root, and so left behind.
-    tables = breadth_first(bodies, shapes)
-    if len(tables.bodies) != len(bodies):
-        root_link = tables.bodies[0].name
-        raise RobotError(
-            f"{path}: some joints form a loop apart from the root {root_link!r}; a robot must be"
-            " one tree"
-        )
-    return tables
+        text = f"collision meshes not found or not readable, simulated without: {listed}"
+        self._warn("missing-mesh", text, remedy)
 
 
 def read_shape(
@@ -214,39 +530,36 @@ def read_shape(
 ) -> Shape:
     """Return the shape of a ``<geometry>`` of ``link``, at a position and orientation."""
     kind = geometry.tag
-    size: tuple[float, ...] = ()
+    sizes = [read_numbers(geometry, key, text, where) for key, text in SHAPES[kind].items()]
     if kind == "mesh":
-        scale = numbers(geometry, "scale", "1 1 1", where)
-        return Shape(link, link, kind, size, *place, geometry.get("filename", ""), scale)
+        return Shape(link, link, kind, (), *place, geometry.get("filename", "").strip(), sizes[0])
     if kind == "box":
-        size = tuple(0.5 * side for side in numbers(geometry, "size", "0 0 0", where))
-    else:
-        size = (number(geometry, "radius", "0", where),)
-    if kind in ("capsule", "cylinder"):
-        size += (0.5 * number(geometry, "length", "0", where),)
+        return Shape(link, link, kind, tuple(0.5 * side for side in sizes[0]), *place)
+    size = sizes[0]
+    if kind != "sphere":
+        size = (sizes[0][0], 0.5 * sizes[1][0])
     return Shape(link, link, kind, size, *place)
 
 
 def read_origin(element: etree._Element, where: str) -> tuple[Float64, Float64]:
     """Return position (3,) [m] and orientation (4,) of an element's ``<origin>``."""
     origin = element.find("origin")
-    position = np.array(numbers(origin, "xyz", "0 0 0", where))
-    rpy = numbers(origin, "rpy", "0 0 0", where)
+    position = np.array(read_numbers(origin, "xyz", "0 0 0", where))
+    rpy = read_numbers(origin, "rpy", "0 0 0", where)
     return position, from_rpy(rpy) if any(rpy) else NO_TURN  # mostly
 
 
-def _check_tree(links: list[str], joints: list[Joint], path: Path, added: list[str]) -> None:
-    """Raise RobotError for a link with two parents, and unless there is exactly one root."""
-    children = [joint.child_link for joint in joints]
-    if twice := sorted(name for name, count in Counter(children).items() if count > 1):
-        raise RobotError(
-            f"{path}: link with two parents: {', '.join(twice)}; a robot must be a tree"
-        )
-    roots = [name for name in links if name not in children]
-    if len(roots) != 1:
-        remedy = "a robot must be one tree"
-        if added:
-            remedy = f"joints name {added}, not in the file: correct the names"
-        raise RobotError(
-            f"{path}: needs exactly one root link, found {roots or 'a loop'}; {remedy}"
-        )
+def _misplaced(element: etree._Element) -> str | None:
+    """Return the fault of an ``<origin>`` that cannot be read, or None."""
+    origin = element.find("origin")
+    return fault(origin, "xyz", "0 0 0") or fault(origin, "rpy", "0 0 0")
+
+
+def _ends(joint: etree._Element) -> tuple[str, str]:
+    """Return the names of the parent and the child link of a joint, "" where they are missing."""
+    return _text(joint.find("parent"), "link"), _text(joint.find("child"), "link")
+
+
+def _text(element: etree._Element | None, key: str) -> str:
+    """Return an attribute without blanks around it, "" without one."""
+    return "" if element is None else element.get(key, "").strip()

@@ -18,12 +18,9 @@ from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 
 SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
-LFS_POINTER = (  # beginning of the file that git-lfs puts in place of another
-    b"version https://git-lfs"
-)
+LFS_POINTER = b"version https://git-lfs"  # beginning of git-lfs's file in place of another
 MOST_PREFIXES = 100  # of namespaces that nobody declared
 LARGEST = 1e18  # magnitude of a number whose square fits in PhysX's single precision
-LARGEST_LIMIT = 3.4e38  # magnitude of a finite joint limit, which is compared and not multiplied
 
 
 def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Element:
@@ -103,17 +100,14 @@ def _lenient(data: bytes) -> etree._Element:
         text = data.decode("utf-16" if utf16 else "utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("latin-1")
-    for start, end in (
-        ("<!--", "-->"),
-        ("<?", "?>"),
-    ):  # comments and processing instructions, in linear time
+    # Comments and processing instructions, in linear time.
+    for start, end in (("<!--", "-->"), ("<?", "?>")):
         first, *rest = text.split(start)
         text = first + "".join(part.partition(end)[2] for part in rest)
     # An ampersand that begins no entity.
     text = re.sub(r"&(?!\w+;|#)", "&amp;", text)
-    prefixes = sorted(set(re.findall(r"[<\s]([A-Za-z_]\w{0,40}):", text)) - {"xml", "xmlns"})[
-        :MOST_PREFIXES
-    ]
+    names = set(re.findall(r"[<\s]([A-Za-z_]\w{0,40}):", text)) - {"xml", "xmlns"}
+    prefixes = sorted(names)[:MOST_PREFIXES]
     declared = " ".join(f'xmlns:{prefix}="urn:{prefix}"' for prefix in prefixes)
     wrapper = _parse(f"<file {declared}>{text}</file>".encode(errors="replace"))
     root = wrapper.find("{*}robot")
@@ -127,61 +121,42 @@ def _lenient(data: bytes) -> etree._Element:
 
 
 def numbers(
-    element: etree._Element | None, key: str, default: str, where: str, limit: bool = False
-) -> tuple[float, ...]:
-    """Return the numbers in an attribute, as many as there are in ``default``, which replaces a
-    missing or empty one.
-
-    Raises a RobotError, whose message begins with ``where``, unless they are finite and at most
-    LARGEST in magnitude; numbers of a joint ``limit`` may be up to LARGEST_LIMIT or infinite.
-    """
-    values = readable(element, key, default, limit)
-    if values is None:
-        raise RobotError(f"{where}: {fault(element, key, default, limit)}; correct the URDF")
-    return values
-
-
-def number(
-    element: etree._Element | None, key: str, default: str, where: str, limit: bool = False
-) -> float:
-    """Return the number in an attribute; see :func:`numbers`."""
-    return numbers(element, key, default, where, limit)[0]
-
-
-def readable(
     element: etree._Element | None, key: str, default: str, limit: bool = False
 ) -> tuple[float, ...] | None:
-    """Return the numbers in an attribute, or None where :func:`numbers` raises."""
-    if element is None:
-        text = default
-    else:
-        text = element.get(key, default)
-    words = (text if text.strip() else default).split()
-    largest = LARGEST_LIMIT if limit else LARGEST
+    """Return the numbers in an attribute, as many as there are in ``default``, which replaces a
+    missing or empty one; commas count as blanks.
+
+    None unless they are finite and at most LARGEST in magnitude; a joint ``limit`` may be infinite.
+    """
+    text = "" if element is None else element.get(key, "").strip()
+    words = (text or default).replace(",", " ").split()
     try:
-        values = tuple(float(word) for word in words if word.isascii() and "_" not in word)
+        values = tuple(map(float, words))
     except ValueError:
         return None
-    if element is None:
-        return values
-    fits = all(abs(value) <= largest or (limit and math.isinf(value)) for value in values)
-    if fits and len(values) == len(words) == len(default.split()):
+    # Python alone reads 1_0 as a number.
+    if len(values) != len(default.split()) or "_" in text:
+        return None
+    if all(abs(value) <= LARGEST or (limit and math.isinf(value)) for value in values):
         return values
     return None
 
 
-def fault(
-    element: etree._Element | None, key: str, default: str, limit: bool = False
-) -> str | None:
-    """Return the reason for which :func:`numbers` raises, which quotes the attribute, or None where
-    it does not.
-    """
-    if element is None or readable(element, key, default, limit) is not None:
+def fault(element: etree._Element | None, key: str, default: str) -> str | None:
+    """Return the reason for which :func:`numbers` is None, which quotes the attribute, or None."""
+    if element is None or numbers(element, key, default) is not None:
         return None
     count = len(default.split())
-    if count == 1:
-        need = "one finite number"
-    else:
-        need = f"{count} finite numbers"
-    within = f"within +-{LARGEST_LIMIT if limit else LARGEST:g}, which PhysX can hold"
+    need = f"{count} finite number" + "s" * (count > 1)
+    within = f"within +-{LARGEST:g}, which PhysX can hold"
     return f"<{element.tag} {key}={element.get(key)!r}> needs {need} {within}"
+
+
+def read_numbers(
+    element: etree._Element | None, key: str, default: str, where: str
+) -> tuple[float, ...]:
+    """Return :func:`numbers`, or raise a RobotError whose message begins with ``where``."""
+    values = numbers(element, key, default)
+    if values is None:
+        raise RobotError(f"{where}: {fault(element, key, default)}; correct the URDF")
+    return values

@@ -20,7 +20,7 @@ from batchpid.sim.loop.faults import FARTHEST, ORIGIN
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot_model import base_start
 from batchpid.sim.runner.runner_state import Motion, RunnerState
-from batchpid.sim.signals.command import POSE_UNITS, TWIST_UNITS
+from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS
 
 _SHORTEST = 1e-9
 """Smallest length of a quaternion: a shorter one has large rounding errors."""
@@ -30,30 +30,31 @@ def read_command(
     options: RunnerOptions,
     state: RunnerState,
     limits: SetpointCheck | None,
-    given: Mapping[str, ArrayLike | None],
+    inputs: Mapping[str, ArrayLike | None],
     seconds: float,
     ticks: int | None = None,
 ) -> Command:
     """Return the command (ticks, envs, ...) of one tick, or of ``ticks``, of ``seconds`` each, as a
     copy.
 
-    ``given`` has its arrays by the names of their arguments, in the order of :class:`Command`.
+    ``inputs`` are its arrays by the names of their arguments, in the order of :class:`Command`.
     Positions of followers are computed from their leaders; the loop passes efforts on to the
     leaders. ``limits`` warns of setpoints.
     """
-    _, rate, acceleration, _ = given.values()
+    _, rate, acceleration, _ = inputs.values()
     if acceleration is not None:
-        _check_acceleration(state.params, given)
+        _check_acceleration(state.params, inputs)
     table = (options.num_envs,) if ticks is None else (ticks, options.num_envs)
     finite = options.on_invalid_input == "raise"
     rows = list[Any]()
-    for (name, value), (kind, names) in zip(given.items(), options.command_columns, strict=True):
+    for (name, value), (kind, names) in zip(inputs.items(), options.command_columns, strict=True):
         if value is None and rows:  # the setpoint, which is first, must be given
             rows.append(None)
             continue
         entries: Any = value
         if ticks is not None:
             entries = read_array(name, entries)
+            # Rows for all envs.
             entries = entries[:, None] if entries.ndim == 2 else entries
         entries = array(name, entries, (*table, len(names)), names, finite=finite, kind=kind).copy()
         rows.append(entries[None] if ticks is None else entries)
@@ -75,27 +76,28 @@ def accelerated(command: Command, motion: Motion, seconds: float) -> Command:
     with rates.
 
     The mean is the change of the rate over the tick, from ``motion`` before the first. It is taken
-    where the setpoints confirm that rates (and given accelerations) are those at the tick's end,
-    since they change by the mean of the old and the new rate rather than by the new one, as
-    increments do. Elsewhere the given acceleration is kept, or 0.
+    where the setpoints confirm that rates (and accelerations) are those at the tick's end, since
+    they change by the mean of the old and the new rate rather than by the new one, as increments
+    do. Elsewhere the acceleration of the command is kept, or 0.
     """
-    setpoint, rate, given, _ = command
-    before = [0.0 * rate[0] if rows is None else rows for rows in motion]
+    setpoint, rate, acceleration, _ = command
+    position, velocity = motion
+    if velocity is None:
+        velocity = np.zeros_like(rate[0])
     with np.errstate(invalid="ignore"):  # non-finite rates become faults
-        moved, change = (
-            np.diff(rows, axis=0, prepend=first[None])
-            for rows, first in zip((setpoint, rate), before, strict=True)
-        )
+        moved = np.diff(setpoint, axis=0, prepend=position[None])
+        change = np.diff(rate, axis=0, prepend=velocity[None])
         ahead = moved - seconds * rate  # of increments 0, else minus half the change
         fits = np.abs(ahead + 0.5 * seconds * change) < 4 * np.abs(ahead)
-        if (
-            given is not None
-        ):  # with the jerk (given - mean) / (seconds / 2), where the rate is at its largest, too
-            end = seconds**2 * given
+        if acceleration is None:
+            acceleration = 0.0
+        else:
+            # With the jerk (acceleration - mean) / (seconds / 2), where the rate is at its largest,
+            # too.
+            end = seconds**2 * acceleration
             fits |= np.abs(ahead + end / 6 + seconds * change / 3) < np.abs(end) / 24
-    return command._replace(
-        setpoint_acceleration=np.where(fits, change / seconds, 0.0 if given is None else given)
-    )
+    mean = np.where(fits, change / seconds, acceleration)
+    return command._replace(setpoint_acceleration=mean)
 
 
 def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
@@ -113,17 +115,16 @@ def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
     return len(rows)
 
 
-def _check_acceleration(params: bp.PIDParams, given: Mapping[str, ArrayLike | None]) -> None:
+def _check_acceleration(params: bp.PIDParams, inputs: Mapping[str, ArrayLike | None]) -> None:
     """Raise InvalidArgumentError for an acceleration that the law does not take."""
-    _, rate, acceleration, _ = given
+    _, rate, acceleration, _ = inputs
     if params.gain_units is None:
         problem = "is for gains in accelerations, and these are efforts"
         remedy = "give M(q) times it as feedforward, or use robot.designed()"
         raise InvalidArgumentError(acceleration, problem, remedy=remedy)
-    if given[rate] is None:
-        raise InvalidArgumentError(
-            acceleration, f"is given without {rate}", remedy=f"give {rate}, too"
-        )
+    if inputs[rate] is None:
+        problem, remedy = f"is given without {rate}", f"give {rate}, too"
+        raise InvalidArgumentError(acceleration, problem, remedy=remedy)
 
 
 def joint_rows(options: RunnerOptions, name: str, value: ArrayLike) -> Float64:
@@ -140,58 +141,47 @@ def joint_rows(options: RunnerOptions, name: str, value: ArrayLike) -> Float64:
 
 def base_rows(
     options: RunnerOptions,
-    pose: ArrayLike | None,
-    twist: ArrayLike | None,
+    inputs: Mapping[str, ArrayLike | None],
     qpos: NDArray[np.float64],
     mask: Bool,
 ) -> Float64 | None:
     """Return poses and twists (envs, 13) of floating bases to reset to, at joint positions
     ``qpos``.
 
-    By default a base is at rest at :func:`batchpid.sim.robot.robot_model.base_start`.
+    ``inputs`` are ``base_pose`` and ``base_twist``, or None. By default a base is at rest at
+    :func:`batchpid.sim.robot.robot_model.base_start`.
     """
-    robot, num_envs = options.robot, options.num_envs
+    robot = options.robot
     if robot.fixed_base:
-        for name, value in (("base_pose", pose), ("base_twist", twist)):
+        for name, value in inputs.items():
             if value is not None:
+                problem = "is for a floating base, and this one is fixed"
                 remedy = "leave it out, or load the robot with fixed_base=False"
-                raise InvalidArgumentError(
-                    name, "is for a floating base, and this one is fixed", remedy=remedy
-                )
+                raise InvalidArgumentError(name, problem, remedy=remedy)
         return None
-    rows = np.tile(ORIGIN, (num_envs, 1))
-    if twist is not None:
-        rows[:, 7:] = _base_entries("base_twist", twist, num_envs, tuple(TWIST_UNITS))
-    if pose is not None:
-        rows[:, :7] = _base_entries("base_pose", pose, num_envs, tuple(POSE_UNITS))
-        length = np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
-        if (length < _SHORTEST).any():
-            problem = (
-                f"env {int(np.flatnonzero(length < _SHORTEST)[0])} has a quaternion of length 0"
-            )
-            raise InvalidArgumentError(
-                "base_pose", problem, remedy="give (w, x, y, z), (1, 0, 0, 0) upright"
-            )
-        rows[:, 3:7] /= length
-    else:
-        starts: dict[bytes, Float64] = {}
-        ground = (
-            options.ground and options.mjcf is None
-        )  # an MJCF file may have a ground at another height
-        for env in np.flatnonzero(mask).tolist():
-            key = qpos[env].tobytes()
-            if key not in starts:
-                starts[key] = base_start(robot, qpos[env], ground)
-            rows[env, :7] = starts[key]
-    return rows
-
-
-def _base_entries(name: str, value: ArrayLike, num_envs: int, columns: tuple[str, ...]) -> Float64:
-    """Return poses or twists (envs, entries), which must be as near as positions and velocities of
-    joints.
-    """
-    rows = array(name, value, (num_envs, len(columns)), columns, kind="entry")
+    rows = np.tile(ORIGIN, (options.num_envs, 1))
+    pose = rows[:, :7]
+    parts = (pose, POSE_UNITS), (rows[:, 7:], TWIST_UNITS)
+    for (name, value), (part, units) in zip(inputs.items(), parts, strict=True):
+        if value is None:
+            continue
+        columns = tuple(units)
+        part[...] = array(name, value, part.shape, columns, kind="entry")
+        # As near as positions and velocities of joints.
+        near = np.abs(part) <= FARTHEST
+        entries(name, part, near, f"is beyond +-{FARTHEST:g}", columns, kind="entry")
+    if inputs["base_pose"] is None:
+        # An MJCF file may have a ground at another height.
+        ground = options.ground and options.mjcf is None
+        different, which = np.unique(qpos[mask], axis=0, return_inverse=True)
+        starts = [base_start(robot, row, ground) for row in different]
+        pose[mask] = np.array(starts).reshape(-1, 7)[which.ravel()]
+        return rows
+    length = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    remedy = "give (w, x, y, z), (1, 0, 0, 0) upright"
+    is_long = length > _SHORTEST
     entries(
-        name, rows, np.abs(rows) <= FARTHEST, f"is beyond +-{FARTHEST:g}", columns, kind="entry"
+        "base_pose", length, is_long, "is too short", ("quaternion",), kind="entry", remedy=remedy
     )
+    pose[:, 3:] /= length
     return rows

@@ -7,6 +7,7 @@ to the workers, and then replaces its state by the result of :meth:`Operation.co
 from __future__ import annotations
 
 import pickle
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain, repeat
 from operator import is_not, itemgetter
@@ -17,18 +18,20 @@ from numpy.typing import ArrayLike
 
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64, Rows
+from batchpid.arrays.trees import flatten
 from batchpid.checks.validate import env_mask
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.custom import initial_state
+from batchpid.sim.loop.env_parts import effective
 from batchpid.sim.loop.loop import Loop
-from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
+from batchpid.sim.loop.snapshot import Snapshot, join_rows
+from batchpid.sim.loop.step_setup import empty_state
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.runner.arguments import base_rows, joint_rows
 from batchpid.sim.runner.runner_state import RunnerState
-from batchpid.sim.signals.observation import untouched
 from batchpid.sim.workers.pool import Outcome
 from batchpid.sim.workers.requests import Request
 
@@ -65,7 +68,7 @@ class Reset(Operation):
         pose: tuple[ArrayLike | None, ArrayLike | None],
         mask: ArrayLike | None,
         seed: int | ArrayLike | None,
-        base: tuple[ArrayLike | None, ArrayLike | None],
+        base: Mapping[str, ArrayLike | None],
     ) -> Self:
         """Return the operation for arguments of :meth:`batchpid.sim.Runner.reset`."""
         robot = options.robot
@@ -88,7 +91,7 @@ class Reset(Operation):
             )
         qpos = robot.coupling.positions(qpos)
         qvel = robot.coupling.rates(qvel)
-        return cls(chosen, qpos, qvel, draws, base_rows(options, *base, qpos, chosen))
+        return cls(chosen, qpos, qvel, draws, base_rows(options, base, qpos, chosen))
 
     def apply(self, loop: Loop) -> None:
         loop.reset(self.mask, self.qpos, self.qvel, self.draws, self.base)
@@ -100,7 +103,7 @@ class Reset(Operation):
             setpoint, rate = motion
             rate = np.where(chosen, self.qvel, 0.0 if rate is None else rate)
             motion = np.where(chosen, self.qpos, setpoint), rate
-        faults = state.faults.without(self.mask).with_faults(outcome.present)
+        faults = state.faults.without(self.mask).with_events(outcome.present)
         return state._replace(faults=faults, draws=self.draws, motion=motion)
 
 
@@ -141,14 +144,12 @@ class Run(Operation):
         contacts = state.contacts
         motion = state.motion
         count = outcome.num_ticks
-        are_ok = np.logical_and.reduce(outcome.ticks.arrays.observation.ok[:count], axis=None)
+        are_ok = np.logical_and.reduce(outcome.arrays.observation.ok[:count], axis=None)
         if not are_ok or contacts is not None:
             for arrays in outcome.completed:
-                faults = faults.with_faults(arrays)
-                if contacts is None:
-                    contacts = None
-                else:
-                    contacts = contacts.with_contacts(arrays)
+                faults = faults.with_events(arrays)
+                if contacts is not None:
+                    contacts = contacts.with_events(arrays)
         if motion is not None and count:
             motion = setpoint[count - 1], None if rate is None else rate[count - 1]
         steps = count * self.substeps
@@ -189,14 +190,26 @@ class SetActuators(Operation):
 
 
 @dataclass(frozen=True)
-class TakeSnapshot(Operation):
+class ReadRows(Operation):
+    """Read the state of every env."""
+
+    changes_loop = False
+
+    def apply(self, loop: Loop) -> dict[str, Rows]:
+        return loop.read()
+
+    def join(self, results: list[dict[str, Rows]]) -> dict[str, Rows]:
+        return join_rows(results)
+
+
+@dataclass(frozen=True)
+class TakeSnapshot(ReadRows):
     """Read the state of every env, and go on as if restored from it."""
 
-    def apply(self, loop: Loop) -> EnvStates:
-        return loop.snapshot()
+    changes_loop = True
 
-    def join(self, results: list[EnvStates]) -> EnvStates:
-        return EnvStates.join(results)
+    def apply(self, loop: Loop) -> dict[str, Rows]:
+        return loop.snapshot()
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         return state._replace(steps_since_checkpoint=0)
@@ -215,27 +228,19 @@ class Restore(Operation):
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         snapshot = self.snapshot
+        motion = state.motion
+        if motion is not None:
+            setpoint, rate = snapshot.rows["motion"].swapaxes(0, 1)
+            motion = setpoint, rate
         return state._replace(
             params=snapshot.params,
             actuators=snapshot.actuators,
             draws=self.draws,
-            faults=state.faults.restored(snapshot.states.containment["step"]),
-            motion=(
-                None if snapshot.motion is None else (snapshot.motion[:, 0], snapshot.motion[:, 1])
-            ),
+            faults=state.faults.restored(snapshot.rows["containment/step"]),
+            motion=motion,
             steps=snapshot.steps,
             steps_since_checkpoint=0,
         )
-
-
-@dataclass(frozen=True)
-class ReadStateSizes(Operation):
-    """Read the number of values in the engine's state of each env."""
-
-    changes_loop = False
-
-    def apply(self, loop: Loop) -> list[int]:
-        return loop.state_sizes()
 
 
 @dataclass(frozen=True)
@@ -257,52 +262,40 @@ class ReadPoses(Operation):
         return [*chain.from_iterable(results)]
 
 
-def snapshot_of(options: RunnerOptions, state: RunnerState, states: EnvStates) -> Snapshot:
-    """Return the snapshot of a runner in ``state``, with the ``states`` of its envs that the
-    workers have read.
-    """
-    motion = None
+def snapshot_of(options: RunnerOptions, state: RunnerState, rows: dict[str, Rows]) -> Snapshot:
+    """Return the snapshot of a runner in ``state``, with the ``rows`` that the workers have read."""
+    rows = dict(rows)
     if state.motion is not None:
-        last, rate = state.motion
-        motion = np.stack([last, np.zeros_like(last) if rate is None else rate], axis=1)
-    if options.randomization is None:
-        episodes = None
-    else:
-        episodes = state.draws.episodes.copy()
-    return Snapshot(
-        options.described, state.steps, state.params, states, state.actuators, episodes, motion
-    )
+        setpoint, rate = state.motion
+        if rate is None:
+            rate = np.zeros_like(setpoint)
+        rows["motion"] = np.stack([setpoint, rate], axis=1)
+    if options.randomization is not None:
+        rows["episodes"] = state.draws.episodes.copy()
+    return Snapshot(options.described, state.steps, state.params, rows, state.actuators)
 
 
-def restored(
-    options: RunnerOptions, state: RunnerState, snapshot: Snapshot, sizes: list[int]
-) -> Restore:
-    """Return the operation that restores a snapshot in a runner in ``state``, checked and copied.
+def restored(options: RunnerOptions, snapshot: Snapshot, present: Snapshot) -> Restore:
+    """Return the operation that restores a snapshot, checked and copied.
 
-    ``sizes`` are the numbers of values in the engine's state of each env.
+    ``present`` is a snapshot of the runner, whose rows have the same names and shapes but for those
+    that depend on params and actuators.
     """
-    robot = options.robot
-    randomization = options.randomization
-    draws = NOTHING
-    present = snapshot_of(options, state, snapshot.states)
     snapshot.check_options(present.about)
-    snapshot.check_tables(present.tables())
+    num_envs = options.num_envs
+    randomization = options.randomization
     params = options.check_params(snapshot.params)
     acting = actuators = options.check_actuators(
         IDEAL if snapshot.actuators is None else snapshot.actuators
     )
-    if randomization is not None and snapshot.episodes is not None:
-        draws = randomization.draw(robot, snapshot.episodes)
-        acting = randomization.randomized_actuators(actuators, draws, robot)
-    fresh = EnvStates.fresh(
-        options.num_envs,
-        robot.dof,
-        stiction=options.has_stiction(acting),
-        guard=options.guard is not None,
-        pushes=options.has_pushes,
-        law=initial_state(options, params),
-        motors=initial_actuators(acting, options.num_envs, robot.dof, options.timestep),
-        sensors=untouched(options.num_envs, options.observed),
-    )
-    snapshot.states.check(fresh, options.command.size, sizes)
+    draws = NOTHING
+    if randomization is not None:
+        # Delays of drawn actuators say how long the histories are.
+        draws = randomization.draw(options.robot, snapshot.episodes(num_envs))
+        acting = randomization.randomized("actuators", actuators, draws, options.robot)
+    law = initial_state(options, params)
+    stiction = options.has_stiction(acting)
+    control = empty_state(options, law, effective(acting), stiction, num_envs)
+    rows = {name: table for name, table in present.rows.items() if "control/" not in name}
+    snapshot.check_rows(rows | flatten({"control": control}))
     return Restore(replace(snapshot.copy(), params=params, actuators=actuators), draws)

@@ -6,10 +6,10 @@ import batchpid as bp
 from batchpid.checks.warn import warn
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
-from batchpid.sim.loop.faults import FaultLog, FaultWarning
+from batchpid.sim.loop.faults import EventLog, FaultWarning, MissedContactWarning
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.tool_space.osc_controller import OperationalSpace
-from batchpid.sim.workers.contact_log import MissedContactLog, MissedContactWarning
+from batchpid.sim.runner.runner_state import RunnerState
+from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.pool import RecoveryWarning
 
 
@@ -30,17 +30,17 @@ class RunWarnings:
         self._control = control
         self._stability = StabilityCheck(robot, timestep) if control == "pid" else None
         self._moving = MovingSetpointCheck(robot) if control == "pid" else None
-        self._has_warned_of_fault = self._has_warned_of_contact = False
-
-    def check_stability(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
-        """Warn of gains beyond the stability bound of the sampled loop."""
-        if self._stability is not None:
-            self._stability.check(params, actuators)
+        self._issued = set[type[Warning]]()
 
     def check_controller(self) -> None:
         """Warn of such gains of operational-space control."""
         if isinstance(self._control, OperationalSpace):
             self._control.check_stability()
+
+    def check_stability(self, state: RunnerState) -> None:
+        """Warn of gains beyond the stability bound of the sampled loop."""
+        if self._stability is not None:
+            self._stability.check(state.params, state.actuators)
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Watch the next ticks for what these gains may lead to."""
@@ -48,16 +48,20 @@ class RunWarnings:
             self._moving.set_params(params)
             self.moving = self._moving if self._moving.is_watching else None
 
-    def issue(self, faults: FaultLog, contacts: MissedContactLog | None, lost: list[str]) -> None:
+    def issue(self, faults: EventLog, contacts: EventLog | None, lost: list[str]) -> None:
         """Warn of lost workers (the messages ``lost``, which are removed), faults and missed
         contacts.
         """
         while lost:
             warn(lost.pop(), RecoveryWarning)
-        if faults.faults and not self._has_warned_of_fault:
-            self._has_warned_of_fault = True
-            more = "see runner.faults for more, of which there is no further warning"
-            warn(f"{faults.faults[0]}; {more}", FaultWarning)
-        if contacts is not None and contacts.contacts and not self._has_warned_of_contact:
-            self._has_warned_of_contact = True
-            warn(contacts.message(), MissedContactWarning)
+        if faults.events:
+            self._warn_once(f"{faults.events[0]}; see runner.faults for more", FaultWarning)
+        if contacts is not None and contacts.events:
+            problem = "without collisions robots went through what they would have touched"
+            remedy = "Use collisions=True, or other moves; see runner.missed_contacts for more"
+            self._warn_once(f"{problem}: {contacts.events[0]}. {remedy}", MissedContactWarning)
+
+    def _warn_once(self, text: str, kind: type[Warning]) -> None:
+        if kind not in self._issued:
+            self._issued.add(kind)
+            warn(f"{text}, of which there is no further warning", kind)

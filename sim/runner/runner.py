@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from inspect import Signature, signature
-from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from time import strftime
@@ -30,7 +29,7 @@ from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.backend import describe
-from batchpid.sim.loop.faults import Fault
+from batchpid.sim.loop.faults import Fault, MissedContact
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.options.options import KINDS, OPTIONS, RunnerOptions, arguments_of, checked_option
@@ -38,7 +37,7 @@ from batchpid.sim.runner.arguments import count_ticks, read_command
 from batchpid.sim.runner.operations import (
     Operation,
     ReadPoses,
-    ReadStateSizes,
+    ReadRows,
     Reset,
     Restore,
     Run,
@@ -50,10 +49,8 @@ from batchpid.sim.runner.operations import (
 )
 from batchpid.sim.runner.run_warnings import RunWarnings
 from batchpid.sim.runner.runner_state import RunnerState
-from batchpid.sim.signals.command import CommandSpec
-from batchpid.sim.signals.observation import Observation, empty_observation
+from batchpid.sim.signals.quantities import CommandSpec, Observation, empty_observation
 from batchpid.sim.signals.rollout import Rollout, RunInfo
-from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, WorkerPool
@@ -113,8 +110,8 @@ class Runner(SingleOwner):
         self._call, self._warnings = OneCall(), RunWarnings(checked)
         self._derived = checked.derived
         self._state = RunnerState.first(checked)
-        self._sent: Run | None = None  # and not completed yet
-        self._unreceived: Observation | None = None
+        self._sent: Run | None = None  # by send(), until recv()
+        self._is_running = False  # whether the workers run it
         self._cause: BaseException | None = None  # of the end
         try:
             self._open()
@@ -125,34 +122,29 @@ class Runner(SingleOwner):
 
     def _open(self) -> None:
         """Start the workers, and reset all envs."""
-        state, options = self._state, self.options
+        options = self.options
+        checks = self._warnings
         seed = None if options.randomization is None else 0
-        start = Reset.read(
-            options, state, self._warnings.limits, (None, None), None, seed, (None, None)
-        )
+        base = {"base_pose": None, "base_twist": None}
+        start = Reset.read(options, self._state, checks.limits, (None, None), None, seed, base)
         self._call.begin()
         try:
             self._call.waits = True
-            self._pool = WorkerPool(options, state.params)
+            self._pool = WorkerPool(options, options.params)
             self._pool.open()
-            outcome = self._pool.run(start)
-            if outcome.failure is not None:
-                raise outcome.failure.error
-            self._state = state = start.committed(state, outcome)
         finally:
             self._call.end()
-        self._warnings.issue(state.faults, state.contacts, self._pool.warnings)
-        self._warnings.check_stability(state.params, state.actuators)
-        self._warnings.set_params(state.params)
-        self._warnings.check_controller()
+        self._execute(start)
+        checks.check_stability(self._state)
+        checks.set_params(options.params)
+        checks.check_controller()
 
     def __repr__(self) -> str:
         options = self.options
-        where = f"{len(self.nodes) or len(self.pids)} {'nodes' if self.nodes else 'workers'}"
         state = "closed" if self.closed else f"at {self.time:g} s"
         return (
-            f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control"
-            f" {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
+            f"Runner({self.robot.name}, {self.num_envs} envs, {options.workers} workers,"
+            f" control {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
             f" {self.substeps} substeps, {state})"
         )
 
@@ -196,11 +188,12 @@ class Runner(SingleOwner):
             The observation of a tick that was sent has not been received, as for :meth:`step`,
             :meth:`rollout` and :meth:`restore`.
         """
-        self._ready("reset")
+        self._ready()
         limits = self._warnings.limits
-        base = (base_pose, base_twist)
-        self._execute(Reset.read(self.options, self._state, limits, (qpos, qvel), mask, seed, base))
-        return self._pool.present.observation.copied(self._derived)
+        base = {"base_pose": base_pose, "base_twist": base_twist}
+        start = Reset.read(self.options, self._state, limits, (qpos, qvel), mask, seed, base)
+        self._execute(start)
+        return self.observe()
 
     def step(
         self,
@@ -239,8 +232,8 @@ class Runner(SingleOwner):
         substeps
             Sim steps of this tick; default the runner's.
         """
-        if self._sent is not None or self._unreceived is not None or self._pool.closed:
-            self._ready("step")
+        if self._sent is not None or self._pool.closed:
+            self._ready()
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         self._execute(self._tick(command, substeps))
         return self._pool.present.observation.copied(self._derived)
@@ -256,33 +249,49 @@ class Runner(SingleOwner):
     ) -> None:
         """Begin a tick and return, while the workers run it; :meth:`recv` returns its observation.
 
-        The two are bit-identical to one :meth:`step`, and take its arguments. Other calls in
-        between, and attributes such as :attr:`time`, first wait for the tick to end. Calls that
-        change the observation raise CallOrderError. With ``workers=0`` the tick runs in this call.
+        The two are bit-identical to one :meth:`step`, and take its arguments. In between,
+        attributes such as :attr:`time` are those of the tick before, and other methods but
+        :meth:`close` raise CallOrderError. With ``workers=0`` the tick runs in this call.
 
         Raises
         ------
         CallOrderError
             The observation of the last tick that was sent has not been received.
         """
-        self._ready("send")
+        self._ready()
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
-        self._begin(self._tick(command, substeps))
+        run = self._tick(command, substeps)
+        self._prepare_ticks()
+        self._call.begin()
+        try:
+            self._call.waits = True
+            self._pool.begin(run)
+            self._sent = run
+            self._is_running = True
+        except BaseException as error:
+            self._fail(error)
+            raise
+        finally:
+            if self._pool.closed:
+                self._pool.close()
+            self._call.end()
 
     def recv(self) -> Observation:
-        """Wait for the end of the tick that :meth:`send` began; return its observation.
+        """Wait for the end of the tick that :meth:`send` began; return its observation. After an
+        interrupt it can be called again.
 
         Raises
         ------
         CallOrderError
             No tick was sent since the last call.
         """
-        self._ready()
-        observation = self._unreceived
-        self._unreceived = None
-        if observation is None:
-            raise CallOrderError("recv: no tick was sent; call send(setpoint) first")
-        return observation
+        self._check_open()
+        if self._sent is None:
+            raise CallOrderError("no tick was sent; call send(setpoint) first")
+        if self._is_running:
+            self._execute(self._sent)
+        self._sent = None
+        return self._pool.present.observation.copied(self._derived)
 
     def rollout(
         self,
@@ -305,7 +314,7 @@ class Runner(SingleOwner):
         progress
             Wraps the range of ticks, e.g. ``tqdm.tqdm``.
         """
-        self._ready("rollout")
+        self._ready()
         arrays = {
             "setpoints": setpoints,
             "setpoint_rates": setpoint_rates,
@@ -313,36 +322,32 @@ class Runner(SingleOwner):
             "feedforwards": feedforwards,
         }
         options = self.options
-        ticks = count_ticks(self.options, setpoints)
-        tick = options.substeps * options.timestep
-        command = read_command(
-            options, self._state, self._warnings.setpoint_limits, arrays, tick, ticks
-        )
-        robot = options.robot
+        limits = self._warnings.setpoint_limits
+        ticks = count_ticks(options, setpoints)
+        seconds = options.substeps * options.timestep
+        command = read_command(options, self._state, limits, arrays, seconds, ticks)
+        seen = empty_observation(ticks, self.num_envs, options.robot.dof, observed=options.observed)
+        info = self.info
+        steps = self._state.steps + options.substeps * np.arange(1.0, ticks + 1)
         done = 0
-        seen = empty_observation(ticks, self.num_envs, robot.dof, observed=options.observed)
-        times = (
-            self._state.steps + options.substeps * np.arange(1.0, ticks + 1)
-        ) * options.timestep
-        info = replace(self.info, rates=command.setpoint_rate is not None)
         shown = iter(range(ticks) if progress is None else progress(range(ticks)))
         for number in range(ticks):  # not over ``shown``, which may yield anything
             next(shown, None)
             if number == done:
+                # One request has several ticks.
                 done = min(ticks, number + self._max_ticks())
                 part = slice(number, done)
                 rows = command.map(itemgetter(part))
                 self._execute(Run(done - number, options.substeps, rows))
+                observed = self._pool.arrays.observation.map(itemgetter(slice(done - number)))
                 for name in options.observed:
-                    getattr(seen, name)[part] = getattr(self._pool.arrays.observation, name)[
-                        : done - number
-                    ]
+                    getattr(seen, name)[part] = getattr(observed, name)
         next(shown, None)  # the end
-        further = {name: derive(seen) for name, derive in options.derived.items()}
-        seen = seen._replace(**further)
-        if (faults := self._state.faults.faults) is not info.faults:
-            info = replace(info, faults=faults)
-        return Rollout(times, command.setpoint, seen, tick, info, command.feedforward)
+        seen = seen._replace(**{name: derive(seen) for name, derive in self._derived.items()})
+        rated = command.setpoint_rate is not None
+        info = replace(info, rates=rated, faults=self._state.faults.events)
+        times = steps * options.timestep
+        return Rollout(times, command.setpoint, seen, seconds, info, command.feedforward)
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
@@ -390,14 +395,14 @@ class Runner(SingleOwner):
         """PID parameters; assign new ones to change gains, limits or times in flight (bumpless in
         the integral).
         """
-        return self._settled().params
+        return self._state.params
 
     @params.setter
     def params(self, params: bp.PIDParams) -> None:
         self._ready()
         checked = self.options.check_params(params)
         self._execute(SetParams(checked))
-        self._warnings.check_stability(checked, self._state.actuators)
+        self._warnings.check_stability(self._state)
         self._warnings.set_params(checked)
 
     @property
@@ -408,7 +413,7 @@ class Runner(SingleOwner):
         As in the option, assign None for the robot's own actuators, and ``bp.Actuators()`` for
         ideal ones.
         """
-        return self._settled().actuators
+        return self._state.actuators
 
     @actuators.setter
     def actuators(self, actuators: bp.Actuators | None) -> None:
@@ -442,18 +447,13 @@ class Runner(SingleOwner):
             It is of another robot, number of envs, timestep, control, ...; the message names the
             options.
         """
-        self._ready("restore")
+        self._ready()
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
-        restore = restored(self.options, self._state, snapshot, self._state_sizes)
+        restore = restored(self.options, snapshot, self._present)
         self._execute(restore)
         self._pool.start_replay_from(restore)
         self._warnings.set_params(self._state.params)
-        return self._pool.present.observation.copied(self._derived)
-
-    def settle(self) -> None:
-        """Complete a tick that :meth:`send` began, as every other method does first."""
-        if self._sent is not None and not self.closed:
-            self._execute(self._sent)
+        return self.observe()
 
     # -- properties
     # ----------------------------------------------------------------------------------------------
@@ -476,13 +476,13 @@ class Runner(SingleOwner):
             start=start,
             versions=dict(self._versions),
             begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
-            faults=state.faults.faults,
+            faults=state.faults.events,
         )
 
     @cached_property
-    def _state_sizes(self) -> list[int]:
-        """Number of values in the engine's state of each env."""
-        return [*chain.from_iterable(self._execute(ReadStateSizes()).results)]
+    def _present(self) -> Snapshot:
+        """Snapshot of a moment, whose names and shapes those to restore are compared with."""
+        return snapshot_of(self.options, self._state, self._read(ReadRows()))
 
     @cached_property
     def _versions(self) -> dict[str, str]:
@@ -496,31 +496,31 @@ class Runner(SingleOwner):
     @property
     def faults(self) -> tuple[Fault, ...]:
         """Envs that failed, latest last: the last ten thousand."""
-        return self._settled().faults.faults
+        return self._state.faults.events
 
     @property
     def missed_contacts(self) -> tuple[MissedContact, ...]:
         """First contact that each robot without shapes would have had since its reset; latest
         last.
         """
-        contacts = self._settled().contacts
+        contacts = self._state.contacts
         if contacts is None:
             return ()
-        return tuple(contacts.contacts)
+        return contacts.events
 
     @property
     def draws(self) -> dict[str, NDArray[np.float64]]:
         """Draws of the randomization for the present episodes, by field: (envs, joints or links),
         as copies.
         """
-        return {name: rows.copy() for name, rows in self._settled().draws.values.items()}
+        return {name: rows.copy() for name, rows in self._state.draws.values.items()}
 
     @property
     def episodes(self) -> NDArray[np.int64]:
         """Stream and number of the present episode of each env (envs, 2); (0, 2) without a
         randomization.
         """
-        return self._settled().draws.episodes.copy()
+        return self._state.draws.episodes.copy()
 
     @property
     def backend(self) -> str:
@@ -532,14 +532,14 @@ class Runner(SingleOwner):
     @property
     def time(self) -> float:
         """Simulated time since the start [s]."""
-        return self._settled().steps * self.timestep
+        return self._state.steps * self.timestep
 
     @property
     def work_seconds(self) -> NDArray[np.float64]:
         """Seconds of work of each worker in the last tick; after a rollout, the mean over the ticks
         of one request.
         """
-        seconds, ticks = self._settled().work
+        seconds, ticks = self._state.work
         return np.array(seconds) / ticks
 
     @property
@@ -583,43 +583,37 @@ class Runner(SingleOwner):
     # -- execution of commands
     # -------------------------------------------------------------------------------------
 
-    def _ready(self, call: str | None = None) -> None:
-        """Complete a tick that was sent.
+    def _ready(self) -> None:
+        """Check that no tick was sent, and as :meth:`_check_open`.
 
-        ``call`` is the name of a method that changes the observation.
+        Raises
+        ------
+        CallOrderError
+            The observation of a tick that was sent has not been received.
+        """
+        self._check_open()
+        if self._sent is not None:
+            problem = "the observation of the last tick that was sent has not been received"
+            raise CallOrderError(f"{problem}; call recv() first")
+
+    def _check_open(self) -> None:
+        """Check that the runner can be used.
 
         Raises
         ------
         ClosedError
             The runner is closed.
-        CallOrderError
-            The observation of a tick that was sent has not been received, and ``call`` would change
-            it.
         InUseError
             Another call is in progress, or the runner belongs to another process.
         """
         if self._pool.closed:
-            cause, reason = self._cause, ""
+            reason = ""
+            cause = self._cause
             if cause is not None:
-                reason = (
-                    ", since a call failed"
-                    f" ({(str(cause).splitlines() or [type(cause).__name__])[0]})"
-                )
+                text = str(cause) or type(cause).__name__
+                reason = f", since a call failed ({text.splitlines()[0]})"
             raise ClosedError(f"this Runner is closed{reason}; make a new one")
         self._call.check()
-        if self._sent is not None:
-            self._execute(self._sent)
-        if self._unreceived is not None and call is not None:
-            problem = "the observation of the last tick that was sent has not been received"
-            raise CallOrderError(f"{call}: {problem}; call recv() first")
-
-    def _settled(self) -> RunnerState:
-        """Return the state after the last command; during a call, and after the end, after the last
-        completed one.
-        """
-        if self._sent is not None and not (self._call.in_use or self._pool.closed):
-            self._execute(self._sent)
-        return self._state
 
     def _tick(self, arrays: tuple[ArrayLike | None, ...], substeps: int | None) -> Run:
         """Return the operation for the arguments of :meth:`step`, checked."""
@@ -637,22 +631,6 @@ class Runner(SingleOwner):
         command = read_command(self.options, self._state, limits, inputs, seconds)
         return Run(1, count, command)
 
-    def _begin(self, run: Run) -> None:
-        """Send a request of ticks, for :meth:`_execute` to complete."""
-        self._prepare_ticks()
-        self._call.begin()
-        try:
-            self._call.waits = True
-            self._pool.begin(run)
-            self._sent = run
-        except BaseException as error:
-            self._fail(error)
-            raise
-        finally:
-            if self._pool.closed:
-                self._pool.close()
-            self._call.end()
-
     def _read(self, operation: Operation) -> Any:
         """Return the result of an operation that reads from the loops of all envs."""
         return operation.join(self._execute(operation).results)
@@ -665,7 +643,7 @@ class Runner(SingleOwner):
         """
         call = self._call
         pool = self._pool
-        is_sent = operation is self._sent
+        is_sent = self._is_running
         run = operation if isinstance(operation, Run) else None
         is_due = self.recorder is not None or self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
         if is_due and run is not None and not is_sent:
@@ -677,21 +655,12 @@ class Runner(SingleOwner):
             if not is_sent:
                 pool.begin(operation)
             outcome = pool.finish()
-            call.waits = False
+            call.waits = self._is_running = False
             # Ticks before a failure count: the workers have run them.
             if outcome.failure is None or run is not None:
                 self._state = operation.committed(before, outcome)
             if run is not None and self.recorder is not None:
                 self._record(self.recorder, run, before, outcome)
-            if is_sent:
-                self._sent, self._unreceived = (
-                    None,
-                    (
-                        None
-                        if outcome.failure
-                        else self._pool.present.observation.copied(self._derived)
-                    ),
-                )
             if outcome.failure is not None and operation.changes_loop:
                 self._fail(outcome.failure.error)
         except BaseException as error:
@@ -709,10 +678,9 @@ class Runner(SingleOwner):
             rows = run.command.setpoint[: outcome.num_ticks]
             rates = run.command.setpoint_rate
             moving.see(rows, rates is not None, run.substeps * self.timestep)
-        faults = self._state.faults
-        contacts = self._state.contacts
-        if pool.warnings or faults.faults or contacts is not None:
-            self._warnings.issue(faults, contacts, pool.warnings)
+        state = self._state
+        if pool.warnings or state.faults.events or state.contacts is not None:
+            self._warnings.issue(state.faults, state.contacts, pool.warnings)
         return outcome
 
     def _prepare_ticks(self) -> None:
@@ -755,7 +723,7 @@ class Runner(SingleOwner):
     def _max_ticks(self) -> int:
         """Return the number of ticks that one request may have: none beyond the next checkpoint."""
         left = CHECKPOINT_STEPS - self._state.steps_since_checkpoint % CHECKPOINT_STEPS
-        return min(len(self._pool.ticks), -(-left // self.options.substeps))
+        return min(len(self._pool.arrays.observation.ok), -(-left // self.options.substeps))
 
 
 _PARAMETERS = signature(RunnerOptions).parameters.items()

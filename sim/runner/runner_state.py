@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.loop.faults import FaultLog
+from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, EventLog, Fault, MissedContact
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
-from batchpid.sim.workers.contact_log import MissedContactLog
 
 Motion = tuple[Float64, Float64 | None]
 """Setpoints of joints and their rates (envs, dof); None for 0."""
@@ -25,8 +26,8 @@ class RunnerState(NamedTuple):
     params: bp.PIDParams
     actuators: bp.Actuators | None
     draws: Draws
-    faults: FaultLog
-    contacts: MissedContactLog | None
+    faults: EventLog
+    contacts: EventLog | None
     """None if contacts are not watched: the robots have collision shapes."""
     motion: Motion | None
     """Setpoint of the last tick and its rate, or position and velocity after a reset. None for
@@ -41,19 +42,34 @@ class RunnerState(NamedTuple):
     def first(cls, options: RunnerOptions) -> RunnerState:
         """Return the state before the first reset, which places all envs."""
         robot = options.robot
-        command = options.own_command
         count = options.num_envs
         draws = NOTHING
         if options.randomization is not None:
             draws = options.randomization.first(robot, count, options.first_env)
-        names = None if command is None else command.names
-        faults = FaultLog(count, robot.joint_names, options.timestep, options.on_fault, names)
+        faults = EventLog(count, "step", -1, partial(_fault, options))
         contacts = None
         if options.misses_contacts:
-            nearest = lambda qpos: robot.dynamics().contacts.nearest_links(qpos)  # noqa: E731
-            contacts = MissedContactLog(count, options.timestep, nearest)
+            contacts = EventLog(count, "missed_contact", 0, partial(_missed_contact, options))
+        motion = None
         if options.sets_positions:
             motion = (np.tile(robot.start, (count, 1)), None)
-        else:
-            motion = None
         return cls(options.params, options.actuators, draws, faults, contacts, motion)
+
+
+def _fault(options: RunnerOptions, env: int, arrays: Arrays) -> Fault:
+    """Return the last fault of an env in the arrays of a tick."""
+    step = int(arrays.fault.step[env])
+    cause = CAUSES[arrays.fault.cause[env]]
+    command = options.own_command
+    kind, names = "joint", options.robot.joint_names
+    if command is not None and cause in COMMAND_CAUSES:
+        kind, names = "entry", command.names
+    joint = names[arrays.fault.joint[env]]
+    return Fault(env, step, step * options.timestep, joint, cause, options.on_fault, kind)
+
+
+def _missed_contact(options: RunnerOptions, env: int, arrays: Arrays) -> MissedContact:
+    """Return the first missed contact of an env in the arrays of a tick."""
+    time = int(arrays.fault.missed_contact[env]) * options.timestep
+    contacts = options.robot.dynamics().contacts
+    return MissedContact(env, time, contacts.nearest_links(arrays.observation.qpos[env]))

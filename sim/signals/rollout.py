@@ -14,12 +14,13 @@ from batchpid.arrays.array_types import Float64, Rows
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
-from batchpid.sim.signals.command import CommandSpec, joint_command
-from batchpid.sim.signals.observation import (
+from batchpid.sim.signals.quantities import (
     QUANTITIES,
+    CommandSpec,
     Observation,
     Quantity,
     failed_envs,
+    joint_command,
     observed,
 )
 
@@ -112,8 +113,6 @@ class RunInfo:
     """Motors and sensors at the start, before draws of a randomization; None for ideal ones."""
     start: Rows | None = None
     """Positions before the first tick (envs, joints) [rad or m]."""
-    seed: int | None = None
-    """Seed of the run."""
     versions: Mapping[str, str] | None = None
     """Versions of the packages that results depend on, by name."""
     begun: str | None = None
@@ -136,8 +135,6 @@ class RunInfo:
     """
     urdf: str | None = field(default=None, repr=False)
     """Robot of a recording, as :func:`batchpid.sim.to_urdf` writes it, to be drawn."""
-    options: Mapping[str, Any] | None = None
-    """Further options of the runner that recordings keep, by name."""
 
     @classmethod
     def of(cls, robot: Any, **options: Any) -> RunInfo:
@@ -155,10 +152,11 @@ class RunInfo:
     @property
     def sets_positions(self) -> bool:
         """True if setpoints are joint positions."""
-        own = self.own_command
-        if own is None:
+        command = self.own_command
+        if command is None:
             return self.control != "effort"
-        return (own.names, own.units) == (self.joint_names, self.units)
+        # A controller may declare the joints by name.
+        return (command.names, command.units) == (self.joint_names, self.units)
 
     @property
     def recorded(self) -> dict[str, Quantity]:
@@ -216,6 +214,7 @@ class RunInfo:
         """Return the info of the ticks between two times [s], where the first begins at the
         positions ``start``.
         """
+        # Episodes that began before these ticks are those of the start.
         earlier = [redraw for redraw in self.redraws if redraw.time <= begin]
         episodes = self.episodes
         if episodes is not None and earlier:
@@ -268,6 +267,7 @@ class Rollout:
 
     def __getattr__(self, name: str) -> Rows:
         if name not in QUANTITIES:
+            # Only names that are no fields come here.
             names = ", ".join(QUANTITIES)
             raise AttributeError(
                 f"a Rollout has no {name!r}; it has time, setpoint, tick, info, {names}"
@@ -303,7 +303,8 @@ class Rollout:
         info = self.info
         if len(numbers):
             first = numbers[0]
-            start, begin = info.start, -np.inf
+            start = info.start
+            begin = -np.inf
             # A later part starts where the ticks before it ended.
             if first:
                 start = self.qpos[first - 1]
@@ -345,7 +346,10 @@ class Rollout:
 
     def __repr__(self) -> str:
         ticks, envs, dof = self.qpos.shape
-        end = f"up to {self.time[-1]:g} s" if ticks else "empty"
+        if ticks:
+            end = f"up to {self.time[-1]:g} s"
+        else:
+            end = "empty"
         return f"Rollout({ticks} ticks {end}, {envs} envs, {dof} joints, {failed_envs(self.ok)})"
 
     def findings(self, robot: Any = None) -> Any:
@@ -365,9 +369,13 @@ class Rollout:
         InvalidArgumentError
             The robot is not known, or has other joints than the run.
         """
+        # Rooms above load where they are used.
         from batchpid.sim.diagnosis.causes import unsettled_findings
 
-        robot = self.info.description if robot is None else robot
+        if robot is None:
+            robot = self.info.description
+        else:
+            robot = robot
         if robot is None:
             problem = "of this run is not known"
             remedy = "pass it: rollout.findings(Robot.load(...))"

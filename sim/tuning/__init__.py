@@ -1,18 +1,17 @@
 """Gains by simulation: moves to evaluate them on, their evaluation, and the search for them."""
 
-from batchpid.sim.tuning.comparison import Comparison, compare
-from batchpid.sim.tuning.cost import Weights
+from batchpid.sim.tuning.candidates import Weights
+from batchpid.sim.tuning.comparison import Comparison, GainSet, compare, gain_set
 from batchpid.sim.tuning.evaluation import (
     Evaluation,
     arm_joints,
     evaluate_gains,
     following_error,
+    load_randomization,
     run_moves,
     step_response_metrics,
 )
-from batchpid.sim.tuning.gain_sets import GainSet, gain_set
-from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
-from batchpid.sim.tuning.randomization_files import load_randomization
+from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 from batchpid.sim.tuning.search import Tuning, tune
 
 __all__ = [
@@ -30,7 +29,6 @@ __all__ = [
     "load_randomization",
     "random_moves",
     "run_moves",
-    "search_moves",
     "step_response_metrics",
     "tune",
     "tutorial_move",

@@ -1,28 +1,37 @@
-"""Comparison of sets of gains on the same moves, as a table, as figures and as a picture."""
+"""Sets of gains by name, and their comparison on the same moves: as a table, as figures and as a
+picture.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING, Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 from tabulate import tabulate
 
+import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
+from batchpid.motors import DRIVEN
 from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.options.groups import EngineName
+from batchpid.sim.options.groups import ControlMode, EngineName
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tuning.evaluation import Evaluation, arm_joints, evaluate_gains, tuning_engine
-from batchpid.sim.tuning.gain_sets import GainSet, gain_set
+from batchpid.sim.tuning.evaluation import (
+    Evaluation,
+    arm_joints,
+    evaluate_gains,
+    reseeded,
+    tuning_engine,
+)
 from batchpid.sim.tuning.moves import random_moves, tutorial_move
-from batchpid.sim.tuning.randomization_files import at_the_joints, reseeded
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,6 +52,64 @@ Median / worst over the arm's joints and all moves, made as steps of the setpoin
 |qpos - setpoint| of a joint [rad or m] on the same moves as smooth motions, with setpoint rates. overshoot: of joints
 that settled. chatter: variation of the effort over that of the smooth move. settled / in time: moves of which every
 joint settled, within the run and within a second or 1.2 times the shortest that the effort limits allow."""
+
+
+class GainSet(NamedTuple):
+    """Params with a name, and the control of :class:`batchpid.sim.Runner` that they are for."""
+
+    name: str
+    params: bp.PIDParams
+    control: ControlMode = "pid"
+
+
+def default_gains(robot: Robot) -> str:
+    """Return the name of the gains that a robot has by default."""
+    if robot.has_tuned:
+        return "tuned"
+    return "designed"
+
+
+def gain_set(robot: Robot, name: str | None = None) -> GainSet:
+    """Return the gains of ``robot`` by name; default "tuned" where the robot has them, else
+    "designed".
+
+    "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "sapien-tutorial"
+    are the gains in SAPIEN's tutorial, for a bundled robot, "mjcf" is
+    :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or "drive:STIFFNESS,DAMPING" is the engine's
+    internal drive. Other names are params files.
+
+    Raises
+    ------
+    InvalidArgumentError
+        There is no such name or file, or the robot lacks these gains.
+    """
+    name = name or default_gains(robot)
+    named = {
+        "tuned": robot.tuned,
+        "designed": robot.designed,
+        "sapien-tutorial": robot.params,
+        "mjcf": robot.mjcf_gains,
+    }
+    if name in named:
+        return GainSet(name, named[name]())
+    kind, _, figures = name.partition(":")
+    if kind == "drive":
+        try:
+            stiffness, damping = map(float, (figures or "20,5").split(","))
+        except ValueError:
+            remedy = "write drive:STIFFNESS,DAMPING, e.g. drive:20,5"
+            raise InvalidArgumentError(
+                "gains", "is not a drive", value=name, remedy=remedy
+            ) from None
+        params = robot.params(kp=stiffness, ki=0.0, kd=damping, effort_limit=None)
+        return GainSet(f"drive ({stiffness:g}, {damping:g})", params, "drive")
+    path = Path(name)
+    if not path.is_file():
+        remedy = f"use {', '.join(named)}, drive, or a params file"
+        raise InvalidArgumentError(
+            "gains", "is neither a name nor a file", value=name, remedy=remedy
+        )
+    return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +201,7 @@ class Comparison:
 def compare(
     robot: Robot,
     gains: tuple[str, ...] | Sequence[GainSet] = (),
-    moves: Annotated[int, Field(high=100_000)] = 20,
+    moves: Annotated[int, Field(low=1, high=100_000)] = 20,
     seed: Annotated[int, Field(high=2**31 - 1)] = 0,
     seconds: Annotated[float, Field("simulated time, s", low=1e-6, high=1e6)] = 2.0,
     engine: tuple[EngineName, ...] | None = None,
@@ -162,7 +229,7 @@ def compare(
     seconds
         Simulated time of each move [s].
     engine
-        Physics engines, one or both. Default: mujoco.
+        Physics engines, separated by a space: sapien, mujoco or both. Default: mujoco.
     randomization
         Draw the robot of each move: a YAML file (docs/randomization.md), e.g. `payload: {uniform:
         [0, 0.5]}`.
@@ -176,21 +243,21 @@ def compare(
     Raises
     ------
     InvalidArgumentError
-        A set of gains is unknown, or no move is left.
+        A set of gains is unknown.
     """
-    engines = tuning_engine(runner_options.get("build")) if engine is None else engine
-    engines = (engines,) if isinstance(engines, str) else tuple(dict.fromkeys(engines))
-    if not engines:
-        raise InvalidArgumentError("engine", "is missing", remedy="name sapien, mujoco or both")
-    if not moves and robot.settings is None:
-        remedy = "use 1 or more: the robot has no move of a tutorial"
-        raise InvalidArgumentError("moves", "leaves none", value=moves, remedy=remedy)
-    sets = [gain_set(robot, name) if isinstance(name, str) else name for name in gains]
-    sets = sets or [gain_set(robot, name) for name in default_sets(robot)]
-    titles = {name: load_engine(name).title for name in engines}
+    if engine is None:
+        engine = (tuning_engine(runner_options.get("build")),)
+    titles = {name: load_engine(name).title for name in engine}
+    named = gains or default_sets(robot)
+    sets = [gain_set(robot, entry) if isinstance(entry, str) else entry for entry in named]
     # The search of the same seed has other moves and other draws.
     unseen = tutorial_move(robot) + random_moves(robot, moves, seed + 1)
     draws = reseeded(randomization, seed + 1)
+    # Drives know friction and inertia, and no other actuators.
+    drawn_drives = draws
+    if draws is not None:
+        kinds = {name: draw for name, draw in draws.actuators.items() if name in DRIVEN}
+        drawn_drives = replace(draws, actuators=kinds)
     pairs = list(product(sets, titles))
     evaluations = []
     for chosen, name in pairs if progress is None else progress(pairs):
@@ -202,14 +269,13 @@ def compare(
             seconds=seconds,
             follow=True,
             control=chosen.control,
-            # Of the actuators, those at the joints act on drives.
-            randomization=at_the_joints(draws) if chosen.control == "drive" else draws,
+            randomization=drawn_drives if chosen.control == "drive" else draws,
             engine=name,
             workers=workers,
             **runner_options,
         )
         evaluations.append(evaluation)
-    return Comparison(robot, tuple(evaluations), engines)
+    return Comparison(robot, tuple(evaluations), tuple(titles))
 
 
 def default_sets(robot: Robot) -> tuple[str, ...]:

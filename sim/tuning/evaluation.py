@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,12 +21,15 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.elementwise import TURN
-from batchpid.checks.validate import number
+from batchpid.checks.validate import file_path, number
 from batchpid.errors import InvalidArgumentError
+from batchpid.io import documents
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.diagnosis.causes import absolute_band
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.options.groups import EngineName
+from batchpid.sim.randomization.checks import check_robot
+from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
 from batchpid.sim.signals.rollout import Rollout
@@ -40,10 +45,10 @@ SUBSTEPS = 5
 """Sim steps of a tick: an odd number, so that an effort that alternates from step to step shows in
 the samples.
 """
-SETTLE_SECONDS, SETTLE_SLACK = 1.0, 1.2
-"""A move should settle within a second, or within this multiple of the shortest that its effort
-limits allow.
-"""
+SETTLE_SECONDS = 1.0
+"""Time within which a move should settle [s]."""
+SETTLE_SLACK = 1.2
+"""Or within this multiple of the shortest time that the effort limits allow."""
 
 
 class Evaluation(NamedTuple):
@@ -85,7 +90,8 @@ def step_response_metrics(
     Followers have the metrics of their leaders. Without ``with_effort`` the metrics of efforts are
     undefined (NaN), as under control "drive".
     """
-    if (command := rollout.info.own_command) is not None:
+    command = rollout.info.own_command
+    if command is not None:
         problem = f"has setpoints of {', '.join(command.names)}, not of joints"
         remedy = "pass a run with joint setpoints"
         raise InvalidArgumentError("rollout", problem, remedy=remedy)
@@ -110,8 +116,10 @@ def following_error(robot: Robot, rollout: Rollout) -> Float64:
     Followers have the error of their leaders. The errors of continuous joints are modulo 2 pi.
     """
     error = rollout.qpos - rollout.setpoint
-    error = np.abs(np.where(robot.continuous, error - TURN * np.rint(error / TURN), error))
-    return robot.coupling.of_leaders(np.where(rollout.ok[..., None], error, np.inf).max(0))
+    nearest = error - TURN * np.rint(error / TURN)
+    size = np.abs(np.where(robot.continuous, nearest, error))
+    largest = np.where(rollout.ok[..., None], size, np.inf).max(0)
+    return robot.coupling.of_leaders(largest)
 
 
 def arm_joints(robot: Robot) -> NDArray[np.bool_]:
@@ -128,8 +136,10 @@ def arm_joints(robot: Robot) -> NDArray[np.bool_]:
         while link in above:
             leaves[above[link].name] += 1
             link = above[link].parent_link
-    shared = np.array([leaves[name] > 1 for name in robot.joint_names])
-    return (shared if shared.sum() >= 3 else np.ones(robot.dof, bool)) & robot.independent
+    carries = np.array([leaves[name] > 1 for name in robot.joint_names])
+    if carries.sum() < 3:
+        return robot.independent
+    return carries & robot.independent
 
 
 def settling_limits(robot: Robot, moves: Moves) -> Float64:
@@ -139,56 +149,75 @@ def settling_limits(robot: Robot, moves: Moves) -> Float64:
     return np.maximum(SETTLE_SECONDS, SETTLE_SLACK * shortest_durations(robot, moves))
 
 
+def load_randomization(path: str | Path, robot: Robot, seed: int = 0) -> Randomization:
+    """Return the randomization in a YAML or JSON file, with ``seed`` unless the file gives one.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    InvalidArgumentError
+        It is not a randomization, or does not fit the robot.
+    """
+    path = file_path("randomize", path)
+    document = documents.read(path)
+    with documents.named(str(path)):
+        if isinstance(document, dict):
+            document = {"seed": seed, **document}
+        randomization = Randomization.from_dict(document)
+        check_robot(randomization, robot)
+    return randomization
+
+
+def reseeded(randomization: Randomization | None, seed: int) -> Randomization | None:
+    """Return ``randomization`` with ``seed`` added to its seed, for other draws."""
+    if randomization is None:
+        return None
+    return replace(randomization, seed=randomization.seed + seed)
+
+
 def run_moves(
     runner: Runner,
     moves: Moves,
     seconds: float,
-    progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
-    streams: NDArray[np.int64] | None = None,
     *,
+    streams: NDArray[np.int64] | None = None,
     durations: NDArray[np.float64] | None = None,
 ) -> tuple[Rollout, StepMetrics]:
     """Run ``moves``, one per env, from rest for ``seconds``, two ticks at least; return the rollout
     and its metrics.
 
-    ``progress`` wraps the range of ticks, e.g. ``tqdm.tqdm``. ``streams`` (moves,) are streams of
-    the runner's randomization, by default one for each move, so that the draws are the same at
-    every call.
-
-    A move is a step of the setpoint, or, where ``durations`` (moves,) [s] are above 0, a
-    minimum-jerk motion of that duration, or its beginning, with setpoint rates. Raises
-    InvalidArgumentError if ``seconds`` are out of range.
+    ``streams`` (moves,) are streams of the runner's randomization, by default one for each move, so
+    that the draws are the same at every call. A move is a step of the setpoint, or, where
+    ``durations`` (moves,) [s] are above 0, a minimum-jerk motion of that duration, or its
+    beginning, with setpoint rates. Raises InvalidArgumentError if ``seconds`` are out of range.
     """
     seconds = number("seconds", seconds, 1e-6, 1e6, "simulated time, s")
     tick = runner.timestep * runner.substeps
     ticks = max(2, round(seconds / tick))
+    start = moves.start
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SetpointWarning)
-        randomized = runner.options.randomization is not None
-        start = runner.reset(
-            moves.start, seed=(0 if streams is None else streams) if randomized else None
-        )
+        # A randomization may move the start poses; without one they are exact.
+        if runner.options.randomization is None:
+            runner.reset(start)
+        else:
+            observation = runner.reset(start, seed=0 if streams is None else streams)
+            start = observation.qpos.astype(np.float64)
         setpoints = np.broadcast_to(moves.target, (ticks, *moves.target.shape))
-        further = {}
+        rates = None
         if durations is not None:
-            total = np.maximum(durations, tick)[:, None]
-            if randomized:
-                began = start.qpos.astype(np.float64)
-            else:
-                began = moves.start
-            motion = minimum_jerk(began, moves.target, tick, duration=total)
-            rows = np.minimum(
-                np.arange(ticks), motion.ticks - 1
-            )  # the last one holds the target, at rest
-            smooth = durations[:, None] > 0
-            setpoints = np.where(smooth, motion.position[rows], setpoints)
-            further["setpoint_rates"] = np.where(smooth, motion.velocity[rows], 0.0)
-        rollout = runner.rollout(setpoints, progress=progress, **further)
+            motion = minimum_jerk(
+                start, moves.target, tick, duration=np.maximum(durations, tick)[:, None]
+            )
+            # The last row holds the target, at rest.
+            rows = np.minimum(np.arange(ticks), motion.ticks - 1)
+            is_smooth = durations[:, None] > 0
+            setpoints = np.where(is_smooth, motion.position[rows], setpoints)
+            rates = np.where(is_smooth, motion.velocity[rows], 0.0)
+        rollout = runner.rollout(setpoints, setpoint_rates=rates)
     with_effort = runner.control != "drive"
-    began = moves.start
-    if randomized and rollout.info.start is not None:
-        began = rollout.info.start.astype(np.float64)
-    return rollout, step_response_metrics(runner.robot, rollout, began, with_effort=with_effort)
+    return rollout, step_response_metrics(runner.robot, rollout, start, with_effort=with_effort)
 
 
 def evaluate_gains(
@@ -208,21 +237,20 @@ def evaluate_gains(
     :class:`batchpid.sim.Runner`. With ``follow`` the moves are made once more, as smooth motions of
     :func:`smooth_durations`, of which the first ``seconds`` are run, with setpoint rates.
     """
-    # Steps of the setpoint, then the same moves as smooth motions, in the same scenes.
-    with Runner(
-        robot, len(moves.start), params=params, **{"substeps": SUBSTEPS, **runner_options}
-    ) as runner:
+    options = {"substeps": SUBSTEPS, **runner_options}
+    with Runner(robot, len(moves.start), params=params, **options) as runner:
         rollout, metrics = run_moves(runner, moves, seconds)
         followed = None
+        # The same moves as smooth motions, in the same scenes.
         if follow:
             motion, _ = run_moves(runner, moves, seconds, durations=smooth_durations(robot, moves))
             followed = following_error(robot, motion)
-    shortest = shortest_durations(robot, moves)
     # The smooth motion to compare with takes as long as the slowest arm joint took to settle.
-    settled = np.where(
-        np.isfinite(metrics.settling_time) & arm_joints(robot), metrics.settling_time, 0.0
-    ).max(1)
-    durations = np.maximum(np.maximum(settled, np.where(np.isfinite(shortest), shortest, 0.0)), 0.1)
+    settling = metrics.settling_time
+    settled = np.where(np.isfinite(settling) & arm_joints(robot), settling, 0.0).max(1)
+    shortest = shortest_durations(robot, moves)
+    possible = np.where(np.isfinite(shortest), shortest, 0.0)
+    durations = np.maximum(np.maximum(settled, possible), 0.1)
     return Evaluation(
         name=name,
         moves=moves,

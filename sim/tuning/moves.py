@@ -30,6 +30,7 @@ from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_model import RobotModel
+from batchpid.trajectories import minimum_jerk
 
 KINDS = ("large", "small", "one joint", "all alike")
 """Kinds of random moves, in turn: up to ``size``; up to a tenth of it; of one joint; of all joints
@@ -39,26 +40,31 @@ MAX_OVERSHOOT = 0.05
 """Overshoot that a good move may have, as a fraction of it."""
 LONGEST = 1.0
 """Shortest duration [s] above which a random move is too hard for the effort limits to be drawn."""
-SMOOTH_VELOCITY, SMOOTH_EFFORT = 0.5, 0.7
+SMOOTH_VELOCITY = 0.5
+SMOOTH_EFFORT = 0.7
 """Shares of the velocity limits, and of the effort limits beside gravity, that a smooth motion may
 take.
 """
 FREE_VELOCITY = {"rad": 2.0, "m": 0.3}
 """Velocity limit of joints without one, in a smooth motion, per second."""
-_PEAK_VELOCITY = 15 / 8  # of the minimum-jerk motion in unit time
-_LINE = 24
+LINE = 24
 """Points of a move's line."""
-_EASY = 0.6
-_ROUNDS = 80
-_TRIED = 8
-_CHANGED = 0.3
-_STUCK = 0.9
-"""Share of poses in which a joint cannot move by its effort limit, above which no move moves it."""
-_CLEARANCE, _ROOMY = 1e-3, 1e-2  # m
-_EDGE = 0.02
-_PATIENCE = 50
+SAMPLES = 200
+"""Samples of the effort in a smooth motion."""
+EDGE = 0.02
+"""Distance of a move from the joint limits, as a share of the range."""
+PATIENCE = 50
 """Draws in vain after which moves get smaller."""
-_NEARBY = 0.3
+EASY = 0.6
+"""Share of the effort limits up to which a pose is held easily."""
+STUCK = 0.9
+"""Share of poses in which a joint cannot move by its effort limit, above which no move moves it."""
+TRIED = 200
+"""Poses that are tested for contact."""
+CLEARANCE = 1e-3
+"""Distance of links below which they touch [m]."""
+ROOMY = 1e-2
+"""Distance of links that are well apart [m]."""
 
 
 class Moves(NamedTuple):
@@ -68,14 +74,10 @@ class Moves(NamedTuple):
     target: Float64
     names: tuple[str, ...]
 
-    def __add__(self, other: object) -> Moves:
-        if not isinstance(other, Moves):
-            return NotImplemented
-        return Moves(
-            np.concatenate([self.start, other.start]),
-            np.concatenate([self.target, other.target]),
-            self.names + other.names,
-        )
+    def __add__(self, other: Moves) -> Moves:  # type: ignore[override]
+        start = np.concatenate([self.start, other.start])
+        target = np.concatenate([self.target, other.target])
+        return Moves(start, target, self.names + other.names)
 
     def take(self, rows: Iterable[int]) -> Moves:
         """Return the moves ``rows``."""
@@ -86,33 +88,9 @@ class Moves(NamedTuple):
 def tutorial_move(robot: Robot) -> Moves:
     """Return the move of a bundled robot's settings; none for other robots."""
     if robot.settings is None:
-        return Moves(np.empty((0, robot.dof)), np.empty((0, robot.dof)), ())
+        none = np.empty((0, robot.dof))
+        return Moves(none, none, ())
     return Moves(robot.settings.start[None], robot.settings.target[None], ("tutorial",))
-
-
-def search_moves(robot: Robot, seed: int = 0) -> Moves:
-    """Return the moves that gains are searched on.
-
-    The tutorial's, where there is one, with the hardest of 64 that start within 0.3 rad [or m] of
-    it; a random move of each kind; and the hardest of 28 more. The hardest needs most time under
-    the effort limits, so it limits how fast the gains may be.
-    """
-    moves = tutorial_move(robot)
-    drawn = random_moves(robot, 32, seed)
-    if robot.settings is not None:
-        spread = np.minimum(_NEARBY, (robot.upper - robot.lower) / 4)
-        shift = np.random.default_rng(seed).uniform(-spread, spread, (64, robot.dof))
-        starts = np.clip(robot.settings.start + shift, robot.lower, robot.upper)
-        near = Moves(starts, np.tile(robot.settings.target, (64, 1)), ("near the tutorial's",) * 64)
-        moves += _hardest(robot, near)
-    return (
-        moves + drawn.take(range(len(KINDS))) + _hardest(robot, drawn.take(range(len(KINDS), 32)))
-    )
-
-
-def _hardest(robot: Robot, moves: Moves) -> Moves:
-    duration = shortest_durations(robot, moves)
-    return moves.take([int(np.argmax(np.where(np.isfinite(duration), duration, -1.0)))])
 
 
 def random_moves(
@@ -137,66 +115,57 @@ def random_moves(
     """
     count = integer("count", count, 0, 100_000)
     size = number("size", size, 1e-3, 10.0, "rad or m")
-    dynamics = robot.dynamics(ground)
     rng = np.random.default_rng(integer("seed", seed, 0, 2**63 - 1))
+    dynamics = robot.dynamics(ground)
     poses = robot.sample(1000, seed=0)
     reach = np.ptp(poses, axis=0)
-    low = robot.lower + _EDGE * reach
-    high = robot.upper - _EDGE * reach
-    line = np.linspace(0, 1 + MAX_OVERSHOOT, _LINE)[:, None]
+    low = robot.lower + EDGE * reach
+    high = robot.upper - EDGE * reach
+    line = np.linspace(0, 1 + MAX_OVERSHOOT, LINE)[:, None]
     center, movable = easy_pose(robot, dynamics, poses[:200])
-    if dynamics.in_contact(center[None], _CLEARANCE)[0]:
+    clearance = CLEARANCE
+    # Around a pose in contact, only deeper contact can be avoided.
+    if dynamics.in_contact(center[None], CLEARANCE)[0]:
         clearance = 0.0
-    else:
-        clearance = _CLEARANCE
-    share, in_vain = 1.0, 0
-    moves = list[tuple[Float64, Float64, str]]()
+    moves = Moves(np.empty((0, robot.dof)), np.empty((0, robot.dof)), ())
+    share = 1.0
+    in_vain = 0
     for _ in range(200 * count + 200):
-        if len(moves) == count:
-            break
-        # Where few poses are free of contact, moves get smaller.
-        if in_vain == _PATIENCE:
-            share = share / 2
+        if len(moves.names) == count:
+            return moves
+        if in_vain == PATIENCE:
+            share /= 2
             in_vain = 0
-        kind = KINDS[len(moves) % len(KINDS)]
+        # Start, then a step of the next kind.
         pose = robot.sample(1, seed=int(rng.integers(2**31)))[0]
-        start = np.clip(pose if share == 1 else center + share * (pose - center), low, high)
-        joint = rng.integers(robot.dof)
-        fraction = rng.uniform(-1, 1, robot.dof)
-        if kind == "all alike":
-            fraction[:] = fraction[0]
-        if kind == "one joint":
-            joint = robot.coupling.leader[joint]
-            fraction[np.arange(robot.dof) != joint] = 0.0
+        start = np.clip(center + share * (pose - center), low, high)
+        kind = KINDS[len(moves.names) % len(KINDS)]
+        step = rng.uniform(-1, 1, robot.dof)
+        joint = robot.coupling.leader[rng.integers(robot.dof)]
+        if kind == "small":
+            step /= 10
+        elif kind == "all alike":
+            step[:] = step[0]
+        elif kind == "one joint":
+            step[np.arange(robot.dof) != joint] = 0.0
             kind = f"{robot.joint_names[joint]} alone"
-        span = np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
-        start, target = (
-            robot.coupled(ends)
-            for ends in (start, np.clip(start + movable * share * fraction * span, low, high))
-        )
+        step *= movable * share * np.minimum(size, reach)
+        target = np.clip(start + step, low, high)
+        move = Moves(robot.coupled(start[None]), robot.coupled(target[None]), (kind,))
         # The ends are tested first: most moves in contact are so at an end.
-        path = start + line * (target - start)
+        path = move.start + line * (move.target - move.start)
         touches = any(dynamics.in_contact(q, clearance).any() for q in (path[[0, -1]], path))
-        move = Moves(start[None], target[None], (kind,))
         if touches or shortest_durations(robot, move)[0] > LONGEST:
             in_vain += 1
-            continue
-        in_vain = 0
-        moves.append((start, target, kind))
-    if len(moves) < count:
-        problem = (
-            f"{robot.name!r} touches itself or the ground where it should not, or is too weak, in"
-            f" nearly every draw of a move: {len(moves)} of {count} were found"
-        )
-        remedy = (
-            "give the moves or gains yourself, or correct what batchpid inspect lists as touching"
-            " or weak"
-        )
-        raise InvalidArgumentError("robot", problem, remedy=remedy)
-    starts, targets = (
-        np.array([move[end] for move in moves]).reshape(-1, robot.dof) for end in (0, 1)
+        else:
+            moves += move
+            in_vain = 0
+    problem = (
+        f"{robot.name!r} touches itself or the ground, or is too weak, in nearly every draw of a"
+        f" move: {len(moves.names)} of {count} moves were found"
     )
-    return Moves(starts, targets, tuple(name for _, _, name in moves))
+    remedy = "pass moves or gains, or correct the contacts and limits that batchpid inspect lists"
+    raise InvalidArgumentError("robot", problem, remedy=remedy)
 
 
 def easy_pose(
@@ -206,52 +175,39 @@ def easy_pose(
     (dof,).
 
     It is the start pose if its links are well apart and the effort limits hold it easily. Otherwise
-    a better pose is found by descent: some joints of the best pose so far move towards random
-    poses, by smaller and smaller steps.
+    it is the pose of the least effort whose links are well apart, among ``poses`` and others
+    between these and the start pose; if none of the first :data:`TRIED` is, the start pose.
     """
-    rng = np.random.default_rng(0)
 
     def shares(qpos: Float64) -> Float64:
         still = np.zeros_like(qpos)
         return np.abs(motion_effort(robot, qpos, still, still)) / robot.design_effort_limit
 
-    def cost(qpos: Float64, share: float) -> tuple[float, ...]:
-        levels = (0.0, _CLEARANCE, _ROOMY)  # contact at one of them is contact at the next
-        apart = next(
-            (n for n, level in enumerate(levels) if dynamics.in_contact(qpos[None], level)[0]),
-            len(levels),
-        )
-        return float(apart == 0), float(share >= 1), float(len(levels) - apart), max(share, _EASY)
-
     # A joint that cannot hold itself nearly anywhere does not move.
-    movable = (shares(poses) + robot.friction / robot.design_effort_limit >= 1).mean(0) <= _STUCK
-    center = robot.start
-    least = cost(center, float(shares(center[None]).max()))
-    for spread in np.geomspace(1.0, 0.05, _ROUNDS):
-        if least == (0, 0, 0, _EASY):
-            break
-        changed = rng.random(poses.shape) < _CHANGED
-        tried = robot.coupled(np.where(changed, center + spread * (poses - center), center))
-        # The contact of a pose takes long to compute: the easiest poses are tried first.
-        share = shares(tried).max(1)
-        for index in np.argsort(share, kind="stable")[:_TRIED]:
-            if (move_cost := cost(tried[index], float(share[index]))) < least:
-                center = tried[index]
-                least = move_cost
-                break
-    return center, movable
+    weak = shares(poses) + robot.friction / robot.design_effort_limit >= 1
+    movable = weak.mean(0) <= STUCK
+    spreads = np.geomspace(1.0, 0.05, 8)[:, None, None]
+    near = robot.start + spreads * (poses - robot.start)
+    candidates = robot.coupled(np.vstack([robot.start[None], *near]))
+    # Contact takes long to compute. A stable order has the start first among the easy poses.
+    order = np.argsort(np.maximum(shares(candidates).max(1), EASY), kind="stable")
+    for pose in candidates[order[:TRIED]]:
+        if not dynamics.in_contact(pose[None], ROOMY)[0]:
+            return pose, movable
+    return robot.start, movable
 
 
 def shortest_durations(robot: Robot, moves: Moves) -> Float64:
     """Return the time of the shortest bang-bang motion along each move (moves,) [s]; inf if gravity
     forbids it.
     """
-    t = (np.arange(2 * _LINE)[:, None] + 0.5) / (2 * _LINE)
-    early = t < 0.5
-    z = np.where(early, 2 * t**2, 1 - 2 * (1 - t) ** 2)
-    return _durations(
-        robot, moves, z, np.where(early, 4 * t, 4 * (1 - t)), np.where(early, 4.0, -4.0)
-    )
+    time = (np.arange(2 * LINE)[:, None] + 0.5) / (2 * LINE)
+    # The second half is the first one backwards in time, with the opposite acceleration.
+    left = np.minimum(time, 1 - time)
+    is_early = time < 0.5
+    position = np.where(is_early, 2 * left**2, 1 - 2 * left**2)
+    acceleration = np.where(is_early, 4.0, -4.0)
+    return _durations(robot, moves, position, 4 * left, acceleration)
 
 
 def smooth_durations(robot: Robot, moves: Moves) -> Float64:
@@ -262,22 +218,20 @@ def smooth_durations(robot: Robot, moves: Moves) -> Float64:
     and friction take at most 0.7 of the effort that gravity leaves. Where gravity leaves none, the
     velocity limits alone count.
     """
-    velocity = np.where(
-        np.isfinite(robot.velocity_limit),
-        robot.velocity_limit,
-        [FREE_VELOCITY[u] for u in robot.units],
+    free = np.array([FREE_VELOCITY[unit] for unit in robot.units])
+    fastest = np.where(np.isfinite(robot.velocity_limit), robot.velocity_limit, free)
+    unit_time = minimum_jerk([0.0], [1.0], 0.5 / LINE, duration=1.0)
+    peak = unit_time.velocity.max()
+    by_velocity = peak * np.abs(moves.target - moves.start) / (SMOOTH_VELOCITY * fastest)
+    by_effort = _durations(
+        robot,
+        moves,
+        unit_time.position,
+        unit_time.velocity,
+        unit_time.acceleration,
+        SMOOTH_EFFORT,
     )
-    by_velocity = (
-        _PEAK_VELOCITY * np.abs(moves.target - moves.start) / (SMOOTH_VELOCITY * velocity)
-    ).max(1)
-    t = (np.arange(2 * _LINE)[:, None] + 0.5) / (2 * _LINE)
-    profile = (
-        t**3 * (10 - 15 * t + 6 * t**2),
-        30 * t**2 * (1 - t) ** 2,
-        60 * t * (1 - t) * (1 - 2 * t),
-    )
-    by_effort = _durations(robot, moves, *profile, SMOOTH_EFFORT)
-    return np.maximum(by_velocity, np.where(np.isfinite(by_effort), by_effort, 0.0))
+    return np.maximum(by_velocity.max(1), np.where(np.isfinite(by_effort), by_effort, 0.0))
 
 
 def _durations(
@@ -295,16 +249,16 @@ def _durations(
         # The effort is linear in 1 / T^2: gravity, and the motion in unit time.
         gravity = motion_effort(robot, qpos, still, still)
         moving = motion_effort(robot, qpos, rate * step, acceleration * step) - gravity
-        along = moving * step > 0  # there friction and damping take their share of the effort
-        room = (
-            share * np.where(moving > 0, limit - gravity, limit + gravity) - along * robot.friction
-        )
+        # Friction and damping take a share of the effort where it has the direction of the motion.
+        along = moving * step > 0
+        free = np.where(moving > 0, limit - gravity, limit + gravity)
+        room = share * free - along * robot.friction
         # Without room somewhere on the line there is no motion, however slow.
         if (room > 0).all() and (np.abs(gravity) < limit).all():
-            drag = along * robot.damping * np.abs(rate * step)  # room T^2 - drag T - |moving| >= 0
-            durations[row] = (
-                (drag + np.sqrt(drag**2 + 4 * room * np.abs(moving))) / (2 * room)
-            ).max()
+            # The positive root of room T^2 - drag T - |moving|.
+            drag = along * robot.damping * np.abs(rate * step)
+            root = np.sqrt(drag**2 + 4 * room * np.abs(moving))
+            durations[row] = ((drag + root) / (2 * room)).max()
     return durations
 
 
@@ -315,22 +269,15 @@ def motion_effort(robot: Robot, qpos: Float64, qvel: Float64, qacc: Float64) -> 
     return robot.coupling.efforts(robot.dynamics().inverse_dynamics(qpos, qvel, qacc))
 
 
-def smooth_effort(
-    robot: Robot, start: Float64, target: Float64, duration: float, samples: int = 200
-) -> Float64:
-    """Return the efforts (samples, dof) of the minimum-jerk motion from ``start`` to ``target`` in
-    ``duration`` [s].
-
-    They overcome the joints' friction and damping.
-    T. Flash and N. Hogan, "The coordination of arm movements", J. Neuroscience 5 (1985).
+def smooth_effort(robot: Robot, start: Float64, target: Float64, duration: float) -> Float64:
+    """Return the efforts (:data:`SAMPLES`, dof) of the minimum-jerk motion from ``start`` to
+    ``target`` in ``duration`` [s]: they overcome the joints' friction and damping.
     """
-    t = np.linspace(0, 1, samples)[:, None]
-    step = target - start
-    qpos = start + step * (10 * t**3 - 15 * t**4 + 6 * t**5)
-    qvel = step * (30 * t**2 - 60 * t**3 + 30 * t**4) / duration
-    qacc = step * (60 * t - 180 * t**2 + 120 * t**3) / duration**2
-    dissipation = robot.damping * qvel + robot.friction * np.sign(qvel)
-    return motion_effort(robot, qpos, qvel, qacc) + dissipation
+    unit_time = minimum_jerk(start, target, 1 / SAMPLES, duration=1.0)
+    velocity = unit_time.velocity / duration
+    acceleration = unit_time.acceleration / duration**2
+    dissipation = robot.damping * velocity + robot.friction * np.sign(velocity)
+    return motion_effort(robot, unit_time.position, velocity, acceleration) + dissipation
 
 
 def smooth_variation(robot: Robot, moves: Moves, durations: Float64 | float) -> Float64:
@@ -339,6 +286,9 @@ def smooth_variation(robot: Robot, moves: Moves, durations: Float64 | float) -> 
     ``durations`` [s] are (moves,) or one for all. Less than a thousandth of the joint's effort
     limit counts as that. Followers have the variation of their leaders.
     """
-    rows = zip(moves.start, moves.target, np.broadcast_to(durations, len(moves.start)), strict=True)
-    variation = [np.abs(np.diff(smooth_effort(robot, *row), axis=0)).sum(0) for row in rows]
+    variation = []
+    times = np.broadcast_to(durations, len(moves.start))
+    for start, target, duration in zip(moves.start, moves.target, times, strict=True):
+        efforts = smooth_effort(robot, start, target, float(duration))
+        variation.append(np.abs(np.diff(efforts, axis=0)).sum(0))
     return robot.coupling.of_leaders(np.maximum(variation, 1e-3 * robot.design_effort_limit))

@@ -10,7 +10,7 @@ that beat the designed gains run a final round with these on more moves, with co
 caller's solver, at the full effort limits. The gains with the lowest cost there are the result.
 
 Good gains for robots that differ from the model, by actuators or a randomization, are farther from
-the designed ones. For such robots the first generation consists of designs for the loop's delay
+the designed ones. For such robots the first generation consists of other designs
 (:mod:`batchpid.sim.tuning.candidates`), and CMA-ES starts from the best of them.
 """
 
@@ -19,7 +19,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -31,19 +31,14 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.versions import package_versions
+from batchpid.sim.loop.faults import MissedContactWarning
 from batchpid.sim.options.groups import EngineName
-from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner.runner import Runner
-from batchpid.sim.tuning.candidates import Candidates, first_gains, loop_delay
-from batchpid.sim.tuning.comparison import Comparison, compare
-from batchpid.sim.tuning.cost import Weights
-from batchpid.sim.tuning.evaluation import SUBSTEPS, tuning_engine
-from batchpid.sim.tuning.gain_sets import GainSet
-from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
-from batchpid.sim.tuning.randomization_files import reseeded
-from batchpid.sim.workers.contact_log import MissedContactWarning
+from batchpid.sim.tuning.candidates import FACTORS, Candidates, Weights
+from batchpid.sim.tuning.comparison import Comparison, GainSet, compare
+from batchpid.sim.tuning.evaluation import SUBSTEPS, reseeded, tuning_engine
+from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,14 +47,12 @@ INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
 HEADROOM = 0.9
 """Share of the effort limits that candidates may use."""
-VARIED_MOVES, DRAWN_MOVES = 20, 8
-"""Number of random moves in the search for robots that differ from the model, and with drawn
-motors.
-"""
-FINAL_MOVES, FINALISTS = 24, 3
-"""Number of moves of the final round, and the largest number of candidates in it, besides the
-designed gains.
-"""
+SEARCH_MOVES = 12
+"""Number of random moves of the search."""
+FINAL_MOVES = 24
+"""Number of moves of the final round."""
+FINALISTS = 3
+"""Largest number of candidates in the final round, besides the designed gains."""
 FINAL_SEED = 1_000_003
 """Difference between the seed of the final round and the seed of the search."""
 SEARCH_SCENE: Document = {"collisions": False, "physics": "fast", "ground": None}
@@ -83,9 +76,7 @@ class Tuning:
     settings: Document
     """Seed, moves, options and versions, for the record."""
     rejected: str | None
-    """Criterion by which the designed gains beat all candidates, with both figures; None if a
-    candidate was best.
-    """
+    """Why the designed gains are the result; None if a candidate was best."""
     scene: Document
     """Options of the comparison with the designed gains."""
 
@@ -98,22 +89,18 @@ class Tuning:
 
     def report(self) -> str:
         """Return the costs, and the table of the :attr:`comparison`."""
-        lines = [f"cost {self.start_cost:.4f} as designed, {self.cost:.4f} as tuned\n"]
+        lines = [
+            f"cost of the designed gains {self.start_cost:.4f}, of the tuned gains {self.cost:.4f}\n"
+        ]
         if self.rejected is not None:
-            lines.append(
-                f"The designed gains are the result, the tuned ones are rejected: {self.rejected}."
-            )
+            lines.append(f"The designed gains are the result: {self.rejected}.")
         return "\n".join([*lines, self.comparison.report()])
 
     def save(self, path: str | Path) -> None:
         """Write the params and the settings of the search."""
-        about = {
-            "cost": self.cost,
-            "start_cost": self.start_cost,
-            "gains": "tuned" if self.rejected is None else "designed",
-        }
+        about: Document = {"cost": self.cost, "start_cost": self.start_cost, "gains": "tuned"}
         if self.rejected is not None:
-            about["rejected"] = self.rejected
+            about |= {"gains": "designed", "rejected": self.rejected}
         bp.save_params(path, self.params, self.robot.joint_names, self.settings | about)
 
     def figure(self) -> Figure:
@@ -129,7 +116,6 @@ def tune(
     seed: int = 0,
     seconds: float = 1.5,
     gain_units: Literal["mass_matrix", "effort"] = "mass_matrix",
-    per_joint: bool = False,
     weights: Weights | None = None,
     moves: Moves | None = None,
     randomization: Randomization | None = None,
@@ -157,17 +143,13 @@ def tune(
         Simulated time of each move of the search [s].
     gain_units
         Gains per mass matrix (all joints respond equally fast), or as efforts (for any controller).
-    per_joint
-        Search for a factor of each joint too; needs more generations.
     weights
         Of the terms of the cost. Default: 1 for a second of a step's settling time and 1 for the
         logarithm of the following error.
     moves
-        Default: :func:`batchpid.sim.tuning.moves.search_moves`, and FINAL_MOVES random ones in the
-        final round. For robots with actuators or a randomization, the search uses the tutorial's
-        move and VARIED_MOVES random ones (with drawn ``motors`` DRAWN_MOVES), because the hardest
-        moves within the effort limits of the model are too hard for such robots. Given moves
-        replace them, with contacts, since they may touch something. There is then no final round.
+        Default: the tutorial's move and SEARCH_MOVES random ones, and FINAL_MOVES others in the
+        final round. Given moves replace them, with contacts, since they may touch something. There
+        is then no final round.
     randomization
         Draw the robot of each move, the same for all candidates: a YAML file
         (docs/randomization.md), e.g. `payload: {uniform: [0, 0.5]}`.
@@ -181,7 +163,7 @@ def tune(
     workers
         Processes that step the scenes; 0: this one. Default: one per available core.
     progress
-        Wraps the range of generations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
+        Wraps the range of generations, e.g. ``tqdm.tqdm``.
     runner_options
         More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``, for the final round.
         In the search, robots with a fixed base and without a ``build`` have no collision shapes and
@@ -205,11 +187,8 @@ def tune(
         remedy = "bp.design_gains makes implicit gains"
         raise InvalidArgumentError(name, problem, remedy=remedy)
     if motors is not None and runner_options.get("actuators") is not None:
-        remedy = (
-            "leave it out; the control knows the actuators of the robot: Robot.load(...,"
-            " actuators=...)"
-        )
-        raise InvalidArgumentError("actuators", "is given with motors", remedy=remedy)
+        remedy = "leave it out: the control knows the actuators of the robot"
+        raise InvalidArgumentError("actuators", "cannot be combined with motors", remedy=remedy)
     weights = Weights() if weights is None else weights
     build = runner_options.get("build")
     engine = tuning_engine(build) if engine is None else engine
@@ -217,15 +196,12 @@ def tune(
     scene: Document = {"engine": engine, "workers": workers, **runner_options}
     options: Document = {"substeps": SUBSTEPS, **scene}
 
-    is_varied = randomization is not None or robot.actuators is not None or motors is not None
+    differs = randomization is not None or robot.actuators is not None or motors is not None
     unseen = None
     fast = Document()
     if moves is None:
         unseen = random_moves(robot, FINAL_MOVES, seed + FINAL_SEED)
-        moves = search_moves(robot, seed)
-        if is_varied:
-            count = VARIED_MOVES if motors is None else DRAWN_MOVES
-            moves = tutorial_move(robot) + random_moves(robot, count, seed)
+        moves = tutorial_move(robot) + random_moves(robot, SEARCH_MOVES, seed)
         if robot.fixed_base and build is None:
             fast = SEARCH_SCENE
 
@@ -233,54 +209,39 @@ def tune(
         return Candidates(
             robot,
             gain_units,
-            per_joint,
             moves,
             seconds,
             weights,
             headroom=headroom,
-            varied=is_varied and motors is None,
+            drawn=differs and motors is None,
             motors=motors,
         )
 
-    # Search, from the designed gains or from designs for the loop's delay.
-    searched = candidates(moves, 1.0 if is_varied else HEADROOM)
-    start = searched.params(np.zeros((1, searched.dimension)))
-    designs = None
-    if is_varied:
-        dt = float(runner_options.get("timestep", RunnerOptions.timestep))
-        filter_time = float(np.max(start.derivative_filter_time))
-        delay = loop_delay(robot, randomization, dt + filter_time, motors)
-        designs = searched.points(first_gains(delay))
+    # The designed gains are the first candidate, so that every cost has a reference.
+    searched = candidates(moves, 1.0 if differs else HEADROOM)
+    first = np.zeros((1, len(FACTORS)))
+    start = searched.params(first)
+    if differs:
+        first = np.vstack([first, searched.designs()])[:population]
     options["params"] = start
     options["randomization"] = reseeded(randomization, seed)
     with searched.runner(population, options | fast) as runner:
-        points, history = _evolve(
-            searched, runner, seed, generations, population, designs, progress
-        )
+        evaluate = partial(searched.costs, runner)
+        points, history = _evolve(evaluate, first, generations, population, seed, progress)
 
-    # Final round: the designed gains against the candidates that beat them.
+    # Final round, on other moves: the designed gains against the candidates that beat them.
     costs = np.concatenate(history)
-    ranking = np.argsort(costs, kind="stable")[:FINALISTS].tolist()
-    if 0 in ranking:
-        finalists = ranking[: ranking.index(0)]
-    else:
-        finalists = ranking
-    best = (finalists or [0])[0]
-    rejected = None
-    if not finalists:
-        rejected = (
-            f"cost in the search: best candidate {costs[1:].min():.4f}, designed {costs[0]:.4f}"
-        )
-    elif unseen is not None:
+    ranking = np.argsort(costs, kind="stable")[:FINALISTS]
+    finalists = np.append(ranking[costs[ranking] < costs[0]], 0)
+    stage = "search"
+    final_costs = costs[finalists]
+    if unseen is not None and len(finalists) > 1:
+        stage = "final round"
         final = candidates(unseen, 1.0)
         options["randomization"] = reseeded(randomization, seed + FINAL_SEED)
-        with final.runner(1 + len(finalists), options) as runner:
-            judged = final.costs(runner, points[[0, *finalists]])
-        best = [0, *finalists][int(np.argmin(judged))]
-        if not best:
-            rejected = (
-                f"cost in the final: best candidate {min(judged[1:]):.4f}, designed {judged[0]:.4f}"
-            )
+        with final.runner(len(finalists), options) as runner:
+            final_costs = final.costs(runner, points[finalists])
+    best = int(finalists[np.argmin(final_costs)])
 
     settings: Document = {
         **robot.describe(),
@@ -289,7 +250,6 @@ def tune(
         "population": population,
         "seconds": seconds,
         "gain_units": gain_units,
-        "per_joint": per_joint,
         "weights": asdict(weights),
         "moves": list(moves.names),
         "randomization": None if randomization is None else randomization.to_dict(),
@@ -305,63 +265,51 @@ def tune(
         start_cost=history[0][0],
         history=history,
         settings=settings,
-        rejected=rejected,
-        scene=scene | {"randomization": randomization},
+        rejected=f"no candidate beats the designed gains in the {stage}" if best == 0 else None,
+        scene=scene | {"engine": (engine,), "randomization": randomization},
     )
 
 
 def _evolve(
-    candidates: Candidates,
-    runner: Runner,
-    seed: int,
+    evaluate: Callable[[Float64], Float64],
+    first: Float64,
     generations: int,
     population: int,
-    designs: Float64 | None,
+    seed: int,
     progress: Callable[[Any], Any] | None,
 ) -> tuple[Float64, tuple[tuple[float, ...], ...]]:
-    """Return all points (n, dimension), the first of which is 0, and their costs by generation.
+    """Return all points (n, factors) and their costs by generation.
 
-    ``designs`` (n, dimension) are candidates of the first generation too, and CMA-ES starts from
-    the best of it.
+    The search begins at ``first[0]``. Other points ``first`` (n, factors) are candidates of the
+    first generation too.
     """
     from cmaes import CMA
 
-    def optimizer_at(mean: Float64) -> CMA:
-        return CMA(mean=mean, sigma=INITIAL_SPREAD, seed=seed, population_size=population)
-
-    start = np.zeros(candidates.dimension)
-    firsts = np.array([start] if designs is None else [start, *designs])[:population]
-    optimizer = optimizer_at(start)
-    points = list[Float64]()
-    history = list[tuple[float, ...]]()
-    bar = (progress or (lambda items: items))(range(generations))
+    make = partial(CMA, sigma=INITIAL_SPREAD, seed=seed, population_size=population)
+    optimizer = make(mean=first[0])
+    points = []
+    history = []
+    numbers = range(generations)
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", MissedContactWarning
-        )  # bad gains may leave the way of a move
-        for generation in bar:
+        # Bad gains may leave the way of a move.
+        warnings.simplefilter("ignore", MissedContactWarning)
+        for generation in numbers if progress is None else progress(numbers):
             samples = np.array([optimizer.ask() for _ in range(population)])
-            # The designed gains are the first candidate, so that every cost has a reference.
             if generation == 0:
-                samples[: len(firsts)] = firsts
-            costs = candidates.costs(runner, samples)
-            if generation == 0 and designs is not None:
-                optimizer = optimizer_at(samples[int(np.argmin(costs))])
+                samples[: len(first)] = first
+            costs = evaluate(samples)
+            if generation == 0 and len(first) > 1:
+                # Points far outside its spread would upset CMA-ES: it starts anew at the best one.
+                optimizer = make(mean=samples[int(np.argmin(costs))])
             else:
                 optimizer.tell(list(zip(samples, costs.tolist(), strict=True)))
             points.append(samples)
             history.append(tuple(costs.tolist()))
-            if hasattr(bar, "set_postfix"):
-                bar.set_postfix(cost=f"{np.min(history):.4f}", start=f"{history[0][0]:.4f}")
     return np.concatenate(points), tuple(history)
 
 
 def _plain(value: Any) -> Any:
     """Return an option of the runner as a plain value, or as text."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    else:
-        value = value
     if value is None or isinstance(value, bool | int | float | str):
         return value
     return getattr(value, "__qualname__", None) or repr(value)

@@ -3,7 +3,6 @@ docs/files.md.
 """
 
 from batchpid.sim.view.page import View
-from batchpid.sim.view.playback import Playback
-from batchpid.sim.view.simulation import LiveSimulation
+from batchpid.sim.view.view_data import LiveSimulation, Playback
 
 __all__ = ["LiveSimulation", "Playback", "View"]

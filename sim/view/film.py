@@ -7,10 +7,10 @@ from __future__ import annotations
 import math
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -24,11 +24,11 @@ from batchpid.errors import BatchPIDError, MissingDependencyError
 from batchpid.io.files import replacing
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.rollout import Rollout
-from batchpid.sim.view.playback import Playback, rows_at
-from batchpid.sim.view.scene import FIELD_OF_VIEW, MAX_ROBOTS, TILE, RobotScene
+from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
+from batchpid.sim.view.view_data import Playback, rows_at
 from batchpid.task_space.frames import matrix_of, rotate
 
-LIGHT = np.array([0.5, 0.2, 0.85]) / np.linalg.norm([0.5, 0.2, 0.85])
+LIGHT = np.array([0.5, 0.2, 0.84])
 """Direction to the light."""
 _FLOOR = "#bdc6d3"
 _GRID = "#d5dae2"
@@ -111,17 +111,12 @@ class Painter:
         return seen[..., :2] / scale[..., None], depth
 
 
-FORMATS = (".mp4", ".gif")
-_ENCODERS = {
-    ".mp4": (
-        "-vf",
-        "pad=ceil(iw/2)*2:ceil(ih/2)*2",
-        "-pix_fmt",
-        "yuv420p",
-    ),  # which halves both sides for colours
-    ".gif": ("-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse", "-loop", "0"),
+ENCODERS = {
+    # Colours are halved on both sides, which are therefore even.
+    ".mp4": "-vf pad=ceil(iw/2)*2:ceil(ih/2)*2 -pix_fmt yuv420p",
+    ".gif": "-vf split[a][b];[a]palettegen[p];[b][p]paletteuse -loop 0",
 }
-"""ffmpeg's options for each format."""
+"""Options of ffmpeg for each format."""
 
 
 def write_film(
@@ -141,7 +136,7 @@ def write_film(
     out
         File that ends in .mp4 or .gif.
     robot
-        Robot of the run; default :func:`batchpid.sim.view.playback.recorded_robot`.
+        Robot of the run; default :func:`batchpid.sim.view.view_data.recorded_robot`.
     fps, width, height
         Frames per second; size in pixels.
     progress
@@ -156,10 +151,9 @@ def write_film(
     BatchPIDError
         ffmpeg failed.
     """
-    path = file_path("out", out, FORMATS)
+    path = file_path("out", out, ENCODERS)
     rate = number("fps", fps, 1.0, 120.0, "frames per second")
     size = integer("width", width, 16, 8192), integer("height", height, 16, 8192)
-    integer("num_envs", rollout.num_envs, 1, MAX_ROBOTS)
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError:
@@ -167,14 +161,17 @@ def write_film(
     recorded = Playback(rollout, robot)
     painter = Painter(recorded.robot, rollout.num_envs, recorded.ground, size)
     rows = film_rows(rollout, rate).tolist()
-    bases = rollout.base_pose
-    pictures = (
-        painter.picture(rollout.qpos[row], None if bases is None else bases[row])
-        for row in (rows if progress is None else progress(rows))
-    )
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        for row in rows if progress is None else progress(rows):
+            base = None
+            if rollout.base_pose is not None:
+                base = rollout.base_pose[row]
+            yield painter.picture(rollout.qpos[row], base)
+
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
-        encode(pictures, temporary, get_ffmpeg_exe(), size, rate)
+        encode(pictures(), temporary, get_ffmpeg_exe(), size, rate)
     return path
 
 
@@ -188,49 +185,25 @@ def encode(
     """Write RGB ``pictures`` (height, width, 3) of ``size`` (width, height) to a film, by the
     program ``ffmpeg``.
     """
-    source = (
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-s",
-        "{}x{}".format(*size),
-        "-r",
-        f"{fps}",
-        "-i",
-        "-",
-    )
-    command = [
-        ffmpeg,
-        "-v",
-        "error",
-        *source,
-        *_ENCODERS[path.suffix.lower()],
-        "-y",
-        f"file:{path}",
-    ]
+    source = "-v error -f rawvideo -pix_fmt rgb24 -s {}x{} -r {} -i -".format(*size, fps)
+    options = ENCODERS[path.suffix.lower()]
+    command = [ffmpeg, *source.split(), *options.split(), "-y", f"file:{path}"]
     with tempfile.TemporaryFile() as messages:
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=messages
         )
-        assert process.stdin is not None
         try:
-            for picture in pictures:
-                process.stdin.write(picture.tobytes())
-        except BrokenPipeError:
-            pass  # ffmpeg has ended, with a message
-        except BaseException:
-            process.kill()
-            raise
+            # The pipe breaks where ffmpeg has ended, with a message.
+            with suppress(BrokenPipeError), cast("IO[bytes]", process.stdin) as pipe:
+                for picture in pictures:
+                    pipe.write(picture.tobytes())
         finally:
-            with suppress(BrokenPipeError):
-                process.stdin.close()
+            # Its input is closed, so ffmpeg ends, also after Ctrl-C.
             status = process.wait()
         if status:
             messages.seek(0)
-            raise BatchPIDError(
-                f"{path}: ffmpeg: {messages.read().decode(errors='replace').strip()}"
-            )
+            text = messages.read().decode(errors="replace").strip()
+            raise BatchPIDError(f"{path}: ffmpeg: {text}")
 
 
 def film_rows(rollout: Rollout, fps: float) -> NDArray[np.int64]:

@@ -14,12 +14,8 @@ from typing import Any
 import numpy as np
 
 from batchpid.errors import BatchPIDError
-from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.rollout import Rollout
-from batchpid.sim.view.playback import Playback
-from batchpid.sim.view.simulation import GAINS, LiveSimulation
-
-ViewData = LiveSimulation | Playback
+from batchpid.sim.view.view_data import GAINS, LiveSimulation, Playback, ViewData
 
 
 class Panel:
@@ -28,25 +24,24 @@ class Panel:
     """
 
     def __init__(self, gui: Any, data: ViewData) -> None:
-        self._gui, self._data = gui, data
+        self._gui = gui
+        self._data = data
         self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self.frames_left = math.inf
         """Frames to run before the next pause."""
-        self._names = short_names(data.robot)
-        self._status = gui.add_markdown("starting ...")
         self._problem = ""
-        self._connect(
-            gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset")), self._control_motion
-        )
+        self._status = gui.add_markdown("starting ...")
+        buttons = gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset"))
+        self._connect(buttons, self._control_motion)
         self._speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
         if isinstance(data, Playback):
-            self._time = self._connect(
-                gui.add_slider("Time [s]", 0.0, data.duration, data.period, 0.0), data.seek
-            )
+            times = gui.add_slider("Time [s]", 0.0, data.duration, data.period, 0.0)
+            self._time = self._connect(times, data.seek)
+        # The watched robot and joint; a change shows at the next frame.
         self._robot = gui.add_slider("Robot", 0, max(1, data.num_envs - 1), 1, 0)
         self._robot.disabled = data.num_envs == 1
-        self._joint = gui.add_dropdown("Joint", self._names)
         self._connect(self._robot, lambda _: None)
+        self._joint = gui.add_dropdown("Joint", data.robot.joint_names)
         self._connect(self._joint, lambda _: None)
         if isinstance(data, LiveSimulation):
             tabs = gui.add_tab_group()
@@ -63,7 +58,7 @@ class Panel:
     @property
     def joint(self) -> int:
         """Watched joint."""
-        return self._names.index(self._joint.value)
+        return self._data.robot.joint_names.index(self._joint.value)
 
     @property
     def speed(self) -> float:
@@ -87,18 +82,20 @@ class Panel:
                 self._problem = html.escape(str(error))
         return count > 0
 
-    def update_status(self, frame: Rollout, factor: float, rate: float) -> None:
-        """Show time, real-time factor, frame rate, and how many robots diverged or saturate."""
+    def update_status(self, frame: Rollout, rate: float) -> None:
+        """Show time, real-time factor, frame ``rate`` [1/s], and how many robots diverged or
+        saturate.
+        """
         data = self._data
         time = float(frame.time[0])
+        factor = rate * data.period
+        pace = f"t = {time:.2f} s · {factor:.2f} x real time · {rate:.0f} frames/s"
+        saturated = int(frame.saturated.any(-1).sum())
+        diverged = int((~frame.ok).sum())
         lines = [
             f"**{data.num_envs} x {data.robot.name}**",
-            (
-                f"t = {time:.2f} s · {factor:.2f} x real time · {rate:.0f} frames/s"
-                if self.frames_left
-                else "paused"
-            ),
-            f"{int(frame.saturated.any(-1).sum())} saturated, {int((~frame.ok).sum())} diverged",
+            pace if self.frames_left else "paused",
+            f"{saturated} saturated, {diverged} diverged",
             self._problem,
         ]
         self._status.content = "  \n".join(lines)
@@ -110,26 +107,36 @@ class Panel:
         return its handle.
         """
 
-        async def changed(event: Any) -> None:  # a coroutine, so that the changes stay in order
+        # A coroutine, so that the changes stay in order.
+        async def changed(event: Any) -> None:
             if event.client is not None:
                 self._requests.put(partial(action, handle.value))
 
-        (handle.on_click if hasattr(handle, "on_click") else handle.on_update)(changed)
+        if hasattr(handle, "on_click"):
+            register = handle.on_click
+        else:
+            register = handle.on_update
+        register(changed)
         return handle
 
     def _control_motion(self, button: str) -> None:
+        """Carry out a button of the motion."""
         if button == "Reset":
             self._data.reset()
-        elif button == "Step":
-            if math.isinf(self.frames_left):
-                self.frames_left = 1
-            else:
-                self.frames_left = self.frames_left + 1
+        elif button == "Run":
+            self.frames_left = math.inf
+        elif button == "Pause":
+            self.frames_left = 0
+        # Steps add up, and the first one pauses a run.
+        elif math.isinf(self.frames_left):
+            self.frames_left = 1
         else:
-            self.frames_left = math.inf if button == "Run" else 0
+            self.frames_left += 1
 
     def _add_setpoints(self, live: LiveSimulation) -> None:
-        gui, robot = self._gui, live.robot
+        """Add a slider for each joint, and buttons for poses."""
+        gui = self._gui
+        robot = live.robot
         poses = {"start": robot.start, "target": robot.target}
         sliders: dict[int, Any] = {}
 
@@ -139,26 +146,27 @@ class Panel:
             else:
                 live.set_setpoint(poses[pose])
             for joint, slider in sliders.items():
-                slider.value = float(
-                    np.clip(live.setpoint[self.env, joint], slider.min, slider.max)
-                )
+                position = live.setpoint[self.env, joint]
+                slider.value = float(np.clip(position, slider.min, slider.max))
 
         def move(joint: int, position: float) -> None:
             live.set_setpoint(position, joint=joint)
 
         self._connect(gui.add_button_group("Go to", (*poses, "random")), go_to)
-        for index in np.flatnonzero(
-            robot.independent
-        ).tolist():  # followers move with their leaders
+        # Followers move with their leaders.
+        for index in np.flatnonzero(robot.independent).tolist():
             joint = robot.joints[index]
-            low = math.ceil(1e3 * max(joint.lower, -2 * math.pi)) / 1e3  # fewer digits to read
+            # Fewer digits to read, inside the limits.
+            low = math.ceil(1e3 * max(joint.lower, -2 * math.pi)) / 1e3
             high = math.floor(1e3 * min(joint.upper, 2 * math.pi)) / 1e3
             value = float(np.clip(live.setpoint[0, index], low, high))
-            slider = gui.add_slider(f"{self._names[index]} [{joint.unit}]", low, high, 1e-3, value)
+            slider = gui.add_slider(f"{joint.name} [{joint.unit}]", low, high, 1e-3, value)
             sliders[index] = self._connect(slider, partial(move, index))
 
     def _add_gains(self, live: LiveSimulation) -> None:
-        gui, first = self._gui, live.params
+        """Add a slider for each gain, and a button for the first gains."""
+        gui = self._gui
+        first = live.params
         gui.add_markdown("Of the watched joint, on every robot.")
         sliders: dict[str, Any] = {}
 
@@ -179,21 +187,8 @@ class Panel:
             show()
 
         for gain in GAINS:
-            sliders[gain] = self._connect(
-                gui.add_slider(gain, 0.0, 1.0, 0.001, 0.0), partial(change, gain)
-            )
+            slider = gui.add_slider(gain, 0.0, 1.0, 0.001, 0.0)
+            sliders[gain] = self._connect(slider, partial(change, gain))
         self._connect(gui.add_button_group("All joints", ("back to the first gains",)), restore)
         self._connect(self._joint, show)
         show()
-
-
-def short_names(robot: Robot) -> tuple[str, ...]:
-    """Return the joint names without the words that all of them begin with; a bare number keeps the
-    word before.
-    """
-    words = [name.split("_") for name in robot.joint_names]
-    first, last = min(words), max(words)  # their common start is the common start of all names
-    shared = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
-    return tuple(
-        "_".join(word[shared - (shared > 0 and word[shared].isdigit()) :]) for word in words
-    )

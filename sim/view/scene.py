@@ -21,7 +21,7 @@ TILE = 0.5
 """Edge of a tile of the floor [m]."""
 _PITCH = 1.3
 """Distance between neighbours, in reaches: two robots overlap only when both stretch out."""
-_CAMERA_DIRECTION = np.array([-0.62, -0.80, 0.52]) / np.linalg.norm([-0.62, -0.80, 0.52])
+_CAMERA_DIRECTION = np.array([-0.62, -0.80, 0.52])
 
 
 class RobotScene:
@@ -61,7 +61,7 @@ class RobotScene:
         self.target: Float64 = np.array([0.0, 0.0, self.floor + 0.35 * self.reach])
         """Point that the camera looks at (3,) [m]."""
         size = 2 * math.hypot(*self.positions[0, :2]) + 2.0 * self.reach
-        self.eye: Float64 = 1.16 * size * _CAMERA_DIRECTION + [0.0, 0.0, self.floor]
+        self.eye: Float64 = 1.02 * size * _CAMERA_DIRECTION + [0.0, 0.0, self.floor]
         """Position of the camera (3,) [m]."""
         self._qpos = np.tile(robot.start, (count, 1))
         self._base = np.tile([0.0, 0, 0, 1, 0, 0, 0], (count, 1))

@@ -12,19 +12,26 @@ signal handler, leaves the pool in an invalid state, and its owner must close it
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import batchpid as bp
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import ClosedError
-from batchpid.sim.loop.arrays import Arrays, Ticks
-from batchpid.sim.loop.failure import Failure, order
+from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.loop import Failure, order
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeInfo, NodeWorker
-from batchpid.sim.workers.placement import pinned_cores, split_in_shares
-from batchpid.sim.workers.requests import Build, Request, Start
-from batchpid.sim.workers.worker import LocalWorker, ProcessWorker, Worker, WorkerLost
+from batchpid.sim.workers.requests import Build, Request, Start, split
+from batchpid.sim.workers.worker import (
+    LocalWorker,
+    ProcessWorker,
+    Worker,
+    WorkerLost,
+    pinned_cores,
+)
 
 MAX_LOSSES = 5
 """Number of losses of one worker during the same request after which the pool gives up."""
@@ -50,18 +57,20 @@ class Outcome(NamedTuple):
     """First failure of a loop."""
     num_ticks: int
     """Ticks with observations that all envs completed."""
-    ticks: Ticks
-    """Input and output of the ticks."""
+    arrays: Arrays
+    """Input and output of all ticks."""
+    at: Callable[[int], Arrays]
+    """Function that returns views of the arrays at a tick."""
 
     @property
     def completed(self) -> list[Arrays]:
         """Ticks that all envs completed."""
-        return self.ticks.first(self.num_ticks)
+        return [self.at(tick) for tick in range(self.num_ticks)]
 
     @property
     def present(self) -> Arrays:
         """The last of them."""
-        return self.ticks[self.num_ticks - 1]
+        return self.at(self.num_ticks - 1)
 
 
 class WorkerPool(SingleOwner):
@@ -94,13 +103,13 @@ class WorkerPool(SingleOwner):
         if options.cluster is not None:
             cluster = Cluster(options.cluster, num_envs)
             slices = cluster.slices
-            widest = cluster.widest
+            loops = len(slices) * cluster.workers
             most_steps = NODE_STEPS
         else:
-            slices = split_in_shares(num_envs, [1] * max(1, min(count or 0, num_envs)))
-            widest = -(-num_envs // len(slices))
+            slices = split(num_envs, max(1, min(count or 0, num_envs)))
+            loops = len(slices)
             most_steps = _MAX_STEPS
-        steps = max(_LEAST_STEPS, most_steps // widest)
+        steps = max(_LEAST_STEPS, most_steps * loops // num_envs)
         ticks = ticks or max(1, steps // options.substeps)
         layout = Arrays.layout(
             ticks, num_envs, options.robot.dof, options.command.size, options.observed
@@ -108,9 +117,9 @@ class WorkerPool(SingleOwner):
         self._shared = SharedArrays(layout)
         self.arrays = Arrays.from_fields(self._shared.arrays)
         """Input and output of a request (ticks, envs, ...)."""
-        self.ticks = Ticks(self.arrays)
-        """Input and output of each tick."""
-        self.present = self.ticks[0]
+        # Views are made once; a cached call is none of Python in the path of a tick.
+        self._at = cache(self.arrays.at)
+        self.present = self._at(0)
         """Tick with the present observation."""
         self._request: Request = Build()
         self._replay: list[Request] = []
@@ -204,13 +213,9 @@ class WorkerPool(SingleOwner):
         elif request.changes_loop:
             self._replay.append(request)
         if count:
-            views = self.ticks.made
-            if count <= len(views):
-                self.present = views[count - 1]
-            else:
-                self.present = self.ticks[count - 1]
+            self.present = self._at(count - 1)
         # No constructor of a named tuple, which is a call of Python in the path of a tick.
-        return tuple.__new__(Outcome, (results, failure, count, self.ticks))
+        return tuple.__new__(Outcome, (results, failure, count, self.arrays, self._at))
 
     def start_replay_from(self, request: Request | None) -> None:
         """Drop the kept requests, because ``request``, whose arrays no one changes, brings a new
@@ -229,7 +234,7 @@ class WorkerPool(SingleOwner):
         self.workers = []
         for name in (
             "arrays",
-            "ticks",
+            "_at",
             "present",
         ):  # views that would keep the memory and its descriptor
             vars(self).pop(name, None)

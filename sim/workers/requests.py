@@ -1,10 +1,13 @@
-"""Requests to workers (:mod:`batchpid.sim.runner.operations`), and the start of a loop."""
+"""Requests to workers (:mod:`batchpid.sim.runner.operations`), the start of a loop, and the division
+of envs among workers.
+"""
 
 from __future__ import annotations
 
 import pickle
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Self
 
 import batchpid as bp
@@ -89,3 +92,9 @@ class Build(Request):
 
     def apply(self, loop: Loop) -> None:
         pass
+
+
+def split(num_envs: int, parts: int) -> list[slice]:
+    """Return contiguous slices of envs, as equal as they can be."""
+    cuts = [num_envs * part // parts for part in range(parts + 1)]
+    return [slice(low, high) for low, high in pairwise(cuts)]

@@ -18,8 +18,7 @@ import time
 from typing import Any
 
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.failure import failure_of
-from batchpid.sim.loop.loop import Loop
+from batchpid.sim.loop.loop import Failure, Loop
 from batchpid.sim.workers.exchange import SharedArrays
 
 _SPIN_SECONDS = 2e-4
@@ -51,7 +50,7 @@ def _serve(connection: socket.socket, memory: int) -> None:
     try:
         loop = start.build(Arrays.from_fields(SharedArrays(layout, memory).arrays))
     except Exception as error:
-        connection.sendall(pickle.dumps(failure_of(error).portable()))
+        connection.sendall(pickle.dumps(Failure.of(error).portable()))
         return
     connection.sendall(pickle.dumps(None))
     # The hot loop makes no reference cycles, so that collections would only cost time.
@@ -73,4 +72,4 @@ def _result(request: Any, loop: Loop) -> Any:
             return loop.run(*request)
         return request.apply(loop)
     except Exception as error:
-        return failure_of(error).portable()
+        return Failure.of(error).portable()

@@ -19,7 +19,6 @@ import subprocess
 import sys
 import time
 from abc import ABC, abstractmethod
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +29,7 @@ from batchpid.errors import InvalidArgumentError, WorkerError
 from batchpid.io.files import standard_streams_occupied
 from batchpid.sim.engine import native
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.failure import Failure, failure_of
-from batchpid.sim.loop.loop import Loop
-from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.loop.loop import Failure, Loop
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.requests import Build, Request, Start
 
@@ -118,7 +115,7 @@ class LocalWorker(Worker):
                 self._loop = self._start.build(Arrays.from_fields(self._shared.arrays))
             self._result = request.apply(self._loop)
         except Exception as error:
-            self._result = failure_of(error)
+            self._result = Failure.of(error)
 
     def receive(self) -> Any:
         return self._result
@@ -136,7 +133,7 @@ class ProcessWorker(Worker):
         self._core = core
         # Once: a controller may change in the caller, and a replacement begins as the first worker
         # did.
-        self._message = pickled((start, shared.layout), start.options)
+        self._message = pickled((start, shared.layout))
         self._end = contextlib.ExitStack()
         """Ends the process and closes its files."""
 
@@ -229,31 +226,31 @@ class ProcessWorker(Worker):
         return WorkerLost(f"worker {self.label} {cause}")
 
 
-def pickled(message: Any, options: RunnerOptions) -> bytes:
+def pickled(message: Any) -> bytes:
     """Return the start message of a worker as bytes, with functions and classes that the worker
     cannot import.
 
     Raises
     ------
     InvalidArgumentError
-        One of ``options`` cannot be pickled.
+        An option cannot be pickled.
     """
     try:
         return cloudpickle.dumps(message)
     except Exception as error:
-        raise InvalidArgumentError(
-            next(
-                (entry.name for entry in fields(options) if _refuses(getattr(options, entry.name))),
-                "options",
-            ),
-            f"cannot be sent to a worker process: {error}",
-            remedy="let it hold nothing that cannot be pickled, or pass workers=0",
-        ) from error
+        problem = f"cannot be sent to a worker process: {error}"
+        remedy = "let it hold nothing that cannot be pickled, or pass workers=0"
+        raise InvalidArgumentError("control or build", problem, remedy=remedy) from error
 
 
-def _refuses(value: Any) -> bool:
-    try:
-        cloudpickle.dumps(value)
-    except Exception:
-        return True
-    return False
+def pinned_cores(workers: int) -> list[int]:
+    """Return one core for each worker if there are as many workers as cores; else none.
+
+    The kernel may wake two workers on the core of the parent and leave another core idle for
+    milliseconds. Fewer workers than cores are not pinned: several programs could pin their workers
+    to the same cores.
+    """
+    cores = sorted(os.sched_getaffinity(0))
+    if workers == len(cores):
+        return cores
+    return []

@@ -18,37 +18,3 @@ ALL = {
     "continuous": [True, False, False, True],
     "seed": 3,
 }
-
-
-def random_options(rng, envs, joints):
-    """Return arguments of make_actuators for some random effects, over many decades."""
-    scales = {
-        "command_delay": 0.01,
-        "sensor_delay": 0.01,
-        "lag": 0.01,
-        "strength": 1,
-        "bias": 1,
-        "effort_limit": 30,
-    }
-    scales |= {
-        "saturation_effort": 50,
-        "no_load_speed": 3,
-        "backlash": 0.01,
-        "coulomb": 0.3,
-        "viscous": 1,
-    }
-    scales |= {
-        "armature": 0.1,
-        "position_resolution": 1e-3,
-        "velocity_resolution": 1e-2,
-        "position_noise": 1e-3,
-    }
-    scales |= {"velocity_noise": 1e-2}
-    chosen = {name for name in scales if rng.random() < 0.5}
-    chosen |= {"saturation_effort", "no_load_speed"} if "no_load_speed" in chosen else set()
-    chosen -= {"saturation_effort"} if "no_load_speed" not in chosen else set()
-    shapes = [(), (joints,), (envs, joints)]
-    return {
-        name: scales[name] * 10.0 ** rng.uniform(-2, 0.5, shapes[rng.integers(3)])
-        for name in sorted(chosen)
-    }

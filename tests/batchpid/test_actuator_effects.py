@@ -30,42 +30,6 @@ def run_motor(chosen, efforts, qpos=0.0, qvel=0.0, before=0.0):
     return np.array(delivered)
 
 
-def run_sensor(chosen, positions, velocities=None):
-    """Return the positions and velocities (steps, envs, joints) as measured."""
-    speeds = np.gradient(positions, DT, axis=0) if velocities is None else velocities
-    state, seen = actuators.init(chosen, positions[0], DT, qvel=speeds[0]), []
-    for qpos, qvel in zip(positions, speeds, strict=True):
-        state, *measured = actuators.measure(
-            chosen, state, read_only(qpos, float), read_only(qvel, float), DT
-        )
-        seen.append(measured)
-    return tuple(map(np.array, zip(*seen, strict=True)))
-
-
-@given(delay=st.floats(0, 0.02), frequency=st.floats(1, 100))
-@settings(max_examples=15)
-def test_a_sine_comes_late_by_the_delay(delay, frequency):
-    """To within the bound of linear interpolation, (w dt)^2 / 8, and exactly at whole steps."""
-    chosen, w = bp.make_actuators(1, command_delay=delay), 2 * np.pi * frequency
-    time = DT * np.arange(200)
-    late = run_motor(chosen, np.sin(w * time))[:, 0, 0]
-    warm = slice(int(delay / DT) + 2, None)
-    error = np.abs(late - np.sin(w * (time - delay)))[warm].max()
-    assert error <= (w * DT) ** 2 / 8 + 1e-6
-    whole = bp.make_actuators(1, command_delay=round(delay / DT) * DT)
-    steps, same = round(delay / DT), np.sin(w * time)
-    np.testing.assert_array_equal(run_motor(whole, same)[steps:, 0, 0], same[: len(same) - steps])
-
-
-@given(lag=st.floats(0, 0.05), effort=st.floats(-100, 100))
-@settings(max_examples=25)
-def test_the_lag_answers_a_step_by_an_exponential(lag, effort):
-    time = DT * np.arange(1, 101)
-    expected = effort * -np.expm1(-time / lag) if lag > 1e-6 else np.full(100, effort)
-    delivered = run_motor(bp.make_actuators(1, lag=lag), np.full(100, effort))[:, 0, 0]
-    np.testing.assert_allclose(delivered, expected, rtol=1e-9, atol=1e-9)
-
-
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=15)
 def test_the_envelope_is_that_of_isaac_lab(seed):
@@ -134,29 +98,6 @@ def test_without_an_envelope_no_command_is_clipped():
     assert actuators.command_limits(k, q, q) == (None, None)
 
 
-@given(ratio=st.floats(0.05, 0.95))
-@settings(max_examples=6)
-def test_backlash_has_the_describing_function_of_the_play(ratio):
-    """J.-J. Slotine and W. Li, Applied Nonlinear Control (1991), section 5.2.3, with half width b
-    and amplitude A.
-    """
-    amplitude, count = 1.0, 600
-    b = ratio * amplitude
-    phase = 2 * np.pi * np.arange(2 * count) / count
-    seen, _ = run_sensor(
-        bp.make_actuators(1, backlash=2 * b), (amplitude * np.sin(phase))[:, None, None]
-    )
-    period = seen[count:, 0, 0]
-    in_phase, quadrature = (
-        2 / count * (period * wave(phase[count:])).sum() for wave in (np.sin, np.cos)
-    )
-    x = 2 * b / amplitude - 1
-    assert in_phase == pytest.approx(
-        amplitude / np.pi * (np.pi / 2 - np.arcsin(x) - x * np.sqrt(1 - x**2)), abs=2e-3
-    )
-    assert quadrature == pytest.approx(4 * b / np.pi * (b / amplitude - 1), abs=2e-3)
-
-
 def test_noise_has_the_moments_of_a_normal_distribution():
     key = noise.keys(np.array([[1, 2]], np.uint32), np.arange(50), np.zeros(50), np)
     both = noise.normals(
@@ -170,14 +111,6 @@ def test_noise_has_the_moments_of_a_normal_distribution():
         for shifted in (np.roll(z, 1, axis) for axis in range(3)):  # steps, envs and joints
             assert abs((z * shifted).mean()) < 4 / np.sqrt(count)
     assert abs((both[0] * both[1]).mean()) < 4 / np.sqrt(count)
-
-
-def test_the_table_of_the_noise_is_normal():
-    z = noise.quantiles(float)
-    assert (np.diff(z) > 0).all()
-    np.testing.assert_array_equal(z, -z[::-1])
-    assert (z**2).mean() == pytest.approx(1, abs=1e-12)
-    assert (z**4).mean() == pytest.approx(3, abs=3e-3)
 
 
 def test_noise_depends_on_seed_env_episode_and_step_alone():

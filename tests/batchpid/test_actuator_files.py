@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from motor_cases import ALL, random_options
+from motor_cases import ALL
 
 import batchpid as bp
 
@@ -28,15 +26,6 @@ def test_every_effect_survives_a_file(suffix, dtype, tmp_path):
     loaded, names = bp.load_actuators(tmp_path / f"a{suffix}")
     assert names == NAMES
     assert same(loaded, actuators)
-
-
-@given(seed=st.integers(0, 2**32 - 1), suffix=st.sampled_from([".yaml", ".json"]))
-@settings(max_examples=10)
-def test_random_actuators_survive_a_file(tmp_path_factory, seed, suffix):
-    rng, path = np.random.default_rng(seed), tmp_path_factory.mktemp("files") / f"a{suffix}"
-    actuators = bp.make_actuators(4, **random_options(rng, 3, 4))
-    bp.save_actuators(path, actuators, NAMES)
-    assert same(bp.load_actuators(path, NAMES)[0], actuators)
 
 
 def test_a_file_written_by_hand(tmp_path):

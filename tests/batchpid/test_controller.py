@@ -2,7 +2,6 @@
 backend.
 """
 
-import subprocess
 import sys
 
 import jax
@@ -103,19 +102,6 @@ def test_a_missing_jax_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax", None)
     with pytest.raises(bp.MissingDependencyError, match=r"\.\[jax\]"):
         bp.BatchPID(PARAMS, ENVS, DT, "jax")
-
-
-def test_import_loads_no_optional_package():
-    code = (
-        "import sys, batchpid; print(sorted({'jax', 'sapien', 'matplotlib', 'tyro'} &"
-        " set(sys.modules)))"
-    )
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        ).stdout
-        == "[]\n"
-    )
 
 
 def test_a_large_batch_is_stepped_in_blocks_with_equal_results(monkeypatch, inputs):

@@ -10,8 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid.arrays.choices import CHOICE_TYPES, HoldEffort, ZeroEffort
@@ -32,41 +30,6 @@ class Other(NamedTuple):
 class Record:
     first: Any
     second: Any = None
-
-
-SCALARS = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.binary())
-VALUES = st.recursive(
-    SCALARS,
-    lambda parts: st.one_of(
-        st.lists(parts, max_size=3),
-        st.dictionaries(st.text(max_size=2), parts, max_size=3),
-        st.builds(Pair, parts, parts),
-        st.builds(Record, parts, parts),
-    ),
-    max_leaves=4,
-)
-
-
-def described(value: Any) -> str:
-    """Return a text that tells every value of these tests from every other."""
-    if isinstance(value, np.ndarray):
-        return f"array({value.dtype}, {value.shape}, {value.tolist()})"
-    if isinstance(value, dict):
-        return (
-            "{"
-            + ", ".join(sorted(f"{key!r}: {described(part)}" for key, part in value.items()))
-            + "}"
-        )
-    if isinstance(value, tuple | Record):
-        parts = value if isinstance(value, tuple) else (value.first, value.second)
-        return f"{type(value).__name__}({', '.join(map(described, parts))})"
-    return f"[{', '.join(map(described, value))}]" if isinstance(value, list) else repr(value)
-
-
-@settings(max_examples=25)
-@given(VALUES, VALUES)
-def test_digests_are_equal_if_and_only_if_the_content_is(one, two):
-    assert (digest(one) == digest(two)) == (described(one) == described(two))
 
 
 def test_memory_layout_and_byte_order_do_not_matter():

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from batchpid.errors import InvalidArgumentError
 from batchpid.motors import friction
 
 Friction = friction.Friction
@@ -74,17 +73,6 @@ def test_friction_is_within_its_limit(seed):
     assert (np.abs(coulomb) <= model.coulomb * (1 + 1e-9) + 1e-9 * np.abs(total)).all()
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.1, 400.0])
-def test_a_joint_at_rest_holds_its_load_and_lets_go_above_its_friction(damping):
-    mass, model = np.full((1, 1, 1), 0.01), Friction(np.ones((1, 1)), np.full((1, 1), damping))
-    efforts = np.concatenate([np.full((500, 1, 1), 0.99), np.full((500, 1, 1), 1.5)])
-    velocity, total = simulate(mass, model, efforts)
-    assert (velocity[:500] == 0).all()
-    assert (total[:500] == 0).all()
-    implicit = velocity[-2] + DT * (0.5 - damping * velocity[-1]) / mass[0]
-    np.testing.assert_allclose(velocity[-1], implicit, rtol=1e-9)  # backward Euler
-
-
 @pytest.mark.parametrize("viscous", [None, 4.0])
 @pytest.mark.parametrize(
     ("damping", "stiffness"), [(0.0, 0.0), (30.0, 0.0), (0.0, 3e4), (30.0, 3e4)]
@@ -132,27 +120,6 @@ def test_a_static_friction_holds_until_the_joint_yields_and_again_after_it_has_s
     assert abs(stops[-1]) < 1e-9
     assert np.abs(held_again).max() < 1e-9
     np.testing.assert_allclose(total[-1], 0.0, atol=1e-9)
-
-
-def test_a_refresh_takes_another_mass_matrix_and_keeps_the_rest():
-    rng, (mass, model) = np.random.default_rng(0), random_plant(1)
-    velocity, load, effort = rng.normal(size=(3, 1, mass.shape[1]))
-    state, _ = friction.advance(
-        model, friction.init(model, velocity, load, 3 * mass, DT), effort, velocity
-    )
-    fresh = friction.init(model, velocity, load, mass, DT)
-    again = friction.refresh(model, state, mass, DT)
-    for name in ("gain", "memory"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
-    assert (again.effort is state.effort, again.velocity is state.velocity) == (True, True)
-
-
-def test_nothing_is_done_without_friction():
-    effort = np.ones((2, 3))
-    state = friction.init(Friction(), effort, effort, np.eye(3)[None], DT)
-    assert friction.advance(Friction(), state, effort, effort) == (friction.FrictionState(), effort)
-    with pytest.raises(InvalidArgumentError, match="dt"):
-        friction.init(Friction(), effort, effort, np.eye(3)[None], 2000.0)
 
 
 @given(seed=st.integers(0, 2**32 - 1))

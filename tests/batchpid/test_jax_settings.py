@@ -9,7 +9,6 @@ import pytest
 from jax_debugging import SETTINGS, changed
 
 import batchpid as bp
-from batchpid import backends
 
 
 def controller():
@@ -56,14 +55,6 @@ def test_no_setting_changes_a_result(pid, name):
     expected = efforts(pid)
     with changed(**{name: SETTINGS[name]}):
         np.testing.assert_array_equal(efforts(pid), expected)
-
-
-@pytest.mark.slow
-def test_all_of_them_at_once_in_large_batches(monkeypatch):
-    monkeypatch.setattr(backends, "LARGE", 1)
-    expected = efforts(controller())
-    with changed(**SETTINGS):
-        np.testing.assert_array_equal(efforts(controller()), expected)
 
 
 def test_a_controller_keeps_the_precision_that_it_was_built_with(x64):

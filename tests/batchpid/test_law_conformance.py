@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from law_cases import DT, JOINTS, Inputs, generated_options, made_up_inputs, read_only
 from quick_jit import quick_jit
-from scalar_pid import ScalarPID, scalar_pids
+from scalar_pid import scalar_pids
 
 import batchpid as bp
 
@@ -189,28 +189,3 @@ def test_an_option_with_a_neutral_value_is_off():
         JOINTS, **gains, **limits, **zeros, setpoint_weight=1.0, continuous=False
     )
     assert {name for name, leaf in neutral._asdict().items() if leaf is not None} == gains.keys()
-
-
-def test_every_option_that_is_on_changes_the_efforts(options, inputs):
-    """Every case of the table changes the efforts of a plain PID: no case is without effect."""
-    if set(options) <= {"kp", "ki", "kd"}:
-        pytest.skip("a plain PID")
-    inputs = Inputs(inputs.setpoint, inputs.measurement)
-    plain = bp.make_params(JOINTS, options["kp"], options["ki"], options["kd"])
-    assert not np.array_equal(
-        by_steps(plain, inputs), by_steps(bp.make_params(JOINTS, **options), inputs)
-    )
-
-
-def test_the_scalar_law_by_hand():
-    pid = ScalarPID(
-        2.0, 3.0, 0.5, effort_max=2.1, anti_windup="back_calculation", tracking_time=0.2
-    )
-    pid.start(0.0)
-    assert pid.step(1.0, 0.0, 0.1) == 2.0, (
-        "output first, and no derivative at the first measurement"
-    )
-    assert pid.integral == pytest.approx(0.3)
-    assert pid.step(1.0, -0.1, 0.1) == 2.1
-    assert pid.unsaturated == pytest.approx(2.2 + 0.3 + 0.5)
-    assert pid.integral == pytest.approx(0.3 + 0.33 + 0.5 * (2.1 - 3.0))

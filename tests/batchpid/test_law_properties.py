@@ -1,7 +1,5 @@
 """Properties of the law for all numbers."""
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -174,53 +172,6 @@ def test_a_change_of_ki_is_bumpless(run, ki):
     before = bp.step(params, state, run[0][0], run[1][0], DT)[1]
     after = bp.step(params.replace(ki=ki), state, run[0][0], run[1][0], DT)[1]
     assert before.tobytes() == after.tobytes()
-
-
-@pytest.mark.parametrize("turns", [-2, 1])
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"kd": 0.5},
-        {"kd": 0.5, "setpoint_weight": 0.3, "setpoint_weight_derivative": 0.8},
-        {"setpoint_weight": 0.3},
-    ],
-    ids=str,
-)
-def test_whole_turns_of_a_continuous_joint_change_no_term(turns, options):
-    """Readings that jump by whole turns give the terms of readings that do not: no spike in P, I or
-    D.
-    """
-    params = bp.make_params(1, 3.0, 2.0, continuous=True, **options)
-    rng = np.random.default_rng(3)
-    y = np.cumsum(rng.uniform(0, 0.3, (60, 1, 1)), 0)
-    r = y + 0.4
-    jumps = 2 * math.pi * turns * (rng.uniform(size=y.shape) < 0.3)
-    jumps[0] = 0
-    expected, terms = roll(params, r, y)[1], roll(params, r + 2 * math.pi, y + jumps)[1]
-    for a, b in zip(expected, terms, strict=True):
-        for x, z in zip(a[:6], b[:6], strict=True):
-            np.testing.assert_allclose(x, z, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_recovery_from_saturation_overshoots_less_with_anti_windup():
-    """A double integrator with a weak motor: the textbook's case of windup; an env for each
-    strategy.
-    """
-    strategies = [["none"], ["clamp"], ["conditional"], ["back_calculation"]]
-    params = bp.make_params(
-        1, 4.0, 3.0, 4.0, effort_limit=0.2, anti_windup=strategies, tracking_time=0.3
-    )
-    x, v, peak = np.zeros((3, 4, 1))
-    state = bp.init(params, x)
-    for _ in range(6000):
-        state, effort = bp.step(params, state, np.ones((4, 1)), x, DT)
-        v = v + effort * DT
-        x = x + v * DT
-        peak = np.maximum(peak, x)
-    without, *others = peak[:, 0] - 1
-    assert without > 0
-    assert max(others) < 0.7 * without
 
 
 @given(cases, runs, npst.arrays(bool, ENVS), st.booleans())

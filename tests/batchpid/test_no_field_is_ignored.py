@@ -210,7 +210,6 @@ PART_OF_MOTORS = {"no_load_speed": "saturation_effort"}
     "line", [{}, {"saturation_effort": 9.0, "no_load_speed": 5.0, "lag": 0.01}], ids=["pid", "dc"]
 )
 def test_every_field_is_in_an_mjcf_or_a_difference(line, tmp_path):
-    pytest.importorskip("mujoco")
     hinge, part_of = Robot.load(write(tmp_path, one_joint())), PART_OF | PART_OF_MOTORS
 
     def exported(params, motors):

@@ -1,9 +1,6 @@
 """The tutorial's controller, step for step."""
 
-import math
-
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -43,8 +40,3 @@ def test_tutorial(path, kp, ki, kd):
         last = r - y
     found = run(bp.presets.tutorial(1, kp + ki * DT, ki, kd), path, kicks=True)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-8)
-
-
-def test_a_continuous_joint_has_no_derivative_spike():
-    params = bp.make_params(1, 0.0, 0.0, 1.0, continuous=True)
-    assert run(params, [(3.0, 3.1), (3.0, -3.1)])[1] == pytest.approx(-(2 * math.pi - 6.2) / DT)

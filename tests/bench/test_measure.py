@@ -69,7 +69,6 @@ def test_peers_reach_the_same_place_in_every_round(workload, name):
 
 def test_mujoco_runs_the_whole_pid(workload):
     """With the integral it ends nearer to the tutorial's loop than without."""
-    pytest.importorskip("mujoco")
     settings = workload.robot.settings
 
     def final(ki):

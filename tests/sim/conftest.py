@@ -19,7 +19,6 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     """
     name: str = request.param
     if name == "mujoco":
-        pytest.importorskip("mujoco.batch")
         monkeypatch.setattr(load_engine("mujoco"), "group_size", 4)
     original = RunnerOptions.__init__
 

@@ -385,7 +385,7 @@ def leaves(value: Any, path: str = "") -> Any:
     if value is None or isinstance(value, str | bool | int | float | np.ndarray):
         yield path, value
     elif isinstance(value, Snapshot):
-        yield from leaves([vars(value.states), value.params, value.steps], path)
+        yield from leaves([value.rows, value.params, value.steps], path)
     elif isinstance(value, dict):
         yield from (leaf for name, each in value.items() for leaf in leaves(each, f"{path}.{name}"))
     elif isinstance(value, list | tuple):

@@ -115,7 +115,7 @@ def test_forces_are_recorded_and_in_snapshots(stool, engine, tmp_path):
     with make_runner(stool, engine, **options) as runner:
         runner.restore(type(kept).load(tmp_path / "kept.npz"))
         np.testing.assert_array_equal(
-            runner.observe().contact_force, kept.states.sensors["contact_force"]
+            runner.observe().contact_force, kept.rows["sensors/contact_force"]
         )
         with Recorder(tmp_path / "run.h5", runner):
             assert_identical(alone, runner.rollout(table[12:]))

@@ -8,10 +8,10 @@ import re
 
 import cloudpickle
 import pytest
+from tiny_urdf import one_joint, write
 
 from batchpid.errors import NotCopyableError
 from batchpid.sim import Recorder, Robot, Runner
-from tests.sim.tiny_urdf import one_joint, write
 
 COPIES = (copy.copy, copy.deepcopy, pickle.dumps, cloudpickle.dumps)
 

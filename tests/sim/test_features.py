@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from c_programs import COMPILERS, TABLE, compiled
 from featured import FEATURES, joints_of, poses, robot_with
 
 import batchpid as bp
@@ -22,7 +23,6 @@ from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
 from batchpid.sim.identification import identify
 from batchpid.sim.robot.urdf_export import to_urdf
 from batchpid.trajectories import minimum_jerk
-from tests.c_programs import COMPILERS, TABLE, compiled
 
 PAIRS = [
     pair

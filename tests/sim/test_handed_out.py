@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tiny_urdf import gripper, write
 
 import batchpid as bp
 from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Uniform
-from tests.sim.tiny_urdf import gripper, write
 
 
 def arrays(value, path="", seen=None):
@@ -77,7 +77,7 @@ def test_writes_to_a_snapshot_do_not_reach_the_runner(panda):
             taken, restored = runner.snapshot(), runner.snapshot()
             runner.restore(restored)
             if write:
-                taken.episodes[:] = 7
+                taken.rows["episodes"][:] = 7
             after = runner.step(panda.settings.target)
             return after.qpos, runner.reset() and runner.draws["payload"]
 

@@ -24,8 +24,6 @@ from batchpid.sim import (
     Runner,
     RunnerKeywords,
     RunnerOptions,
-    read_recording,
-    write_recording,
 )
 from batchpid.sim.cli import parse
 from batchpid.sim.engine.protocol import SceneSpec
@@ -90,23 +88,6 @@ def test_commands_and_recordings_take_switches_from_their_declaration():
         if re.search(rf"\b{name}\b", text)
     ]
     assert named == []
-
-
-def test_an_option_without_a_field_in_recordings_is_kept_among_their_options(tmp_path, monkeypatch):
-    annotations = {
-        name: kind
-        for name, kind in RunInfo.__annotations__.items()
-        if name not in ("ground", "tool")
-    }
-    monkeypatch.setattr(RunInfo, "__annotations__", annotations)
-    kept = RunnerOptions(PANDA, 2).values_for("recording")
-    assert kept["options"] == {"ground": PANDA.has_ground, "tool": None}
-    assert "ground" not in kept
-    monkeypatch.undo()
-    with Runner(PANDA, 1, workers=0) as runner:
-        run = runner.rollout(np.tile(PANDA.start, (2, 1)))
-    run = dataclasses.replace(run, info=dataclasses.replace(run.info, options=kept["options"]))
-    assert read_recording(write_recording(run, tmp_path / "run.h5")).info.options == kept["options"]
 
 
 def test_options_are_plain_values_of_their_documented_type():

@@ -7,11 +7,11 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium import spaces  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
+from tiny_urdf import one_joint, write  # noqa: E402
 
 from batchpid.errors import InvalidArgumentError  # noqa: E402
 from batchpid.sim import Robot, Runner  # noqa: E402
 from batchpid.sim.gym import RobotEnv, RobotVectorEnv  # noqa: E402
-from tests.sim.tiny_urdf import one_joint, write  # noqa: E402
 
 
 class Swing(RobotVectorEnv):
@@ -176,21 +176,6 @@ def test_setpoints_are_steps_unless_a_task_gives_their_rates(hinge, task):
             )
     assert np.abs(observation[:, 1]).min() > 0
     envs.close()
-
-
-def test_a_step_whose_hook_was_interrupted_can_be_waited_for_again(swings, monkeypatch):
-    def interrupted(observed):
-        monkeypatch.undo()
-        raise KeyboardInterrupt
-
-    first, _ = swings.reset(seed=2)
-    expected = swings.step(np.ones((3, 1)))[0]
-    assert (swings.reset(seed=2)[0] == first).all()
-    swings.step_async(np.ones((3, 1)))
-    monkeypatch.setattr(swings, "observe", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        swings.step_wait()
-    assert (swings.step_wait()[0] == expected).all()
 
 
 def test_options_that_a_task_chooses_are_refused(hinge):

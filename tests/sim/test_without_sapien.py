@@ -7,10 +7,6 @@ from __future__ import annotations
 import subprocess
 import sys
 
-import pytest
-
-pytest.importorskip("mujoco.batch")
-
 REFUSE = """
 import importlib.util
 import sys

@@ -33,8 +33,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.differences import joint_values
-from batchpid.export.pd_drive import Drive
+from batchpid.export.differences import Drive, joint_values
 from batchpid.motors.guard import Guard
 
 FAR = 1e10

@@ -18,15 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, MjModel
+from batchpid.sim.engine.missed_contacts import speed_bounds
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import Clearance
 
 Arrays = dict[str, NDArray[Any]]
 
-_BEYOND = 0.01
-"""Distance beyond its limits up to which a sliding joint's arms are valid [m]: MuJoCo's limits are
-soft.
-"""
 _NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _NEVER = 1 << 30
 """Age without a proof: NEVER in ``clearance.h``."""
@@ -94,46 +91,39 @@ def touching_pairs(model: MjModel) -> NDArray[np.int32]:
 
 def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:
     """Return bounds of the closing speed of pairs of bodies per unit speed of each way (pairs,
-    ways) [m or 1].
+    ways) [m or 1], and the joint positions in which they hold (2, dof).
 
-    A way is a joint; a floating base adds its displacement and its rotation. The bounds hold within
-    a range of joint positions (2, dof), which is returned, too. A body's shapes and children are
-    balls around points of the body; the ball of a child contains everything that moves with it, at
-    any pose. A way that moves both bodies of a pair, or neither, does not change their distance.
+    A way is a joint; a floating base adds its displacement and its rotation. A way that moves both
+    bodies of a pair, or neither, does not change their distance.
     """
     model = robot.model
-    dof = len(robot.qvel)
-    travel = np.tile([[-np.inf], [np.inf]], (1, dof))
-    arms = np.ones(dof + 2 * (robot.base is not None))
-    moved = np.zeros((model.nbody, len(arms)), bool)
-    # Points and radii that a body carries; its children add theirs, from the last body to the root.
-    balls: list[list[tuple[Any, float]]] = [[] for _ in range(model.nbody)]
-    for shape, body in enumerate(model.geom_bodyid):
-        balls[body].append((model.geom_pos[shape], model.geom_rbound[shape]))
-    for body in reversed(range(1, model.nbody)):
-        joint = int(model.body_jntadr[body])
-        slide = 0.0
-        points = np.array([point for point, _ in balls[body]]).reshape(-1, 3)
-        radii = np.array([radius for _, radius in balls[body]])
-        farthest = (np.linalg.norm(points, axis=1) + radii).max(initial=0.0)
-        if joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
-            moved[body, dof:] = True
-            arms[dof + 1] = farthest
-        elif joint >= 0:
-            column = int(np.flatnonzero(robot.qvel == model.jnt_dofadr[joint])[0])
-            moved[body, column] = True
-            if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
-                # A hinge moves a point at its distance from the axis, not from the origin.
-                across = np.cross(points, model.jnt_axis[joint])
-                arms[column] = (np.linalg.norm(across, axis=1) + radii).max(initial=0.0)
-            else:
-                if model.jnt_limited[joint]:
-                    travel[:, column] = model.jnt_range[joint] + (-_BEYOND, _BEYOND)
-                slide = float(np.abs(travel[:, column]).max())
-        balls[model.body_parentid[body]].append((model.body_pos[body], slide + farthest))
-    for body in range(1, model.nbody):
+    dof = len(robot.joints)
+    bodies = model.dof_bodyid[robot.qvel]
+    # The joint above each body: bodies that are welded to another move with it.
+    joint = np.full(model.nbody, -1)
+    joint[bodies] = np.arange(dof)
+    joint = joint[model.body_weldid]
+    parents = joint[model.body_parentid[bodies]]
+    bounds, travel = speed_bounds(
+        robot.joints,
+        parents,
+        model.body_pos[bodies],
+        model.jnt_axis[model.dof_jntid[robot.qvel]],
+        joint[model.geom_bodyid],
+        np.column_stack([model.geom_pos, model.geom_rbound]),
+    )
+    moved = np.zeros((model.nbody, dof), bool)
+    for at, parent in enumerate(parents):
         # What moves a body moves its children.
-        moved[body] |= moved[model.body_parentid[body]]
+        if parent >= 0:
+            moved[bodies[at]] = moved[bodies[parent]]
+        moved[bodies[at], at] = True
+    moved = moved[model.body_weldid]
+    if robot.base is not None:
+        floats = np.repeat(model.body_weldid[:, None] > 0, 2, axis=1)
+        moved = np.hstack([moved, floats])
+        bounds = np.insert(bounds, dof, 1.0)
+    arms = bounds[: moved.shape[1]]
     return np.where(moved[pairs[:, 0]] != moved[pairs[:, 1]], arms, 0.0), travel
 
 

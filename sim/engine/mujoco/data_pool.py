@@ -9,7 +9,7 @@ A pack that is not at work keeps the rows of its states; back at work it compute
 from __future__ import annotations
 
 import copy
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -22,17 +22,6 @@ STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Parts of the state: all of the inputs of a sim step."""
 POSITIONS = 1
 """Place of the positions in the state, after the time."""
-
-
-class User(Protocol):
-    """Pack that uses a :class:`DataPool`: a model and a row of the state for each robot."""
-
-    models: list[Any]
-    rows: Float64
-
-    @property
-    def data(self) -> list[Any]:
-        """``mujoco.MjData`` of each robot, in its state."""
 
 
 def rest(model: MjModel, data: Any) -> None:
@@ -55,7 +44,7 @@ class DataPool:
         self.model = copy.copy(robot.model)
         self._data = list[Any]()
         self._taken = list[Any]()
-        self._user: User | None = None
+        self._rows: Float64 | None = None
         self._initial = np.empty(mujoco.mj_stateSize(robot.model, STATE))
         (data,) = self._new(1)
         rest(robot.model, data)
@@ -65,35 +54,29 @@ class DataPool:
         """Return the rows of ``size`` robots at rest."""
         return np.tile(self._initial, (size, 1))
 
-    def take(self, user: User) -> list[Any]:
-        """Return the data of the robots of ``user``, in their states; another user's states are
-        kept in its rows.
+    def take(self, models: list[Any], rows: Float64) -> list[Any]:
+        """Return the data of the robots with these ``models``, in the states ``rows``; the states
+        of the rows before are kept in those.
         """
-        if self._user is not user:
-            # The states of the pack that used the memory before are read out first.
-            if self._user is not None:
-                for model, data, row in zip(
-                    self._user.models, self._taken, self._user.rows, strict=True
-                ):
-                    mujoco.mj_getState(model, data, row, STATE)
-            self._user, self._taken = user, self._new(len(user.rows))
+        if self._rows is not rows:
+            if self._rows is not None:
+                for data, row in zip(self._taken, self._rows, strict=True):
+                    mujoco.mj_getState(self.model, data, row, STATE)
+            self._rows = rows
+            self._taken = self._new(len(rows))
             # MuJoCo warns of states that are not finite, and the loop finds them by itself.
-            sound = np.all(
-                np.abs(user.rows[:, POSITIONS : POSITIONS + self.robot.model.nq]) <= FARTHEST,
-                axis=1,
-            )
-            for model, data, row, finite in zip(
-                user.models, self._taken, user.rows, sound.tolist(), strict=True
-            ):
+            qpos = rows[:, POSITIONS : POSITIONS + self.model.nq]
+            is_near = np.all(np.abs(qpos) <= FARTHEST, axis=1).tolist()
+            for model, data, row, near in zip(models, self._taken, rows, is_near, strict=True):
                 mujoco.mj_setState(model, data, row, STATE)
-                if finite:
+                if near:
                     mujoco.mj_step1(model, data)
         return self._taken
 
-    def leave(self, user: User) -> None:
-        """Forget the states of ``user``."""
-        if self._user is user:
-            self._user = None
+    def leave(self, rows: Float64) -> None:
+        """Forget the states ``rows``."""
+        if self._rows is rows:
+            self._rows = None
 
     def _new(self, size: int) -> list[Any]:
         self._data += [mujoco.MjData(self.robot.model) for _ in range(size - len(self._data))]

@@ -19,9 +19,8 @@ from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.mjcf.mjcf_compiler import Names, attempt
-from batchpid.sim.robot.mjcf.mjcf_reader import content_of, home
-from batchpid.sim.robot.mjcf.mjcf_tables import find_base
+from batchpid.sim.robot.mjcf_model import RobotInFile, compile_scene
+from batchpid.sim.robot.mjcf_reader import home
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.task_space.frames import inverse, matrix_of, rotate
 
@@ -76,15 +75,13 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
 
     Raises RobotError if the file has changed since the robot was loaded.
     """
-    compiled = attempt(Path(file.path), spec.fixed_base, file.is_whole)
+    compiled = compile_scene(Path(file.path), file.is_whole)
     scene, model = compiled.scene, compiled.model
-    if model is None or content_of(Path(file.path)) != file.content:
-        problem = compiled.problem or "it has another content"
+    if compiled.content != file.content:
         raise RobotError(
-            f"{file.path}: has changed since the robot was loaded: {problem}; load the robot again"
+            f"{file.path}: has changed since the robot was loaded; load the robot again"
         )
-    names = Names(model)
-    find_base(model, names, Path(file.path), [])  # removes other objects
+    names = RobotInFile(model, Path(file.path), [])
     robot = {body: name for body, name in names.bodies.items() if names.is_of_robot(body)}
     for joint in scene.joints:
         joint.name = names.joints.get(joint.id, joint.name)
@@ -138,19 +135,17 @@ def set_ground(scene: MjSpec, ground: bool) -> None:
     one at height 0.
     """
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    planes = [
-        plane_shape
-        for plane_shape in scene.worldbody.geoms
-        if plane_shape.type == plane and (plane_shape.contype or plane_shape.conaffinity)
-    ]
+    planes = [geom for geom in scene.worldbody.geoms if geom.type == plane]
+    planes = [geom for geom in planes if geom.contype or geom.conaffinity]
     if ground and not planes:
         added = scene.worldbody.add_geom(type=plane, size=[0, 0, 1])
         plain = mujoco.MjSpec().worldbody.add_geom()
         for name in _OF_CONTACTS:  # the file's default class would apply otherwise
             setattr(added, name, getattr(plain, name))
         added.contype = added.conaffinity = _EVERYTHING
-    for plane_shape in [] if ground else planes:
-        plane_shape.contype, plane_shape.conaffinity = 0, 0
+    if not ground:
+        for geom in planes:
+            geom.contype = geom.conaffinity = 0
 
 
 def _start(model: MjModel) -> Document:

@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.errors import InvalidArgumentError, RobotError
-from batchpid.export.differences import Exported, joint_values
-from batchpid.export.pd_drive import Drive
+from batchpid.export.differences import Drive, Exported, joint_values
 from batchpid.law.params import PIDParams, make_params
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.friction import Friction
@@ -26,9 +25,9 @@ from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_sp
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.link_repair import nearest_physical
+from batchpid.sim.robot.inertia import nearest_physical
 from batchpid.sim.robot.robot_model import base_start
-from batchpid.task_space.spatial_inertia import SpatialInertia
+from batchpid.task_space.frames import SpatialInertia
 
 
 def to_mjcf(

@@ -29,12 +29,12 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene, set_ground
-from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
+from batchpid.sim.engine.mujoco.mujoco_sensors import add_link_sensors
 from batchpid.sim.engine.physics import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import add_geom
 from batchpid.sim.robot.parts import CONTACT_FRICTION, Joint, MjcfFile
-from batchpid.task_space.spatial_inertia import SpatialInertia
+from batchpid.task_space.frames import SpatialInertia
 
 FLOATING = 6
 """Degrees of freedom of a floating base, which come first in MuJoCo's arrays."""
@@ -64,6 +64,7 @@ class RobotMj:
 
     model: MjModel
     """``mujoco.MjModel``; it is shared, so copy it before a change."""
+    joints: tuple[Joint, ...]
     qpos: NDArray[np.intp]
     """Index of each joint in MuJoCo's qpos (dof,)."""
     qvel: NDArray[np.intp]
@@ -104,7 +105,9 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
         moments, _ = principal_inertia(row.spatial_inertia)
         model.body_inertia[bodies[row.name]] = moments
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    return RobotMj(model, *_places(model, spec), bodies, base=None if spec.fixed_base else (0, 0))
+    return RobotMj(
+        model, spec.joints, *_places(model, spec), bodies, base=None if spec.fixed_base else (0, 0)
+    )
 
 
 def _places(model: MjModel, spec: SceneSpec) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -152,7 +155,7 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         joint = model.joint(model.body(parts.root).jntadr[0])
         base = int(joint.qposadr[0]), int(joint.dofadr[0])
     bodies = {link: model.body(name).id for link, name in parts.names.items()}
-    return RobotMj(model, qpos, qvel, bodies, parts.terms, parts.frames, base)
+    return RobotMj(model, spec.joints, qpos, qvel, bodies, parts.terms, parts.frames, base)
 
 
 def robot_spec(spec: SceneSpec) -> tuple[Any, dict[str, str]]:

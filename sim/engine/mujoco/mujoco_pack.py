@@ -13,13 +13,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Bool, DType, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.model_pack import ModelPack
+from batchpid.sim.engine.model_pack import ORIGIN, ModelPack
 from batchpid.sim.engine.mujoco.data_pool import STATE, DataPool, rest
 from batchpid.sim.engine.mujoco.file_scene import check_links
-from batchpid.sim.engine.mujoco.link_sensors import MujocoLinkSensors
 from batchpid.sim.engine.mujoco.model_builder import (
     FLOATING,
     LARGEST_FORCE,
@@ -27,10 +26,12 @@ from batchpid.sim.engine.mujoco.model_builder import (
     robot_model,
     set_inertia,
 )
+from batchpid.sim.engine.mujoco.mujoco_sensors import MujocoLinkSensors
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
-from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.scene_model import passive_force
+from batchpid.sim.engine.native_model import NativeModel, passive_force
+from batchpid.sim.engine.physics import SOLVERS
+from batchpid.sim.engine.protocol import Engine
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import CONTACT_FRICTION
@@ -47,7 +48,7 @@ _JOINTS = ("dof_armature", "dof_damping", "actuator_biasprm", "actuator_forceran
 class MujocoPack(ModelPack):
     """M robots of ``spec``. Arrays are (M, dof), in the order of ``spec.joints``, SI units.
 
-    Implements :class:`batchpid.sim.engine.protocol.CompiledPack` and DrivenPack.
+    Implements :class:`batchpid.sim.engine.protocol.EnginePack`.
     """
 
     state_is_complete = True
@@ -100,7 +101,7 @@ class MujocoPack(ModelPack):
     @property
     def data(self) -> list[Any]:
         """``mujoco.MjData`` of each robot, in its state."""
-        return self._pool.take(self)
+        return self._pool.take(self.models, self.rows)
 
     def _update(self, rows: Iterable[int]) -> None:
         """Compute all that follows from the states of robots ``rows``, after a change of models."""
@@ -124,17 +125,16 @@ class MujocoPack(ModelPack):
     # -- reading
     # ----------------------------------------------------------------------------------------------
 
-    def read_qpos(self, dtype: DType = np.float64) -> Rows:
-        return np.array([data.qpos[self._at] for data in self.data], dtype)
+    def read_qpos(self) -> Float64:
+        return np.array([data.qpos[self._at] for data in self.data])
 
-    def read_qvel(self, dtype: DType = np.float64) -> Rows:
-        return np.array([data.qvel[self._moves] for data in self.data], dtype)
+    def read_qvel(self) -> Float64:
+        return np.array([data.qvel[self._moves] for data in self.data])
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         if self.steps_read_force(gravity, coriolis):
-            return np.array([data.qfrc_bias[self._moves] for data in self.data], dtype)
-        state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
-        return self._passive_force(*state).astype(dtype)
+            return np.array([data.qfrc_bias[self._moves] for data in self.data])
+        return self._model_force(gravity, coriolis)
 
     @cached_property
     def _bias_model(self) -> NativeModel:
@@ -192,10 +192,16 @@ class MujocoPack(ModelPack):
         arrays = {"qf": self.qf, "sensed": self._sensed}
         if drives:
             arrays |= {"stiffness": self._stiffness, "rate_gain": self._rate_gain}
-        constraint = None if self._constraint is None else self._constraint.address
         reads_force = gravity and coriolis
         return MujocoStep(
-            self, self._robot, reads_force, speed_limit, arrays, self._suspended, constraint
+            self._pool,
+            self.models,
+            self.rows,
+            reads_force,
+            speed_limit,
+            arrays,
+            self._suspended,
+            self._constraint_address,
         )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
@@ -269,7 +275,7 @@ class MujocoPack(ModelPack):
         """
         everyone = self.data
         floats = self._robot.base is not None
-        bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else base.copy()
+        bases = np.tile(ORIGIN, (len(rows), 1)) if base is None else base.copy()
         at, moves = self._robot.base or (0, 0)
         # MuJoCo's angular velocities are in the body's axes.
         bases[:, 10:] = np.einsum("eji,ej->ei", matrix_of(bases[:, 3:7]), bases[:, 10:])
@@ -453,10 +459,18 @@ class MujocoPack(ModelPack):
         """Give back all that fits the present kind of model alone: working memory, and data made
         for its size.
         """
-        self._pool.leave(self)
+        self._pool.leave(self.rows)
         self._own_step = None
         for name in ("_scratch", "_rubbing"):
             self.__dict__.pop(name, None)
 
 
-_ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
+ENGINE = Engine(
+    name="mujoco",
+    title="MuJoCo",
+    capabilities=frozenset({"base_state"}),
+    physics=SOLVERS,
+    group_size=64,
+    make_pack=MujocoPack,
+    native_obstacle=obstacle,
+)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,8 +19,7 @@ import numpy as np
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
-from batchpid.sim.engine.mujoco.data_pool import User
-from batchpid.sim.engine.mujoco.model_builder import RobotMj
+from batchpid.sim.engine.mujoco.data_pool import DataPool
 from batchpid.sim.engine.native.interface import Mujoco
 from batchpid.sim.engine.native_model import NativeStep
 
@@ -83,8 +83,8 @@ class MujocoStep(NativeStep):
 
     Parameters
     ----------
-    pack
-        Pack of the robots.
+    pool, models, rows
+        Working memory, and model and row of the state of each robot.
     reads_force
         Whether to read the forces of gravity and Coriolis; otherwise they are zero.
     speed_limit
@@ -100,20 +100,22 @@ class MujocoStep(NativeStep):
 
     def __init__(
         self,
-        pack: User,
-        robot: RobotMj,
+        pool: DataPool,
+        models: list[Any],
+        rows: Float64,
         reads_force: bool,
         speed_limit: Float64 | None,
         arrays: dict[str, Rows],
         skip: Bool,
         constraint: int | None,
     ) -> None:
-        data = pack.data
+        data = pool.take(models, rows)
+        robot = pool.robot
         dof = len(robot.qpos)
         addresses = dict(functions() or {})
         kinematics = addresses.pop("kinematics")
         tables = {name: [getattr(row, field).ctypes.data for row in data] for name, field in FIELDS}
-        tables["models"] = [model._address for model in pack.models]
+        tables["models"] = [model._address for model in models]
         tables["data"] = [row._address for row in data]
         arrays = arrays | {name: np.array(rows, np.uint64) for name, rows in tables.items()}
         arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64)}
@@ -123,10 +125,11 @@ class MujocoStep(NativeStep):
         clearance = None
         shapes = shape_tables(robot)
         if shapes is not None:
-            clearance = GroupClearance(shapes, kinematics, pack.models, data, dof)
+            clearance = GroupClearance(shapes, kinematics, models, data, dof)
             robots.clearance = clearance.address
-        self._pack = pack
-        self._kept = [*pack.models], data, arrays, robots, clearance
+        self._pool = pool
+        self._states = models, rows
+        self._kept = data, arrays, robots, clearance
         super().__init__(
             len(data),
             dof,
@@ -143,5 +146,5 @@ class MujocoStep(NativeStep):
         """Return the address of the group, for a call of the extension or of XLA; the robots are in
         their states.
         """
-        _ = self._pack.data  # taken into the working memory
+        self._pool.take(*self._states)
         return super().prepare()

@@ -52,27 +52,19 @@ PyObject *address(PyObject *, PyObject *capsule) {
   return gateway == nullptr ? nullptr : PyLong_FromVoidPtr(gateway);
 }
 
-// Copy one vector of each robot into the rows of an array of float or double.
+// Copy one vector of each robot into the rows of an array.
 template <class Get>
 PyObject *read_rows(PyObject *capsule, PyObject *array, Get get) {
   Gateway *gateway = held<Gateway>(capsule);
   if (gateway == nullptr) return nullptr;
   auto const count = static_cast<Py_ssize_t>(gateway->robots.size()) * gateway->dof;
   Buffer out;
-  if (!out.open(array, count, 0, PyBUF_WRITABLE | PyBUF_C_CONTIGUOUS)) return nullptr;
-  bool const wide = out.itemsize() == sizeof(double);
+  if (!out.open(array, count, sizeof(double), PyBUF_WRITABLE | PyBUF_C_CONTIGUOUS)) return nullptr;
   return without_gil([&] {
-    Py_ssize_t at = 0;
+    double *to = out.as<double>();
     for (Articulation *robot : gateway->robots) {
-      VectorXf const row = get(gateway->functions, robot);
-      if (row.size != gateway->dof) throw std::bad_exception();
-      for (std::ptrdiff_t i = 0; i < row.size; ++i, ++at) {
-        if (wide) {
-          out.as<double>()[at] = row.data[i];
-        } else {
-          out.as<float>()[at] = row.data[i];
-        }
-      }
+      copy_row(get(gateway->functions, robot), to, gateway->dof);
+      to += gateway->dof;
     }
   });
 }

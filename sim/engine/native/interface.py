@@ -10,9 +10,7 @@ from __future__ import annotations
 import ctypes
 from typing import Any
 
-from batchpid.native.extensions import ROUNDED, VECTORIZED_ONLY, Extension
-from batchpid.native.operations import PROGRAMS
-from batchpid.native.task_space_extension import RIGID_BODIES
+from batchpid.native.extensions import PROGRAMS, RIGID_BODIES, ROUNDED, VECTORIZED_ONLY, Extension
 
 SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation7getQposEv",

@@ -2,6 +2,11 @@
 pictures.
 """
 
-from batchpid.sim.engine.native.library import import_sapien
+import warnings
 
-import_sapien()  # before the modules of this room import it, with its warnings
+with warnings.catch_warnings():
+    # Before the modules of this room import it: without a system Vulkan SAPIEN warns that it falls
+    # back to its own, but nothing here renders.
+    warnings.filterwarnings("ignore", message=".*libvulkan.*")
+    warnings.filterwarnings("ignore", message=".*pkg_resources.*")
+    import sapien  # noqa: F401

@@ -17,17 +17,16 @@ from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
-from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene, MirroringBuilder
+from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.collision_groups import Words, link_groups
-from batchpid.sim.robot.collision_shapes import mesh_file
+from batchpid.sim.robot.collision_shapes import hull, mesh_file
 from batchpid.sim.robot.meshes import note_meshes
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
+from batchpid.sim.robot.self_collision import Words, link_groups
 from batchpid.sim.robot.simulated_links import rigid_tree
 from batchpid.sim.robot.tables import Body, Shape, Tables
-from batchpid.task_space.frames import from_rpy, matrix_of
+from batchpid.task_space.frames import SpatialInertia, from_rpy, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.spatial_inertia import SpatialInertia
 
 FASTEST = 1000.0
 """Largest speed of links and joints [m/s or rad/s]. PhysX's defaults stop links at 10 m/s and 50
@@ -58,7 +57,7 @@ def articulation_builder(spec: SceneSpec) -> ArticulationBuilder:
 
     Raises RobotError for a body whose moments of inertia are not positive.
     """
-    builder = MirroringBuilder()
+    builder = ArticulationBuilder()
     tables = spec.simulated
     links: dict[str, Any] = {}
     for body in tables.bodies:
@@ -106,7 +105,13 @@ def _add_shape(link: Any, shape: Shape) -> None:
     elif shape.kind == "cylinder":
         link.add_cylinder_collision(place * _ALONG_Z, *size, material)
     else:
-        link.add_convex_collision_from_file(mesh_file(shape), place, shape.scale, material)
+        scale = shape.scale
+        if min(scale) < 0:
+            # Two convex meshes of negative scale that touch end the process in PhysX, so a mirrored
+            # mesh gets a file of its own.
+            shape = shape._replace(vertices=hull(shape))
+            scale = (1.0, 1.0, 1.0)
+        link.add_convex_collision_from_file(mesh_file(shape), place, scale, material)
 
 
 def _pose(position: Float64, axes: Float64) -> Pose:

@@ -3,22 +3,63 @@
 Native calls are one call of the extension for all robots. The extension calls functions that
 SAPIEN's shared library exports, so that it compiles without SAPIEN. It depends on the layout of two
 of SAPIEN's types, which SAPIEN does not guarantee: see
-:data:`batchpid.sim.engine.native.library.TESTED`.
+:data:`TESTED`.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sapien
 
-from batchpid.arrays.array_types import Bool, DType, Float32, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
+from batchpid.sim.engine import native
 from batchpid.sim.engine.native import SWITCH, extension
-from batchpid.sim.engine.native.interface import STATUS
-from batchpid.sim.engine.native.library import functions
+from batchpid.sim.engine.native.interface import STATUS, SYMBOLS
 from batchpid.sim.engine.native_model import NativeStep
+
+TESTED = ("3.0.3",)
+"""Versions of SAPIEN that native code calls; tests/sim/test_conformance.py must pass with each.
+
+The gateway repeats the layout of two types of SAPIEN (gateway.h). No header promises it, and the
+names of the functions do not contain the type that they return: a version that changes it would
+corrupt memory.
+"""
+
+
+def obstacle() -> str:
+    """Return why native code cannot call SAPIEN; "" if it can."""
+    if reason := native.obstacle():
+        return reason
+    if (version := sapien.__version__) not in TESTED:
+        return f"native calls are not tested with SAPIEN {version}; install sapien=={TESTED[-1]}"
+    try:
+        functions()
+    except (OSError, AttributeError) as error:
+        return f"SAPIEN {version} has another library: {error}; install sapien=={version} from PyPI"
+    return ""
+
+
+@cache
+def functions() -> tuple[int, ...]:
+    """Return the addresses of the exported functions; AttributeError names one that is missing."""
+    folder = Path(sapien.__file__).parent
+    paths = [
+        path
+        for place in (folder, folder.parent / "sapien.libs")
+        for path in place.glob("libsapien*.so*")
+    ]
+    if len(paths) != 1:
+        raise OSError("libsapien.so is missing, or there is more than one")
+    library = ctypes.CDLL(str(paths[0]))
+    return tuple(
+        ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value or 0 for symbol in SYMBOLS
+    )
 
 
 class PythonCalls:
@@ -44,20 +85,23 @@ class PythonCalls:
         self._set_qf = [(robot.set_qf, row) for robot, row, skipped in rows if not skipped]
         self._steps = [system.step for system in systems]
 
-    def qpos(self, dtype: DType) -> Rows:
+    def qpos(self) -> Float64:
         """Return the joint positions, a new array."""
-        return np.concatenate([get() for get in self._get_qpos], dtype=dtype).reshape(self._shape)
+        return self._table(get() for get in self._get_qpos)
 
-    def qvel(self, dtype: DType) -> Rows:
+    def qvel(self) -> Float64:
         """Return the joint velocities, a new array."""
-        return np.concatenate([get() for get in self._get_qvel], dtype=dtype).reshape(self._shape)
+        return self._table(get() for get in self._get_qvel)
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new
         array.
         """
-        forces = [compute(gravity, coriolis) for compute in self._passive_force]
-        return np.concatenate(forces, dtype=dtype).reshape(self._shape)
+        return self._table(compute(gravity, coriolis) for compute in self._passive_force)
+
+    def _table(self, rows: Iterable[Float32]) -> Float64:
+        # After close() there are no rows.
+        return np.array([*rows], np.float64).reshape(self._shape)
 
     def write_qf(self) -> None:
         """Apply the efforts in ``qf``."""
@@ -107,23 +151,23 @@ class NativeCalls:
         # The pack's own arrays, which native code reads at each call.
         self.qf, self.skip = qf, skip
 
-    def qpos(self, dtype: DType) -> Rows:
+    def qpos(self) -> Float64:
         """Return the joint positions, a new array."""
-        rows = np.empty(self.qf.shape, dtype)
+        rows = np.empty(self.qf.shape)
         self._native.read_qpos(self.gateway, rows)
         return rows
 
-    def qvel(self, dtype: DType) -> Rows:
+    def qvel(self) -> Float64:
         """Return the joint velocities, a new array."""
-        rows = np.empty(self.qf.shape, dtype)
+        rows = np.empty(self.qf.shape)
         self._native.read_qvel(self.gateway, rows)
         return rows
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new
         array.
         """
-        rows = np.empty(self.qf.shape, dtype)
+        rows = np.empty(self.qf.shape)
         self._native.passive_force(self.gateway, rows, gravity, coriolis)
         return rows
 

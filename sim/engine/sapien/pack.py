@@ -6,7 +6,7 @@ bit-identically to a robot alone.
 
 The engine takes changed payloads, masses, centers of mass and friction while a robot exists, and
 then moves bit-identically to a robot that was built with them. The loop uses only the members of
-:class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities. Longer than 350 lines because
+:class:`batchpid.sim.engine.protocol.EnginePack`. Longer than 350 lines because
 that is the whole interface between loop and engine.
 """
 
@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 from sapien import Pose, physx
 
-from batchpid.arrays.array_types import Bool, DType, Float32, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.model_pack import ModelPack
+from batchpid.sim.engine.model_pack import ORIGIN, ModelPack
 from batchpid.sim.engine.native.interface import FARTHEST
-from batchpid.sim.engine.native.library import obstacle
+from batchpid.sim.engine.physics import PHYSICS
+from batchpid.sim.engine.protocol import Engine
 from batchpid.sim.engine.sapien.building import (
     RESTITUTION,
     build_scene,
@@ -35,15 +36,19 @@ from batchpid.sim.engine.sapien.building import (
     rounded_tree,
     set_inertia,
 )
-from batchpid.sim.engine.sapien.calls import EngineCalls, NativeCalls, PythonCalls, SapienStep
-from batchpid.sim.engine.sapien.link_sensors import SapienLinkSensors
+from batchpid.sim.engine.sapien.calls import (
+    EngineCalls,
+    NativeCalls,
+    PythonCalls,
+    SapienStep,
+    obstacle,
+)
+from batchpid.sim.engine.sapien.sapien_sensors import SapienLinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.task_space.frames import matrix_of, unrotate
 from batchpid.task_space.rigid_tree import RigidTree
-
-_ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
 
 
 class Pack(ModelPack):
@@ -150,8 +155,8 @@ class Pack(ModelPack):
     def step(self) -> None:
         """Do one sim step of every scene, with constraint efforts on coupled joints."""
         if self._constraint is not None:
-            qpos = self._calls.qpos(np.float64)
-            qvel = self._calls.qvel(np.float64)
+            qpos = self._calls.qpos()
+            qvel = self._calls.qvel()
             self._joint_qf[...] = self._constraint.apply(self.qf, qpos, qvel)
             self._calls.write_qf()
         self._stepped[...] = True
@@ -176,18 +181,17 @@ class Pack(ModelPack):
         speed_limit: Float64 | None,
         drives: bool = False,
     ) -> SapienStep:
-        constraint = None if self._constraint is None else self._constraint.address
         reads = (gravity, coriolis, velocities)
         joints = self._joints if drives else None
         sense = None if self._sensors is None else self._sensors.add
-        return SapienStep(self.calls, self._stepped, *reads, speed_limit, constraint, joints, sense)
+        return SapienStep(
+            self.calls, self._stepped, *reads, speed_limit, self._constraint_address, joints, sense
+        )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
         if self._constraint is not None:
-            passive = self._calls.passive_force(True, True, np.float64)
-            self._constraint.update(
-                self.joint_mass_matrix, self._calls.qpos(np.float64), passive, rows
-            )
+            passive = self._calls.passive_force(True, True)
+            self._constraint.update(self.joint_mass_matrix, self._calls.qpos(), passive, rows)
 
     @cached_property
     def rigid_tree(self) -> RigidTree:
@@ -231,17 +235,16 @@ class Pack(ModelPack):
         self._stepped[rows] = False
         self._bind()
 
-    def read_qpos(self, dtype: DType = np.float64) -> Rows:
-        return self._calls.qpos(dtype)
+    def read_qpos(self) -> Float64:
+        return self._calls.qpos()
 
-    def read_qvel(self, dtype: DType = np.float64) -> Rows:
-        return self._calls.qvel(dtype)
+    def read_qvel(self) -> Float64:
+        return self._calls.qvel()
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         if self.steps_read_force(gravity, coriolis):
-            return self._calls.passive_force(gravity, coriolis, dtype)
-        state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
-        return self._passive_force(*state).astype(dtype)
+            return self._calls.passive_force(gravity, coriolis)
+        return self._model_force(gravity, coriolis)
 
     def write_qf(self, effort: Rows) -> None:
         self.qf[...] = effort
@@ -302,7 +305,7 @@ class Pack(ModelPack):
         their efforts become zero, and the content of their scenes is reset.
         """
         bases = (
-            np.tile(_ORIGIN, (len(rows), 1))
+            np.tile(ORIGIN, (len(rows), 1))
             if base is None
             else self._moved_to_origin(rows, base, 1.0)
         )
@@ -459,3 +462,14 @@ def _read_drive(joint: Any) -> tuple[tuple[Any, ...], float, float, Float32]:
 def _disable_gravity(robot: Any, disabled: bool) -> None:
     for link in robot.links:
         link.disable_gravity = disabled
+
+
+ENGINE = Engine(
+    name="sapien",
+    title="SAPIEN",
+    capabilities=frozenset({"build", "partial_force", "sapien_dissipation"}),
+    physics=PHYSICS,
+    group_size=4,
+    make_pack=Pack,
+    native_obstacle=obstacle,
+)

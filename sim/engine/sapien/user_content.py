@@ -1,92 +1,25 @@
 """Scenes that need no render device, and the content that the user's ``build`` function adds to
 them.
-
-Mirrored collision meshes have separate builders. A URDF mirrors a mesh by a negative scale. PhysX
-requires positive scales of convex meshes, SAPIEN passes on any scale, and the process ends with a
-segmentation fault once two such shapes touch. The mirrored vertices make a sound mesh.
 """
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import sapien
 from sapien.physx import (
     PhysxArticulationLinkComponent,
-    PhysxCollisionShapeConvexMesh,
     PhysxCpuSystem,
     PhysxRigidDynamicComponent,
-    get_default_material,
 )
-from sapien.wrapper.actor_builder import ActorBuilder, CollisionShapeRecord, preprocess_mesh_file
-from sapien.wrapper.articulation_builder import ArticulationBuilder, LinkBuilder
+from sapien.wrapper.actor_builder import ActorBuilder
+from sapien.wrapper.articulation_builder import ArticulationBuilder
 
-from batchpid.arrays.array_types import Array, Float32, SapienScene
+from batchpid.arrays.array_types import Float32, SapienScene
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import Build, SceneSpec
-
-
-class MirroringBuilder(ArticulationBuilder):
-    """Articulation builder that builds meshes of negative scale from mirrored vertices."""
-
-    def create_link_builder(self, parent: LinkBuilder | None = None) -> LinkBuilder:
-        """Return a builder of a link below ``parent``."""
-        builder = _LinkBuilder(len(self.link_builders), parent)
-        self.link_builders.append(builder)
-        return builder
-
-
-class _LinkBuilder(LinkBuilder):
-    collision_records: list[CollisionShapeRecord]
-
-    def build_physx_component(self, link_parent: Any = None) -> Any:
-        records = self.collision_records
-        self.collision_records = [record for record in records if min(record.scale) > 0]
-        try:
-            link = super().build_physx_component(link_parent)
-        finally:
-            self.collision_records = records
-        for record in records:
-            if min(record.scale) < 0:
-                _attach(link, record, self.collision_groups)
-        return link
-
-
-def _attach(link: Any, record: CollisionShapeRecord, groups: list[int]) -> None:
-    try:
-        hull = _hull(record.filename)
-    except (
-        RuntimeError
-    ):  # a mesh that SAPIEN cannot read: a shape less than asked for, which build_scene reports
-        return
-    scale = np.abs(record.scale)
-    shape = PhysxCollisionShapeConvexMesh(
-        hull * np.sign(record.scale).astype(np.float32), scale, record.material
-    )
-    shape.local_pose = record.pose
-    shape.set_collision_groups(groups)
-    shape.set_density(record.density)
-    shape.set_patch_radius(record.patch_radius)
-    shape.set_min_patch_radius(record.min_patch_radius)
-    link.attach(shape)
-
-
-@lru_cache(maxsize=256)
-def _hull(filename: str) -> Float32:
-    """Return the vertices (n, 3) of the convex hull of a mesh file, unscaled; SAPIEN, too, reads a
-    file only once.
-    """
-    shape = PhysxCollisionShapeConvexMesh(
-        preprocess_mesh_file(filename), (1, 1, 1), get_default_material()
-    )
-    vertices = np.array(shape.vertices)
-    vertices.setflags(write=False)
-    return vertices
-
 
 Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
 """Links of a robot by name: the entity that each is part of, and its pose in that, None for the
@@ -114,7 +47,7 @@ class HeadlessScene(sapien.Scene):
 
     def create_articulation_builder(self) -> Any:
         """Return a builder of articulations for this scene."""
-        return MirroringBuilder().set_scene(self)
+        return ArticulationBuilder().set_scene(self)
 
     def create_actor_builder(self) -> Any:
         """Return a builder of actors for this scene."""
@@ -143,7 +76,7 @@ class SceneContent:
         self, spec: SceneSpec, build: Build, scene: SapienScene, env: int, links: Frames
     ) -> None:
         # What exists now is the robot and the ground; the rest is the user's.
-        before = {entity.per_scene_id for entity in scene.entities}  # the robot and the ground
+        before = {entity.per_scene_id for entity in scene.entities}
         self.watched = _call(build, scene, env, links)
         if not spec.collisions:
             _refuse_shapes(scene, env)
@@ -157,41 +90,21 @@ class SceneContent:
                     self._bodies.append((entity, component))
                 elif isinstance(component, PhysxArticulationLinkComponent) and component.is_root:
                     self._articulations.append(component.articulation)
-        self._start = self.read(at_rest=True)
+        self._start = self.read()
         self.size = self._start.size
 
     def reset(self) -> None:
-        """Put everything that moves where ``build`` left it, at rest."""
+        """Put everything that moves into the state in which ``build`` left it."""
         self.write(self._start)
 
-    def read(self, at_rest: bool = False) -> Float32:
-        """Return the state of everything that moves (size,), with zero velocities if
-        ``at_rest``.
-        """
-
-        def velocity(values: Array) -> Array:
-            if at_rest:
-                return np.zeros_like(values)
-            return values
-
+    def read(self) -> Float32:
+        """Return the state of everything that moves (size,)."""
         parts: list[Any] = [np.zeros(0, np.float32)]
         for entity, body in self._bodies:
             pose = entity.get_pose()
-            parts += [
-                pose.p,
-                pose.q,
-                velocity(body.get_linear_velocity()),
-                velocity(body.get_angular_velocity()),
-            ]
+            parts += [pose.p, pose.q, body.get_linear_velocity(), body.get_angular_velocity()]
         for robot in self._articulations:
-            root = read_root(robot)
-            parts += [
-                root[:7],
-                velocity(root[7:]),
-                robot.get_qpos(),
-                velocity(robot.get_qvel()),
-                robot.get_qf(),
-            ]
+            parts += [read_root(robot), robot.get_qpos(), robot.get_qvel(), robot.get_qf()]
         return np.concatenate(parts, dtype=np.float32)
 
     def write(self, state: Float32) -> None:
@@ -251,15 +164,9 @@ def _call(
     try:
         returned = build(scene, env)
     except Exception as error:
-        # In a worker, cloudpickle may have dropped the name of the file.
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        raise InvalidArgumentError(
-            "build",
-            f"raised {type(error).__name__}: {error} (in {where.name},"
-            f" {where.filename}:{where.lineno})",
-            env=env,
-            remedy="correct the function; try it with workers=0 for the whole traceback",
-        ) from error
+        problem = f"raised {type(error).__name__}: {error}"
+        remedy = "correct the function; try it with workers=0 for the traceback"
+        raise InvalidArgumentError("build", problem, env=env, remedy=remedy) from error
     if returned is None:
         return []
     several = isinstance(returned, Iterable) and not isinstance(returned, str)

@@ -11,6 +11,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from c_programs import COMPILERS, STRICT, TABLE, compiled, efforts_in_c
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from law_cases import OPTIONS
@@ -21,7 +22,6 @@ from batchpid.export import to_c
 from batchpid.law import advance_with_mass_matrix
 from batchpid.motors import guard as guards
 from batchpid.task_space import bias, gravity, mass_matrix
-from tests.c_programs import COMPILERS, STRICT, TABLE, compiled, efforts_in_c
 
 pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 SINGLE = {name: case for name, case in OPTIONS.items() if not name.endswith("per env")}

@@ -15,9 +15,7 @@ import batchpid as bp
 from batchpid import native
 from batchpid.native import array_program, availability, extensions
 from batchpid.native.availability import obstacle
-from batchpid.native.extensions import ROOT, load
-from batchpid.native.operations import PROGRAM
-from batchpid.native.task_space_extension import TASK_SPACE
+from batchpid.native.extensions import PROGRAM, ROOT, TASK_SPACE, load
 from batchpid.sim.engine.native.interface import EXTENSIONS
 
 needs_extension = pytest.mark.skipif(bool(obstacle()), reason="there is no native code")
@@ -100,7 +98,7 @@ def other_file(monkeypatch, changed):
 
 @needs_extension
 @needs_sources
-@pytest.mark.parametrize("file", ["native/program.h", "native/operations.py", "flags"])
+@pytest.mark.parametrize("file", ["native/program.h", "native/extensions.py", "flags"])
 def test_a_stale_extension_is_one_warning_and_numpy_does_the_work(monkeypatch, file):
     expected = steps()
     assert expected[1]
@@ -121,16 +119,16 @@ def test_without_sources_the_tables_decide_and_the_remedy_is_a_new_installation(
     monkeypatch, tmp_path
 ):
     real = extensions.Extension.digests
-    tables = tmp_path / "batchpid/native/operations.py"
+    tables = tmp_path / "batchpid/native/extensions.py"
     tables.parent.mkdir(parents=True)
-    shutil.copy(ROOT / "batchpid/native/operations.py", tables)
+    shutil.copy(ROOT / "batchpid/native/extensions.py", tables)
     monkeypatch.setattr(extensions, "ROOT", tmp_path)
     monkeypatch.setattr(extensions.Extension, "digests", lambda self: real(self, tmp_path))
     assert load(PROGRAM).run
     load.cache_clear()
     tables.write_text("other")
     with pytest.warns(
-        RuntimeWarning, match=r"\(batchpid/native/operations.py\); install batchpid again"
+        RuntimeWarning, match=r"\(batchpid/native/extensions.py\); install batchpid again"
     ):
         assert obstacle()
 

@@ -5,8 +5,7 @@ singular poses.
 from __future__ import annotations
 
 import numpy as np
-import pytest
-from trees import TOOLS, serial, tree_of
+from trees import TOOLS, tree_of
 
 import batchpid.task_space as ts
 from batchpid.task_space import frames
@@ -141,29 +140,3 @@ def test_the_force_on_a_wall_is_the_one_asked_for():
     errors, _, _ = run(tree, HAND, params, qpos, at, 1000, DT, outside=wall, wrench=wrench)
     np.testing.assert_allclose(forces[-1], asked, rtol=2e-3)
     assert np.abs(errors[-1][:, axes]).max() < 1e-3
-
-
-@pytest.mark.parametrize(
-    "name", ["straight elbow", pytest.param("aligned wrist", marks=pytest.mark.slow)]
-)
-def test_a_setpoint_out_of_reach_for_2_s_and_back(name):
-    """At most 0.01 N m of chatter per step while it is out of reach, and 0.05 mm after the
-    return.
-    """
-    dt = 1 / 500
-    if name == "straight elbow":
-        tree, link, qpos, way = tree_of("panda"), HAND, START[None], [0.5, 0, 0]
-    else:
-        tree, link, way = serial(), "tip", [0, 0.3, 0]
-        qpos = np.array([[0.3, 0.4, 0.9, 0.2, 0.0, 0.1]])
-    at = ts.link_poses(tree, qpos, [link])[:, 0]
-
-    def goal(t):
-        pose = at.copy()
-        pose[:, :3] += np.interp(t, [0, 0.6, 2.6, 3.2], [0, 1, 1, 0]) * np.array(way)
-        return pose
-
-    errors, efforts, _ = run(tree, link, ts.make_osc_params(tree), qpos, goal, 2200, dt)
-    assert np.linalg.norm(errors[1295, 0, :3]) > 0.02
-    assert np.abs(np.diff(efforts[800:1295], n=2, axis=0)).max() < 0.01
-    assert np.linalg.norm(errors[-1, 0, :3]) < 0.05e-3

@@ -31,7 +31,7 @@ def test_demo_reports_every_joint_and_where_it_differs_from_the_tutorial(batchpi
 
 @pytest.mark.slow
 def test_demo_draws(batchpid, tmp_path):
-    path = tmp_path / "new" / "demo.png"
+    path = tmp_path / "demo.png"
     status, said, _ = batchpid("demo", "jaco2", *SHORT, "--workers", 1, "--picture", path)
     assert status == 0
     lines = ("env-steps/s", "real-time factor", str(path))

@@ -16,13 +16,13 @@ import tyro
 from commands_that_write import WORDS, output, output_flags
 
 from batchpid.sim.cli import COMMANDS
-from batchpid.sim.cli.outputs import bar
+from batchpid.sim.cli.commands import bar
 
 HAVE = {
     "--gains": {"demo", "rollout", "compare", "identify", "export", "inspect", "view"},
     "--seconds": {"demo", "rollout", "tune", "compare", "excite"},
     "--engine": {"demo", "rollout", "tune", "compare", "view"},
-    "--base": {"rollout", "tune", "compare", "inspect", "view"},
+    "--base": COMMANDS.keys() - {"plot"},
     "--json": {"rollout", "compare", "identify", "inspect"},
     "--out": {"rollout", "tune", "excite", "identify", "export"},
     "--picture": {"demo", "rollout", "tune", "compare", "identify", "plot"},
@@ -122,7 +122,7 @@ def bad_values(command: str) -> list[tuple[str, str, str]]:
     """Return each flag of a command with a bad value; the command names the flag."""
     found = []
     for flag, kind in flags(command).items():
-        kind = kind.replace("{None}|", "").partition(" [NAME|FILE")[0]
+        kind = kind.replace("{None}|", "")
         found += [
             (command, flag, bad)
             for bad in (("other",) if flag in choices(command) else BAD.get(kind, ()))
@@ -165,17 +165,16 @@ def written(folder: Path) -> set[Path]:
         ("rollout --tool panda_hand", "tool: is for control 'osc'"),
         ("rollout --substeps 0", "substeps: out of range"),
         ("rollout --out a.npz", "out: unknown file format"),
-        ("rollout --gains tunned", "did you mean 'tuned'?"),
+        ("rollout --gains tunned", "use tuned, designed, "),
         ("tune nobody", "no robot 'nobody'"),
         ("tune arm.urdf --population 1", "population: out of range"),
         ("compare --gains drive:a,b", "DAMPING"),
-        ("compare --engine", "engine: is missing"),
         ("identify arm.urdf", "logs: are missing"),
         ("identify arm.urdf run.h5 --extras speed", "extras"),
-        ("export panda --gains drive", "gains: are a drive's"),
+        ("export panda --gains drive", "gains: belong to a drive"),
         ("inspect panda2", "'panda2'"),
         ("inspect --gains nothing", "gains: is neither"),
-        ("compare arm.urdf --moves 0", "moves: leaves none"),
+        ("compare arm.urdf --moves 0", "moves: out of range"),
         ("plot /dev/null", "/dev/null"),
         ("plot .", "."),
         ("view --port 99999", "port: out of range (got 99999)"),

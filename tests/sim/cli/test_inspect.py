@@ -120,22 +120,16 @@ def test_masses_and_their_sources(batchpid, tmp_path):
     assert {"frame", "speck"} <= {line.split(" ")[0] for line in every.splitlines()}
 
 
-def test_strict_fails_on_findings_worse_than_notes(batchpid, odd):
-    assert batchpid("inspect", odd, "--strict")[0] == 1
-    assert batchpid("inspect", "panda", "--strict")[0] == 0
-
-
 def test_gains_are_checked_too(batchpid):
     status, out, _ = batchpid("inspect", "jaco2")
     assert status == 0
     assert "Under gains tuned:\nNothing odd." in out
-    status, out, _ = batchpid("inspect", "jaco2", "--gains", "sapien-tutorial", "--strict")
-    assert status == 1
+    status, out, _ = batchpid("inspect", "jaco2", "--gains", "sapien-tutorial")
+    assert status == 0
     assert "Under gains sapien-tutorial:\nwarning:" in out
 
 
 def test_inspects_an_mjcf_file(tmp_path, batchpid):
-    pytest.importorskip("mujoco")
     path = tmp_path / "arm.xml"
     link = '<body name="{}"><joint name="hinge" armature=".1"/><geom size=".1" mass="2"/>{}</body>'
     path.write_text(f"<mujoco><worldbody>{link.format('arm', '<site/>')}</worldbody></mujoco>")

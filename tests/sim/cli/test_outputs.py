@@ -18,7 +18,7 @@ MJCF = "<mujoco><worldbody><body><joint name='a'/><geom size='.1'/></body></worl
 @pytest.fixture
 def empty_pictures(monkeypatch):
     """Make commands write empty files in place of pictures: only their names matter."""
-    for name in ("step_responses", "efforts", "comparison"):
+    for name in ("step_responses", "efforts"):
         monkeypatch.setattr(f"batchpid.sim.plots.{name}", lambda *_, **__: None)
     monkeypatch.setattr(
         "batchpid.sim.plots.save",
@@ -60,13 +60,13 @@ def test_default_names_say_what_they_show(files, batchpid, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     (tmp_path / "run.h5").write_bytes((files / "run.h5").read_bytes())
     (tmp_path / "run.png").write_text("kept")
-    for words in ((), ("--kind", "efforts"), ("--versus", files / "run.h5")):
+    for words in ((), ("--kind", "efforts")):
         status, _, complaint = batchpid("plot", "run.h5", *words)
         assert status == 0, complaint
         status, _, complaint = batchpid("plot", "run.h5", *words)
         assert "exists already" in complaint
         assert batchpid("plot", "run.h5", *words, "--force")[0] == 0
-    names = {"run.h5", "run.png", "run-responses.png", "run-efforts.png", "run-versus-run.png"}
+    names = {"run.h5", "run.png", "run-responses.png", "run-efforts.png"}
     assert {path.name for path in tmp_path.iterdir()} == names
     assert (tmp_path / "run.png").read_text() == "kept"
 
@@ -91,7 +91,6 @@ INPUTS = {
     "actuators": "a.yaml",
     "randomize": "a.yaml",
     "trajectory": "m.csv",
-    "versus": "run.h5",
 }
 """Flags of files to read, besides those in WORDS."""
 

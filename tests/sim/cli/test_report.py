@@ -38,7 +38,7 @@ def first_order_lag(panda, setpoint, time_constant=0.05):
 
 def report_of(panda, rollout):
     """Return the lines of the report, and those of the table by joint."""
-    lines = report.RunReport(panda, rollout, timestep=5e-4, wall=1.0).report().splitlines()
+    lines = report.RunReport(panda, rollout, 5e-4, 1.0, "NumPy").report().splitlines()
     return lines, {
         name: next(line for line in lines if line.startswith(name)) for name in panda.joint_names
     }

@@ -9,11 +9,11 @@ import warnings
 
 import numpy as np
 import pytest
+from tiny_urdf import joint, link, robot, write
 
 import batchpid as bp
 from batchpid.sim import Robot, Runner, StabilityWarning
 from batchpid.sim.tuning import tune
-from tests.sim.tiny_urdf import joint, link, robot, write
 
 BAD, GOOD = {"kp": 10.0, "ki": 0.0, "kd": [1.0, 5e4]}, {"kp": 10.0, "ki": 0.0, "kd": 1.0}
 

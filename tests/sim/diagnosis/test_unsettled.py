@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from tiny_urdf import write
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
@@ -24,7 +25,6 @@ from batchpid.sim import (
     read_recording,
     write_recording,
 )
-from tests.sim.tiny_urdf import write
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*outside the joint limits", "ignore:setpoint moves in every tick"
@@ -85,7 +85,7 @@ class Case(NamedTuple):
     """True if the setpoint is a ramp up to the end of the run."""
 
 
-LAGGING, LATE = (bp.make_actuators(3, command_delay=[delay, 0.0, 0.0]) for delay in (0.09, 0.06))
+LAGGING = bp.make_actuators(3, command_delay=[0.09, 0.0, 0.0])
 STIFF = {"kp": 200.0, "kd": [20.0, 12.0, 5.0]}
 WEAK = {"kp": [200.0, 8.0, 200.0], "kd": [12.0, 10.0, 2.0]}
 LOADED = {"compensate": "none"}
@@ -94,7 +94,6 @@ CASES = {
     "pressed into the ground": Case("touching", "bar3 on the ground", (0.7, 0.3, 0.0)),
     "links that touch": Case("touching", "bar1", (-0.3, 2.3, 2.4)),
     "a start inside the ground": Case("touching", "bar3 on the ground", (0.75, 0.3, 0.0), start=(0.75, 0.3, 0.0)),
-    "a start inside another link": Case("touching", "bar1", (-0.3, 2.3, 2.6), start=(-0.3, 2.2, 2.2)),
     "gravity above the effort limit": Case("effort-limit", "elbow", (0.0, -0.5, 0.0), robot={"effort": 3.0}),
     "a move too long for the effort limit": Case(
         "effort-limit", "elbow", (0.0, 2.9, 0.0), robot={"axis": "0 0 1", "effort": 1.0}, seconds=1.0
@@ -116,9 +115,6 @@ CASES = {
         "slow", "elbow", (0.0, 1.0, 0.0), gains={"kp": 100.0, "kd": [20.0, 12.0, 2.0]}, moves=True
     ),
     "a delay of the motors": Case("oscillates", "shoulder", (0.3, 0.0, 0.0), options={"actuators": LAGGING}),
-    "an integral that is too fast for a delay": Case(
-        "oscillates", "shoulder", (0.3, 0.0, 0.0), options={"actuators": LATE}
-    ),
     "a joint without gains": Case("gains", "elbow", (0.0, 0.5, 0.0), gains={"kp": [200.0, 0, 200], "kd": 12.0}),
     "a guard": Case(
         "guard", "elbow", (0.0, 1.0, 0.0), options={"guard": bp.make_guard(3, rate=0.2)}, seconds=1.0

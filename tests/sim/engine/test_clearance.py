@@ -14,7 +14,6 @@ from tiny_urdf import random_tree, robot, write
 
 from batchpid.sim import Robot, Runner
 
-mujoco = pytest.importorskip("mujoco.batch")
 pytestmark = pytest.mark.filterwarnings(
     "ignore::batchpid.sim.StabilityWarning", "ignore::batchpid.sim.FaultWarning"
 )

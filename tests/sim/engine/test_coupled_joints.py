@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tiny_urdf import write
 
 from batchpid.sim import Robot, Runner
-from tests.sim.tiny_urdf import write
 
 FREE_LIMIT = '<limit lower="-3" upper="3" effort="200" velocity="10"/>'
 

@@ -3,20 +3,19 @@ state of an env.
 """
 
 import dataclasses
+import os
 
+import mujoco
 import numpy as np
 import pytest
 
-mujoco = pytest.importorskip("mujoco")
-pytest.importorskip("mujoco.batch")
-
-from batchpid.errors import InvalidArgumentError, RobotError  # noqa: E402
-from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform  # noqa: E402
-from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
-from batchpid.sim.engine.mujoco.mujoco_engine import ENGINE  # noqa: E402
-from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation  # noqa: E402
-from batchpid.sim.randomization.fields import nominal_values  # noqa: E402
+from batchpid.errors import InvalidArgumentError, RobotError
+from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform
+from batchpid.sim.engine.mujoco.model_builder import robot_model
+from batchpid.sim.engine.mujoco.mujoco_pack import ENGINE
+from batchpid.sim.engine.physics import SOLVERS
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.randomization.distributions import nominal_values
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits"
@@ -493,6 +492,7 @@ def test_every_file_that_a_load_opens_is_part_of_the_identity(tmp_path, changed)
         .replace(b".1", b".2")
         .replace(*(np.float32(x).tobytes() for x in (0.3, 0.5)))
     )
+    os.utime(path, (2e9, 2e9))  # MuJoCo keeps meshes by the time of the file
     assert Robot.load(tmp_path / "scene.xml").describe() != robot.describe()
     robot_model.cache_clear()
     with pytest.raises(RobotError, match="has changed since the robot was loaded"):

@@ -4,16 +4,12 @@ import sys
 
 import numpy as np
 import pytest
+from identical import assert_identical
+from tiny_urdf import INERTIAL, joint, link, one_joint, robot, write
 
-mujoco = pytest.importorskip("mujoco")
-pytest.importorskip("mujoco.batch")
-
-from identical import assert_identical  # noqa: E402
-from tiny_urdf import INERTIAL, joint, link, one_joint, robot, write  # noqa: E402
-
-import batchpid as bp  # noqa: E402
-from batchpid.errors import MissingDependencyError  # noqa: E402
-from batchpid.sim import MujocoSolver, Robot, Runner  # noqa: E402
+import batchpid as bp
+from batchpid.errors import MissingDependencyError
+from batchpid.sim import MujocoSolver, Robot, Runner
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
@@ -80,7 +76,7 @@ def test_solver_settings_are_those_given(panda):
 
 
 def test_without_mujoco_the_error_names_the_package(panda, monkeypatch):
-    monkeypatch.delitem(sys.modules, "batchpid.sim.engine.mujoco.mujoco_engine", raising=False)
+    monkeypatch.delitem(sys.modules, "batchpid.sim.engine.mujoco.mujoco_pack", raising=False)
     monkeypatch.setitem(sys.modules, "mujoco.batch", None)
     with pytest.raises(MissingDependencyError, match="mujoco"):
         Runner(panda, 1, workers=0, engine="mujoco")

@@ -4,21 +4,18 @@ the work.
 
 from __future__ import annotations
 
-import importlib
 import re
-import sys
-import warnings
 
 import numpy as np
 import pytest
 from identical import assert_identical
 
 from batchpid.native import availability, extensions
-from batchpid.native.operations import PROGRAM
+from batchpid.native.extensions import PROGRAM
 from batchpid.sim import Runner
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native import library
 from batchpid.sim.engine.native.interface import EXTENSIONS
+from batchpid.sim.engine.sapien import calls
 
 needs_extension = pytest.mark.skipif(bool(native.obstacle()), reason="there are no native calls")
 
@@ -27,12 +24,12 @@ needs_extension = pytest.mark.skipif(bool(native.obstacle()), reason="there are 
 def fresh(monkeypatch):
     """Reload and recheck extensions, in the test and after it."""
     monkeypatch.delenv("BATCHPID_NATIVE", raising=False)
-    caches = extensions.load, availability._fault, library.functions
-    for each in caches:
-        each.cache_clear()
+    caches = extensions.load, availability._fault, calls.functions
+    for cache in caches:
+        cache.cache_clear()
     yield
-    for each in caches:
-        each.cache_clear()
+    for cache in caches:
+        cache.cache_clear()
 
 
 def rollout(panda, workers=0, runners=1, engine="sapien"):
@@ -80,17 +77,6 @@ def test_worker_processes_give_no_warning_of_their_own(monkeypatch, panda, capfd
     assert "Warning" not in capfd.readouterr().err
 
 
-def test_an_extension_that_was_not_built_is_no_fault(monkeypatch, tmp_path, panda):
-    monkeypatch.delitem(sys.modules, "batchpid.sim.engine.native._gateway", raising=False)
-    monkeypatch.setattr(native, "__path__", [str(tmp_path)])
-    importlib.invalidate_caches()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
-        assert (
-            rollout(panda)[1] == f"law in NumPy, Python calls into SAPIEN ({extensions.NOT_BUILT})"
-        )
-
-
 @needs_extension
 @pytest.mark.parametrize(
     ("name", "value", "reason"),
@@ -110,8 +96,8 @@ def test_an_extension_that_was_not_built_is_no_fault(monkeypatch, tmp_path, pand
 )
 def test_another_sapien_is_refused_by_name(monkeypatch, panda, name, value, reason):
     expected, _ = rollout(panda)
-    monkeypatch.setattr(library, name, value)
-    library.functions.cache_clear()
+    monkeypatch.setattr(calls, name, value)
+    calls.functions.cache_clear()
     found, backend = rollout(panda)
     assert_identical(expected, found)
     assert re.fullmatch(rf"law in NumPy, Python calls into SAPIEN \({reason}.*\)", backend)

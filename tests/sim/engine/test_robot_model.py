@@ -7,6 +7,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from xml.etree import ElementTree
 
+import mujoco
 import numpy as np
 import pytest
 from tiny_urdf import random_tree, robot, write
@@ -14,7 +15,6 @@ from tiny_urdf import random_tree, robot, write
 import batchpid.task_space as ts
 from batchpid.sim import Randomization, Robot, Runner, Uniform, to_urdf
 
-mujoco = pytest.importorskip("mujoco", "3.17")
 ENGINES = ("sapien", "mujoco")
 FREE = {"control": "effort", "compensate": "none", "ground": False, "workers": 0}
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tiny_urdf import one_joint, write
 
 from batchpid.sim import Robot, Runner
-from tests.sim.tiny_urdf import one_joint, write
 
 
 def wheel(folder, kind: str = "", multiplier: float = 0.0) -> Robot:

@@ -209,7 +209,7 @@ def test_another_reading_that_explains_a_log_is_named(robot, log, effort_log, wo
 def test_setpoints_that_were_logged_late_are_named(robot, log):
     late = replace(log, command_time=log.command_time + 0.03)
     with pytest.raises(
-        bp.InvalidArgumentError, match="setpoints that were logged about 3[05] ms late"
+        bp.InvalidArgumentError, match=r"setpoints that were logged about 3[05] ms late"
     ):
         identify(robot, [late], payload=False)
 

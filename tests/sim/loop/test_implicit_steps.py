@@ -85,13 +85,6 @@ def test_its_integral_tracks_too(arm):
         assert after < 1e-4
 
 
-def test_mujoco_runs_it(arm):
-    pytest.importorskip("mujoco")
-    worst, after = largest_error(arm, 1 / 100, params_of(arm, 316.0), engine="mujoco")
-    assert worst < 0.15e-3
-    assert after < 1e-6
-
-
 def test_setpoint_steps_in_long_ticks_settle():
     """The mass matrix is fresh in every sim step: kept for 4 steps, it would diverge."""
     panda = load_bundled("panda")

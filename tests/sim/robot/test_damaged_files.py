@@ -5,7 +5,6 @@ memory.
 from __future__ import annotations
 
 import resource
-import time
 from collections.abc import Collection
 from pathlib import Path
 
@@ -89,10 +88,8 @@ def damaged(draw: st.DrawFn, data: bytes) -> bytes:
 
 
 def try_loading(path: Path, build: bool) -> None:
-    """Load a robot and ``build`` a scene of it: an error is one of ours, and neither takes long nor
-    much memory.
-    """
-    before, started = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    """Load a robot and ``build`` a scene of it: an error is one of ours, and the memory is bounded."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
         loaded = Robot.load(path)
         if build:
@@ -100,7 +97,6 @@ def try_loading(path: Path, build: bool) -> None:
                 runner.step(loaded.start)
     except RobotError:
         pass
-    assert time.process_time() - started < 5
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
 
 

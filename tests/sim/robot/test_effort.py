@@ -7,7 +7,7 @@ import pytest
 from tiny_urdf import LIMIT, joint, link, one_joint, robot, write
 
 import batchpid as bp
-from batchpid.sim import Robot, Runner
+from batchpid.sim import Robot
 
 UNLIMITED = LIMIT.replace('effort="10"', "")
 OFF_CENTRE = (
@@ -44,16 +44,3 @@ def test_stated_limits_are_kept_and_designed_gains_have_both(tmp_path):
         np.testing.assert_array_equal(np.squeeze(params.effort_max), [stated, suggested])
     assert bp.design_gains(mixed, 2.0, effort_limit=None).effort_max is None
     assert np.isinf(np.squeeze(mixed.params(kp=1.0).effort_max)[1])
-
-
-def test_a_robot_without_effort_limits_settles_under_designed_gains(tmp_path):
-    free = Robot.load(
-        write(
-            tmp_path,
-            one_joint('<limit lower="-1" upper="1" effort="0" velocity="0"/>', arm=OFF_CENTRE),
-        )
-    )
-    with Runner(free, 1, params=free.designed(), workers=0, ground=False) as runner:
-        for _ in range(200):
-            qpos = runner.step([0.5]).qpos
-    np.testing.assert_allclose(qpos, 0.5, atol=1e-3)

@@ -8,9 +8,9 @@ import warnings
 
 import numpy as np
 import pytest
+from tiny_urdf import joint, link, robot, write
 
 from batchpid.sim import Robot, Runner, SetpointWarning
-from tests.sim.tiny_urdf import joint, link, robot, write
 
 
 @pytest.fixture

@@ -8,8 +8,7 @@ import batchpid.task_space as ts
 from batchpid.sim import Robot
 from batchpid.sim.robot.merging import link_inertias, merge_links, place_links
 from batchpid.sim.robot.simulated_links import rigid_tree
-from batchpid.task_space.frames import compose, matrix_of, rotate
-from batchpid.task_space.spatial_inertia import total
+from batchpid.task_space.frames import compose, matrix_of, rotate, total
 
 BOX = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.sim import Robot
-from tests.sim.tiny_urdf import INERTIAL, joint, link, robot, write
 
 
 def hand(folder, **mimics: str) -> Robot:

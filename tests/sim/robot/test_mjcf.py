@@ -5,22 +5,19 @@ a finding.
 from __future__ import annotations
 
 import random
-import sys
 from contextlib import suppress
 
+import mujoco
 import numpy as np
 import pytest
 
-mujoco = pytest.importorskip("mujoco")
-pytest.importorskip("mujoco.batch")
-
-from batchpid.errors import InvalidArgumentError, MissingDependencyError, RobotError  # noqa: E402
-from batchpid.sim import Robot, Runner, to_urdf  # noqa: E402
-from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
-from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
-from batchpid.sim.engine.protocol import SceneSpec  # noqa: E402
-from batchpid.sim.robot.shapes import surfaces  # noqa: E402
-from batchpid.sim.tuning import gain_set  # noqa: E402
+from batchpid.errors import InvalidArgumentError, RobotError
+from batchpid.sim import Robot, Runner, to_urdf
+from batchpid.sim.engine.mujoco.model_builder import robot_model
+from batchpid.sim.engine.physics import SOLVERS
+from batchpid.sim.engine.protocol import SceneSpec
+from batchpid.sim.robot.shapes import surfaces
+from batchpid.sim.tuning import gain_set
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
@@ -327,51 +324,6 @@ def test_several_actuators_of_a_joint_add_up(load):
     )
 
 
-@pytest.mark.skipif(not hasattr(mujoco.mjtDyn, "mjDYN_PID"), reason="an older MuJoCo")
-def test_a_pid_has_gains_and_further_effects_are_told(load):
-    text = two_links(
-        rest="""<actuator><pid joint="j" kp="5" kv="1" ki="3" imax=".5" gear="2" input="pos vel ff"/>
-        <motor joint="j" gear="3" ctrlrange="-2 2" delay="0.01" nsample="9"/></actuator>"""
-    )
-    robot = load(text, self_collision="none")
-    gains = robot.mjcf_gains()
-    np.testing.assert_array_equal(np.ravel([gains.kp, gains.kd]), [20, 4])
-    findings = [str(finding) for finding in robot.check()]
-    assert any("'number 0' has effects" in text and "an integral" in text for text in findings)
-    assert any("'number 1' has effects" in text and "a delay" in text for text in findings)
-
-
-@pytest.mark.parametrize(
-    ("actuator", "said"),
-    [
-        (
-            '<general joint="j" gainprm="5" biastype="affine" biasprm="2 -5 -1"/>',
-            "a constant force",
-        ),
-        (
-            '<general joint="j" gainprm="5" biastype="affine" biasprm="0 5 -1"/>',
-            "a negative gain",
-        ),
-        ('<damper joint="j" kv="2" ctrlrange="0 1"/>', "gains of type affine"),
-        ('<pid joint="j" kp="5" input="vel ff"/>', "it is a spring"),
-        ('<dcmotor joint="j" nominal="24 6 3"/>', "gains of type dcmotor"),
-        ('<general joint="j" gainprm="0" biastype="affine" biasprm="0 -5 0"/>', "no input"),
-        ('<velocity joint="j" kv="2"/>', "a velocity as its target"),
-        (
-            '<general joint="j" biastype="user"/>',
-            "a bias of type user",
-        ),
-        (
-            '<motor joint="j" group="2"/></actuator><option actuatorgroupdisable="2"/><actuator>',
-            "disables its group",
-        ),
-    ],
-)
-def test_what_an_actuator_does_besides_is_told(load, actuator, said):
-    robot = load(two_links(rest=f"<actuator>{actuator}</actuator>"))
-    assert [said in str(each) for each in robot.repairs if each.code == "actuator"] == [True]
-
-
 def test_the_gear_of_an_actuator_after_an_orientation_servo_is_its_own(load):
     """Of the servo's three outputs each has a gear."""
     servo = '<orientation site="s" refsite="r" kp="1"/>'
@@ -382,7 +334,6 @@ def test_the_gear_of_an_actuator_after_an_orientation_servo_is_its_own(load):
     np.testing.assert_array_equal(load(text.replace(BOX, sites, 1)).effort_limit, [6])
 
 
-@pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_armature"), reason="an older MuJoCo")
 def test_armature_of_actuators(load):
     text = two_links(rest='<actuator><motor joint="j" armature=".3" gear="3"/></actuator>')
     robot = load(text)
@@ -470,27 +421,25 @@ def test_what_has_no_equivalent_is_told(load, name):
 
 def test_all_that_is_left_out_is_named(load):
     """A floating robot is not fixed to the world, whose shapes are not its links'."""
-    floor = '<geom {} type="plane" size="1 1 .1"/>'
-    named = floor.format("name='floor'")
-    world = f'{named}<geom name="wall" size=".1"/><geom type="box" size=".1 .1 .1"/>'
+    floor = '<geom type="plane" size="1 1 .1" pos="0 0 0"/>'
+    world = f'{floor}<geom name="wall" size=".1"/><geom type="box" size=".1 .1 .1"/>'
     rest = """<equality><weld name="hold" body1="leg1"/></equality>"""
     told = "\n".join(
         map(str, load(WALKER.replace("<worldbody>", f"{rest}<worldbody>{world}")).repairs)
     )
     for name in (
-        "'floor'",
-        "'wall', 'number 2'",
-        "weld 'hold'",
+        "sphere 'wall', box 'number 2'",
+        "'hold'",
         "'ball'",
         "'goal'",
     ):
         assert name in told
     for place in ('pos="0 0 -1"', 'euler="30 0 0"'):
-        (found,) = load(
-            two_links().replace("<worldbody>", f"<worldbody>{floor.format(place)}")
-        ).repairs
+        plane = floor.replace('pos="0 0 0"', place)
+        (found,) = load(two_links().replace("<worldbody>", f"<worldbody>{plane}")).repairs
         assert (found.severity, found.code) == ("warning", "collision")
         assert "plane 'number 0'" in found.text
+    assert load(two_links().replace("<worldbody>", f"<worldbody>{floor}")).repairs == ()
 
 
 def test_a_plain_file_needs_no_repair(load):
@@ -526,40 +475,24 @@ def test_what_cannot_be_simulated_is_refused(load, name):
 
 
 INERTIAL = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"
-UNREADABLE = {"not found": None, "git lfs pull": POINTER}
 
 
-@pytest.mark.parametrize("suffix", ["stl", "obj"])
-@pytest.mark.parametrize("reason", UNREADABLE)
-def test_missing_meshes(load, tmp_path, reason, suffix):
+def test_missing_meshes(load, tmp_path):
     """A mesh may be missing if the mass of its body is known, and is named."""
-    (tmp_path / "parts").mkdir()
-    if UNREADABLE[reason] is not None:
-        (tmp_path / "parts" / f"gone.{suffix}").write_bytes(UNREADABLE[reason])
-    asset = f'<compiler meshdir="parts"/><asset><mesh name="m" file="gone.{suffix}"/></asset>'
-    shown = '<geom name="{}" type="mesh" mesh="m" contype="0" conaffinity="0"/>'
-    assert (
-        load(
-            two_links(rest=asset, geom=INERTIAL + BOX + shown.format("")), missing_meshes="error"
-        ).repairs
-        == ()
-    )
+    asset = '<compiler meshdir="parts"/><asset><mesh name="m" file="gone.stl"/></asset>'
+    shown = '<geom type="mesh" mesh="m" contype="0" conaffinity="0"/>'
+    drawn = two_links(rest=asset, geom=INERTIAL + BOX + shown)
+    assert load(drawn, missing_meshes="error").repairs == ()
     for shape in ('<geom type="mesh" mesh="m"/>', '<geom type="box" mesh="m"/>'):
-        for body in (
-            f"{INERTIAL}{BOX}{shape}",
-            f"{INERTIAL}{shape}",
-            BOX + shape.replace("/>", ' mass="0"/>'),
-        ):
+        for body in (f"{INERTIAL}{shape}", BOX + shape.replace("/>", ' mass="0"/>')):
             text = two_links(rest=asset, geom=body)
-            robot = load(text)
-            (finding,) = robot.repairs
+            (finding,) = load(text).repairs
             assert finding.code == "missing-mesh"
-            assert f"gone.{suffix}" in finding.text
-            assert reason in finding.text
-            with pytest.raises(RobotError, match=rf"gone\.{suffix}.*{reason}.*missing_meshes"):
+            assert "gone.stl" in finding.text
+            with pytest.raises(RobotError, match=r"gone\.stl"):
                 load(text, missing_meshes="error")
-    (tmp_path / "parts" / f"gone.{suffix}").write_bytes(b"solid wedge")
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "gone.stl").write_bytes(b"solid wedge")
     with pytest.raises(RobotError, match=r"MuJoCo cannot compile the file: .*(gone|'m')"):
         load(text)
 
@@ -568,43 +501,20 @@ def test_missing_meshes(load, tmp_path, reason, suffix):
 @pytest.mark.parametrize("drawn", ["", 'contype="0" conaffinity="0"'])
 @pytest.mark.parametrize("inferred", [False, True])
 def test_a_missing_mesh_without_which_the_mass_is_unknown_is_refused(load, mode, drawn, inferred):
-    asset = f'<compiler inertiafromgeom="{str(inferred).lower() if inferred else "auto"}"/>'
+    asset = f'<compiler inertiafromgeom="{"true" if inferred else "auto"}"/>'
     asset += '<asset><mesh name="m" file="gone.stl"/></asset>'
     shape = f'<geom type="mesh" mesh="m" {drawn}/>'
     for geom in (shape, BOX + shape, BOX + shape.replace("/>", ' mass="2"/>')):
         text = two_links(geom=INERTIAL * inferred + geom, rest=asset)
-        with pytest.raises(
-            RobotError,
-            match=r"mesh gone\.stl \(not found\) of body 'b'; restore the file, or give the",
-        ):
+        with pytest.raises(RobotError, match=r"gone\.stl.*restore the file"):
             load(text, missing_meshes=mode)
-    base = two_links(rest=asset).replace(BOX, BOX + shape, 1)
-    if not (mode == "error" and not drawn):
-        assert load(base, missing_meshes=mode).dof == 1  # the mass of a fixed base has no effect
-    with pytest.raises(RobotError, match=r"of body 'a'; restore the file"):
-        load(base, missing_meshes=mode, fixed_base=False)
-
-
-@pytest.mark.parametrize(
-    "asset",
-    [
-        '<include file="part.xml"/>',
-        '<asset><hfield name="h" file="part.png" size="1 1 1 1"/></asset>',
-    ],
-)
-def test_a_git_lfs_pointer_in_place_of_another_file_is_named(load, tmp_path, asset):
-    for suffix in ("png", "xml"):
-        (tmp_path / f"part.{suffix}").write_bytes(POINTER)
-    with pytest.raises(
-        RobotError,
-        match=r"part\.(png|xml) is a git-lfs pointer instead of the file; run git lfs pull",
-    ):
-        load(two_links(rest=asset))
 
 
 @pytest.mark.parametrize("name", ["robot.xml", "robot.urdf"])
 def test_a_git_lfs_pointer_in_place_of_the_robot_is_named(tmp_path, name):
-    (tmp_path / name).write_bytes(POINTER)
+    (tmp_path / name).write_bytes(
+        b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"
+    )
     with pytest.raises(
         RobotError, match=r"robot\.\w+: a git-lfs pointer instead of the file; run git lfs pull"
     ):
@@ -633,7 +543,6 @@ def test_a_mesh_beside_a_missing_one_keeps_its_shape(load, tmp_path):
 
 
 def test_a_default_namespace_changes_nothing(load, tmp_path):
-    pytest.importorskip("trimesh")
     (tmp_path / "part.xml").write_text(
         f'<mujocoinclude xmlns="urn:m"><body name="c">{BOX}</body></mujocoinclude>'
     )
@@ -685,14 +594,6 @@ def test_a_damaged_file_is_a_robot_or_an_error(load, seed, tmp_path, monkeypatch
             load(text[:begin] + part + text[begin + rng.randrange(8) :])
 
 
-def test_needs_mujoco(load, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(
-        MissingDependencyError, match=r"reading an MJCF file.*pip install 'mujoco>=3.17'"
-    ):
-        load(ARM)
-
-
 def test_an_unwritable_cache_is_an_error(load, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
@@ -702,7 +603,6 @@ def test_an_unwritable_cache_is_an_error(load, monkeypatch, tmp_path):
 
 
 def test_is_drawn_by_its_shapes(load):
-    pytest.importorskip("trimesh")
     assert {surface.link for surface in surfaces(load(ARM))} == {
         "base",
         "upper",

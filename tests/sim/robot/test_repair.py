@@ -12,11 +12,11 @@ import pytest
 from faulty_urdfs import ARM, HINGE, REPAIRED
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_urdf import INERTIAL, link, one_joint, robot, write
+from tiny_urdf import INERTIAL, LIMIT, link, one_joint, robot, write
 
 from batchpid.errors import RobotError
 from batchpid.sim import RepairWarning, Robot
-from batchpid.sim.robot.link_repair import ball, nearest_physical, triangle_excess
+from batchpid.sim.robot.inertia import ball, nearest_physical, triangle_excess
 
 
 @pytest.mark.parametrize("case", REPAIRED)
@@ -47,12 +47,18 @@ def test_repairs_have_the_effect_that_they_tell(tmp_path):
     assert load("joint name twice").joint_names == ("hinge", "hinge_2")
     assert [joint.mimic for joint in load("mimics in a circle").joints].count(None) == 1
     assert load("floating base").joint_names == ("hinge",)
-    assert load("commas").joints[0].axis == (0, 1, 0)
     assert {"placeholder", "no-effort-limit"} <= {
         finding.code for finding in load("effort of 0").check()
     }
     heavy = load("no inertia").mass_matrix([0.0])[0]
     np.testing.assert_allclose(heavy, ball(2.0)[:1, :1], rtol=1e-4)
+
+
+def test_commas_count_as_blanks_and_nothing_as_the_default(tmp_path):
+    text = one_joint(LIMIT.replace('"10"', '""')).replace("0 1 0", "0, 1, 0")
+    loaded = Robot.load(write(tmp_path, text), strict=True)
+    assert loaded.joints[0].axis == (0, 1, 0)
+    assert loaded.effort_limit == np.inf
 
 
 def test_latin_1_that_claims_to_be_utf_8_is_read(tmp_path):

@@ -14,7 +14,7 @@ from robots import load_bundled
 from tiny_urdf import one_joint, random_tree, write
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Robot, Runner
+from batchpid.sim import Robot
 
 
 @given(st.integers(0, 2**32), st.floats(-4, 4), st.floats(0, 9))
@@ -53,19 +53,6 @@ def test_a_robot_from_a_pipe():
     )
     assert shown.returncode == 0, shown.stderr
     assert "hinge" in shown.stdout
-
-
-@pytest.mark.parametrize("units", ["mass_matrix", "effort"])
-def test_designed_gains_move_any_urdf_to_its_setpoint(units, tmp_path):
-    robot = Robot.load(write(tmp_path, one_joint()))
-    params = robot.designed(gain_units=units)
-    np.testing.assert_array_equal(
-        params.effort_max, np.broadcast_to(robot.effort_limit, params.effort_max.shape)
-    )
-    with Runner(robot, 1, params=params, workers=0) as runner:
-        for _ in range(200):
-            obs = runner.step([0.5])
-    np.testing.assert_allclose(obs.qpos, 0.5, atol=0.01)
 
 
 def test_designed_gains_have_one_bandwidth_with_the_mass_matrix(panda):

@@ -18,7 +18,6 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
 from batchpid.sim.engine.protocol import SceneSpec
-from batchpid.sim.engine.scene_model import contacts_of
 
 BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
 SLIDE = '<limit lower="-0.5" upper="0.5" effort="10" velocity="2"/>'
@@ -186,7 +185,7 @@ def test_contacts_are_of_all_pairs_but_the_disabled_and_the_neighbours(seed):
         lines = (f'<disable_collisions link1="{a}" link2="{b}"/>' for a, b in disabled)
         write(Path(folder), robot(*lines), "test.srdf")
         loaded = Robot.load(path, self_collision="urdf")
-        near = contacts_of(spec_of(loaded), False).near(loaded.start)
+        near = spec_of(loaded).contact_model(False).near(loaded.start)
         seen = {frozenset((first, second)) for first, second, _ in near}
     far = {pair for pair in map(frozenset, pairs) if len({body[name] for name in pair}) == 2}
     neighbours = {frozenset((a, b)) for a, b in pairs if {body[a], body[b]} == {"arm0", "arm4"}}

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from robots import load_bundled
@@ -15,7 +16,6 @@ from batchpid.errors import RobotError
 from batchpid.sim import Robot
 from batchpid.sim.robot.shapes import FEWEST, MOST, segments_of, surfaces
 
-trimesh = pytest.importorskip("trimesh")
 RED = '<material name="red"><color rgba="1 0 0 0.5"/></material>'
 BOX = '<box size="0.1 0.2 0.4"/>'
 
@@ -162,7 +162,6 @@ def test_a_mesh_file_is_read_and_scaled(mirror, tmp_path):
     ("unit", "factor"), [("", 1.0), ('<unit name="millimeter" meter="0.001"/>', 1e-3)]
 )
 def test_a_collada_file_is_read_in_its_unit(unit, factor, tmp_path):
-    pytest.importorskip("collada")
     text = trimesh.creation.box((1, 2, 3)).export(file_type="dae").decode()
     (tmp_path / "box.dae").write_text(text.replace("<up_axis>", f"{unit}<up_axis>"))
     findings = []
@@ -207,9 +206,7 @@ def test_visuals_are_looked_up_in_package_dirs(tmp_path):
 
 
 def test_a_malformed_visual_is_an_error_that_names_it(tmp_path):
-    with pytest.raises(
-        RobotError, match=r"link 'a': <sphere radius='big'> needs one finite number"
-    ):
+    with pytest.raises(RobotError, match=r"link 'a': <sphere radius='big'> needs 1 finite number"):
         surfaces(load(tmp_path, a=visual('<sphere radius="big"/>')))
 
 

@@ -273,8 +273,6 @@ def test_links_may_have_the_names_of_added_bodies(engine, tmp_path):
     """MuJoCo's root is called world; where links of a body collide in part, each gets a body "LINK
     (shapes)".
     """
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
     box = INERTIAL + '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
     names = ["world", "world_link", "world_link_2", "a", "b", "a (shapes)", "a (shapes)_2"]
     joints = [

@@ -13,6 +13,7 @@ from robots import load_bundled
 
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError, RobotError
+from batchpid.native.availability import SWITCH
 from batchpid.sim import OperationalSpace, Robot, Runner, StabilityWarning
 
 HAND = "panda_hand"
@@ -44,8 +45,6 @@ def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
     """5 cm of radius, once in 2 s; the orientation is held. Damping and friction of the joints are
     compensated.
     """
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
     of = request.getfixturevalue(name)
     tool, start = (
         (HAND, START) if name == "panda" else ("l6", np.array([0.3, 0.4, 0.9, 0.2, 0.7, 0.1]))
@@ -54,16 +53,13 @@ def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
     at, ticks, dt = pose_of(of, start, tool), 100, 1 / 100
     phase = np.pi * dt * np.arange(1, ticks + 1)
     setpoints = np.tile(np.concatenate([at, np.zeros(12)]), (ticks, 1))
-    ahead = 0.5 * np.pi * dt  # a setpoint is held for a tick: its middle is that of the motion
-    setpoints[:, 0] += 0.05 * (np.cos(phase - ahead) - 1)
-    setpoints[:, 1] += 0.05 * np.sin(phase - ahead)
+    setpoints[:, 0] += 0.05 * (np.cos(phase) - 1)
+    setpoints[:, 1] += 0.05 * np.sin(phase)
     setpoints[:, 7], setpoints[:, 8] = (
-        -0.05 * np.pi * np.sin(phase - ahead),
-        0.05 * np.pi * np.cos(phase - ahead),
+        -0.05 * np.pi * np.sin(phase),
+        0.05 * np.pi * np.cos(phase),
     )
-    setpoints[:, 13:15] = (
-        -0.05 * np.pi**2 * np.stack([np.cos(phase - ahead), np.sin(phase - ahead)], axis=-1)
-    )
+    setpoints[:, 13:15] = -0.05 * np.pi**2 * np.stack([np.cos(phase), np.sin(phase)], axis=-1)
     with Runner(
         of, 1, control=control, engine=engine, workers=0, timestep=1 / 1000, substeps=10
     ) as runner:
@@ -77,6 +73,45 @@ def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
     )
     assert np.linalg.norm(found[..., :3] - circle, axis=-1).max() < 1e-3
     assert np.abs((found[..., 3:] * at[3:]).sum(-1)).min() > 1 - 1e-5
+
+
+@pytest.mark.parametrize(("backend", "native"), [("numpy", "1"), ("numpy", "0"), ("jax", "1")])
+@pytest.mark.parametrize("discretization", ["explicit", "implicit"])
+def test_a_pose_moves_with_its_twist_within_a_tick(
+    panda, discretization, backend, native, monkeypatch
+):
+    """A tick of many sim steps under a constant twist is many ticks of one sim step."""
+    if backend == "jax":
+        pytest.importorskip("jax")
+    monkeypatch.setenv(SWITCH, native)
+    options = {"twist": True, "acceleration": True, "discretization": discretization}
+    control = OperationalSpace(panda, HAND, **options)
+    dt, substeps, twist = 1 / 500, 20, np.array([0.1, -0.2, 0.1, 0.0, 0.0, 0.8])
+    start = pose_of(panda, panda.start, HAND)
+    time = dt * np.arange(1, substeps + 1)[:, None]
+    half = 0.5 * time * twist[5]
+    w, x, y, z = start[3:]
+    turned = np.hstack(
+        [
+            np.cos(half) * w - np.sin(half) * z,
+            np.cos(half) * x - np.sin(half) * y,
+            np.cos(half) * y + np.sin(half) * x,
+            np.cos(half) * z + np.sin(half) * w,
+        ]
+    )
+    rest = np.tile([*twist, *np.zeros(6)], (substeps, 1))
+    setpoints = np.hstack([start[:3] + time * twist[:3], turned, rest])
+    ends = []
+    for steps, rows in ((1, setpoints), (substeps, setpoints[-1:])):
+        with Runner(
+            panda, 1, control=control, backend=backend, workers=0, timestep=dt, substeps=steps
+        ) as runner:
+            runner.reset(panda.start)
+            rollout = runner.rollout(rows)
+        assert rollout.ok.all()
+        ends.append(rollout.qpos[-1, 0])
+    assert np.abs(ends[0] - panda.start).max() > 1e-3
+    np.testing.assert_allclose(*ends, atol=2e-6)
 
 
 def test_quaternions_have_any_length_but_zero_and_fingers_their_setpoint(panda):

@@ -38,8 +38,6 @@ def test_a_setpoint_out_of_reach_for_2_s_and_back(arm, engine, rest):
     tool by kd / kp of that. Env 0 gets setpoints in reach, env 2 a quaternion of zeros, which makes
     it NaN: env 0 has the same bits in a run without these two.
     """
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
     robot, link, start, way = arm
     pose = ts.link_poses(robot.kinematic_tree(), start[None], [link])[0, 0]
     time = DT * np.arange(1, round(END / DT) + 1)
@@ -83,8 +81,6 @@ def smallest_eigenvalue(tree, qpos):
 @pytest.mark.parametrize("pull", [0.5, -0.5])
 def test_the_posture_does_not_pull_the_tool_off_a_near_singular_pose(engine, pull, tmp_path):
     """The error is below 0.05 mm after 2 s. Springs that leak as the damping does leave 2 mm."""
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
     robot, posture, start = six(tmp_path), BENT.copy(), BENT.copy()
     tree = robot.kinematic_tree()
     assert 0.005 < smallest_eigenvalue(tree, BENT) < 0.01  # the bound is 0.02
@@ -110,8 +106,6 @@ def test_motion_through_a_straight_elbow_is_damped(engine, tmp_path):
     the posture kept out of the task down to the bound of its springs, the tool would swing about
     the setpoint for more than 2 s.
     """
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
     robot, posture = six(tmp_path), BENT.copy()
     tree = robot.kinematic_tree()
     posture[1] += 0.5

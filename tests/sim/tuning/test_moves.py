@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from batchpid.sim.tuning import Moves, random_moves, search_moves, tutorial_move
+from batchpid.sim.tuning import Moves, random_moves, tutorial_move
 from batchpid.sim.tuning.moves import (
     shortest_durations,
     smooth_durations,
@@ -31,15 +31,6 @@ def test_random_moves_are_seeded_within_limits_and_free_of_contact(panda):
         assert not panda.dynamics().in_contact(line).any()
     assert sum("alone" in name for name in moves.names) == 2
     np.testing.assert_array_equal(random_moves(panda, 3, 3).start, moves.start[:3])
-
-
-def test_search_moves_are_the_tutorials_one_of_each_kind_and_the_hardest_of_more(panda):
-    moves, drawn = search_moves(panda, 4), random_moves(panda, 32, 4)
-    durations = shortest_durations(panda, moves)
-    assert moves.names[:2] == ("tutorial", "near the tutorial's")
-    np.testing.assert_array_equal(moves.start[2:6], drawn.start[:4])
-    assert durations[-1] == shortest_durations(panda, drawn.take(range(4, 32))).max()
-    assert durations[1] > durations[0]
 
 
 def test_shortest_duration_is_the_double_integrators_bang_bang_for_a_lone_joint(panda):
@@ -81,13 +72,12 @@ def test_smooth_motions_take_half_of_the_velocity_limits_and_leave_a_reserve_of_
         assert velocity > 0.499 or shares.max() > 0.6
 
 
-def test_smooth_effort_is_gravity_at_both_ends(panda):
+def test_smooth_effort_is_gravity_at_the_end(panda):
     move = tutorial_move(panda)
     efforts = smooth_effort(panda, move.start[0], move.target[0], 1.0)
-    for row, pose in ((0, move.start), (-1, move.target)):
-        np.testing.assert_allclose(
-            efforts[row], panda.dynamics().inverse_dynamics(pose, 0 * pose, 0 * pose)[0], atol=1e-9
-        )
+    still = np.zeros_like(move.target)
+    gravity = panda.dynamics().inverse_dynamics(move.target, still, still)[0]
+    np.testing.assert_allclose(efforts[-1], gravity, atol=1e-9)
 
 
 def test_smooth_variation_of_a_joint_at_rest_is_a_thousandth_of_its_limit(panda):

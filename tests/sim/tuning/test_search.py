@@ -29,9 +29,7 @@ SMALL = {"generations": 2, "population": 4, "seconds": 0.1, "engine": "mujoco"}
 @pytest.fixture
 def few_moves(monkeypatch):
     """Search on two moves, with a final on one other."""
-    monkeypatch.setattr(
-        "batchpid.sim.tuning.search.search_moves", lambda robot, seed: random_moves(robot, 2, seed)
-    )
+    monkeypatch.setattr("batchpid.sim.tuning.search.SEARCH_MOVES", 2)
     monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
 
 
@@ -43,7 +41,7 @@ def test_gains_and_implicit_laws_are_refused(panda):
             r"params: .*explicit gains; .*bp\.design_gains makes implicit gains",
         ),
         ({"discretization": "implicit"}, r"discretization: .*explicit gains; .*bp\.design_gains"),
-        ({"motors": motors, "actuators": motors}, "actuators: is given with motors"),
+        ({"motors": motors, "actuators": motors}, "actuators: cannot be combined with motors"),
     ):
         with pytest.raises(InvalidArgumentError, match=message):
             tune(panda, workers=0, **options)
@@ -99,12 +97,10 @@ def test_search_starts_from_the_designed_gains():
         )
 
 
-def test_gains_in_efforts_and_of_single_joints_can_be_searched_too():
-    found = tune(
-        ARM, moves=random_moves(ARM, 1, 0), gain_units="effort", per_joint=True, workers=0, **SMALL
-    )
+def test_gains_in_efforts_can_be_searched_too():
+    found = tune(ARM, moves=random_moves(ARM, 1, 0), gain_units="effort", workers=0, **SMALL)
     ratio = found.params.kp / found.start_params.kp
-    assert found.cost == found.start_cost or np.ptp(ratio) > 0
+    assert found.cost == found.start_cost or (ratio != 1).all()
 
 
 def test_moves_are_made_with_different_motors_of_which_the_worst_counts():
@@ -140,7 +136,7 @@ def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(
 
 
 @pytest.mark.slow
-def test_gains_of_the_search_follow_unseen_motions_more_closely_than_designed_ones(panda):
+def test_gains_of_the_search_settle_sooner_than_designed_ones_and_follow_closely(panda):
     found = tune(panda)
     moves = tutorial_move(panda) + random_moves(panda, 20, 1)
     designed, tuned = (
@@ -148,8 +144,9 @@ def test_gains_of_the_search_follow_unseen_motions_more_closely_than_designed_on
         for each in (found.start_params, found.params)
     )
     arm = arm_joints(panda)
-    assert tuned.following_error[:, arm].max() < 0.8 * designed.following_error[:, arm].max()
-    assert tuned.metrics.settling_time[:, arm].max() <= designed.metrics.settling_time[:, arm].max()
+    assert tuned.following_error[:, arm].max() < 1e-3
+    settling = [each.metrics.settling_time[:, arm].max() for each in (designed, tuned)]
+    assert settling[1] < 0.95 * settling[0]
 
 
 @pytest.mark.parametrize("weight", [float("nan"), float("inf"), -1.0])

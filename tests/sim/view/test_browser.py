@@ -8,6 +8,8 @@ import pytest
 from batchpid.sim import Runner
 from batchpid.sim.view import LiveSimulation, Playback
 
+pytestmark = pytest.mark.timeout(900)  # each wait for the page has a limit of its own
+
 
 def picture(page):
     """Return a screenshot (height, width, 3)."""
@@ -30,9 +32,7 @@ def number_box(page, label):
     """Return the number box of the slider with this label."""
     from selenium.webdriver.common.by import By
 
-    return page.find_element(
-        By.XPATH, f"//label[text()='{label}']/following::input[@type='text'][1]"
-    )
+    return page.find_element(By.XPATH, f"//label[.='{label}']/following::input[@type='text'][1]")
 
 
 def press(page, text):
@@ -54,9 +54,7 @@ def slide(page, label, steps):
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
 
-    thumb = page.find_element(
-        By.XPATH, f"//label[text()='{label}']/following::*[@role='slider'][1]"
-    )
+    thumb = page.find_element(By.XPATH, f"//label[.='{label}']/following::*[@role='slider'][1]")
     for _ in range(steps):
         thumb.send_keys(Keys.ARROW_RIGHT)
 
@@ -79,9 +77,9 @@ def test_robots_are_drawn_and_a_slider_moves_them(live, view, open_page, until):
     until(lambda: dark(picture(page)) > 500, what="drawing the robots")
     before, pose = picture(page), live.frame().qpos[0]
     assert abs(pose[0, 0]) < 0.1
-    enter(page, "joint1 [rad]", 1.5)
+    enter(page, "panda_joint1 [rad]", 1.5)
     until(lambda: live.setpoint[0, 0] == 1.5, what="the number's setpoint")
-    slide(page, "joint1 [rad]", 5)
+    slide(page, "panda_joint1 [rad]", 5)
     until(lambda: live.setpoint[0, 0] == pytest.approx(1.505), what="the slider's setpoint")
     assert (live.setpoint[:, 0] == live.setpoint[0, 0]).all()
     press(page, "Run")
@@ -116,7 +114,7 @@ def test_charts_draw_the_watched_joint(live, view, open_page, until):
     live.set_setpoint(live.robot.target)
     view.panel.frames_left = 10
     page = open_page(view.url)
-    until(lambda: "joint1 [rad]" in page.page_source, what="the chart's title")
+    until(lambda: "panda_joint1 [rad]" in page.page_source, what="the chart's title")
 
     def ink():
         left = picture(page)[:, :380]

@@ -2,7 +2,6 @@
 other site.
 """
 
-import socket
 import urllib.error
 import urllib.request
 
@@ -68,20 +67,9 @@ def test_so_does_a_web_socket(view, cut, options):
     assert error.value.response.status_code == 403
 
 
-def test_an_open_address_has_the_numbers_and_the_name_of_this_machine():
-    gate = Gate("0.0.0.0", 18210)
-    with gate.socket:
-        path = f"/{gate.token}/"
-        for host in ("10.0.0.1:8080", "localhost", socket.gethostname()):
-            assert gate.problem([host], [f"http://{host}"], path) is None
-        for hosts in ([], [""], ["evil.example"], ["localhost", "localhost"]):
-            assert gate.problem(hosts, [], path)
-        assert gate.problem(["localhost"], ["http://localhost"] * 2, path)
-
-
 def test_a_port_in_use_is_left_to_its_owner():
-    first = Gate("127.0.0.1", 18230)
-    second = Gate("127.0.0.1", 18230)
+    first = Gate(18230)
+    second = Gate(18230)
     with first.socket, second.socket:
         assert second.port != first.port
 
@@ -93,7 +81,7 @@ def test_a_viser_that_starts_its_server_in_another_way_is_refused():
         def stop(self):
             Other.stopped = True
 
-    gate = Gate("127.0.0.1", 18240)
+    gate = Gate(18240)
     with gate.socket, pytest.raises(BatchPIDError, match="this version of viser"):
         gate.start(Other)
     assert Other.stopped

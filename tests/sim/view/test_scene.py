@@ -10,7 +10,6 @@ from batchpid.sim import Robot, Runner
 from batchpid.sim.view import LiveSimulation, Playback
 from batchpid.sim.view.scene import RobotScene
 
-pytest.importorskip("trimesh")
 LEG = (
     '<collision><origin xyz="0 0 -0.2"/><geometry><box size="0.1 0.1 0.4"/></geometry></collision>'
 )

@@ -7,7 +7,6 @@ from identical import assert_identical
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import FaultWarning, Robot, Runner
 from batchpid.sim.view import LiveSimulation
-from batchpid.sim.view.panel import short_names
 
 
 @pytest.fixture
@@ -98,12 +97,3 @@ def test_bad_arguments_are_named(panda, live):
         with pytest.raises(InvalidArgumentError, match=named):
             live.set_gain(gain, 0, value)
     assert live.params is before
-
-
-def test_joint_names_lose_the_words_that_all_share(panda, jaco2):
-    assert short_names(panda) == (
-        *(f"joint{k}" for k in range(1, 8)),
-        "finger_joint1",
-        "finger_joint2",
-    )
-    assert short_names(jaco2)[6:8] == ("joint_7", "finger_1")

@@ -20,22 +20,21 @@ from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
-from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.command import POSE_UNITS, CommandSpec
+from batchpid.sim.robot.robot_options import BAND, known_joints
+from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec
 from batchpid.task_space import native_law, native_rows
-from batchpid.task_space.frames import pose_error
+from batchpid.task_space.frames import moved, pose_error
 from batchpid.task_space.native_law import BoundOSC
 from batchpid.task_space.osc_params import AXES
 from batchpid.task_space.symmetric import gram, solve
 
-OPTIONAL = {
-    "twist": ("vx vy vz wx wy wz", "m/s", "rad/s"),
-    "acceleration": ("ax ay az alphax alphay alphaz", "m/s^2", "rad/s^2"),
-    "wrench": ("fx fy fz mx my mz", "N", "N m"),
+ACCELERATION_UNITS = {
+    **dict.fromkeys(("ax", "ay", "az"), "m/s^2"),
+    **dict.fromkeys(("alphax", "alphay", "alphaz"), "rad/s^2"),
 }
-"""Names of further entries of a setpoint, and units of the linear and angular ones."""
+"""Names and units of the numbers in an acceleration: linear and angular."""
 
 
 class OperationalSpace:
@@ -50,7 +49,7 @@ class OperationalSpace:
     The bias is the runner's passive force, as ``compensate`` selects, plus the efforts of the
     joints' known damping and friction. Friction is compensated for the motion to the setpoint. Its
     direction is dq = J^T (J J^T + 1e-4)^-1 e, with the error e of the pose. Jacobian and mass
-    matrix are computed from ``tree``. The state is the posture of each env, which a reset restores,
+    matrix are computed from the kinematic tree. The state is the posture of each env, which a reset restores,
     and the integral. An env that has failed holds the pose of the posture. A runner sets time step
     and ``compensate``; elsewhere they are 1/2000 s and "none".
 
@@ -65,7 +64,8 @@ class OperationalSpace:
     twist, acceleration
         Whether setpoints give the velocity of the tool (m/s and rad/s), and its acceleration, in
         the world: a tool that moves follows its setpoint without the delay kd/kp, and on a circle
-        without the error r w^2/kp.
+        without the error r w^2/kp. They hold, as the pose does, at the end of the tick; within the
+        tick the pose moves with the twist. Without twist it is held.
     wrench
         Whether setpoints give the wrench of the tool on its surroundings (N and N m), in the axes
         of the params' frame.
@@ -74,10 +74,6 @@ class OperationalSpace:
         setpoint; others hold their posture.
     posture
         Joint positions (dof,) that the null space is drawn to; default ``robot.start``.
-    tree
-        Kinematic tree; default ``robot.kinematic_tree()``.
-    params
-        Params of one row, in place of ``options``.
     options
         Options of :func:`batchpid.task_space.make_osc_params`, one row for all envs;
         ``effort_limit`` is by default the robot's.
@@ -101,45 +97,30 @@ class OperationalSpace:
         wrench: bool = False,
         joints: Sequence[str] = (),
         posture: ArrayLike | None = None,
-        tree: ts.RigidTree | None = None,
-        params: ts.OSCParams | None = None,
         **options: Any,
     ) -> None:
         robot = instance("robot", robot, Robot, "pass Robot.load(...)")
-        tree = robot.kinematic_tree() if tree is None else tree
-        self.tree = instance("tree", tree, ts.RigidTree, "pass robot.kinematic_tree()")
+        self.tree = tree = robot.kinematic_tree()
         """Model of the robot."""
         self.link = link
         """Link that carries the tool."""
-        self.point = (
-            None if point is None else array("point", point, (1, 3), "xyz", kind="entry")[0]
-        )
+        self.point = None
         """Tool in the link's frame (3,) [m]; None for its origin."""
-        _check_coupling(tree, robot)
+        if point is not None:
+            self.point = array("point", point, (1, 3), "xyz", kind="entry")[0]
         posture = robot.start if posture is None else posture
         self._posture = robot.coupled(array("posture", posture, (1, tree.dof), tree.joint_names))
-        if params is None:
-            if not {"effort_limit", "effort_min", "effort_max"} & set(options):
-                options["effort_limit"] = robot.effort_limit
-            params = ts.make_osc_params(tree, **options)
-        elif options:
-            problem = "are given together with params"
-            remedy = "give them to the function that makes the params"
-            raise InvalidArgumentError(next(iter(options)), problem, remedy=remedy)
-        params = _of_one_row(
-            instance("params", params, ts.OSCParams, "make them with make_osc_params()")
-        )
-        if (params.posture_stiffness * ~tree.independent).any():
-            problem = (
-                "are for a tree without the coupling of the joints: followers have a posture"
-                " stiffness"
-            )
-            raise InvalidArgumentError(
-                "params", problem, remedy="make them with robot.kinematic_tree()"
-            )
-        self._params = params
-        self._k = ts.discretise(params, 1 / 2000)
+        if options.keys().isdisjoint(("effort_limit", "effort_min", "effort_max")):
+            options["effort_limit"] = robot.effort_limit
+        params = ts.make_osc_params(tree, **options)
+        for name, leaf in params._asdict().items():
+            if isinstance(leaf, np.ndarray) and len(leaf) > 1:
+                problem = f"has rows for {len(leaf)} envs"
+                remedy = "give one row: a controller is called for groups of envs"
+                raise InvalidArgumentError(name, problem, remedy=remedy)
+        self._params = frozen(params)
         self._timestep = 1 / 2000
+        self._k = ts.discretise(self._params, self._timestep)
         # Coulomb friction, and the band of errors in which it is reduced.
         self._friction: tuple[Array, Array] | None = None
         # Damping and friction that the robot is known to have: the law acts against them.
@@ -150,39 +131,31 @@ class OperationalSpace:
         coulomb = motors.coulomb + robot.friction * modelled
         band = np.array([BAND[unit] for unit in robot.units])
         self._known_friction = (coulomb[None], band[None]) if coulomb.any() else None
-        chain = tree.chain(link)
         # A setpoint has the pose (7), then the optional twist, acceleration and wrench (6 each),
         # then single joints.
-        self._columns = np.zeros(tree.dof, np.intp)  # of the setpoint, for each joint; 0 for none
         entries = dict(POSE_UNITS)
-        self._parts = dict[str, slice]()
-        for name, is_part in {
-            "twist": twist,
-            "acceleration": acceleration,
-            "wrench": wrench,
-        }.items():
+        self._parts: dict[str, slice] = {}
+        for name, is_part, units in (
+            ("twist", twist, TWIST_UNITS),
+            ("acceleration", acceleration, ACCELERATION_UNITS),
+            ("wrench", wrench, WRENCH_UNITS),
+        ):
             if flag(name, is_part):
-                (words, linear, angular), first = OPTIONAL[name], len(entries)
-                entries |= zip(words.split(), [linear] * 3 + [angular] * 3, strict=True)
-                self._parts[name] = slice(first, first + 6)
-        size = len(entries)
-        for column, name in enumerate(names("joints", list(joints)), size):
-            joint = tree.joint_names.index(choice("joints", name, tree.joint_names))
-            if chain[joint]:
-                remedy = "name joints outside the chain, such as fingers"
-                raise InvalidArgumentError(
-                    "joints", f"the pose of {link!r} controls it", joint=name, remedy=remedy
-                )
-            if not tree.independent[joint]:
-                raise InvalidArgumentError(
-                    "joints", "follows another joint", joint=name, remedy="name its leader"
-                )
-            self._columns[joint] = column
-        units = dict(zip(robot.joint_names, robot.units, strict=True)) if joints else {}
-        entries |= {name: units[name] for name in joints}
+                self._parts[name] = slice(len(entries), len(entries) + 6)
+                entries |= units
         pose = ts.link_poses(tree, self._posture, [link], point=self.point)[0, 0]
-        others = [self._posture[0, tree.joint_names.index(name)] for name in joints]
-        neutral = np.concatenate([pose, np.zeros(size - len(POSE_UNITS)), others])
+        neutral = [*pose, *[0.0] * (len(entries) - len(POSE_UNITS))]
+        self._columns = np.zeros(tree.dof, np.intp)  # of the setpoint, for each joint; 0 for none
+        controlled = tree.chain(link) | ~tree.independent
+        for name in names("joints", list(joints)):
+            joint = tree.joint_names.index(choice("joints", name, tree.joint_names))
+            if controlled[joint]:
+                problem = f"the pose of {link!r}, or the joint's leader, controls it"
+                remedy = "name leaders outside the chain, such as fingers"
+                raise InvalidArgumentError("joints", problem, joint=name, remedy=remedy)
+            self._columns[joint] = len(entries)
+            entries[name] = robot.units[joint]
+            neutral.append(self._posture[0, joint])
         self.command = CommandSpec(tuple(entries), tuple(entries.values()), neutral=neutral)
         """Names and units of a setpoint; the neutral one is the pose of the posture."""
 
@@ -212,13 +185,9 @@ class OperationalSpace:
             The robot has other joints than the one of this controller.
         """
         if robot.joint_names != self.tree.joint_names:
-            problem = (
-                f"was made for the joints {', '.join(self.tree.joint_names)}, but the runner's"
-                " robot has others"
-            )
-            raise InvalidArgumentError(
-                "control", problem, remedy="make it for the robot of the runner"
-            )
+            problem = f"was made for the joints {', '.join(self.tree.joint_names)}"
+            remedy = "make it for the robot of the runner"
+            raise InvalidArgumentError("control", problem, remedy=remedy)
         return ts.init(self._params, np.repeat(self._posture, num_envs, axis=0))
 
     def __call__(
@@ -238,44 +207,67 @@ class OperationalSpace:
         return None
 
     def _advance(
-        self, state: ts.OSCState, setpoint: Array, qpos: Array, qvel: Array, passive: Array
+        self,
+        state: ts.OSCState,
+        setpoint: Array,
+        qpos: Array,
+        qvel: Array,
+        passive: Array,
+        left: Array = 0.0,
     ) -> tuple[Array, Array, Array]:
         xp = namespace(setpoint, qpos)
-        aimed = state
+        setpoint = self._carried(setpoint, left)
+        posture = state.posture
         if self._columns.any():
-            aimed = state._replace(
-                posture=xp.where(self._columns > 0, setpoint[:, self._columns], state.posture)
-            )
+            posture = xp.where(self._columns > 0, setpoint[:, self._columns], posture)
         dynamics = ts.task_dynamics(
             self.tree, qpos, qvel, self.link, point=self.point, bias=passive
         )
         parts = {name: setpoint[:, part] for name, part in self._parts.items()}
         feedforward = None
         if self._damping is not None:
+            # Damping acts within the step: as mass that is added to the joints.
             feedforward = self._damping * qvel
             added = self._timestep * (self._damping[:, None] * xp.eye(qpos.shape[1]))
-            dynamics = dynamics._replace(
-                mass_matrix=dynamics.mass_matrix + added.astype(qpos.dtype)
-            )
+            mass_matrix = dynamics.mass_matrix + added.astype(qpos.dtype)
+            dynamics = dynamics._replace(mass_matrix=mass_matrix)
         if self._friction is not None:
-            friction = self._friction_to(
-                setpoint, parts.get("twist"), aimed.posture, qpos, dynamics
-            )
+            friction = self._friction_to(setpoint, parts.get("twist"), posture, qpos, dynamics)
             feedforward = friction if feedforward is None else feedforward + friction
         inputs = ts.OSCInputs(setpoint[:, :7], qpos, qvel, **parts, feedforward=feedforward)
+        # The state holds the posture of the episode, without the setpoints of single joints.
         new, terms = ts.osc(
-            self._coefficients(setpoint), aimed, dynamics, inputs, ("effort", "unsaturated")
+            self._coefficients(setpoint),
+            state._replace(posture=posture),
+            dynamics,
+            inputs,
+            ("effort", "unsaturated"),
         )
-        return new._replace(posture=state.posture), terms.effort, terms.effort != terms.unsaturated
+        saturated = terms.effort != terms.unsaturated
+        return new._replace(posture=state.posture), terms.effort, saturated
+
+    def _carried(self, setpoint: Array, left: Array) -> Array:
+        """Return setpoints at the time ``left`` [s] before the end of their tick, to which they
+        move with their twist: :func:`batchpid.sim.loop.control_step.carried` for poses.
+        """
+        if "twist" not in self._parts:
+            return setpoint
+        twist = setpoint[:, 7:13]
+        change: Array = 0.0
+        if "acceleration" in self._parts:
+            change = left * setpoint[:, self._parts["acceleration"]]
+        pose = moved(setpoint[:, :7], -left * (twist - 0.5 * change))
+        parts = [pose, twist - change, setpoint[:, 13:]]
+        return namespace(setpoint).concatenate(parts, axis=-1)
 
     @property
     def is_native(self) -> bool:
         """Whether native code has this law; a subclass may change it."""
         return type(self) is OperationalSpace
 
-    def bound(self, qpos: Array, qvel: Array, passive: Array) -> BoundOSC | None:
-        """Return this controller as a native call on these arrays (envs, dof); None where it must
-        run in Python.
+    def bound(self, qpos: Array, qvel: Array, passive: Array, left: Array) -> BoundOSC | None:
+        """Return this controller as a native call on these arrays (envs, dof), and the time to the
+        end of the tick (); None where it must run in Python.
         """
         if not self.is_native or native_rows.in_use() is None:
             return None
@@ -289,6 +281,7 @@ class OperationalSpace:
             self._friction,
             self._timestep,
             (qpos, qvel, passive),
+            left,
         )
 
     def _coefficients(self, setpoint: Array) -> ts.OSCCoefficients:
@@ -331,15 +324,18 @@ class OperationalSpace:
 
     def check_stability(self) -> None:
         """Warn if explicit gains are unstable at the time step: kp dt^2 + 2 kd dt > 4."""
-        p, dt = self._params, self._timestep
-        if p.discretization is not None:
+        params, dt = self._params, self._timestep
+        # An implicit law is stable at any time step.
+        if params.discretization is not None:
             return
+        joints = self.tree.joint_names
         for name, kp, kd, columns in (
-            ("stiffness", p.stiffness, p.damping, AXES),
-            ("posture_stiffness", p.posture_stiffness, p.posture_damping, self.tree.joint_names),
+            ("stiffness", params.stiffness, params.damping, AXES),
+            ("posture_stiffness", params.posture_stiffness, params.posture_damping, joints),
         ):
             ratio = (kp * dt * dt + 2 * kd * dt)[0] / 4
-            if ratio[worst := int(ratio.argmax())] > 1:
+            worst = int(ratio.argmax())
+            if ratio[worst] > 1:
                 warn(
                     f"{name}, {columns[worst]!r}: {kp[0, worst]:g} with damping {kd[0, worst]:g} is"
                     f" {ratio[worst]:.3g} times the stability bound of the sampled loop at a time"
@@ -363,27 +359,3 @@ def default_tool(robot: Robot) -> str:
 def tool_pose(tree: ts.RigidTree, link: str, point: Array, qpos: Array) -> NDArray[np.float32]:
     """Return the poses of a tool (..., 7) at ``qpos`` (..., dof), as they are observed."""
     return ts.link_poses(tree, qpos, [link], point=point)[..., 0, :].astype(np.float32)
-
-
-def _check_coupling(tree: ts.RigidTree, robot: Robot) -> None:
-    """Raise InvalidArgumentError if ``tree`` has another coupling of the joints than ``robot``."""
-    fields = ("leader", "multiplier", "offset")
-    if not all(
-        np.array_equal(getattr(robot.coupling, name), getattr(tree.coupling, name))
-        for name in fields
-    ):
-        problem = f"has {tree.coupling}, but the robot {robot.coupling}"
-        raise InvalidArgumentError("tree", problem, remedy="pass robot.kinematic_tree(...)")
-
-
-def _of_one_row(params: ts.OSCParams) -> ts.OSCParams:
-    """Return a copy; raise InvalidArgumentError for options that differ by env: a controller gets
-    any group of envs.
-    """
-    for name, leaf in params._asdict().items():
-        if isinstance(leaf, np.ndarray) and len(leaf) > 1:
-            problem = f"has rows for {len(leaf)} envs"
-            raise InvalidArgumentError(
-                name, problem, remedy="give one row: a controller is called for groups of envs"
-            )
-    return frozen(params)

@@ -1,21 +1,110 @@
-"""Observations. A sensor is one line of :class:`Observation`: dtype, text, unit, columns, and the
-option that it belongs to.
+"""Commands and observations: names, units and shapes of their numbers.
 
-Shared memory, snapshots, recordings and rollouts take names and shapes from that line. Its value
-comes from ``EnvGroup.observe``, from the engine's sensors of links, or from the function ``derive``
-of the line, if it follows from other quantities.
+A sensor is one line of :class:`Observation`: dtype, text, unit, columns, and the option that it
+belongs to. Shared memory, snapshots, recordings and rollouts take names and shapes from that line.
+Its value comes from ``EnvGroup.observe``, or from the engine's sensors of links.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from operator import itemgetter
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Bool, DType, Float32, Rows
-from batchpid.sim.signals.command import FORCE_UNITS, POSE_UNITS, TWIST_UNITS, WRENCH_UNITS
+from batchpid.checks.validate import array
+from batchpid.checks.validate import names as different_names
+from batchpid.errors import InvalidArgumentError
+
+POSE_UNITS = {"x": "m", "y": "m", "z": "m", "qw": "", "qx": "", "qy": "", "qz": ""}
+"""Names and units of the numbers in a pose: position and quaternion (w, x, y, z)."""
+TWIST_UNITS = {"vx": "m/s", "vy": "m/s", "vz": "m/s", "wx": "rad/s", "wy": "rad/s", "wz": "rad/s"}
+"""Names and units of the numbers in a twist: linear and angular velocity."""
+FORCE_UNITS = {"fx": "N", "fy": "N", "fz": "N"}
+"""Names and units of the numbers in a force."""
+WRENCH_UNITS = FORCE_UNITS | {"tx": "N m", "ty": "N m", "tz": "N m"}
+"""Names and units of the numbers in a wrench: force and torque."""
+
+
+@dataclass(frozen=True)
+class CommandSpec:
+    """Names and units of the numbers in a setpoint of one env.
+
+    A :class:`batchpid.sim.Controller` whose setpoints are not one number per joint has a spec as
+    its attribute ``command``. Two specs are equal if their names and units are equal.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Names repeat, or a field does not have one entry per name.
+    """
+
+    names: tuple[str, ...]
+    """Name of each entry."""
+    units: tuple[str, ...] = ()
+    """Unit of each entry; default "", unknown."""
+    _: KW_ONLY
+    neutral: ArrayLike = field(default=0.0, compare=False)
+    """Finite setpoint (size,) for an env that has failed; default 0."""
+
+    def __post_init__(self) -> None:
+        names = tuple(different_names("names", self.names))
+        units = tuple(self.units) or ("",) * len(names)
+        if len(units) != len(names):
+            problem = f"has {len(units)} units for {len(names)} names"
+            remedy = "give one unit for each name"
+            raise InvalidArgumentError("units", problem, value=units, remedy=remedy)
+        neutral = array("neutral", self.neutral, (1, len(names)), names, kind="entry")[0]
+        # The class is frozen; its __dict__ is not.
+        vars(self).update(names=names, units=units, neutral=tuple(neutral.tolist()))
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return len(self.names)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names with units, such as "x [m]"."""
+        labels = []
+        for name, unit in zip(self.names, self.units, strict=True):
+            labels.append(f"{name} [{unit}]" if unit else name)
+        return tuple(labels)
+
+
+def joint_command(joint_names: Sequence[str], units: Sequence[str], control: object) -> CommandSpec:
+    """Return the default command of a control: joint efforts under control "effort", else joint
+    positions.
+
+    ``units`` are the units of the joint positions, "rad" or "m".
+    """
+    if control == "effort":
+        units = ["N" if unit == "m" else "N m" for unit in units]
+    return CommandSpec(tuple(joint_names), tuple(units))
+
+
+def own_command(control: object) -> CommandSpec | None:
+    """Return the attribute ``command`` of the caller's own controller; None if it has none.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The attribute is neither a CommandSpec nor a sequence of names.
+    """
+    # A control that is a word has no attribute of this name.
+    command = getattr(control, "command", None)
+    if command is None or isinstance(command, CommandSpec):
+        return command
+    try:
+        return CommandSpec(command)
+    except InvalidArgumentError as error:
+        problem = f"has an attribute 'command' whose {error.argument} {error.problem}"
+        remedy = "use a batchpid.sim.CommandSpec, or names such as ('x', 'y')"
+        raise InvalidArgumentError("control", problem, remedy=remedy) from None
 
 
 class Quantity(NamedTuple):
@@ -33,10 +122,6 @@ class Quantity(NamedTuple):
     """
     links: tuple[str, ...] | None = None
     """These links."""
-    derive: Callable[[Any], Rows] | None = None
-    """Function from an observation, for a quantity that follows from the others; None for a
-    quantity that the loop reads.
-    """
 
     def shape(self, joints: tuple[int, ...]) -> tuple[int, ...]:
         """Return the shape of this quantity where that of a quantity per joint is ``joints`` (...,
@@ -44,9 +129,13 @@ class Quantity(NamedTuple):
         """
         if self.columns is None:
             return joints
-        rows = () if self.links is None else (len(self.links),)
-        columns = (len(self.columns),) if self.columns else ()
-        return (*joints[:-1], *rows, *columns)
+        # Links stand between the envs and the columns.
+        shape = joints[:-1]
+        if self.links is not None:
+            shape += (len(self.links),)
+        if self.columns:
+            shape += (len(self.columns),)
+        return shape
 
     def unit_for(self, position: str) -> str:
         """Return the unit for a joint whose position is in ``position``, "rad" or "m"."""
@@ -110,14 +199,14 @@ class Observation(NamedTuple):
 
     def map(self, function: Callable[[Rows], Rows]) -> Observation:
         """Return an observation with ``function`` applied to each array that there is."""
-        return Observation._make([None if array is None else function(array) for array in self])
+        return Observation._make([None if rows is None else function(rows) for rows in self])
 
     def copied(self, derived: Mapping[str, Callable[[Observation], Rows]]) -> Observation:
         """Return a copy with arrays of its own, and with ``derived`` quantities, by name."""
         rows = list[Any]()
         # No comprehension and no constructor, which are calls of Python in the path of a tick.
-        for array in self:
-            rows.append(None if array is None else array.copy())
+        for values in self:
+            rows.append(None if values is None else values.copy())
         for name, derive in derived.items():
             rows[_INDICES[name]] = derive(self)
         return tuple.__new__(Observation, rows)
@@ -179,10 +268,8 @@ def untouched(num_envs: int, observed: Mapping[str, Quantity]) -> dict[str, Rows
 
 def failed_envs(ok: Bool) -> str:
     """Return in words how many envs failed in ``ok`` (..., envs)."""
-    if ok.size:
-        failed = int((~ok.reshape(-1, ok.shape[-1]).all(0)).sum())
-    else:
-        failed = 0
+    # Rows are ticks: an env that failed in one of them counts once.
+    failed = int((~ok.reshape(-1, ok.shape[-1])).any(0).sum())
     if failed:
         return f"{failed} failed"
     return "all ok"

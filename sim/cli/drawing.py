@@ -1,0 +1,154 @@
+"""``batchpid plot``: a picture or a film of a recording. ``batchpid view``: robots in the browser,
+live or recorded.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from batchpid.arrays.field_tables import Field
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim import Robot, Rollout, read_recording
+from batchpid.sim.tuning.comparison import gain_set
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from batchpid.sim.view import LiveSimulation, Playback
+
+SHOWN_ENVS = 16
+"""Envs in a film."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Recorded run that is drawn or filmed."""
+
+    path: Path
+    rollout: Rollout
+    robot: Robot | None
+    kind: str
+
+    def report(self) -> str:
+        """Return a line about the run."""
+        return recording_line(self.path, self.rollout)
+
+    def figure(self) -> Figure:
+        """Draw the run."""
+        from batchpid.sim import plots
+
+        if self.kind == "responses":
+            return plots.step_responses(self.rollout)
+        if self.kind == "efforts":
+            return plots.efforts(self.rollout)
+        return plots.following_errors(self.rollout)
+
+    def film(self, path: Path, progress: Callable[[Any], Any]) -> None:
+        """Film the first :data:`SHOWN_ENVS` envs in real time."""
+        from batchpid.sim.view.film import write_film
+
+        shown = self.rollout.for_envs(slice(0, SHOWN_ENVS))
+        write_film(shown, path, robot=self.robot, progress=progress)
+
+
+def plot(
+    recording: tyro.conf.Positional[Path],
+    robot: Robot | None = None,
+    kind: Literal["responses", "efforts", "following"] = "responses",
+) -> Recording:
+    """Draw a recorded run, or film it.
+
+    The recording may be complete, cut short by a kill, or still being written. A film draws
+    the robot of the recording, or the one that is named.
+
+    Parameters
+    ----------
+    recording
+        File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote, .h5.
+    kind
+        Step responses, efforts against their limits, or errors of following.
+    """
+    rollout = read_recording(recording)
+    if not len(rollout.time):
+        remedy = "its run was cut short: run it again"
+        raise InvalidArgumentError("recording", f"{recording} holds no tick", remedy=remedy)
+    return Recording(recording, rollout, robot, kind)
+
+
+def recording_line(path: Path, rollout: Rollout) -> str:
+    """Return a line about a recorded run."""
+    cut = "" if rollout.info.complete else " (cut short)"
+    return f"{path}{cut}: {rollout.info.robot}, {rollout!r}"
+
+
+def view(
+    robot: Robot | None = None,
+    num_envs: Annotated[int, Field(low=1, high=64)] = 16,
+    gains: str | None = None,
+    play: Path | None = None,
+    port: Annotated[int, Field(low=1, high=65535)] = 8080,
+    time_limit: Annotated[float | None, Field("s")] = None,
+    **options: Any,
+) -> None:
+    """Show moving robots in the browser: sliders for setpoints and gains, and charts.
+
+    The page is served on localhost only; from another machine, use ``ssh -L``. With ``--play`` it
+    shows a recorded run, of the robot in the recording, or of the one that is named.
+
+    Parameters
+    ----------
+    num_envs
+        Number of robots; 64 at most.
+    gains
+        Gains, as for `batchpid rollout`.
+    play
+        Recorded run to show, .h5.
+    port
+        Port, or a free one if it is taken.
+    time_limit
+        Stop after this wall-clock time [s]. Default: none.
+    """
+    from batchpid.sim.view import View
+
+    if play is None:
+        source: Any = _live(robot or Robot.load("panda"), num_envs, gains, options)
+    else:
+        source = _recorded(play, robot)
+    with closing(source), View(source, port=port) as page:
+        for finding in page.findings:
+            print(f"batchpid: {finding}", file=sys.stderr)
+        print(f"Open in a browser: {page.url}  (Ctrl-C ends it)", flush=True)
+        # Ctrl-C is how a view ends.
+        with suppress(KeyboardInterrupt):
+            page.run(time_limit)
+
+
+def _live(
+    robot: Robot, num_envs: int, gains: str | None, options: dict[str, Any]
+) -> LiveSimulation:
+    """Return the running robots."""
+    from batchpid.sim.view import LiveSimulation
+
+    chosen = gain_set(robot, gains)
+    if chosen.control != "pid":
+        raise InvalidArgumentError("gains", "must be PID gains", value=gains, remedy="name others")
+    return LiveSimulation(robot, num_envs, params=chosen.params, **options)
+
+
+def _recorded(path: Path, robot: Robot | None) -> Playback:
+    """Return the run in the file; of many envs those that fit on the page."""
+    from batchpid.sim.view import Playback
+    from batchpid.sim.view.scene import MAX_ROBOTS
+
+    rollout = read_recording(path)
+    print(recording_line(path, rollout))
+    if rollout.num_envs > MAX_ROBOTS:
+        print(f"showing the first {MAX_ROBOTS} of {rollout.num_envs} envs")
+    return Playback(rollout.for_envs(slice(0, MAX_ROBOTS)), robot)

@@ -1,1 +1,0 @@
-"""MJCF files as robots, compiled by MuJoCo and written as the equivalent URDF."""

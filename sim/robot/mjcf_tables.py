@@ -1,0 +1,278 @@
+r"""Bodies, joints and collision shapes of a compiled MJCF file, as the tables of a robot.
+
+A hinge with anchor p, axis a and reference angle q0 moves its body by Trans(p) Rot(a, q - q0)
+Trans(-p), so that the row of the tables, whose origin is the anchor, is at::
+
+    origin = X Trans(p) Rot(a, -q0)        row = origin Rot(a, q)        body = row Trans(-p)
+
+with X the pose of the body before this joint, in the row above; a slide moves by Trans(a (q -
+q0)), with p = 0. Several joints of one body become a chain of rows, of which the last has the mass.
+(MuJoCo's documentation, "Computation", kinematic tree.)
+
+A mesh collides as its convex hull, in MuJoCo and in PhysX, and an ellipsoid as a polyhedron.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from itertools import combinations
+
+import mujoco
+import numpy as np
+
+from batchpid.arrays.array_types import Float64, MjModel
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.inertia import possible_inertia
+from batchpid.sim.robot.mjcf_actuators import Couplings, Motors
+from batchpid.sim.robot.mjcf_model import ALONE, RobotInFile, can_collide, label, unique
+from batchpid.sim.robot.parts import DisabledPair, Joint, Mimic
+from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Shape, ShapeKind, Tables, breadth_first
+from batchpid.task_space.frames import about, compose, matrix_of, rotate
+
+NO_MASS = 1e-9
+"""Mass [kg] of a body with shapes and without mass: a row without mass gets that of its shapes."""
+_KINDS: dict[int, tuple[ShapeKind, int]] = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: ("sphere", 1),
+    mujoco.mjtGeom.mjGEOM_BOX: ("box", 3),
+    mujoco.mjtGeom.mjGEOM_CAPSULE: ("capsule", 2),
+    mujoco.mjtGeom.mjGEOM_CYLINDER: ("cylinder", 2),
+}
+"""Kind of a shape, and the number of its sizes, by type of a geom."""
+_PARALLELS, _MERIDIANS = 12, 16
+"""Rings, poles included, and vertices of a ring, of an ellipsoid's hull."""
+
+
+class TableReader:
+    """Reader of the tables of ``robot`` in ``model``.
+
+    ``solid`` is the row of each body that has shapes, by the body's number.
+    """
+
+    def __init__(
+        self, model: MjModel, robot: RobotInFile, findings: list[Finding], motors: Motors
+    ) -> None:
+        self._model = model
+        self._robot = robot
+        self._findings = findings
+        self._motors = motors
+        self._anchors = {0: ORIGIN}  # origin of each body's row, in the frame of the body
+        self._bodies: list[Body] = []
+        self._shapes: list[Shape] = []
+        self.solid: dict[int, str] = {}
+
+    def read(self, couplings: Couplings, is_held: bool) -> Tables:
+        """Return the tables; ``is_held`` says whether a base on a free joint is fixed."""
+        model, robot = self._model, self._robot
+        root = None
+        if robot.base == 0:
+            self._add(0, Body(robot.bodies[0], None), ORIGIN)
+        # A free joint that is held keeps its turn: a row above the base has it.
+        elif is_held and model.body_quat[robot.base][0] != 1:
+            root = unique(f"{robot.bodies[robot.base]}_frame", robot.link_names)
+            self._bodies.append(Body(root, None))
+        rows = {robot.base}
+        for body in range(1, model.nbody):
+            above = int(model.body_parentid[body])
+            if body == robot.base:
+                self._read_body(body, root, couplings)
+            elif above in rows and robot.is_of_robot(body):
+                self._read_body(body, robot.bodies[above], couplings)
+                rows.add(body)
+        self._report_absent(rows)
+        return breadth_first(self._bodies, self._shapes)
+
+    def _read_body(self, body: int, parent: str | None, couplings: Couplings) -> None:
+        """Read a body, and the joints between it and the row ``parent``; None for the root."""
+        model = self._model
+        name = self._robot.bodies[body]
+        joints = [joint for joint in self._robot.joints if model.jnt_bodyid[joint] == body]
+        place = model.body_pos[body] - self._anchors[int(model.body_parentid[body])]
+        turn = model.body_quat[body].copy()
+        anchor = ORIGIN
+        if model.body_jntnum[body] > len(joints):  # on a free joint, which has the position
+            place = ORIGIN
+        row = Body(name, None)
+        if parent is not None and not joints:
+            fixed = unique(f"{name}_fixed", self._robot.joint_names)
+            row = Body(name, Joint(fixed, "fixed", parent, name), place, turn)
+        for number in joints:
+            axis = model.jnt_axis[number]
+            rest = model.qpos0[model.jnt_qposadr[number]]
+            if model.jnt_type[number] == mujoco.mjtJoint.mjJNT_SLIDE:
+                anchor = ORIGIN
+                place = place - rest * rotate(matrix_of(turn), axis)
+            else:
+                anchor = model.jnt_pos[number]
+                place = place + rotate(matrix_of(turn), anchor)
+                turn = compose(turn, about(axis, np.asarray(-rest)))
+            link = name
+            if number != joints[-1]:
+                link = unique(f"{name}_{self._robot.joints[number]}", self._robot.link_names)
+            row = Body(link, self._read_joint(number, str(parent), link, couplings), place, turn)
+            if number != joints[-1]:
+                self._bodies.append(row)
+            # The next joint of the body begins where this one ends.
+            parent = link
+            place = -anchor
+            turn = NO_TURN
+        self._add(body, row, anchor)
+
+    def _read_joint(self, number: int, parent: str, link: str, couplings: Couplings) -> Joint:
+        model = self._model
+        name = self._robot.joints[number]
+        dof = model.jnt_dofadr[number]
+        lower, upper = -np.inf, np.inf
+        if model.jnt_limited[number]:
+            lower, upper = model.jnt_range[number].tolist()
+        if model.jnt_type[number] == mujoco.mjtJoint.mjJNT_SLIDE:
+            kind = "prismatic"
+        elif model.jnt_limited[number]:
+            kind = "revolute"
+        else:
+            kind = "continuous"
+        return Joint(
+            name,
+            kind,
+            parent,
+            link,
+            lower,
+            upper,
+            effort_limit=self._motors.effort_limit[name],
+            damping=float(model.dof_damping[dof]),
+            friction=float(model.dof_frictionloss[dof]),
+            mimic=Mimic(*couplings[name]) if name in couplings else None,
+            axis=tuple(model.jnt_axis[number].tolist()),
+        )
+
+    def _add(self, body: int, row: Body, anchor: Float64) -> None:
+        """Add a row with inertia and shapes of a body, in a frame with its origin at ``anchor``."""
+        model = self._model
+        self._anchors[body] = anchor
+        for geom in self._geoms(body):
+            if (shape := self._read_shape(geom, row.name, anchor)) is not None:
+                self._shapes.append(shape)
+                self.solid[body] = row.name
+        mass = float(model.body_mass[body])
+        center = model.body_ipos[body] - anchor
+        inertia = np.diag(model.body_inertia[body])
+        # Else the row would get the mass of its shapes.
+        if mass == 0 and body in self.solid:
+            mass = NO_MASS
+            center = ORIGIN
+            inertia = 1e-3 * NO_MASS * np.eye(3)
+        if mass > 0:
+            inertia, repair = possible_inertia(mass, inertia)
+            if repair is not None:
+                text, detail = repair
+                remedy = "correct <inertia>"
+                self._findings.append(
+                    Finding("warning", "inertia", text, remedy, link=row.name, detail=detail)
+                )
+            axes = model.body_iquat[body].copy()
+            row = row._replace(mass=mass, center=center, inertia=inertia, inertia_wxyz=axes)
+        self._bodies.append(row)
+
+    def _geoms(self, body: int) -> list[int]:
+        """Return the geoms of a body that can collide."""
+        first = int(self._model.body_geomadr[body])
+        geoms = range(first, first + int(self._model.body_geomnum[body]))
+        return [geom for geom in geoms if can_collide(self._model, geom)]
+
+    def _read_shape(self, geom: int, link: str, anchor: Float64) -> Shape | None:
+        """Return the shape of a geom of ``link``, None for a plane or a height field."""
+        model = self._model
+        shape_type = int(model.geom_type[geom])
+        place = model.geom_pos[geom] - anchor
+        turn = model.geom_quat[geom].copy()
+        if shape_type in _KINDS:
+            kind, count = _KINDS[shape_type]
+            size = tuple(model.geom_size[geom, :count].tolist())
+            return Shape(link, link, kind, size, place, turn)
+        if shape_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID:  # which PhysX does not have
+            vertices = _ellipsoid(model.geom_size[geom])
+        elif shape_type in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF):
+            vertices = _hull(model, int(model.geom_dataid[geom]))
+        else:
+            return None
+        return Shape(link, link, "mesh", (), place, turn, vertices=vertices)
+
+    def _report_absent(self, rows: set[int]) -> None:
+        """Report the shapes of the robot and of the world that are no shapes of the tables. A level
+        plane at height 0 is the ground of the engines.
+        """
+        model = self._model
+        absent = []
+        for geom in [geom for body in sorted({0, *rows}) for geom in self._geoms(body)]:
+            body = int(model.geom_bodyid[geom])
+            kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+            pose = [*model.geom_pos[geom, 2:], *model.geom_quat[geom, 1:3]]
+            is_ground = body == 0 and kind == "plane" and not any(pose)
+            is_solid = body in self.solid and kind not in ("plane", "hfield")
+            if not is_ground and not is_solid:
+                absent.append(f"{kind} {label(model.geom(geom))}")
+        if absent:
+            text = f"{ALONE} shapes that are not of the robot: {', '.join(absent)}"
+            remedy = "in SAPIEN add them with build= of Runner"
+            self._findings.append(Finding("warning", "collision", text, remedy))
+
+
+def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair, ...]:
+    """Return the pairs of rows with shapes that never collide: excluded, or by the masks of all
+    their geoms.
+
+    ``solid`` maps bodies with shapes to their rows. Bodies that are welded together do not count.
+    """
+    excluded = {
+        frozenset((int(pair) >> 16, int(pair) & 0xFFFF)) for pair in model.exclude_signature
+    }
+    paired = {
+        frozenset(model.geom_bodyid[[one, other]].tolist())
+        for one, other in zip(model.pair_geom1, model.pair_geom2, strict=True)
+    }
+    # A body's geoms touch another's if a bit of the one's types is in the other's affinities.
+    masks: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for geom, body in enumerate(model.geom_bodyid.tolist()):
+        masks[body].append((int(model.geom_contype[geom]), int(model.geom_conaffinity[geom])))
+
+    def collide(first: int, second: int) -> bool:
+        pair = frozenset((first, second))
+        if pair in paired or pair in excluded:
+            return pair in paired
+        return any(
+            types & other_affinities or other_types & affinities
+            for types, affinities in masks[first]
+            for other_types, other_affinities in masks[second]
+        )
+
+    return tuple(
+        DisabledPair(solid[first], solid[second], "User")
+        for first, second in combinations(solid, 2)
+        if model.body_weldid[first] != model.body_weldid[second] and not collide(first, second)
+    )
+
+
+def _hull(model: MjModel, mesh: int) -> Float64:
+    """Return the vertices (n, 3) [m] of the convex hull of a mesh, or of the mesh if it has none.
+
+    The hull's graph has the layout of ``mesh_graph`` in MuJoCo's mjmodel.h: two counts, an address
+    for each vertex, and the numbers of the vertices.
+    """
+    first = int(model.mesh_vertadr[mesh])
+    count = int(model.mesh_vertnum[mesh])
+    vertices = model.mesh_vert[first : first + count].astype(np.float64)
+    begin = int(model.mesh_graphadr[mesh])
+    if begin >= 0:
+        corners = int(model.mesh_graph[begin])
+        begin += 2 + corners
+        vertices = vertices[np.sort(model.mesh_graph[begin : begin + corners])]
+    return vertices
+
+
+def _ellipsoid(radii: Float64) -> Float64:
+    """Return vertices (n, 3) of a polyhedron with its vertices on an ellipsoid."""
+    polar = np.linspace(0, np.pi, _PARALLELS)[1:-1, None]
+    angle = np.arange(_MERIDIANS) * 2 * np.pi / _MERIDIANS
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(_MERIDIANS)], -1)
+    pole = np.array([0.0, 0.0, 1.0])
+    rings = np.sin(polar)[..., None] * ring + np.cos(polar)[..., None] * pole
+    return np.concatenate([rings.reshape(-1, 3), [pole, -pole]]) * radii

@@ -1,0 +1,188 @@
+"""Actuators and guard of a run, fitted to the robot's joints and the control."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import batchpid as bp
+from batchpid.arrays.records import frozen
+from batchpid.checks.validate import instance
+from batchpid.errors import InvalidArgumentError
+from batchpid.motors import DRIVEN, JOINT_SIDE
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.parts import Joint
+
+BAND = {"rad": 1e-4, "m": 2e-5}
+"""Half width, by the joint's unit, of the band in which the compensation of friction is less than
+the friction.
+"""
+FRICTION_SHARE = 0.8
+"""Share of the robot's own actuators' Coulomb friction that is compensated.
+
+Overcompensated friction lets a joint oscillate about its setpoint (C. Canudas de Wit, "Robust
+control for servo-mechanisms under inexact friction compensation", Automatica 29, 1993). Friction
+identified from a log is inexact; friction in the robot's description is exact, because the joint is
+simulated with it.
+"""
+
+_NO_LIMIT = {"lower": -np.inf, "upper": np.inf, "rate": np.inf, "acceleration": np.inf}
+
+
+class KnownJoints(NamedTuple):
+    """Joints as a controller knows them, in addition to the robot's description, (dof,)."""
+
+    coulomb: NDArray[np.float64]
+    """Coulomb friction to compensate [N m or N]."""
+    viscous: NDArray[np.float64]
+    """Viscous damping [N m s/rad or N s/m]."""
+    armature: NDArray[np.float64]
+    """Reflected inertia of the motors [kg m^2 or kg]."""
+
+
+def known_joints(robot: RobotDescription) -> KnownJoints:
+    """Return friction, damping and armature of the robot's own actuators, which its controller
+    knows.
+    """
+    if robot.actuators is None:
+        motors = bp.Actuators()
+    else:
+        motors = robot.actuators
+    coulomb, viscous, armature = (
+        np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
+        for leaf in (motors.coulomb, motors.viscous, motors.armature)
+    )
+    return KnownJoints(FRICTION_SHARE * coulomb, viscous, armature)
+
+
+def load_robot_actuators(
+    source: bp.Actuators | str | Path, robot: RobotDescription
+) -> bp.Actuators:
+    """Return actuators of ``robot``, given or in a file.
+
+    Raises
+    ------
+    InvalidArgumentError
+        They do not fit the robot, or the file cannot be read.
+    FileNotFoundError
+        The file does not exist.
+    """
+    if isinstance(source, str | Path):
+        source, _ = bp.load_actuators(source, robot.joint_names)
+    return fit_actuators(source, robot, 1, "pid")
+
+
+def fit_actuators(
+    actuators: bp.Actuators, robot: RobotDescription, num_envs: int, control: object
+) -> bp.Actuators:
+    """Return ``actuators`` if they fit robot and control, with the robot's continuous joints.
+
+    Followers have no motor: their bias, friction and armature are left out. Raises
+    InvalidArgumentError if they do not fit.
+    """
+    instance("actuators", actuators, bp.Actuators, "build them with make_actuators()")
+    actuators.check(num_envs, robot.joint_names)
+    if control == "drive" and (
+        actuators.measures or actuators.delivers or actuators.load_friction is not None
+    ):
+        raise InvalidArgumentError(
+            "actuators",
+            "act on efforts and measurements, or need the effort, and PhysX's drives bypass all"
+            " three",
+            remedy=f"use control 'pid', or leave only {', '.join(DRIVEN)}",
+        )
+    # Ideal ones have no leaf that a joint could change.
+    if not actuators.num_joints:
+        return actuators
+    motors = {name: getattr(actuators, name) for name in ("bias", *JOINT_SIDE)}
+    # The leader carries friction and armature of its followers.
+    motors = {name: leaf * robot.independent for name, leaf in motors.items() if leaf is not None}
+    return actuators.replace(**motors, continuous=robot.continuous)
+
+
+def setpoint_guard(
+    joints: Sequence[Joint], rate: ArrayLike | None, acceleration: ArrayLike | None
+) -> bp.Guard:
+    """Return the limits of setpoints of the degrees of freedom ``joints``, of the URDF where they
+    are not given.
+
+    Followers have none: their limits narrow the limits of their leaders.
+
+    Raises InvalidArgumentError if a follower of a continuous joint has position limits.
+    """
+    limits = bp.make_guard(
+        len(joints),
+        lower=[max(joint.lower, joint.soft_lower) for joint in joints],
+        upper=[min(joint.upper, joint.soft_upper) for joint in joints],
+        rate=[joint.velocity_limit for joint in joints] if rate is None else rate,
+        acceleration=acceleration,
+        continuous=[joint.continuous for joint in joints],
+        joint_names=[joint.name for joint in joints],
+    )
+    return _of_leaders(limits, joints)
+
+
+def fit_guard(
+    guard: object, joints: Sequence[Joint], num_envs: int, control: str, sets_positions: bool
+) -> bp.Guard | None:
+    """Return the guard for a runner's option ``guard``; None means no guard.
+
+    Raises InvalidArgumentError if it does not fit the robot or the control, or limits the positions
+    of a follower of a continuous joint.
+    """
+    if guard is False or guard is None:
+        return None
+    if not sets_positions:
+        problem = "limits positions of joints, which this control does not take"
+        remedy = "use control 'pid' or 'drive'"
+        raise InvalidArgumentError("guard", problem, value=control, remedy=remedy)
+    limits = setpoint_guard(joints, None, None) if guard is True else guard
+    limits = instance("guard", limits, bp.Guard, "pass True, or robot.guard(...)")
+    limits.check(num_envs, [joint.name for joint in joints])
+    return frozen(_of_leaders(limits, joints))
+
+
+def _of_leaders(guard: bp.Guard, joints: Sequence[Joint]) -> bp.Guard:
+    """Return ``guard`` with limits of the leaders that hold for their followers, too, and none of
+    the followers.
+
+    Position limits of a follower that leave its leader no range are left out, as in a robot's own
+    limits.
+    """
+    coupling = coupling_of(tuple(joints))
+    if coupling.is_identity:  # its limits keep their shapes
+        return guard
+    shape = max((np.shape(leaf) for leaf in guard if leaf is not None), default=(1, len(joints)))
+    limits = {}
+    for name, none in _NO_LIMIT.items():
+        leaf = getattr(guard, name)
+        limits[name] = np.broadcast_to(none if leaf is None else leaf, shape).astype(np.float64)
+    low, high = limits["lower"], limits["upper"]
+    for index in coupling.followers.tolist():
+        leader = int(coupling.leader[index])
+        multiplier = float(coupling.multiplier[index])
+        for name in ("rate", "acceleration"):
+            fastest = limits[name][:, index] / abs(multiplier)
+            limits[name][:, leader] = np.minimum(limits[name][:, leader], fastest)
+        ends = [(end[:, index] - coupling.offset[index]) / multiplier for end in (low, high)]
+        # A leader that turns without end takes its follower anywhere.
+        if joints[leader].continuous and np.isfinite(ends).any():
+            problem = f"cannot hold the position limits of its follower {joints[index].name!r}"
+            remedy = "make the leader revolute with limits, or leave out lower and upper"
+            raise InvalidArgumentError("guard", problem, joint=joints[leader].name, remedy=remedy)
+        lower = np.maximum(low[:, leader], np.min(ends, axis=0))
+        upper = np.minimum(high[:, leader], np.max(ends, axis=0))
+        # Limits that exclude each other would leave no setpoint.
+        narrower = lower < upper
+        low[narrower, leader] = lower[narrower]
+        high[narrower, leader] = upper[narrower]
+    leaves = {}
+    for name, none in _NO_LIMIT.items():
+        limits[name][:, coupling.followers] = none
+        leaves[name] = None if np.isinf(limits[name]).all() else limits[name]
+    return guard._replace(**leaves)

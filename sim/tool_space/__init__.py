@@ -1,1 +1,0 @@
-"""Operational-space control of a tool in the Runner."""

@@ -1,0 +1,249 @@
+"""Data of a page: robots that run while they are shown, or a recorded run."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import batchpid as bp
+from batchpid.arrays.array_types import Float64
+from batchpid.arrays.digest import digest
+from batchpid.checks.validate import choice, integer, number
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner.runner import Runner
+from batchpid.sim.signals.quantities import Observation
+from batchpid.sim.signals.rollout import Rollout, RunInfo
+from batchpid.sim.view.scene import MAX_ROBOTS
+
+GAINS = ("kp", "ki", "kd")
+"""Gains that the page changes."""
+HISTORY_SECONDS = 8.0
+"""Longest past that the charts show [s]."""
+
+
+class LiveSimulation:
+    """``num_envs`` robots under the PID, steered from the page.
+
+    Parameters
+    ----------
+    period
+        Simulated time between frames [s], rounded to whole sim steps.
+    spread
+        Largest distance of a joint from the robot's start pose at the beginning [rad or m];
+        ``seed`` determines it.
+    options
+        Of :class:`batchpid.sim.Runner`: params, workers, engine, physics, compensate, timestep, ...
+
+    Raises
+    ------
+    InvalidArgumentError
+        An argument is out of range, before any process starts.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        num_envs: int,
+        *,
+        period: float = 1 / 30,
+        spread: float = 0.2,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        self.robot = robot
+        self.num_envs = integer("num_envs", num_envs, 1, MAX_ROBOTS)
+        timestep = options.get("timestep", RunnerOptions.timestep)
+        period = number("period", period, timestep, 1.0, "seconds between frames")
+        substeps = round(period / timestep)
+        self.period = substeps * timestep
+        self._random = np.random.default_rng(seed)
+        offsets = self._random.uniform(-spread, spread, (num_envs, robot.dof))
+        self.start = np.clip(robot.start + offsets, robot.lower, robot.upper)
+        """Joint positions at the beginning (envs, dof) [rad or m]."""
+        self.setpoint: Float64 = np.tile(robot.start, (num_envs, 1))
+        """Setpoints (envs, dof) [rad or m]."""
+        self._frames: deque[Rollout] = deque()
+        self._runner = Runner(robot, num_envs, substeps=substeps, **options)
+        self.ground = self._runner.options.ground
+        """True if the scenes have a ground at height 0."""
+        self._info = RunInfo.of(robot, ground=self.ground)
+        self.reset()
+
+    @property
+    def params(self) -> bp.PIDParams:
+        """Gains in force; assign others to change them in flight."""
+        return self._runner.params
+
+    @params.setter
+    def params(self, params: bp.PIDParams) -> None:
+        self._runner.params = params
+
+    def set_gain(self, gain: str, joint: int, value: float) -> None:
+        """Set one of :data:`GAINS` of a joint, on every robot."""
+        gains = np.array(getattr(self.params, choice("gain", gain, GAINS)))
+        gains[:, joint] = value
+        self.params = self.params.replace(**{gain: gains})
+
+    def set_setpoint(
+        self, position: ArrayLike, *, joint: int | None = None, env: int | None = None
+    ) -> None:
+        """Set setpoints [rad or m]: of one joint or all, (dof,) or (envs, dof); of one env or
+        all.
+        """
+        envs = slice(None) if env is None else env
+        joints = slice(None) if joint is None else joint
+        self.setpoint[envs, joints] = position
+        self.setpoint = self.robot.coupled(self.setpoint)
+
+    def randomize_setpoints(self) -> None:
+        """Draw a setpoint for each env, within the joint limits and 1 rad (or m) of the start
+        pose.
+        """
+        drawn = self.robot.start + self._random.uniform(-1.0, 1.0, self.setpoint.shape)
+        self.set_setpoint(np.clip(drawn, self.robot.lower, self.robot.upper))
+
+    def reset(self) -> None:
+        """Put every robot back to its start pose, at rest, with a reset controller."""
+        first = self._frame(self._runner.reset(self.start), 0.0)
+        # The page's thread reads the frames at any time: there is no moment without one.
+        self._frames = deque([first], round(HISTORY_SECONDS / self.period))
+
+    def advance(self) -> None:
+        """Run one frame."""
+        time = float(self._frames[-1].time[0])
+        self._frames.append(self._frame(self._runner.step(self.setpoint), time + self.period))
+
+    def frame(self) -> Rollout:
+        """Return the present state, with the setpoints of the next frame, as a rollout of one
+        tick.
+        """
+        return replace(self._frames[-1], setpoint=self.setpoint[None].copy())
+
+    def history(self) -> Rollout:
+        """Return the frames of the last :data:`HISTORY_SECONDS`, the present one included."""
+        return Rollout.join(list(self._frames))
+
+    def close(self) -> None:
+        """Close the runner."""
+        self._runner.close()
+
+    def _frame(self, observation: Observation, time: float) -> Rollout:
+        """Return an observation as a rollout of one tick."""
+        row = observation.map(lambda array: array[None])
+        return Rollout(np.array([time]), self.setpoint[None].copy(), row, self.period, self._info)
+
+
+class Playback:
+    """Recorded run, from the first row to the last and then again.
+
+    ``robot`` is by default :func:`recorded_robot`. Frames are ``period`` [s] apart, or a tick of
+    the run.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The run has more robots than fit on a page, or another number of joints than the robot; or
+        the recording holds no robot.
+    """
+
+    def __init__(
+        self, rollout: Rollout, robot: Robot | None = None, *, period: float = 1 / 30
+    ) -> None:
+        robot = recorded_robot(rollout) if robot is None else robot
+        joints = rollout.qpos.shape[2]
+        if joints != robot.dof:
+            problem = f"has {joints} joints, robot {robot.name!r} has {robot.dof}"
+            remedy = "give the robot that was recorded"
+            raise InvalidArgumentError("rollout", problem, remedy=remedy)
+        self.robot = robot
+        self.num_envs = integer("num_envs", rollout.num_envs, 1, MAX_ROBOTS)
+        ground = rollout.info.ground
+        if ground is None:
+            ground = robot.has_ground
+        self.ground = ground
+        """True if the run had a ground at height 0."""
+        self._rollout = replace(rollout, time=rollout.time - rollout.time[0])
+        self.duration = float(self._rollout.time[-1])
+        """Time from the first row to the last [s]."""
+        self.period = max(period, rollout.tick)
+        self._now = 0.0
+
+    def reset(self) -> None:
+        """Go to the first row."""
+        self._now = 0.0
+
+    def seek(self, time: float) -> None:
+        """Go to a time [s] since the first row."""
+        self._now = min(max(0.0, time), self.duration)
+
+    def advance(self) -> None:
+        """Go to the next frame; after the last to the first."""
+        if self._now >= self.duration:
+            self.reset()
+        else:
+            self.seek(self._now + self.period)
+
+    def frame(self) -> Rollout:
+        """Return the state recorded at the present time, as a rollout of one tick."""
+        return self._since(self._now)
+
+    def history(self) -> Rollout:
+        """Return the rows up to the present one, of the last :data:`HISTORY_SECONDS`."""
+        return self._since(self._now - HISTORY_SECONDS)
+
+    def close(self) -> None:
+        """Do nothing: a playback holds no resources."""
+
+    def _since(self, start: float) -> Rollout:
+        """Return the rows from a time [s] to the present one."""
+        first, last = rows_at(self._rollout, np.array([start, self._now])).tolist()
+        return self._rollout.for_ticks(slice(first, last + 1))
+
+
+ViewData = LiveSimulation | Playback
+
+
+def recorded_robot(rollout: Rollout) -> Robot:
+    """Return the robot of a run in this process, or the bundled one that was recorded, or the one
+    in the recording; its meshes are read from their files, and left out where these are gone.
+
+    Raises InvalidArgumentError if the recording has none.
+    """
+    info = rollout.info
+    if isinstance(info.description, Robot):
+        return info.description
+    # Another robot may have the name of a bundled one.
+    if info.robot in Robot.bundled():
+        bundled = Robot.load(info.robot, fixed_base=info.fixed_base)
+        if info.digest in (None, bundled.digest):
+            return bundled
+    if info.urdf is None:
+        problem = f"{info.robot!r} is not bundled, and the recording holds no description of it"
+        remedy = "name its URDF or MJCF file"
+        raise InvalidArgumentError("robot", problem, remedy=remedy)
+    path = Path(_folder().name, f"{digest(info.urdf)[:32]}.urdf")
+    path.write_text(info.urdf, encoding="utf-8")
+    return Robot.load(path, fixed_base=info.fixed_base)
+
+
+@cache
+def _folder() -> TemporaryDirectory[str]:
+    """Return the folder of recorded robots, whose files are read again when they are drawn; it is
+    removed at the end of the process.
+    """
+    return TemporaryDirectory(prefix="batchpid-")
+
+
+def rows_at(rollout: Rollout, seconds: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the rows of ``rollout`` that are shown at times [s] since its first row."""
+    elapsed = rollout.time - rollout.time[0]
+    return np.searchsorted(elapsed, seconds - 1e-9).clip(0, len(elapsed) - 1)
