@@ -68,7 +68,8 @@ class NumPyBackend:
 
     def call(self, function: Any, *inputs: Array, **named: Any) -> PIDState:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
-        return function(self.params, *inputs, **named)
+        state: PIDState = function(self.params, *inputs, **named)
+        return state
 
     def step(
         self, state: PIDState, out: Array, *inputs: Array
@@ -173,7 +174,8 @@ class JAXBackend:
         if function not in self._compiled:
             self._compiled[function] = self._compile(function)
         with own_settings(self.dtype):
-            return self._compiled[function](*self.packed, *inputs, **named)
+            state: PIDState = self._compiled[function](*self.packed, *inputs, **named)
+            return state
 
     def step(
         self, state: PIDState, out: None, r: Array, y: Array, *rates: Array

@@ -232,7 +232,8 @@ def _or_inf(figure: Float64) -> Float64:
 
 def _row(table: Float64, k: Rows) -> Float64:
     """Return ``table[k]`` for an index k per env and joint."""
-    return np.take_along_axis(table, k[None], 0)[0]
+    values: Float64 = np.take_along_axis(table, k[None], 0)[0]
+    return values
 
 
 def _unwrap(y: Float64, r: Float64, continuous: NDArray[np.bool_]) -> tuple[Float64, Float64]:

@@ -1,6 +1,7 @@
 """Types of NumPy arrays, for annotations."""
 
-from typing import Any, TypeAlias
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,13 +10,19 @@ Bool = NDArray[np.bool_]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-Array: TypeAlias = Any
-"""An array of NumPy or JAX, or a value of the tracer: code that takes one runs on each of them."""
+# JAX is optional, and its stubs refuse operations that both libraries have.
+if TYPE_CHECKING:
+    import jax
+
+    Array: TypeAlias = NDArray[Any] | jax.Array
+    """An array of NumPy or JAX, or a symbol of a trace: code that takes one runs on each of them."""
+else:
+    Array = np.ndarray
 
 Rows = NDArray[Any]
 """An array of NumPy whose dtype is the caller's."""
 
-ArrayModule: TypeAlias = Any
+ArrayModule = ModuleType
 """numpy, jax.numpy, or the tracer's functions under the same names."""
 
 Document = dict[str, Any]
@@ -24,10 +31,10 @@ Document = dict[str, Any]
 MjModel: TypeAlias = Any
 """A mujoco.MjModel: MuJoCo is optional, and is imported where it is used."""
 
-Kind: TypeAlias = Any
+Kind = object
 """The type of a field, as its annotation declares it."""
 
-DType: TypeAlias = Any
+DType = type | np.dtype[Any] | str | None
 """What ``np.dtype`` takes."""
 
 MjSpec: TypeAlias = Any

@@ -6,25 +6,27 @@ import math
 from collections.abc import Callable
 from functools import cache, wraps
 from types import NoneType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule, DType
 from batchpid.arrays.choices import CHOICE_TYPES
 
+T = TypeVar("T", bound=tuple[Any, ...])
 TURN = 2 * math.pi
 _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
 
 
-def namespace(*leaves: Array) -> Array:
+def namespace(*leaves: Array) -> ArrayModule:
     """Return the array namespace in which all these leaves can be used: NumPy's, unless one belongs
     to another.
     """
     if not _NUMPY_OR_NEUTRAL.issuperset(map(type, leaves)):
         for leaf in leaves:
             if not isinstance(leaf, np.ndarray) and hasattr(leaf, "__array_namespace__"):
-                return leaf.__array_namespace__()
+                module: ArrayModule = leaf.__array_namespace__()
+                return module
     return np
 
 
@@ -110,7 +112,7 @@ def read_history(history: Array, places: Array) -> Array:
     return history.take(places)
 
 
-def replace_envs(state: Any, fresh: Any, mask: Array) -> Array:
+def replace_envs(state: T, fresh: T, mask: Array) -> T:
     """Return ``state``, a named tuple of arrays (envs, ...), with the envs of ``mask`` (envs,) bool
     as in ``fresh``.
     """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,6 +13,6 @@ def read_only(array: T) -> T:
     """Return a read-only view of a NumPy array; return any other object unchanged."""
     if not isinstance(array, np.ndarray):
         return array
-    view: Any = array.view()
+    view = array.view()
     view.flags.writeable = False
     return view

@@ -75,7 +75,8 @@ class Record(tuple[Any, ...]):
     @property
     def dtype(self) -> DType:
         """Dtype of the arrays."""
-        return next(leaf.dtype for leaf in self.leaves().values())
+        dtype: DType = next(leaf.dtype for leaf in self.leaves().values())
+        return dtype
 
     def for_envs(self: R, envs: slice | Rows | Sequence[int]) -> R:
         """Return the part of some envs (a slice or an index array); shared rows stay shared."""

@@ -89,15 +89,11 @@ def check_time_step(argument: str, value: object) -> None:
 
 def choice(argument: str, value: object, known: Collection[S]) -> S:
     """Return ``value`` if it is one of ``known``."""
-    chosen: Any = value
-    if not isinstance(value, str) or value not in known:
-        raise InvalidArgumentError(
-            argument,
-            "unknown option",
-            value=value,
-            remedy=f"use one of {', '.join(map(repr, known))}",
-        )
-    return chosen
+    for option in known:
+        if isinstance(value, str) and option == value:
+            return option
+    remedy = f"use one of {', '.join(map(repr, known))}"
+    raise InvalidArgumentError(argument, "unknown option", value=value, remedy=remedy)
 
 
 def flag(argument: str, value: object) -> bool:
@@ -177,7 +173,7 @@ def read_array(
     try:
         if isinstance(value, np.ma.MaskedArray):
             raise TypeError("it is masked")
-        result: Any = value if traced and is_traced(value) else np.asarray(value)
+        result: NDArray[Any] = value if traced and is_traced(value) else np.asarray(value)  # type: ignore[assignment]
         if result.dtype.kind not in kinds:
             raise TypeError(f"its dtype is {result.dtype}")
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -339,7 +335,9 @@ def joint_speeds(
     argument: str, value: ArrayLike, joint_names: Sequence[str]
 ) -> NDArray[np.float64]:
     """Return ``value`` as one positive number per joint (dof,)."""
-    speeds = array(argument, value, (1, len(joint_names)), joint_names)[0].copy()
+    speeds: NDArray[np.float64] = array(argument, value, (1, len(joint_names)), joint_names)[
+        0
+    ].copy()
     entries(
         argument, speeds, speeds > 0, "must be > 0", joint_names, remedy="leave it out for none"
     )

@@ -189,7 +189,8 @@ def _loop(z: Rows, m: Float64, unit: Float64, columns: list[Float64], dt: float)
     late = entry**-whole * (1 - part + part / entry) * intake / (1 - (1 - intake) / entry)
     plant = (z - 1)[:, None, None] * m + dt * z[:, None, None] * (b * np.eye(len(b)))
     moved: Rows = np.linalg.solve(plant, late[..., None] * unit * law[:, None, :])
-    return moved * (dt**2 * z / (z - 1))[:, None, None]
+    response: Rows = moved * (dt**2 * z / (z - 1))[:, None, None]
+    return response
 
 
 def _crossing(z: Rows, values: Rows) -> tuple[float, int]:
@@ -239,7 +240,8 @@ def spectral_radius(
     m/(rad s) or N/(m s)], shaped as kp. Where ki is 0 its pole at 1 is left out.
     """
     values = np.linalg.eigvals(_one_step(mass_matrix, dt, kp, ki, kd, filter_time, damping))
-    return np.abs(values).max(-1)
+    radius: Float64 = np.abs(values).max(-1)
+    return radius
 
 
 def oscillation(

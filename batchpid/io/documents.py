@@ -355,7 +355,8 @@ def _parse_yaml(text: str) -> Any:
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
-                raise ValueError(f"aliases are not allowed, {self.peek_event().start_mark}")
+                event: Any = self.peek_event()  # type: ignore[no-untyped-call]
+                raise ValueError(f"aliases are not allowed, {event.start_mark}")
             return super().compose_node(parent, index)
 
         def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:

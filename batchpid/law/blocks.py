@@ -70,4 +70,5 @@ def advance_in_blocks(
 
     arguments = jax.tree.map(flat, (k, state, *inputs))
     out = jax.lax.fori_loop(0, -(-envs // rows), step, jax.tree.map(flat, out))
-    return jax.tree.map(lambda x: x.reshape(envs, joints), out)
+    results: tuple[PIDState, Array] = jax.tree.map(lambda x: x.reshape(envs, joints), out)
+    return results

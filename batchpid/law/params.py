@@ -257,8 +257,11 @@ def make_params(
         build, options.get("tracking_time"), back, *[leaves[name] for name in GAINS]
     )
     is_everywhere = conditional is not None and conditional.all()
+    # A choice is no array.
+    for name in FIELDS & leaves.keys():
+        leaves[name] = build.freeze(leaves[name])
     return PIDParams(
-        **{name: build.freeze(leaf) if name in FIELDS else leaf for name, leaf in leaves.items()},
+        **leaves,
         tracking_time=time,
         conditional=Everywhere() if is_everywhere else build.freeze(conditional),
         continuous=build.mask("continuous", options.get("continuous")),

@@ -209,7 +209,8 @@ def advance(
     u = p
 
     # The effort takes I before it includes the present error: a change of ki is bumpless.
-    i, integral = 0.0, state.integral
+    i: Array | float = 0.0
+    integral = state.integral
     if k.ki_dt is not None:
         integral = integral + k.ki_dt * error
         if k.ki_dt2 is not None and r_rate is not None:
@@ -218,7 +219,8 @@ def advance(
         u = u + i
 
     # The filter acts on the weighted rate, so that one state serves measurement and setpoint.
-    d, derivative = 0.0, None
+    d: Array | float = 0.0
+    derivative = None
     if k.kd is not None:
         if y_rate is not None:
             rate = -y_rate

@@ -35,7 +35,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, ArrayModule
+from batchpid.arrays.array_types import Array, ArrayModule, Document
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, clip, in_dtype_of, namespace, push_history, wrap
 from batchpid.checks.validate import check_time_step
@@ -56,8 +56,8 @@ class MotorCoefficients(NamedTuple):
     position_delay: delay.Delay | None = None
     """Delay of the sensor's positions, in its history of positions and velocities."""
     velocity_delay: delay.Delay | None = None
-    envelope: Array = Envelope()
-    commands: Array = Envelope()
+    envelope: Envelope = Envelope()
+    commands: Envelope = Envelope()
     """Envelope of the commands that the motor delivers unclipped."""
     intake: Array = None
     """1 - exp(-dt / T)."""
@@ -75,10 +75,9 @@ class MotorCoefficients(NamedTuple):
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
 
     def __repr__(self) -> str:
-        delays = {"command": None, "position_delay": None, "velocity_delay": None}
-        return array_summary(
-            self._replace(**delays, envelope=None, commands=None), "envs", "joints"
-        )
+        parts = ("command", "position_delay", "velocity_delay", "envelope", "commands")
+        hidden: Document = dict.fromkeys(parts)
+        return array_summary(self._replace(**hidden), "envs", "joints")
 
 
 def init(
@@ -197,7 +196,9 @@ def discretise(
         return xp.broadcast_to(leaf, (*leaf.shape[:-2], num_envs, leaf.shape[-1])).copy()
 
     # An envelope is a tuple within the tuple.
-    flat = {name: spread(leaf) for name, leaf in k._asdict().items() if not isinstance(leaf, tuple)}
+    flat: Document = {
+        name: spread(leaf) for name, leaf in k._asdict().items() if not isinstance(leaf, tuple)
+    }
     ends, commands = (Envelope(*map(spread, item)) for item in (k.envelope, k.commands))
     return k._replace(**flat, envelope=ends, commands=commands)
 
@@ -223,9 +224,8 @@ def measure(
 
     ``qpos`` and ``qvel`` are the true positions [rad or m] and velocities; none is written to.
     """
-    return advance_measurement(
-        discretise(actuators, state, dt), state, *in_dtype_of(actuators, qpos, qvel)
-    )
+    qpos, qvel = in_dtype_of(actuators, qpos, qvel)
+    return advance_measurement(discretise(actuators, state, dt), state, qpos, qvel)
 
 
 def _motor(k: MotorCoefficients, effort: Array) -> Array:

@@ -27,7 +27,7 @@ _NEAR = 1e-5  # steps: a delay that is a whole number of steps but for rounding 
 class Delay(NamedTuple):
     """A delay at one time step, for histories (envs, samples, numbers)."""
 
-    index: Array
+    index: Array  # type: ignore[assignment]  # a field hides tuple.index
     """Flat indices of x_{k-n} in a history, and of x_{k-n-1} (1 or 2, envs, joints)."""
     fraction: Array
     """f (envs, joints); None: 0 everywhere."""

@@ -13,7 +13,8 @@ import hashlib
 import importlib
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 NOT_BUILT = "the extension was not built: it needs a C++ compiler when batchpid is installed"
@@ -205,7 +206,7 @@ EXTENSIONS = {"_program": PROGRAM, "_task_space": TASK_SPACE}
 
 
 @cache
-def load(extension: Extension) -> Any:
+def load(extension: Extension) -> ModuleType:
     """Return the module of an extension.
 
     Raises

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, DType
+from batchpid.arrays.array_types import DType
 from batchpid.native.extensions import MASKS, OPERATIONS
 
 _NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
@@ -39,7 +39,7 @@ class Namespace:
             raise TypeError(f"a program of {self.dtype} cannot hold a scalar of {value.dtype}")
         return self.literals.setdefault(repr(float(value)), (float(value), Symbol(self)))[1]
 
-    def apply(self, name: str, *values: Array) -> Symbol:
+    def apply(self, name: str, *values: Any) -> Symbol:
         """Record an operation; return its result."""
         result = Symbol(self, name in MASKS or (name == "gather" and values[0].is_mask))
         self.noted.append((name, tuple(map(self.symbol, values)), result))

@@ -195,7 +195,8 @@ class _Search(NamedTuple):
 
     def size(self, nearest: _Found) -> Float64:
         """Return the larger of position and rotation error over its tolerance (n,)."""
-        return (nearest.errors / self.tolerance).max(-1)
+        worst: Float64 = (nearest.errors / self.tolerance).max(-1)
+        return worst
 
     def reached(self, nearest: _Found) -> Bool:
         """Return the rows (n,) with both errors within the tolerances."""

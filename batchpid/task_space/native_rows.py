@@ -12,6 +12,7 @@ import math
 import os
 from collections.abc import Callable
 from functools import cache, partial
+from types import ModuleType
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -38,7 +39,7 @@ _DYNAMICS = {"mass_matrix", "bias"}
 _trees: WeakKeyDictionary[RigidTree, Any] = WeakKeyDictionary()
 
 
-def in_use() -> Array:
+def in_use() -> ModuleType | None:
     """Return the extension, or None where native code is not used."""
     if os.environ.get(SWITCH) == "0":
         return None
@@ -46,7 +47,7 @@ def in_use() -> Array:
 
 
 @cache
-def _extension() -> Array:
+def _extension() -> ModuleType | None:
     if obstacle():
         return None
     return load(TASK_SPACE)
@@ -169,7 +170,8 @@ def tool(tree: RigidTree, index: int, point: Array) -> Float64:
     if point is not None:
         tool = np.broadcast_to(tool, (*point.shape[:-1], 3, 4)).copy()
         tool[..., 3] += (tool[..., :3] * point[..., None, :]).sum(-1)
-    return tool.reshape(-1, 12)
+    frames: Float64 = tool.reshape(-1, 12)
+    return frames
 
 
 def native_tree(native: Any, tree: RigidTree) -> Any:
@@ -183,7 +185,7 @@ def native_tree(native: Any, tree: RigidTree) -> Any:
     return _trees[tree]
 
 
-def for_rows(like: Array, *arrays: Array) -> Array:
+def for_rows(like: Array, *arrays: Array) -> ModuleType | None:
     """Return the extension if all arrays are NumPy's and ``like`` is (envs, columns), else None."""
     plain = _PLAIN.issuperset(map(type, arrays)) or all(
         x is None or isinstance(x, np.ndarray) for x in arrays

@@ -284,7 +284,8 @@ class RigidTree:
 
     def positions(self, qpos: Float64) -> Float64:
         """Return ``qpos`` (..., dof) with the followers moved to match their leaders."""
-        return self.coupling.positions(qpos)
+        positions: Float64 = self.coupling.positions(qpos)
+        return positions
 
     def rates(self, qvel: Array) -> Array:
         """Return ``qvel`` (..., dof) with the rates of followers computed from their leaders'."""
@@ -298,7 +299,8 @@ class RigidTree:
         """Return the mask (dof,) of the joints between the base and ``link``, and of joints coupled
         to them.
         """
-        return self.chains[self.link_bodies[self.index(link)]] > 0
+        carried: NDArray[np.bool_] = self.chains[self.link_bodies[self.index(link)]] > 0
+        return carried
 
     @cached_property
     def chains(self) -> Float64:
@@ -308,7 +310,7 @@ class RigidTree:
         The last row, body -1, is the base.
         """
         # A joint that is coupled to one of the chain moves the tool, too.
-        rows = np.concatenate([self.bodies.moves, np.zeros((1, self.dof))])
+        rows: Float64 = np.concatenate([self.bodies.moves, np.zeros((1, self.dof))])
         rows = (rows @ (self.coupling.leader[:, None] == self.coupling.leader) > 0).astype(
             np.float64
         )

@@ -115,7 +115,8 @@ def eigen(matrix: Array) -> tuple[Array, Array]:
     symmetric matrices.
     """
     if namespace(matrix) is not np:
-        return namespace(matrix).linalg.eigh(matrix)
+        eigen: tuple[Array, Array] = namespace(matrix).linalg.eigh(matrix)
+        return eigen
     matrix, sound = _sound(matrix)
     values, vectors = np.linalg.eigh(matrix)
     return np.where(sound[..., 0], values, np.nan), np.where(sound, vectors, np.nan)

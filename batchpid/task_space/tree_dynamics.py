@@ -167,7 +167,7 @@ def effort_of(
     effort = (xp.concatenate([motions.linear, motions.angular], axis=-1) * wrench).sum(-1)
     if not tree.fixed_base:
         all_ = _composite(tree, bodies, motions, xp)
-        on_base = sum(
+        on_base: Array = sum(
             wrench[..., joint, :] for joint, above in enumerate(tree.body_parents) if above < 0
         )
         if turning is not None:

@@ -130,12 +130,13 @@ def _flag(name: str, kind: Kind, default: Any, text: str) -> tuple[str, Any, Any
             return ""
         return f"(default: {default})"
 
-    options = {}
+    options: Document = {}
     if name in METAVARS:
         options["metavar"] = METAVARS[name]
     if default is None and Path in get_args(kind):
         options["metavar"] = "FILE"
-    described = Annotated[kind, tyro.conf.arg(help=text, help_behavior_hint=hint, **options)]
+    setting = tyro.conf.arg(help=text, help_behavior_hint=hint, **options)
+    described = Annotated[kind, setting]  # type: ignore[valid-type]
     if default is inspect.Parameter.empty:
         return name, described, field()
     return name, described, field(default=default)

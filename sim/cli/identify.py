@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     import batchpid as bp
-    from batchpid.sim.identification.identification import Identification
+    from batchpid.sim.identification.result import Identification
 
 EVALUATIONS = 45
 """Length of the bar: a fit usually ends before."""

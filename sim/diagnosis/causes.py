@@ -38,7 +38,8 @@ def settled_envs(rollout: Rollout, robot: RobotDescription) -> Bool:
     """Return the envs of a ``rollout`` of ``robot`` that have not failed and whose joints all
     settle (envs,).
     """
-    return ~np.logical_or.reduce(_Run(rollout, robot).unsettled, axis=1)
+    settled: Bool = ~np.logical_or.reduce(_Run(rollout, robot).unsettled, axis=1)
+    return settled
 
 
 def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
@@ -128,7 +129,7 @@ class _Run:
 
     def _find_goal(self) -> Float64:
         command = self.info.own_command
-        end = self.qpos[-1]
+        end: Float64 = self.qpos[-1]
         if command is None and self.info.control != "effort":
             return self.robot.coupled(self.rollout.setpoint[-1])
         if (
@@ -204,7 +205,8 @@ class _Run:
         rest = len(away) - np.argmax(away[::-1], axis=0)
         failure = np.argmin(self.rollout.ok, axis=0)[:, None]
         ticks = np.where(self.failed, failure, np.minimum(rest, len(away) - 1))
-        return self.rollout.time[ticks]
+        times: Float64 = self.rollout.time[ticks]
+        return times
 
     def _distances(self, qpos: Float64) -> dict[str, float]:
         """Return the distances [m] below TOUCH of links to each other and to the ground."""
@@ -259,7 +261,8 @@ def _oscillates(run: _Run) -> Bool:
 def _is_too_weak(run: _Run) -> Bool:
     at_limit = np.mean(np.abs(run.effort) >= 0.999 * run.limit, axis=0) > 0.5
     needed = np.abs(run.load).max(0) + run.robot.friction
-    return at_limit & ~run.buzzes & (~run.is_at_rest | (needed >= 0.95 * run.limit))
+    blocked: Bool = at_limit & ~run.buzzes & (~run.is_at_rest | (needed >= 0.95 * run.limit))
+    return blocked
 
 
 def _is_blocked(run: _Run) -> Bool:
@@ -267,7 +270,10 @@ def _is_blocked(run: _Run) -> Bool:
     applied = np.median(run.effort[run.tail], axis=0)
     noise = 0.05 * (np.abs(applied) + np.abs(run.load[0]))
     unexplained = np.abs(applied - run.load[0])
-    return run.is_at_rest.all(1, keepdims=True) & (unexplained > 1.2 * run.robot.friction + noise)
+    stuck: Bool = run.is_at_rest.all(1, keepdims=True) & (
+        unexplained > 1.2 * run.robot.friction + noise
+    )
+    return stuck
 
 
 # Facts come before symptoms: an env that failed, setpoints that cannot be reached, links that

@@ -70,8 +70,9 @@ def _loop(
         return table(leaf, neutral)[:, coupling.independent]
 
     def matrix(armature: Array) -> Float64:
-        inertia = table(armature)[:, None] * np.eye(robot.dof)
-        return coupling.reduced(robot.mass_matrix(qpos) + inertia)
+        added = table(armature)[:, None] * np.eye(robot.dof)
+        inertia: Float64 = coupling.reduced(robot.mass_matrix(qpos) + added)
+        return inertia
 
     loop: Document = {name: column(getattr(params, name)) for name in ("kp", "ki", "kd")}
     eye = np.eye(loop["kp"].shape[1])

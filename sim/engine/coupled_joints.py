@@ -170,4 +170,5 @@ class ConstraintEfforts:
         rate = (qvel - coupling.rates(qvel))[:, followers]
         wrong = matrix_vector(self._response, effort - self._passive)
         wrong += self._rate_gain * rate + self._position_gain * error
-        return effort - matrix_vector(self._push, wrong)
+        passed: Float64 = effort - matrix_vector(self._push, wrong)
+        return passed

@@ -172,7 +172,7 @@ class NativeRefresh:
         self._native = native.extension("_gateway")
         shape = (size, armature.shape[1])
         if friction.viscous is None:
-            viscous = 0.0
+            viscous: Any = 0.0
         else:
             viscous = friction.viscous
         named = {"armature": armature, "coulomb": friction.most, "viscous": viscous}

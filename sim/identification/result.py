@@ -88,7 +88,8 @@ class Identification:
     @property
     def values(self) -> Float64:
         """Values of the unknowns (unknowns,)."""
-        return self.unknowns.values(self.fit.solution.point[None])[0]
+        values: Float64 = self.unknowns.values(self.fit.solution.point[None])[0]
+        return values
 
     @property
     def held_out_error(self) -> tuple[float, float]:

@@ -294,7 +294,7 @@ class SimulatedControl:
         state.gain[...] = fresh.gain
         state.memory[...] = fresh.memory
 
-    def advance(self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64) -> Float64:
+    def advance(self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64) -> Any:
         """Return the efforts of motors and friction (n, joints), which the next call may reuse.
 
         ``command`` are setpoints or efforts, ``passive`` the compensated force and the feedforward.
@@ -353,7 +353,10 @@ def _returned(state: StepState) -> StepState:
 def _repeated(params: bp.PIDParams, count: int) -> bp.PIDParams:
     """Return ``params`` of some envs for ``count`` envs, one set after the other."""
     times = count // len(params.kp)
-    return mapped(lambda leaf: np.tile(leaf, (times, 1)) if leaf.ndim == 2 else leaf, params)
+    tiled: bp.PIDParams = mapped(
+        lambda leaf: np.tile(leaf, (times, 1)) if leaf.ndim == 2 else leaf, params
+    )
+    return tiled
 
 
 def changed_params(params: bp.PIDParams, law: Mapping[str, Float64]) -> bp.PIDParams:

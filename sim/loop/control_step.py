@@ -106,7 +106,8 @@ def refreshed(
 ) -> FrictionState:
     """Return the state of the friction model with the inertia at ``qpos``, for the leaders only."""
     if layout.model.refresh is not None:
-        return layout.model.refresh(friction, qpos)
+        fresh: FrictionState = layout.model.refresh(friction, qpos)
+        return fresh
     matrix = constants.coupling.mass_matrix(layout.model.joint_mass_matrix(qpos))
     return friction_model.refresh(
         constants.friction, friction, matrix, constants.timestep, *constants.drive
@@ -241,7 +242,7 @@ def _controller(layout: Layout, constants: Constants, values: Values) -> Values:
 def _law(layout: Layout, constants: Constants, values: Values) -> Values:
     """Effort within the limits of params and motors."""
     qpos, qvel, _ = values.seen
-    limits = None, None
+    limits: tuple[Array, Array] = (None, None)
     if constants.motors is not None:
         limits = command_limits(constants.motors, qpos, qvel)
     values = _LAWS[layout.control](layout, constants, values, limits)
@@ -261,7 +262,7 @@ def _pid(
     if constants.damping is not None:
         viscous = coupling.efforts(constants.damping * qvel)
     setpoint, rate, acceleration, _ = values.command
-    motion = setpoint, None, None
+    motion: tuple[Array, Array, Array] = (setpoint, None, None)
     if layout.moves:  # the leaders' mass matrix has the followers' share
         motion = setpoint, rate, coupling.of_independent(acceleration)
     inputs = motion, qpos, qvel, forward, state.matrix, viscous, *limits

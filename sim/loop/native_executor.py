@@ -190,7 +190,8 @@ def _copied(state: StepState) -> StepState:
     law = state.law
     if isinstance(law, dict):
         law = {name: np.array(leaf) for name, leaf in law.items()}
-    return mapped(partial(np.array, order="C"), state._replace(law=law))
+    copied: StepState = mapped(partial(np.array, order="C"), state._replace(law=law))
+    return copied
 
 
 def _arrays(state: StepState) -> list[Rows]:

@@ -376,4 +376,5 @@ def _row_size(array: Rows) -> int:
         return -1
     if array.ndim == 2:
         return 0
-    return array[0].size
+    size: int = array[0].size
+    return size

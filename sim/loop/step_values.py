@@ -125,7 +125,7 @@ class Measured(NamedTuple):
 class Step(NamedTuple):
     """Place of a sim step in its tick."""
 
-    index: Array
+    index: Array  # type: ignore[assignment]  # a field hides tuple.index
     """Sim steps of the tick before this one."""
     end: Array
     """Sim steps of the tick."""
@@ -190,7 +190,7 @@ class Constants(NamedTuple):
     needed.
     """
 
-    timestep: Array
+    timestep: float
     """[s]"""
     limits: tuple[Array, Array]
     """Least and largest effort of the params [N m or N]."""

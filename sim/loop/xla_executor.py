@@ -225,9 +225,10 @@ def tick(
     none = xp.zeros(qpos.shape, bool)
     outputs = Outputs(zero, zero, none, returned=None if controller is None else zero)
     carry = Carry(xp.stack([span[0], xp.zeros_like(end)]), state, measured, outputs, qpos)
-    return lax.while_loop(
+    final: Carry = lax.while_loop(
         lambda carry: (carry.progress[0] < end) & (carry.progress[1] == 0), body, carry
     )
+    return final
 
 
 @lru_cache(maxsize=8)

@@ -197,7 +197,8 @@ class Scene(OptionGroup):
     def solver(self) -> Physics | MujocoSolver:
         """Solver settings for the option ``physics``."""
         if isinstance(self.physics, str):
-            return self.load_engine().physics[self.physics]
+            settings: Physics | MujocoSolver = self.load_engine().physics[self.physics]
+            return settings
         return self.physics
 
     def file_of(self, robot: Robot) -> MjcfFile | None:

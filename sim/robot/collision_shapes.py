@@ -127,7 +127,8 @@ def vertices_in_file(model: MjModel, indices: Any) -> Float64:
     turned = np.zeros(9)
     place = model.mesh_pos[0]
     mujoco.mju_quat2Mat(turned, model.mesh_quat[0])
-    return model.mesh_vert[indices].astype(float) @ turned.reshape(3, 3).T + place
+    points: Float64 = model.mesh_vert[indices].astype(float) @ turned.reshape(3, 3).T + place
+    return points
 
 
 def inertia_of(shapes: Sequence[Shape]) -> SpatialInertia:

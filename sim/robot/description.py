@@ -55,7 +55,8 @@ def suggested_effort_limit(
     """
     still = np.abs(gravity).max(0) + np.asarray(friction)
     inertia = np.abs(mass_matrix).sum(2).max(0)
-    return GRAVITY_MARGIN * still + SPEED * np.asarray(damping) + ACCELERATION * inertia
+    efforts: Float64 = GRAVITY_MARGIN * still + SPEED * np.asarray(damping) + ACCELERATION * inertia
+    return efforts
 
 
 LIMIT_TOLERANCE = 1e-6  # rad or m
@@ -208,7 +209,8 @@ class RobotDescription:
 
     def coupled(self, qpos: ArrayLike) -> Float64:
         """Return ``qpos`` (..., dof) with the followers moved to match their leaders."""
-        return self.coupling.positions(np.asarray(qpos, np.float64))
+        positions: Float64 = self.coupling.positions(np.asarray(qpos, np.float64))
+        return positions
 
     @property
     def start(self) -> Float64:
@@ -292,7 +294,10 @@ class RobotDescription:
         followers.
         """
         still = np.zeros_like(qpos)
-        return self.coupling.efforts(self.dynamics().inverse_dynamics(qpos, still, still))
+        efforts: Float64 = self.coupling.efforts(
+            self.dynamics().inverse_dynamics(qpos, still, still)
+        )
+        return efforts
 
     def dynamics(self, ground: bool | None = None) -> RobotModel:
         """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed

@@ -47,7 +47,8 @@ def nearest_physical(tensor: Float64) -> Float64:
         a, b, c = 0.0, (b + c) / 2, (b + c) / 2
     moments = np.maximum([a, b, c], 0.0)
     moments[0] = max(moments[0], SLENDER * moments[2])
-    return (axes * moments) @ axes.T
+    nearest: Float64 = (axes * moments) @ axes.T
+    return nearest
 
 
 def possible_inertia(mass: float, tensor: Float64) -> tuple[Float64, tuple[str, str] | None]:
@@ -84,4 +85,5 @@ def ball(mass: float) -> Float64:
     r^2.
     """
     radius = (3 * mass / (4 * np.pi * DENSITY)) ** (1 / 3)
-    return 0.4 * mass * radius**2 * np.eye(3)
+    tensor: Float64 = 0.4 * mass * radius**2 * np.eye(3)
+    return tensor

@@ -141,7 +141,7 @@ def _is_plain(model: MjModel, actuator: int) -> bool:
         return False
     constant, stiffness, damping = model.actuator_biasprm[actuator, :3].tolist()
     is_servo = stiffness < 0 and damping <= 0
-    return constant == 0 and (is_servo or stiffness == damping == 0)
+    return bool(constant == 0 and (is_servo or stiffness == damping == 0))
 
 
 def _servo(model: MjModel, actuator: int) -> tuple[float, float]:

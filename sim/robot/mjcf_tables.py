@@ -259,7 +259,7 @@ def _hull(model: MjModel, mesh: int) -> Float64:
     """
     first = int(model.mesh_vertadr[mesh])
     count = int(model.mesh_vertnum[mesh])
-    vertices = model.mesh_vert[first : first + count].astype(np.float64)
+    vertices: Float64 = model.mesh_vert[first : first + count].astype(np.float64)
     begin = int(model.mesh_graphadr[mesh])
     if begin >= 0:
         corners = int(model.mesh_graph[begin])

@@ -116,7 +116,8 @@ class RobotModel:
                 tree.mass[at] * linear.T @ linear
                 + angular.T @ turn @ tree.inertia[at] @ turn.T @ angular
             )
-        return np.abs(matrix).sum(1)
+        inertia: Float64 = np.abs(matrix).sum(1)
+        return inertia
 
     @cached_property
     def _coupled(self) -> RigidTree:

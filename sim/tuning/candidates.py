@@ -256,7 +256,8 @@ class Candidates:
         last = settling[..., arm_joints(self.robot)].max(2)
         late = np.log1p(np.maximum(last / self._limit - 1, 0) / 0.05)
         moves = cost[..., self.robot.independent].mean(2)
-        return self._over_moves(moves) + weights.late * late.mean(1)
+        costs: Float64 = self._over_moves(moves) + weights.late * late.mean(1)
+        return costs
 
     def _cost_of_motions(self, rollout: Rollout, count: int) -> Float64:
         """Return the cost of moves that are made as smooth motions (count,)."""

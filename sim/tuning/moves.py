@@ -231,7 +231,10 @@ def smooth_durations(robot: Robot, moves: Moves) -> Float64:
         unit_time.acceleration,
         SMOOTH_EFFORT,
     )
-    return np.maximum(by_velocity.max(1), np.where(np.isfinite(by_effort), by_effort, 0.0))
+    slowest: Float64 = np.maximum(
+        by_velocity.max(1), np.where(np.isfinite(by_effort), by_effort, 0.0)
+    )
+    return slowest
 
 
 def _durations(
@@ -266,7 +269,8 @@ def motion_effort(robot: Robot, qpos: Float64, qvel: Float64, qacc: Float64) -> 
     """Return the efforts (n, dof) [N m or N] of a motion, gravity included; followers have none,
     their leaders more.
     """
-    return robot.coupling.efforts(robot.dynamics().inverse_dynamics(qpos, qvel, qacc))
+    efforts: Float64 = robot.coupling.efforts(robot.dynamics().inverse_dynamics(qpos, qvel, qacc))
+    return efforts
 
 
 def smooth_effort(robot: Robot, start: Float64, target: Float64, duration: float) -> Float64:
@@ -291,4 +295,7 @@ def smooth_variation(robot: Robot, moves: Moves, durations: Float64 | float) -> 
     for start, target, duration in zip(moves.start, moves.target, times, strict=True):
         efforts = smooth_effort(robot, start, target, float(duration))
         variation.append(np.abs(np.diff(efforts, axis=0)).sum(0))
-    return robot.coupling.of_leaders(np.maximum(variation, 1e-3 * robot.design_effort_limit))
+    tolerance: Float64 = robot.coupling.of_leaders(
+        np.maximum(variation, 1e-3 * robot.design_effort_limit)
+    )
+    return tolerance

@@ -236,7 +236,8 @@ def pickled(message: Any) -> bytes:
         An option cannot be pickled.
     """
     try:
-        return cloudpickle.dumps(message)
+        reply: bytes = cloudpickle.dumps(message)
+        return reply
     except Exception as error:
         problem = f"cannot be sent to a worker process: {error}"
         remedy = "let it hold nothing that cannot be pickled, or pass workers=0"

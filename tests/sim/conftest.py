@@ -8,6 +8,7 @@ import pytest
 from robots import load_bundled
 
 from batchpid.sim import Robot, RunnerOptions
+from batchpid.sim.engine.native import obstacle
 from batchpid.sim.engine.protocol import load_engine
 
 
@@ -27,6 +28,14 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 
     monkeypatch.setattr(RunnerOptions, "__init__", init)
     return name
+
+
+@pytest.fixture
+def needs_programs() -> None:
+    """Skip a test of Runners with backend "jax", whose programs call native code."""
+    pytest.importorskip("jax")
+    if obstacle():
+        pytest.skip("there is no native code")
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ import os
 import signal
 import tempfile
 from collections.abc import Iterator
-from importlib.util import find_spec
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -579,9 +578,11 @@ def rows() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("path", "case"), [*rows()])
-def test_every_feature_is_the_same_on_every_path(path: Any, case: tuple[str, str]) -> None:
-    if path is in_xla and find_spec("jax") is None:
-        pytest.skip("needs JAX")
+def test_every_feature_is_the_same_on_every_path(
+    path: Any, case: tuple[str, str], request: pytest.FixtureRequest
+) -> None:
+    if path is in_xla:
+        request.getfixturevalue("needs_programs")
     path(case)
 
 

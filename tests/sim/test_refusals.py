@@ -246,8 +246,10 @@ RUNNERS: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("options", "argument"), RUNNERS, ids=label)
 def test_options_that_do_not_go_together_are_refused_by_name(
-    options: dict[str, Any], argument: str
+    options: dict[str, Any], argument: str, request: pytest.FixtureRequest
 ) -> None:
+    if options.get("backend") == "jax":
+        request.getfixturevalue("needs_programs")
     options = {"robot": ARM, "num_envs": N, **options}
     options.setdefault("workers", None if "cluster" in options else 0)
     assert argument in named(lambda: Runner(**options))

@@ -146,9 +146,13 @@ def test_every_option_is_kept_or_has_a_role_apart():
         for index in range(len(option_values(name)))
     ],
 )
-def test_a_snapshot_is_refused_or_goes_on_as_before_under_each_value_of_each_option(name, index):
+def test_a_snapshot_is_refused_or_goes_on_as_before_under_each_value_of_each_option(
+    name, index, request
+):
     """The snapshot is made under the value before it, the last one for the first."""
     before, value = option_values(name)[index - 1], option_values(name)[index]
+    if value == "jax":
+        request.getfixturevalue("needs_programs")
     number, context = next(
         each for each in enumerate(CONTEXTS) if is_possible({**each[1], name: value})
     )

@@ -86,7 +86,10 @@ def touching_pairs(model: MjModel) -> NDArray[np.int32]:
     # A body and its parent touch at their joint; the world is no such parent.
     related = (welded != 0).all(axis=1) & (welded == parents[:, ::-1]).any(axis=1)
     excluded = np.isin((bodies[:, 0] << 16) + bodies[:, 1], model.exclude_signature)
-    return pairs[(welded[:, 0] != welded[:, 1]) & ~related & ~excluded].astype(np.int32)
+    chosen: NDArray[np.int32] = pairs[(welded[:, 0] != welded[:, 1]) & ~related & ~excluded].astype(
+        np.int32
+    )
+    return chosen
 
 
 def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:

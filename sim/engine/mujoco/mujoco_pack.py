@@ -101,7 +101,8 @@ class MujocoPack(ModelPack):
     @property
     def data(self) -> list[Any]:
         """``mujoco.MjData`` of each robot, in its state."""
-        return self._pool.take(self.models, self.rows)
+        data: list[Any] = self._pool.take(self.models, self.rows)
+        return data
 
     def _update(self, rows: Iterable[int]) -> None:
         """Compute all that follows from the states of robots ``rows``, after a change of models."""

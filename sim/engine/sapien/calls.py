@@ -200,7 +200,8 @@ def pointer(wrapper: Any, kind: str) -> int:
         raise RuntimeError(
             f"{problem}; install SAPIEN from PyPI, or set {SWITCH}=0 for Python calls"
         )
-    return _capsule_pointer(capsule, _capsule_name(capsule))
+    address: int = _capsule_pointer(capsule, _capsule_name(capsule))
+    return address
 
 
 _SENSE = 1 << STATUS.index("sense")

@@ -131,4 +131,5 @@ def _in_world(link: Any, joint: Any, force: Float32) -> Float64:
     the torque.
     """
     axes = (link.entity_pose * joint.pose_in_child).to_transformation_matrix()[:3, :3]
-    return axes.astype(np.float64) @ force[:3]
+    forces: Float64 = axes.astype(np.float64) @ force[:3]
+    return forces

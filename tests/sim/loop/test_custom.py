@@ -4,7 +4,6 @@ recovery keep.
 
 from __future__ import annotations
 
-import importlib.util
 import threading
 
 import numpy as np
@@ -88,10 +87,11 @@ class NanAtOneJoint(Counter):
 
 
 @pytest.mark.parametrize("how", ["numpy", "program of XLA", "delayed"])
-def test_a_fault_names_the_controller_whose_effort_is_nan(panda, how):
+def test_a_fault_names_the_controller_whose_effort_is_nan(panda, how, request):
     options = {"workers": 0, "substeps": 10, "control": NanAtOneJoint()}
     delay = 0
     if how == "program of XLA":
+        request.getfixturevalue("needs_programs")
         jnp = pytest.importorskip("jax.numpy")
         options |= {"backend": "jax", "control": NanAtOneJoint(jnp)}
     if how == "delayed":
@@ -245,9 +245,9 @@ CHANGES = {
 
 @pytest.mark.parametrize("backend", ["numpy", "jax"])
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_state_of_another_kind_is_refused_by_name(panda, change, backend):
-    if backend == "jax" and importlib.util.find_spec("jax") is None:
-        pytest.skip("needs JAX")
+def test_a_state_of_another_kind_is_refused_by_name(panda, change, backend, request):
+    if backend == "jax":
+        request.getfixturevalue("needs_programs")
     how, entry = CHANGES[change]
     runner = Runner(panda, N, control=Changes(how), workers=0, backend=backend)
     with runner, pytest.raises(InvalidArgumentError, match=f"^control: returned .*({entry})"):

@@ -11,7 +11,7 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Runner
 
-pytest.importorskip("jax")
+pytestmark = pytest.mark.usefixtures("needs_programs")
 N = 5
 
 

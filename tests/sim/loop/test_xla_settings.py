@@ -12,7 +12,10 @@ from batchpid.sim import Runner
 
 jax = pytest.importorskip("jax")
 jnp = jax.numpy
-pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning"),
+    pytest.mark.usefixtures("needs_programs"),
+]
 
 
 class Integrator:
