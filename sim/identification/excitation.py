@@ -153,7 +153,7 @@ def _obstacle(robot: Robot, motion: Trajectory) -> tuple[str, list[int]]:
 
 def _leaders(robot: Robot, joints: list[int]) -> list[int]:
     """Return the joints that move ``joints``: followers have no motion of their own."""
-    return np.unique(robot.coupling.leader[joints]).tolist()
+    return [int(joint) for joint in np.unique(robot.coupling.leader[joints])]
 
 
 def _centers(robot: Robot, easy: Float64, rng: np.random.Generator) -> Iterator[Float64]:

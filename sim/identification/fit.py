@@ -206,7 +206,7 @@ class Problem:
         """
         errors = np.abs(_residuals(self.windows, evaluation, fitted=True))
         errors = np.minimum(errors, np.quantile(errors, 0.9, axis=0))
-        return np.sqrt((errors**2).mean(0)) + 1e-9
+        return _root_mean_square(errors) + 1e-9
 
     def error(self, point: Float64, free_states: bool = True) -> Float64:
         """Return the root mean square (joints,) of the position error at the held-out rows; at all
@@ -217,7 +217,7 @@ class Problem:
         errors = _residuals(self.windows, evaluation, fitted=False)
         if not len(errors):
             errors = _residuals(self.windows, evaluation, fitted=True)
-        return np.sqrt((errors**2).mean(0))
+        return _root_mean_square(errors)
 
 
 def fit(
@@ -352,6 +352,11 @@ def _residuals(windows: Sequence[Window], evaluation: Sequence[Float64], fitted:
         if len(table):
             tables.append(table[window.fitted == fitted, :, 0])
     return np.concatenate(tables)
+
+
+def _root_mean_square(errors: Float64) -> Float64:
+    size: Float64 = np.sqrt((errors**2).mean(0))
+    return size
 
 
 def _simulated(task: Any) -> list[Float64]:
