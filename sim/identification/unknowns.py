@@ -182,8 +182,8 @@ class Unknowns:
     @property
     def prior(self) -> Float64:
         """Means and standard deviations of the prior (2, unknowns)."""
-        prior: Float64 = np.array([entry.prior for entry in self.entries]).reshape(-1, 2).T
-        return prior
+        rows = [entry.prior for entry in self.entries]
+        return np.array(rows, dtype=np.float64).reshape(-1, 2).T
 
     def values(self, points: Float64) -> Float64:
         """Return the values (n, unknowns) at ``points`` (n, unknowns).
