@@ -49,7 +49,7 @@ class BatchPID:
     backend
         "numpy": computed by the native extension where that was built, with the bytes of NumPy but
         without its floating-point warnings. Or "jax": compiled once, with the state's buffers
-        donated from call to call, and on a CPU block by block where the batch is large.
+        donated from call to call.
     terms
         Keep the :class:`batchpid.Terms` of the last call, at the cost of computing them.
     joint_names

@@ -43,13 +43,8 @@ def number(argument: str, value: object, low: float, high: float, unit: str) -> 
     """Return ``value`` as a finite float within [low, high]; an infinite bound does not limit."""
     value = _scalar(argument, value, unit)
     if not low <= value <= high or math.isinf(value):  # NaN is in no range
-        if math.isfinite(high):
-            ends = f"from {low:g} to {high:g}"
-        else:
-            ends = f">= {low:g}"
-        raise InvalidArgumentError(
-            argument, "out of range", value=value, remedy=f"use a number {ends} ({unit})"
-        )
+        remedy = f"use a number from {low:g} to {high:g} ({unit})"
+        raise InvalidArgumentError(argument, "out of range", value=value, remedy=remedy)
     return value
 
 

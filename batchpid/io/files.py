@@ -92,20 +92,13 @@ def _temporary(path: Path) -> Path:
 
 
 def package_versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
-    """Return the versions of Python and of the installed ``packages``, by name; for batchpid, its
-    ``__version__``.
-    """
+    """Return the versions of Python and of the installed ``packages``, by name."""
     from importlib.metadata import PackageNotFoundError, version  # slow to import
-
-    import batchpid
 
     versions = {"python": platform.python_version()}
     for package in packages:
         try:
-            if package == "batchpid":
-                versions[package] = batchpid.__version__
-            else:
-                versions[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
             continue
     return versions

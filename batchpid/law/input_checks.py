@@ -148,15 +148,10 @@ def checked_state(state: PIDState, needed: PIDState) -> PIDState:
 def checked_mask(mask: Array, state: PIDState) -> Array:
     """Return ``mask`` as bools, one for each env of ``state``."""
     array = _as_array("mask", mask, "b")
-    if array.dtype.kind != "b":
-        raise InvalidArgumentError(
-            "mask", f"must be bools, not {array.dtype}", remedy="give one bool per env"
-        )
     envs = np.broadcast_shapes(*(leaf.shape for leaf in state if leaf is not None))[:1]
-    if array.ndim != 1 or (envs and array.shape != envs):
-        raise InvalidArgumentError(
-            "mask", f"has shape {array.shape}, needs {envs}", remedy="give one bool per env"
-        )
+    if array.dtype.kind != "b" or array.ndim != 1 or (envs and array.shape != envs):
+        problem = f"is {array.dtype} {array.shape}, not bools {envs}"
+        raise InvalidArgumentError("mask", problem, remedy="give one bool per env")
     return array
 
 
