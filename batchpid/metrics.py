@@ -19,15 +19,14 @@ transient response", Trans. AIEE 72 (1953); total variation of the effort after 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
+from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import broadcast, number, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 
@@ -64,27 +63,11 @@ class StepMetrics(NamedTuple):
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")
 
-    def over_envs(self, statistic: Callable[[Float64], Any]) -> StepMetrics:
-        """Return each figure reduced over envs to (joints,) by ``statistic``, a function of one
-        joint's figures.
-
-        Undefined figures (NaN) are left out; a joint that has no other stays NaN.
-        """
-
-        def reduce(figure: Float64) -> Float64:
-            # Joints may lack different envs, so each column is reduced by itself.
-            columns = (column[~np.isnan(column)] for column in figure.T)
-            return np.array([statistic(column) if column.size else np.nan for column in columns])
-
-        return StepMetrics(*map(reduce, self))
-
     def worst(self) -> StepMetrics:
-        """Return the worst case over envs, (joints,)."""
-        return self.over_envs(np.max)
-
-    def median(self) -> StepMetrics:
-        """Return the median over envs, (joints,); inf if half of them or more are inf."""
-        return self.over_envs(lambda column: np.quantile(column, 0.5, method="higher"))
+        """Return the worst case over envs, (joints,); undefined figures (NaN) are left out where
+        another env has one.
+        """
+        return StepMetrics(*map(np.fmax.reduce, self))
 
 
 @np.errstate(divide="ignore", invalid="ignore")

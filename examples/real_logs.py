@@ -3,10 +3,9 @@ identify them.
 
     python examples/real_logs.py --out out/real
 
-A bar hangs on a hinge in four robots, with the same motor: under torques, as a hobby servo that is
-driven by a voltage, under a velocity loop that logs neither setpoints nor torques but currents, and
-under a drive in MIT mode, whose law adds a feedforward. docs/sim-to-real.md says why the command is
-what it is.
+A bar hangs on a hinge in three robots, with the same motor: under torques, as a hobby servo that is
+driven by a voltage, and under a velocity loop that logs neither setpoints nor torques but currents.
+docs/sim-to-real.md says why the command is what it is.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ URDF = """<robot name="hinge"><link name="base"/>
 <joint name="hinge" type="revolute"><parent link="base"/><child link="bar"/><origin xyz="0 0 1"/>
 <axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="12" velocity="20"/></joint></robot>"""
 MOTOR = {"armature": 0.02, "viscous": 0.1, "coulomb": 0.15, "command_delay": 0.004}
-"""The motor of all four robots."""
-STRENGTH = {"torque": 0.9, "servo": 0.5, "velocity": 1.0, "mit": 0.9}
+"""The motor of all three robots."""
+STRENGTH = {"torque": 0.9, "servo": 0.5, "velocity": 1.0}
 """Share of the torque that is delivered; of the servo torque per volt, kt / R [N m / V]."""
 
 
@@ -38,13 +37,7 @@ def wave(seconds: float) -> np.ndarray:
     return (0.9 * np.sin(4 * time + 5 * np.sin(0.8 * time)) * np.minimum(time, 1))[:, None]
 
 
-def move(
-    robot: Robot,
-    kind: str,
-    commands: np.ndarray,
-    params: bp.PIDParams | None,
-    forward: np.ndarray | None = None,
-):
+def move(robot: Robot, kind: str, commands: np.ndarray, params: bp.PIDParams | None):
     """Return times, measured positions, and the efforts that acted before each (rows, 1), under
     ``commands``.
     """
@@ -58,9 +51,7 @@ def move(
         robot, 1, workers=0, timestep=DT, substeps=1, compensate="none", **options
     ) as runner:
         begin = runner.reset(np.zeros((1, 1)))
-        rollout = runner.rollout(
-            commands[:, None], feedforwards=None if forward is None else forward[:, None]
-        )
+        rollout = runner.rollout(commands[:, None])
     qpos, effort = (
         np.concatenate([first, later[:, 0]])[:-1]
         for first, later in ((begin.qpos, rollout.qpos), (begin.effort, rollout.effort))
@@ -101,17 +92,6 @@ def velocity(robot: Robot, out: Path, seconds: float) -> list[str]:
     return ["--compensate", "none"]
 
 
-def mit(robot: Robot, out: Path, seconds: float) -> list[str]:
-    """Write setpoints and feedforwards of kp (r - q) + kd (r' - v) + feedforward."""
-    params = bp.make_params(1, kp=20.0, kd=1.0, effort_limit=12.0, setpoint_weight_derivative=1.0)
-    bp.save_params(out / "mit.yaml", params, robot.joint_names)
-    forward = 9.81 * 0.8 * 0.2 * np.sin(wave(seconds))
-    time, qpos, _ = move(robot, "mit", wave(seconds), params, forward)
-    columns = {"setpoint:hinge": wave(seconds), "feedforward:hinge": forward, "qpos:hinge": qpos}
-    _write(out / "mit.csv", time=time, **columns)
-    return ["--gains", str(out / "mit.yaml"), "--compensate", "none", "--hold"]
-
-
 def _write(path: Path, **columns: np.ndarray) -> None:
     table = np.column_stack([*columns.values()])
     np.savetxt(path, table, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")
@@ -126,7 +106,7 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "hinge.urdf").write_text(URDF)
     robot = Robot.load(options.out / "hinge.urdf")
-    for kind in (torque, servo, velocity, mit):
+    for kind in (torque, servo, velocity):
         flags = kind(robot, options.out, options.seconds)
         log = options.out / f"{kind.__name__}.csv"
         words = [options.out / "hinge.urdf", log, *flags, "--timestep", f"{DT:g}", "--no-payload"]

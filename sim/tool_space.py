@@ -12,12 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.digest import digest
-from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
-from batchpid.arrays.records import frozen
+from batchpid.arrays.records import frozen, summary
 from batchpid.checks.validate import array, choice, flag, instance, names
-from batchpid.checks.warn import warn
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import InvalidArgumentError, warn
 from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.robot.parts import DISSIPATION

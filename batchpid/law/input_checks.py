@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array, DType
-from batchpid.arrays.choices import CHOICES, HoldEffort
+from batchpid.arrays.choices import HoldEffort
 from batchpid.arrays.elementwise import in_dtype_of
 from batchpid.checks.validate import instance, read_array, time_step
 from batchpid.errors import InvalidArgumentError
@@ -62,16 +62,10 @@ def check_alone(law: Any, measurement_rate: Array) -> None:
     that is not given.
     """
     if law.gain_units is not None:
-        unit = next(
-            name
-            for name, entry in CHOICES["gain_units"].items()
-            if type(entry) is type(law.gain_units)
-        )
         raise InvalidArgumentError(
             "params.gain_units",
             "are accelerations: without the robot's mass matrix the law cannot turn them into"
             " efforts",
-            value=unit,
             remedy=(
                 "use gains in efforts, such as robot.designed('effort'), or a batchpid.sim.Runner"
             ),

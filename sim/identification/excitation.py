@@ -14,16 +14,15 @@ all joints move differently. The window w rises from 0 and falls back within a t
 the motion begins and ends at rest at c. Low frequencies show friction, gravity and strength, high
 ones inertia and delay.
 
-Where two links would come too near each other, the joints that bring them together get smaller
-amplitudes, and so does a joint beyond its limits, until the motion is free: about the start pose,
-or about another one with more room.
+A joint beyond its limits gets smaller amplitudes, and so do all joints where two links would come
+too near each other, until the motion is free: about the start pose, or about another one with more
+room.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
@@ -44,12 +43,9 @@ there.
 """
 _EDGE = 0.1
 _DRAWS = 20
-_ROUNDS = 60
 _SHRINK = 0.7
 _LEAST = 0.04
-"""Number of motions about a center, factor of an amplitude from one to the next, and its least
-share.
-"""
+"""Factor of an amplitude from one motion to the next, and its least share."""
 _ENOUGH = 0.5  # mean share of the amplitudes with which no other center is tried
 _COARSE = 40  # poses that are tested first
 _CHECKS = 400  # poses of a motion that are tested for contact
@@ -88,121 +84,84 @@ def excite(
         An argument is out of range, or near every pose the robot touches itself or is too weak: the
         message names the links or the joint.
     """
-    duration, rate = (
-        number("duration", duration, 1.0, 3600.0, "s"),
-        number("rate", rate, 20.0, 10_000.0, "Hz"),
-    )
+    duration = number("duration", duration, 1.0, 3600.0, "s")
+    rate = number("rate", rate, 20.0, 10_000.0, "Hz")
     lowest = number("lowest", lowest, 0.01, 50.0, "Hz")
     highest = number("highest", highest, lowest, rate / 10, "Hz, at most a tenth of the rate")
     rng = np.random.default_rng(integer("seed", seed, 0, 2**31 - 1))
     time = np.arange(1, round(duration * rate) + 1) / rate
     phase = rng.uniform(0, 2 * np.pi, robot.dof)
-    best: tuple[float, Trajectory] | None = None
-    obstacles = Counter[str]()
     easy, movable = easy_pose(robot, robot.dynamics(), robot.sample(200, seed=0))
     movable = movable if movable.any() else ~movable
-    for count, center in enumerate(_centers(robot, easy, rng)):
-        if best is not None and count > 3:
-            break
+    best: tuple[float, Trajectory] | None = None
+    obstacles = Counter[str]()
+    for trial, center in enumerate(_centers(robot, easy, rng)):
+        # The motion shrinks about a center until nothing is in its way.
         share = movable.astype(np.float64)
-        for _ in range(_ROUNDS):
+        obstacle = "the motion is too small"
+        while obstacle and share[movable].min() >= _LEAST:
             motion = _chirp(robot, center, share, time, lowest, highest, phase)
-            obstacle = _obstacle(robot, motion)
-            if obstacle is None:
-                if best is None or share.mean() > best[0]:
-                    best = float(share.mean()), motion
-                break
-            share[robot.coupling.leader[list(obstacle.joints)]] *= _SHRINK
-            if not obstacle.joints or share[movable].min() < _LEAST:
-                obstacles[obstacle.text] += 1
-                break
-        if best is not None and best[0] >= _ENOUGH:
-            break
-    if best is None:
-        ((text, _),) = obstacles.most_common(1)
-        problem = f"{robot.name!r} has no free motion about any pose that was tried: {text}"
-        remedy = (
-            "disable pairs of links that only seem to touch in an .srdf, or correct the effort"
-            " limit or the masses"
-        )
-        raise InvalidArgumentError("robot", problem, remedy=remedy)
-    return best[1]
+            obstacle, joints = _obstacle(robot, motion)
+            share[joints] *= _SHRINK
+        if obstacle:
+            obstacles[obstacle] += 1
+        elif best is None or share.mean() > best[0]:
+            best = float(share.mean()), motion
+        if best is not None and (best[0] >= _ENOUGH or trial >= 3):
+            return best[1]
+    if best is not None:
+        return best[1]
+    ((text, _),) = obstacles.most_common(1)
+    problem = f"{robot.name!r} has no free motion about any pose that was tried: {text}"
+    remedy = "disable pairs of links that only seem to touch in an .srdf, or correct the effort"
+    raise InvalidArgumentError("robot", problem, remedy=f"{remedy} limit or the masses")
 
 
-class _Obstacle(NamedTuple):
-    """Reason for which a motion is not possible, and the joints that have to move less; none if
-    that does not help.
+def _obstacle(robot: Robot, motion: Trajectory) -> tuple[str, list[int]]:
+    """Return what is in the way of a motion, "" for nothing, and the joints that have to move
+    less.
     """
-
-    text: str
-    joints: tuple[int, ...] = ()
-
-
-def _obstacle(robot: Robot, motion: Trajectory) -> _Obstacle | None:
-    """Return the first obstacle of a motion about its first row; None if it is feasible."""
     outside = (motion.position < robot.lower - 1e-9) | (motion.position > robot.upper + 1e-9)
     outside |= np.abs(motion.velocity) > robot.velocity_limit
-    if outside.any():
-        joints = np.flatnonzero(outside.any(0)).tolist()
-        return _Obstacle(
-            f"joint {robot.joint_names[joints[0]]!r} exceeds its limits", tuple(joints)
-        )
+    joints = np.flatnonzero(outside.any(0)).tolist()
+    if joints:
+        return f"joint {robot.joint_names[joints[0]]!r} exceeds its limits", _leaders(robot, joints)
     rows = np.unique(np.linspace(0, motion.ticks - 1, _CHECKS).astype(int))
-    position, velocity = motion.position[rows], motion.velocity[rows]
+    position = motion.position[rows]
+    velocity = motion.velocity[rows]
     effort = motion_effort(robot, position, velocity, motion.acceleration[rows])
     effort += robot.damping * velocity + robot.friction * np.sign(velocity)
     moves = np.ptp(motion.position, axis=0) > 0
-    excess = np.where(moves, np.abs(effort) - robot.design_effort_limit, 0.0)
-    if (excess > 0).any():
-        text = f"joint {robot.joint_names[int(excess.max(0).argmax())]!r} is too weak to move"
-        return _Obstacle(text, tuple(np.flatnonzero((excess > 0).any(0)).tolist()))
-    return _contact(robot, position)
-
-
-def _contact(robot: Robot, position: Float64) -> _Obstacle | None:
-    """Return the first pair of links that come too near each other at poses (n, dof), compared with
-    the first one.
-    """
+    excess = np.where(moves, np.abs(effort) - robot.design_effort_limit, 0.0).max(0)
+    joints = np.flatnonzero(excess > 0).tolist()
+    if joints:
+        name = robot.joint_names[int(excess.argmax())]
+        return f"joint {name!r} is too weak to move", _leaders(robot, joints)
+    # Links keep the distances of the center, or half of them where they are near there.
     contacts = robot.dynamics().contacts
-    allowed = dict[tuple[str, str], float]()
-    for first, second, distance in contacts.near(position[0], CLEARANCE):
-        allowed[first, second] = min(
-            max(0.0, 0.5 * distance), allowed.get((first, second), CLEARANCE)
-        )
+    clearance = CLEARANCE
     coarse = np.linspace(0, len(position) - 1, _COARSE).astype(int)
-    for row in (*coarse, *range(len(position))):
-        for first, second, distance in contacts.near(position[row], CLEARANCE):
-            if distance < allowed.get((first, second), CLEARANCE):
-                names = " and ".join(repr(name) for name in (first, second) if name)
-                text = f"{names} touch" if second else f"{names} and the ground touch"
-                return _Obstacle(text, tuple(_between(robot, (first, second))) if row else ())
-    return None
+    for row in (0, *coarse, *range(len(position))):
+        for first, second, distance in contacts.near(position[row], clearance):
+            if row == 0 and distance > 0:
+                clearance = min(clearance, 0.5 * distance)
+            elif distance < clearance:
+                names = " and ".join(repr(name) for name in (first, second or "ground"))
+                return f"{names} touch", list(range(robot.dof))
+    return "", []
 
 
-def _between(robot: Robot, pair: tuple[str, str]) -> set[int]:
-    """Return the joints, or the leaders of followers, that move two links relative to each other or
-    the ground.
-    """
-    above = {joint.child_link: joint for joint in robot.all_joints}
-    chains = []
-    for link in pair:
-        chain = set()
-        while link in above:
-            if above[link].moves:
-                chain.add(int(robot.coupling.leader[robot.joint_names.index(above[link].name)]))
-            link = above[link].parent_link
-        chains.append(chain)
-    return chains[0] ^ chains[1] or chains[0] | chains[1]
+def _leaders(robot: Robot, joints: list[int]) -> list[int]:
+    """Return the joints that move ``joints``: followers have no motion of their own."""
+    return [int(joint) for joint in np.unique(robot.coupling.leader[joints])]
 
 
 def _centers(robot: Robot, easy: Float64, rng: np.random.Generator) -> Iterator[Float64]:
     """Yield candidates for the center, away from joint limits: the start pose, the ``easy`` one,
     and random ones.
     """
-    low, high = (
-        np.maximum(robot.lower, robot.start - np.pi),
-        np.minimum(robot.upper, robot.start + np.pi),
-    )
+    low = np.maximum(robot.lower, robot.start - np.pi)
+    high = np.minimum(robot.upper, robot.start + np.pi)
     edge = np.minimum(0.4 * (high - low), [REACH[unit] for unit in robot.units])
 
     def inside(pose: Float64, share: float = 1.0) -> Float64:
@@ -229,26 +188,20 @@ def _chirp(
     """
     dt = float(time[0])
     total = float(time[-1])
-    dof = robot.dof
     room = np.minimum(robot.upper - center, center - robot.lower) * (1 - _EDGE)
     reach = np.minimum(room, [REACH[unit] for unit in robot.units])
-    velocity = (
-        np.minimum(robot.velocity_limit, [FREE_VELOCITY[unit] for unit in robot.units])
-        * VELOCITY_SHARE
-    )
-    still = np.zeros((1, dof))
-    left = (
-        robot.design_effort_limit
-        - np.abs(motion_effort(robot, center[None], still, still)[0])
-        - robot.friction
-    )
-    inertia = np.abs(robot.mass_matrix(center)[0]).sum(1)
-    acceleration = EFFORT_SHARE * np.maximum(left, 0.05 * robot.design_effort_limit) / inertia
-    shift = np.argsort(np.argsort(phase)) / dof  # each joint begins at another point of the sweep
+    fastest = np.minimum(robot.velocity_limit, [FREE_VELOCITY[unit] for unit in robot.units])
+    still = np.zeros((1, robot.dof))
+    load = np.abs(motion_effort(robot, center[None], still, still)[0]) + robot.friction
+    left = np.maximum(robot.design_effort_limit - load, 0.05 * robot.design_effort_limit)
+    acceleration = EFFORT_SHARE * left / np.abs(robot.mass_matrix(center)[0]).sum(1)
+    # Each joint begins at another point of the sweep.
+    shift = np.argsort(np.argsort(phase)) / robot.dof
     sweep = (1 - np.cos(2 * np.pi * (time[:, None] / total + shift))) / 2
     omega = 2 * np.pi * lowest * (highest / lowest) ** sweep
-    limits = np.stack(np.broadcast_arrays(reach, velocity / omega, acceleration / omega**2))
-    amplitude = share * (np.maximum(limits, 1e-12) ** -_SHARPNESS).sum(0) ** (-1 / _SHARPNESS)
+    limits = [reach + 0 * omega, VELOCITY_SHARE * fastest / omega, acceleration / omega**2]
+    powers = np.maximum(limits, 1e-12) ** -_SHARPNESS
+    amplitude = share * powers.sum(0) ** (-1 / _SHARPNESS)
     angle = phase + np.cumsum(omega, axis=0) * dt
     edge = np.clip(np.minimum(time, total - time) / (_WINDOW * total), 0.0, 1.0)[:, None]
     window = edge**3 * (10 - 15 * edge + 6 * edge**2)

@@ -9,20 +9,18 @@ from contextlib import ExitStack
 from dataclasses import replace
 from importlib.util import find_spec
 from multiprocessing import get_context
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Bool
+from batchpid.arrays.array_types import Bool, Float64
 from batchpid.checks.validate import choice, flag, instance, integer, number
-from batchpid.checks.warn import warn
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.sim.identification.fit import Problem, windows_of
+from batchpid.errors import InvalidArgumentError, MissingDependencyError, warn
+from batchpid.sim.identification.fit import Problem, fit, windows_of
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
 from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.regression import (
-    SETPOINT_DELAYS,
     Guess,
     LogData,
     better_reading,
@@ -31,7 +29,7 @@ from batchpid.sim.identification.regression import (
 )
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import Dynamics, LogControl, Plant
-from batchpid.sim.identification.unknowns import BASIC, EXTRAS, LAW, Unknowns
+from batchpid.sim.identification.unknowns import BASIC, EXTRAS, KINDS, Unknowns
 from batchpid.sim.options.groups import Compensation
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
@@ -44,21 +42,9 @@ stuck.
 """
 BEYOND = 3.0
 """Effort over the robot's limit from which it looks like another unit."""
-LEAD = 5e-3
-"""Time by which setpoints act before they were logged that is an error of the log [s]."""
 DETOUR = 0.1
 """Least decrease of the regression's cost for a compensation that does not pass through the motors.
 """
-
-
-class Data(NamedTuple):
-    """Logs of the joints that moved."""
-
-    robot: Robot
-    """The robot, whose start pose has the positions of the joints that did not move."""
-    parts: list[LogData]
-    still: list[str]
-    """Names of the joints that did not move."""
 
 
 def identify(
@@ -119,32 +105,29 @@ def identify(
     LogWarning
         A log was changed when it was read, or a joint did not move.
     """
-    for name in extras:
-        choice("extras", name, [*EXTRAS])
-    data = _read(robot, logs, params, compensate, timestep, reading)
-    data, guesses = _regress(data, "slew" in extras)
-    windows = windows_of(data.parts)
-    with ExitStack() as stack:
-        run = _map(stack, integer("workers", workers, 0, 1000))
-        unknowns = [_unknowns(data, guess, extras, flag("payload", payload)) for guess in guesses]
-        problems = [Problem(data.parts, windows, start, run) for start in unknowns]
-        problem = min(problems, key=Problem.start_error)
-        fit = problem.fit(integer("evaluations", evaluations, 2, 1000), progress)
-        return _sensible(Identification.of(fit, data.still))
-
-
-def _read(
-    robot: Robot,
-    logs: Iterable[Any],
-    params: bp.PIDParams | None,
-    compensate: str | None,
-    timestep: float | None,
-    reading: Reading | None,
-) -> Data:
-    """Return the logs of the arguments of :func:`identify`, each with its plant and control."""
     if find_spec("scipy") is None:
         raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
+    kinds = [choice("extras", name, [*EXTRAS]) for name in extras]
+    if flag("payload", payload):
+        kinds.append("payload")
+    evaluations = integer("evaluations", evaluations, 2, 1000)
+    read = _read(robot, logs, params, reading)
+    joints, still = _moving(robot, read)
+    robot, data = _simulated(robot, read, joints, params, compensate, timestep)
+    data, guesses = _regress(robot, data, "slew" in extras)
+    unknowns = [_unknowns(robot, data, guess, kinds) for guess in guesses]
+    windows = windows_of(data)
+    with ExitStack() as stack:
+        run = _map(stack, integer("workers", workers, 0, 1000))
+        problems = [Problem(data, windows, start, run) for start in unknowns]
+        return Identification(fit(problems, evaluations, progress), still)
+
+
+def _read(
+    robot: Robot, logs: Iterable[Any], params: bp.PIDParams | None, reading: Reading | None
+) -> list[Log]:
+    """Return the logs of the arguments of :func:`identify`."""
     kind: CommandKind | None = None
     if params is not None:
         instance("params", params, bp.PIDParams, "load them with load_params()")
@@ -157,35 +140,71 @@ def _read(
             read += read_logs(robot, [source], kind, reading=reading)
     if all(log.settings.held_out for log in read):
         raise InvalidArgumentError("logs", "are missing or held out", remedy="name some to fit")
-    forces = _option("compensate", compensate, read, "gravity+coriolis+friction")
-    forces = str(forces).removesuffix("+friction")
-    choice("compensate", forces, ("gravity+coriolis", "gravity", "none"))
-    dt = number("timestep", _option("timestep", timestep, read, 1 / 2000), 1e-5, 0.01, "seconds")
     for log in read:
         if log.joints != read[0].joints or log.kind != read[0].kind:
             problem = f"holds other joints or commands than {read[0].source}"
-            raise InvalidArgumentError(log.source, problem, remedy="fit them one by one")
+            raise log.error(problem, "fit them one by one")
+    return read
+
+
+def _moving(robot: Robot, logs: list[Log]) -> tuple[Bool, tuple[str, ...]]:
+    """Return the mask (joints,) of the logged joints that moved, and the names of the others, which
+    are jammed or not driven.
+    """
+    joints = logs[0].joints
+    spread = np.concatenate([log.qpos for log in logs]).std(0)
+    moves = spread > [STILL[robot.units[joint]] for joint in joints]
+    if logs[0].kind == "setpoint":
+        moves &= spread > FOLLOWS * np.concatenate([log.command for log in logs]).std(0)
+    still = tuple(robot.joint_names[joint] for joint in np.array(joints)[~moves])
+    names = ", ".join(map(repr, still))
+    if not moves.any():
+        problem = f"show no motion of any joint ({names})"
+        raise InvalidArgumentError("logs", problem, remedy="record a motion")
+    if still:
+        words = "did not move, or did not follow its setpoint: left out, and held in place"
+        warn(f"{names} {words}", LogWarning)
+    return moves, still
+
+
+def _simulated(
+    robot: Robot,
+    logs: list[Log],
+    moves: Bool,
+    params: bp.PIDParams | None,
+    compensate: str | None,
+    timestep: float | None,
+) -> tuple[Robot, list[LogData]]:
+    """Return the robot that rests where it did not move, and the moving joints of each log with
+    their plant and control.
+    """
+    forces = _option("compensate", compensate, logs, "gravity+coriolis+friction")
+    forces = str(forces).removesuffix("+friction")
+    choice("compensate", forces, ("gravity+coriolis", "gravity", "none"))
+    dt = number("timestep", _option("timestep", timestep, logs, 1 / 2000), 1e-5, 0.01, "seconds")
     # Joints that did not move are held at their mean position, with the unlogged ones.
-    moves = _moves(robot, read)
-    joints = np.array(read[0].joints)
+    joints = np.array(logs[0].joints)
     start = robot.start
-    start[joints[~moves]] = np.concatenate([log.qpos for log in read]).mean(0)[~moves]
-    plants = dict[Any, Plant]()
-    parts = list[LogData]()
-    for log in read:
+    start[joints[~moves]] = np.concatenate([log.qpos for log in logs]).mean(0)[~moves]
+    # A joint that went beyond its limits turns freely: its positions were unwrapped.
+    qpos = np.concatenate([log.qpos for log in logs])[:, moves]
+    joints = joints[moves]
+    free = (qpos.min(0) < robot.lower[joints]) | (qpos.max(0) > robot.upper[joints])
+    plants = dict[Robot, Plant]()
+    data = list[LogData]()
+    for log in logs:
         law = _law(robot, log, params)
-        drive = LogControl(dt, None if law is None else law.for_joints(moves), forces)
-        key = id(log.settings.robot), log.settings.payload
+        if law is not None:
+            law = law.for_joints(moves)
+        key = log.settings.robot or robot
         if key not in plants:
-            resting = _resting(log.settings.robot or robot, start)
-            plants[key] = Plant(resting, tuple(joints[moves].tolist()), log.settings.payload)
-        moving = log.part(joints=moves)
-        parts.append(LogData(moving, smooth(moving, dt), plants[key], drive))
-    still = [robot.joint_names[joint] for joint in joints[~moves]]
-    return Data(_resting(robot, start), parts, still)
+            plants[key] = Plant(_resting(key, start), tuple(joints.tolist()), free)
+        part = log.part(joints=moves)
+        data.append(LogData(part, smooth(part, dt), plants[key], LogControl(dt, law, forces)))
+    return _resting(robot, start), data
 
 
-def _resting(robot: Robot, start: Any) -> Robot:
+def _resting(robot: Robot, start: Float64) -> Robot:
     """Return ``robot`` with the start pose ``start`` (dof,)."""
     return replace(robot, settings=None, defaults=FileDefaults(start))
 
@@ -194,11 +213,9 @@ def _option(name: str, value: Any, logs: list[Log], default: Any) -> Any:
     """Return an option as the recordings say, or its ``value``, or the default."""
     for log in logs:
         recorded = getattr(log, name)
-        if recorded is None:
-            continue
-        value = recorded if value is None else value
-        same = np.isclose(recorded, value) if name == "timestep" else recorded == value
-        if not same:
+        if value is None:
+            value = recorded
+        if recorded is not None and recorded != value:
             problem = f"contradicts {log.source}, which was made with {recorded!r}"
             raise InvalidArgumentError(name, problem, value=value, remedy="leave the option out")
     return default if value is None else value
@@ -206,23 +223,23 @@ def _option(name: str, value: Any, logs: list[Log], default: Any) -> Any:
 
 def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
     """Return the params that drove a log, of its joints, one row; None for efforts."""
-    recorded = _of_joints(log.params, robot, log)
     law = _of_joints(log.settings.params or params, robot, log)
-    if law is None:
-        law = recorded
+    recorded = _of_joints(log.params, robot, log)
+    if law is not None and recorded is not None:
+        for name in ("kp", "ki", "kd"):
+            gains = [getattr(table, name) for table in (recorded, law)]
+            before, now = (0.0 if gain is None else gain for gain in gains)
+            if not np.allclose(before, now, rtol=1e-6):
+                problem = f"contradict {log.source}, which was recorded with another {name}"
+                remedy = "leave them out: a recording has its own"
+                raise InvalidArgumentError("params", problem, remedy=remedy)
+    law = law or recorded
     if (law is None) != (log.kind == "effort"):
         remedy = "give the params that drove the robot" if law is None else "give no params"
-        raise InvalidArgumentError(log.source, f"holds {log.kind}s", remedy=remedy)
+        raise log.error(f"holds {log.kind}s", remedy)
     if law is not None and law.gain_units is not None:
         problem = "have gains per inertia or mass matrix, which a fit does not simulate"
         raise InvalidArgumentError("params", problem, remedy="log the efforts, and give no params")
-    for name in ("kp", "ki", "kd") if recorded is not None else ():
-        gains = getattr(recorded, name), getattr(law, name)
-        before, now = (0.0 if gain is None else gain for gain in gains)
-        if not np.allclose(before, now, rtol=1e-6):
-            problem = f"contradict {log.source}, which was recorded with another {name}"
-            remedy = "leave them out: a recording has its own"
-            raise InvalidArgumentError("params", problem, remedy=remedy)
     return law
 
 
@@ -237,73 +254,43 @@ def _of_joints(params: bp.PIDParams | None, robot: Robot, log: Log) -> bp.PIDPar
     return params.for_joints(list(log.joints))
 
 
-def _moves(robot: Robot, logs: list[Log]) -> Bool:
-    """Return the mask (joints,) of the joints that moved; warn about the others, which are jammed
-    or not driven.
-    """
-    joints = logs[0].joints
-    spread = np.concatenate([log.qpos for log in logs]).std(0)
-    moves: Bool = spread > [STILL[robot.units[joint]] for joint in joints]
-    if logs[0].kind == "setpoint":
-        moves &= spread > FOLLOWS * np.concatenate([log.command for log in logs]).std(0)
-    still = [robot.joint_names[joint] for joint in np.array(joints)[~moves]]
-    names = ", ".join(map(repr, still))
-    if not moves.any():
-        problem = f"show no motion of any joint ({names})"
-        raise InvalidArgumentError("logs", problem, remedy="record a motion")
-    if still:
-        words = "did not move, or did not follow its setpoint: left out, and held in place"
-        warn(f"{names} {words}", LogWarning)
-    return moves
-
-
-def _regress(data: Data, has_slew: bool) -> tuple[Data, list[Guess]]:
-    """Return the motors by the regression, and the data with the way of the compensation.
+def _regress(
+    robot: Robot, data: list[LogData], has_slew: bool
+) -> tuple[list[LogData], list[Guess]]:
+    """Return the logs with the path of the compensation, and the motors by the regression.
 
     Raises InvalidArgumentError where a log makes far more sense in another reading.
     """
-    parts, guesses = data.parts, _guesses(data.parts, has_slew)
-    if parts[0].drive.compensate != "none":
+    guesses = _guesses(data, has_slew)
+    if data[0].drive.compensate != "none":
         # A robot that adds the compensation by itself may do so exactly, whatever its motors.
-        exact = [part._replace(drive=part.drive._replace(through=False)) for part in parts]
+        exact = [part._replace(drive=part.drive._replace(through=False)) for part in data]
         others = _guesses(exact, has_slew)
-        if others[0].cost < guesses[0].cost - DETOUR:
-            parts, guesses = exact, others
-    log = parts[0].log
-    limits = data.robot.effort_limit[list(log.joints)]
+        if others[0].cost() < guesses[0].cost() - DETOUR:
+            data = exact
+            guesses = others
+    log = data[0].log
+    limits = robot.effort_limit[list(log.joints)]
     beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > BEYOND * limits
-    is_odd = guesses[0].odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any())
-    if is_odd:
-        names = [data.robot.joint_names[joint] for joint in log.joints]
-        words = better_reading(parts[0], names)
-        if words:
-            remedy = "correct the log or its options"
-            raise InvalidArgumentError("logs", f"make sense with {words}", remedy=remedy)
-    return data._replace(parts=parts), guesses
+    words = ""
+    if guesses[0].odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
+        words = better_reading(data[0], [robot.joint_names[joint] for joint in log.joints])
+    delay = float(guesses[0].values["setpoint_delay"][0])
+    if delay < -1e-9 and not words:
+        words = f"setpoints that were logged about {-1e3 * delay:.0f} ms late"
+    if words:
+        remedy = "correct the log or its options"
+        raise InvalidArgumentError("logs", f"make sense with {words}", remedy=remedy)
+    return data, guesses
 
 
-def _guesses(parts: list[LogData], has_slew: bool) -> list[Guess]:
-    return regress([part for part in parts if not part.log.settings.held_out], has_slew)
+def _guesses(data: list[LogData], has_slew: bool) -> list[Guess]:
+    return regress([part for part in data if not part.log.settings.held_out], has_slew)
 
 
-def _sensible(result: Identification) -> Identification:
-    """Return the result; raise InvalidArgumentError if setpoints acted before they were logged."""
-    for at, entry in enumerate(result.unknowns.entries):
-        delay, _, high = result.row(at)
-        if entry.kind == "setpoint_delay" and SETPOINT_DELAYS[0] <= delay and high < -LEAD:
-            problem = f"make sense with setpoints that were logged {-1e3 * delay:.0f} ms late"
-            raise InvalidArgumentError("logs", problem, remedy="correct their times")
-    return result
-
-
-def _unknowns(data: Data, guess: Guess, extras: Sequence[str], payload: bool) -> Unknowns:
+def _unknowns(robot: Robot, data: list[LogData], guess: Guess, extras: Sequence[str]) -> Unknowns:
     """Return the unknowns with starts from the regression, and typical sizes from the motion."""
-    log, _, plant, drive = data.parts[0]
-    for name in extras:
-        if name in LAW and drive.params is None:
-            problem = "is of a law, and the logs hold efforts"
-            remedy = "leave it out, or give the params of the law"
-            raise InvalidArgumentError("extras", problem, value=name, remedy=remedy)
+    log, _, plant, drive = data[0]
     starts = dict(guess.values)
     kinds = list(BASIC)
     if drive.params is not None:
@@ -316,21 +303,22 @@ def _unknowns(data: Data, guess: Guess, extras: Sequence[str], payload: bool) ->
     if "gain" in extras:
         kinds.remove("strength")
         starts["gain"] = starts["strength"]
-    if payload:
-        kinds.append("payload")
     for name in extras:
-        kinds += EXTRAS[name]
-    motions = [part.motion for part in data.parts]
-    qpos, qvel, qacc = (np.concatenate(tables) for tables in list(zip(*motions, strict=True))[:3])
+        kinds += EXTRAS.get(name, (name,))
+        if KINDS[kinds[-1]].target == "law" and drive.params is None:
+            problem = "is of a law, and the logs hold efforts"
+            remedy = "leave it out, or give the params of the law"
+            raise InvalidArgumentError("extras", problem, value=name, remedy=remedy)
+    motions = [part.motion for part in data]
+    qpos, qvel, qacc, command = (np.concatenate(tables) for tables in zip(*motions, strict=True))
     poses = np.ascontiguousarray(qpos[:: 1 + len(qpos) // 200])
     dynamics = Dynamics(plant, [()] * len(poses), poses, np.zeros_like(poses))
     dynamics.update()
     links = np.diagonal(dynamics.matrix, axis1=1, axis2=2).mean(0)
-    inertia = links + starts["armature"]
     speed = np.maximum(np.sqrt((qvel**2).mean(0)), 1e-3)
     friction = starts["friction"]
+    inertia = links + starts["armature"]
     effort = inertia * np.maximum(np.sqrt((qacc**2).mean(0)), 0.1) + friction
-    errors = np.concatenate([np.abs(motion.command - motion.qpos) for motion in motions])
     sizes = {
         "inertia": links,
         "damping": effort / speed,
@@ -338,9 +326,9 @@ def _unknowns(data: Data, guess: Guess, extras: Sequence[str], payload: bool) ->
         "friction": 0.3 * np.maximum(friction, 0.05 * effort),
         "speed": 0.1 * speed,
         "top_speed": np.mean([motion.top_speed for motion in motions], axis=0),
-        "error": 0.7 * np.quantile(errors, 0.95, axis=0),
+        "error": 0.7 * np.quantile(np.abs(command - qpos), 0.95, axis=0),
     }
-    return Unknowns.of(data.robot, log.joints, kinds, starts, sizes, plant.heavy_links)
+    return Unknowns.of(robot, log.joints, kinds, starts, sizes, plant.heavy_links)
 
 
 def _map(stack: ExitStack, workers: int) -> Callable[..., Any]:

@@ -6,7 +6,6 @@ and setpoints of revolute joints that were logged modulo 2 pi become continuous.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
@@ -16,8 +15,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.elementwise import TURN
-from batchpid.checks.warn import warn
-from batchpid.sim.recording.setpoint_files import error
+from batchpid.errors import InvalidArgumentError, warn
 from batchpid.sim.robot.robot import Robot
 
 CommandKind = Literal["setpoint", "effort"]
@@ -48,8 +46,6 @@ class LogSettings(NamedTuple):
     """The robot, with the same joints as all."""
     params: bp.PIDParams | None = None
     """Params of the PID law, of the joints of the log."""
-    payload: float = 0.0
-    """Known payload at the tool [kg], in addition to the unknown one."""
     held_out: bool | None = None
     """True to hold out the whole log, False to fit it all; None: its last quarter is held out."""
 
@@ -81,13 +77,13 @@ class Log:
     """Time step of the control [s], where the log says it."""
     compensate: str | None = None
     """Forces that the robot compensated, where the log says it."""
-    feedforward: Float64 | None = None
-    """Efforts that are added to the efforts of the law (commands, joints) [N m or N]."""
     measured: bool = False
     """True if the efforts of ``command`` were measured and not commanded: they have no delay."""
     params: bp.PIDParams | None = None
     """Params that drove the robot, where the log says it."""
     settings: LogSettings = ALIKE
+    lines: Rows | None = None
+    """Number of each row's line in a file (rows,)."""
     is_checked: bool = False
     """True for the result of :func:`checked`."""
 
@@ -102,17 +98,16 @@ class Log:
         are rest.
         """
         count = max(4, int((self.time <= self.time[0] + BEGIN).sum()))
-        first = self.qpos[:count]
-        slope, place = np.polyfit(self.time[:count] - self.time[0], first, 1)
+        time = self.time[:count] - self.time[0]
+        slope, place = np.polyfit(time, self.qpos[:count], 1)
         speed = np.diff(self.qpos, axis=0) / np.diff(self.time)[:, None]
         moves = np.abs(slope) > 0.2 * np.sqrt((speed**2).mean(0))
-        return np.where(moves, place, first.mean(0)), np.where(moves, slope, 0.0)
+        return np.where(moves, place, self.qpos[:count].mean(0)), np.where(moves, slope, 0.0)
 
     def part(
         self, rows: Any = slice(None), commands: Any = slice(None), joints: Any = slice(None)
     ) -> Log:
         """Return the log of some rows, commands and joints: slices or masks."""
-        forward = self.feedforward
         return replace(
             self,
             joints=tuple(np.array(self.joints)[joints].tolist()),
@@ -120,20 +115,29 @@ class Log:
             qpos=self.qpos[rows][:, joints],
             command_time=self.command_time[commands],
             command=self.command[commands][:, joints],
-            feedforward=None if forward is None else forward[commands][:, joints],
+            lines=None if self.lines is None else self.lines[rows],
         )
 
-    def commands_at(self, time: Float64, table: Float64 | None = None) -> Float64:
+    def commands_at(self, time: Float64) -> Float64:
         """Return the commands that act at ``time`` (n,), as (n, joints); the first one also acts
         before its time.
-
-        ``table`` takes the place of the commands, such as the feedforward.
         """
-        table = self.command if table is None else table
         if self.held:
             index = np.searchsorted(self.command_time, time + 1e-9, side="right") - 1
-            return table[np.clip(index, 0, len(table) - 1)]
-        return interpolated(time, self.command_time, table)
+            return self.command[np.clip(index, 0, len(self.command) - 1)]
+        return interpolated(time, self.command_time, self.command)
+
+    def place(self, row: Any) -> str:
+        """Return the name of a row."""
+        return f"row {row + 1}" if self.lines is None else f"line {self.lines[row]}"
+
+    def error(self, problem: str, remedy: str, value: object = None) -> InvalidArgumentError:
+        """Return the error of this log."""
+        return InvalidArgumentError(self.source, problem, remedy=remedy, value=value)
+
+    def warn(self, problem: str) -> None:
+        """Warn about this log."""
+        warn(f"{self.source}: {problem}", LogWarning)
 
 
 def interpolated(time: Float64, known: Rows, table: Rows) -> Float64:
@@ -143,10 +147,8 @@ def interpolated(time: Float64, known: Rows, table: Rows) -> Float64:
     return np.stack([np.interp(time, known, column) for column in table.T], axis=1)
 
 
-def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[Log]:
+def checked(robot: Robot, log: Log) -> list[Log]:
     """Return the stretches of ``log`` between gaps in time, with continuous positions.
-
-    ``lines`` are the numbers of its rows in a file.
 
     Raises
     ------
@@ -156,72 +158,66 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
     """
     if log.is_checked:
         return [log]
-    places = [f"row {index + 1}" for index in range(len(log.time))]
-    if lines is not None:
-        places = [f"line {line}" for line in lines]
-    _check_finite(robot, log, places)
-    steps = np.diff(log.time, prepend=-np.inf)
-    if (steps < 0).any():
-        place = places[int(np.argmax(steps < 0))]
-        raise error(log.source, f"{place}: time decreases", "sort the rows")
-    repeated = steps == 0
-    if repeated.any():
-        first = places[int(np.argmax(repeated))]
-        problem = f"{repeated.sum()} rows repeat a time, the first at {first}: left out"
-        warn(f"{log.source}: {problem}", LogWarning)
-        places = [place for place, again in zip(places, repeated, strict=True) if not again]
-        # Commands of a recording have times of their own.
-        rows_are_commands = len(log.command_time) == len(repeated)
-        log = log.part(~repeated, ~repeated if rows_are_commands else slice(None))
+    _check_finite(robot, log)
+    log = _in_order(log)
     period = float(np.median(np.diff(log.time))) if len(log.time) > 1 else 0.0
     units = "time is in seconds, or the column is time_ms, time_us or time_ns"
     if period > LONGEST:
         problem = f"has one row per {period:.3g} s, too few to see friction and delay"
-        raise error(log.source, problem, f"record at 100 Hz or more; {units}")
-    gap = max(GAP, PERIODS * period)
-    cuts = np.flatnonzero(np.diff(log.time) > gap) + 1
+        raise log.error(problem, f"record at 100 Hz or more; {units}")
+    cuts = np.flatnonzero(np.diff(log.time) > max(GAP, PERIODS * period)) + 1
     parts = list[Log]()
     short = list[str]()
     for begin, end in pairwise([0, *cuts.tolist(), len(log.time)]):
-        part = _between(log, slice(begin, end), places) if len(cuts) else log
+        part = _between(log, begin, end) if len(cuts) else log
         if len(part.time) < MIN_ROWS or part.seconds < MIN_SECONDS:
-            short.append(f"{places[begin]} to {places[end - 1]}")
-            continue
-        parts.append(replace(_unwrapped(robot, part, places[begin:end]), is_checked=True))
+            short.append(f"{log.place(begin)} to {log.place(end - 1)}")
+        else:
+            parts.append(_unwrapped(robot, part))
     if not parts:
         problem = f"has {len(log.time)} rows of {log.seconds:.3g} s in {1 + len(cuts)} stretches"
         remedy = f"record {MIN_ROWS} rows and {MIN_SECONDS} s without a gap; {units}"
-        raise error(log.source, problem, remedy)
+        raise log.error(problem, remedy)
     if short:
-        problem = f"stretches between gaps in time are too short, left out: {short[0]} ..."
-        warn(f"{log.source}: {problem}", LogWarning)
+        log.warn(f"stretches between gaps in time are too short, left out: {short[0]} ...")
     return parts
 
 
-def _between(log: Log, rows: slice, places: list[str]) -> Log:
-    """Return the stretch ``rows`` of ``log``, with the commands that act in it."""
-    begin, end = log.time[rows.start], log.time[rows.stop - 1]
-    first = max(int(np.searchsorted(log.command_time, begin, "right")) - 1, 0)
-    last = int(np.searchsorted(log.command_time, end, "right")) + 1
-    source = f"{log.source}, {places[rows.start]} to {places[rows.stop - 1]}"
-    return replace(log.part(rows, slice(first, last)), source=source)
-
-
-def _check_finite(robot: Robot, log: Log, places: list[str]) -> None:
-    tables = {"qpos": log.qpos, log.kind: log.command, "feedforward": log.feedforward}
+def _check_finite(robot: Robot, log: Log) -> None:
     columns = {"time": log.time}
-    for quantity, table in tables.items():
-        if table is not None:
-            for joint, column in zip(log.joints, table.T, strict=True):
-                columns[f"{quantity}:{robot.joint_names[joint]}"] = column
+    for number, joint in enumerate(log.joints):
+        columns[f"qpos:{robot.joint_names[joint]}"] = log.qpos[:, number]
+        columns[f"{log.kind}:{robot.joint_names[joint]}"] = log.command[:, number]
     for name, column in columns.items():
         if not np.isfinite(column).all():
-            place = places[min(int(np.argmin(np.isfinite(column))), len(places) - 1)]
-            problem = f"{place}, column {name!r} is empty or not finite"
-            raise error(log.source, problem, "remove the row")
+            place = log.place(min(int(np.argmin(np.isfinite(column))), len(log.time) - 1))
+            raise log.error(f"{place}, column {name!r} is empty or not finite", "remove the row")
 
 
-def _unwrapped(robot: Robot, log: Log, places: list[str]) -> Log:
+def _in_order(log: Log) -> Log:
+    """Return ``log`` without rows that repeat a time."""
+    steps = np.diff(log.time, prepend=-np.inf)
+    if (steps < 0).any():
+        raise log.error(f"{log.place(np.argmax(steps < 0))}: time decreases", "sort the rows")
+    repeats = steps == 0
+    if not repeats.any():
+        return log
+    first = log.place(np.argmax(repeats))
+    log.warn(f"{repeats.sum()} rows repeat a time, the first at {first}: left out")
+    # Commands of a recording have times of their own.
+    commands = ~repeats if len(log.command_time) == len(repeats) else slice(None)
+    return log.part(~repeats, commands)
+
+
+def _between(log: Log, begin: int, end: int) -> Log:
+    """Return the rows from ``begin`` to ``end`` of ``log``, with the commands that act in them."""
+    first, last = np.searchsorted(log.command_time, log.time[[begin, end - 1]], "right")
+    source = f"{log.source}, {log.place(begin)} to {log.place(end - 1)}"
+    part = log.part(slice(begin, end), slice(max(first - 1, 0), last + 1))
+    return replace(part, source=source)
+
+
+def _unwrapped(robot: Robot, log: Log) -> Log:
     """Return ``log``, without gaps, with continuous positions, and setpoints on the turns closest
     to them.
     """
@@ -229,43 +225,43 @@ def _unwrapped(robot: Robot, log: Log, places: list[str]) -> Log:
     command = log.command.copy()
     limited = list[str]()
     for number, joint in enumerate(log.joints):
-        name, column = robot.joint_names[joint], qpos[:, number]
+        name = robot.joint_names[joint]
+        column = qpos[:, number]
         steps = np.diff(column)
-        turns = np.rint(steps / TURN)
-        if robot.units[joint] != "rad":
-            turns[:] = 0
+        turns = np.rint(steps / TURN) * (robot.units[joint] == "rad")
         wraps = turns.any()
         unclear = (np.abs(steps - TURN * turns) > CLEAR) | (np.abs(turns) > 2)
         if wraps and unclear.any():
-            at = int(np.argmax(unclear))
-            problem = f"{places[at + 1]}: joint {name!r} jumps by {steps[at]:.3g} rad"
+            row = np.argmax(unclear)
+            problem = f"{log.place(row + 1)}: joint {name!r} jumps by {steps[row]:.3g} rad"
             remedy = "give positions in rad, log more rows per second, or remove wrong rows"
-            raise error(log.source, problem, remedy)
-        if wraps and not robot.continuous[joint]:
-            limited.append(name)
-        elif not robot.continuous[joint]:
-            _check_unit(robot, log, joint, column, places)
+            raise log.error(problem, remedy)
+        if not robot.continuous[joint]:
+            if wraps:
+                limited.append(name)
+            else:
+                _check_unit(robot, log, joint, column)
         column[1:] -= TURN * np.cumsum(turns)
         if log.kind == "setpoint" and (wraps or robot.continuous[joint]):
             measured = np.interp(log.command_time, log.time, column)
             command[:, number] -= TURN * np.rint((command[:, number] - measured) / TURN)
     if limited:
-        problem = f"the positions of {', '.join(limited)} jump by whole turns, and were unwrapped"
-        remedy = "in the robot's file the type is not continuous: correct it"
-        warn(f"{log.source}: {problem}; {remedy}", LogWarning)
-    return replace(log, qpos=qpos, command=command)
+        names = ", ".join(limited)
+        problem = f"the positions of {names} jump by whole turns, and were unwrapped"
+        log.warn(f"{problem}; in the robot's file the type is not continuous: correct it")
+    return replace(log, qpos=qpos, command=command, is_checked=True)
 
 
-def _check_unit(robot: Robot, log: Log, joint: int, column: Float64, places: list[str]) -> None:
+def _check_unit(robot: Robot, log: Log, joint: int, column: Float64) -> None:
     """Raise InvalidArgumentError for positions far beyond the joint's limits."""
-    name, unit = robot.joint_names[joint], robot.units[joint]
-    low, high = robot.lower[joint], robot.upper[joint]
+    unit = robot.units[joint]
+    low = robot.lower[joint]
+    high = robot.upper[joint]
     beyond = (column < low - BEYOND[unit]) | (column > high + BEYOND[unit])
-    if not beyond.any():
-        return
-    index = int(np.argmax(beyond))
-    limits = f"far beyond the joint's limits, {low:g} to {high:g}"
-    remedy = f"positions are in {unit}; degrees need the option degrees (--degrees)"
-    remedy += "; a joint that turns freely is of type continuous"
-    problem = f"{places[index]}, column 'qpos:{name}' is {limits}"
-    raise error(log.source, problem, remedy, column[index])
+    if beyond.any():
+        row = np.argmax(beyond)
+        place = f"{log.place(row)}, column 'qpos:{robot.joint_names[joint]}'"
+        problem = f"{place} is far beyond the joint's limits, {low:g} to {high:g}"
+        remedy = f"positions are in {unit}; degrees need the option degrees (--degrees)"
+        remedy += "; a joint that turns freely is of type continuous"
+        raise log.error(problem, remedy, column[row])

@@ -2,11 +2,10 @@
 bags.
 
 Columns are ``time`` [s] (or ``time_ms``, ``time_us``, ``time_ns``), ``qpos:JOINT``, and
-``setpoint:JOINT``, ``effort:JOINT`` or ``measured_effort:JOINT``, optionally ``feedforward:JOINT``;
-others are ignored. A bag is a bag of ROS 1 or ROS 2 or an MCAP file with messages
-``sensor_msgs/JointState``, which hold values of joints by name, in any order. In the topic of
-measurements efforts are measured efforts. In the topic of commands positions are setpoints, and
-efforts are commanded efforts.
+``setpoint:JOINT``, ``effort:JOINT`` or ``measured_effort:JOINT``; others are ignored. A bag is a
+bag of ROS 1 or ROS 2 or an MCAP file with messages ``sensor_msgs/JointState``, which hold values of
+joints by name, in any order. In the topic of measurements efforts are measured efforts. In the
+topic of commands positions are setpoints, and efforts are commanded efforts.
 """
 
 from __future__ import annotations
@@ -23,8 +22,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import file_path
-from batchpid.checks.warn import warn
-from batchpid.errors import MissingDependencyError
+from batchpid.errors import MissingDependencyError, warn
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
 from batchpid.sim.recording.recording_files import RecordingError, read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
@@ -84,13 +82,13 @@ def read_logs(
     """
     logs = list[Log]()
     for path in map(Path, paths):
-        if not path.exists():
-            raise FileNotFoundError(2, "there is no such file", str(path))
         logs += _read(robot, path, kind, reading or Reading())
     return logs
 
 
 def _read(robot: Robot, path: Path, kind: CommandKind | None, reading: Reading) -> list[Log]:
+    if not path.exists():
+        raise FileNotFoundError(2, "there is no such file", str(path))
     if path.suffix.lower() in HDF5:
         try:
             return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
@@ -102,8 +100,10 @@ def _read(robot: Robot, path: Path, kind: CommandKind | None, reading: Reading) 
         columns = _read_bag(robot, path, reading)
     else:
         file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
-        columns, lines = read_csv(path, (*QUANTITIES, "time"))
-    return checked(robot, _build(robot, str(path), columns, kind, reading), lines)
+        columns, numbers = read_csv(path, (*QUANTITIES, "time"))
+        lines = np.array(numbers)
+    log = _build(robot, str(path), columns, kind, reading)
+    return checked(robot, replace(log, lines=lines))
 
 
 def logs_of_rollout(
@@ -124,6 +124,7 @@ def logs_of_rollout(
         f"was made under control {info.control!r}": info.control not in (None, "pid", "effort"),
         f"holds {recorded}s": kind not in (None, recorded),
         "was made with setpoint rates": bool(info.rates) and follows,
+        "was made with a feedforward": rollout.feedforward is not None,
         "has setpoints that a guard changed": bool(np.any(rollout.guarded)),
         "was made with a randomization": bool(info.randomization),
         "has params that were changed": info.params_changed and follows,
@@ -134,29 +135,25 @@ def logs_of_rollout(
         if holds:
             remedy = "record another run under control pid or effort"
             raise error(source, f"{problem}, which a fit cannot use", remedy)
-    joints = tuple(np.flatnonzero(robot.independent).tolist())
-
-    def table(rows: Any) -> Float64:
-        return np.asarray(rows, float)[:, env, joints]
-
+    joints = np.flatnonzero(robot.independent).tolist()
     logs = []
     for env in range(rollout.num_envs):
+        params = None
+        if info.params is not None and follows:
+            params = info.params.for_envs(slice(env, env + 1))
         log = Log(
             source if rollout.num_envs == 1 else f"{source}, env {env}",
-            joints,
+            tuple(joints),
             recorded,
             rollout.time,
-            table(rollout.qpos),
+            rollout.qpos[:, env, joints].astype(float),
             rollout.time - rollout.tick,
-            table(rollout.setpoint),
+            np.asarray(rollout.setpoint)[:, env, joints].astype(float),
             held=True,
             timestep=info.timestep,
             compensate=info.compensate,
+            params=params,
         )
-        if rollout.feedforward is not None:
-            log = replace(log, feedforward=table(rollout.feedforward))
-        if info.params is not None and follows:
-            log = replace(log, params=info.params.for_envs(slice(env, env + 1)))
         logs += checked(robot, log)
     return logs
 
@@ -177,34 +174,29 @@ def _build(
     name, unit = next(iter(times.items()))
     time = SECONDS[unit] * columns[name]
     by = columns_by_joint(robot, source, columns, QUANTITIES, reading.prefix)
+    if by["feedforward"]:
+        remedy = "log the complete efforts, or leave the columns out where they are 0"
+        raise error(source, "has a feedforward, which a fit does not simulate", remedy)
     # Measured efforts stand for commands that were not logged.
     measured = not by["effort"]
     by["effort"] = by["effort"] or by["measured_effort"]
     kind = kind or ("effort" if by["effort"] else "setpoint")
+    names = [name for name in robot.joint_names if name in by["qpos"] or name in by[kind]]
+    names = [name for name in names if robot.independent[robot.joint_names.index(name)]]
+    tables = dict[str, Float64]()
     for quantity in ("qpos", kind):
         if not by[quantity]:
             remedy = f"positions and commands are needed, e.g. {quantity}:{robot.joint_names[0]}"
             raise error(source, f"has no column {quantity}:JOINT", remedy)
-    if kind == "effort" and by["feedforward"]:
-        remedy = "give the gains of the law, or leave it out"
-        raise error(source, "has a feedforward, which efforts include", remedy)
-    used = [name for name in ("qpos", kind, "feedforward") if by[name]]
-    joints = [
-        joint
-        for joint in np.flatnonzero(robot.independent).tolist()
-        if any(robot.joint_names[joint] in by[quantity] for quantity in used)
-    ]
-    tables = dict[str, Float64]()
-    for quantity in used:
-        for joint in joints:
-            name = robot.joint_names[joint]
+        for name in names:
             if name not in by[quantity]:
                 remedy = "give all columns of a joint or none: without columns it rests"
                 raise error(f"{source}: column {quantity}:{name}", "is missing", remedy)
-        rows = [by[quantity][robot.joint_names[joint]] for joint in joints]
-        tables[quantity] = np.stack(rows, axis=1)
-        if reading.degrees and quantity in ("qpos", "setpoint"):
-            revolute = [robot.units[joint] == "rad" for joint in joints]
+        tables[quantity] = np.stack([by[quantity][name] for name in names], axis=1)
+    joints = [robot.joint_names.index(name) for name in names]
+    if reading.degrees:
+        revolute = [robot.units[joint] == "rad" for joint in joints]
+        for quantity in tables.keys() - {"effort"}:
             tables[quantity][:, revolute] = np.radians(tables[quantity][:, revolute])
     return Log(
         source,
@@ -215,7 +207,6 @@ def _build(
         time,
         tables[kind],
         held=reading.hold,
-        feedforward=tables.get("feedforward"),
         measured=measured and kind == "effort",
     )
 

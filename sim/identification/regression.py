@@ -75,7 +75,6 @@ class Motion(NamedTuple):
     qvel: Float64
     qacc: Float64
     command: Float64
-    feedforward: Float64 | None
 
     @property
     def top_speed(self) -> Float64:
@@ -100,9 +99,8 @@ class Guess(NamedTuple):
     costs: Float64
     """log(mean square of the residual / mean square of the motor's effort) of each joint."""
 
-    @property
     def cost(self) -> float:
-        """Mean of the costs."""
+        """Return the mean of the costs."""
         return float(self.costs.mean())
 
     @property
@@ -118,8 +116,7 @@ def smooth(log: Log, timestep: float) -> Motion:
     qpos = lowpass(interpolated(time, log.time, log.qpos), _cutoff(log), timestep)
     qvel = np.gradient(qpos, timestep, axis=0)
     qacc = np.gradient(qvel, timestep, axis=0)
-    forward = None if log.feedforward is None else log.commands_at(time, log.feedforward)
-    return Motion(qpos, qvel, qacc, log.commands_at(time), forward)
+    return Motion(qpos, qvel, qacc, log.commands_at(time))
 
 
 def _cutoff(log: Log) -> float:
@@ -176,7 +173,8 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
     moves |= moves.sum(0) < 50
     guesses = list[Guess]()
     names = ("armature", "damping", "friction", "strength", "bias", "cost")
-    for setpoint_delay, by_delay in zip(SETPOINT_DELAYS, efforts, strict=False):
+    shifts = SETPOINT_DELAYS if len(efforts) > 1 else (0.0,)
+    for setpoint_delay, by_delay in zip(shifts, efforts, strict=True):
         options = list[Guess]()
         for delay, effort in zip(delays, by_delay, strict=True):
             joints = []
@@ -187,17 +185,13 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
             values["delay"] = np.array([delay])
             values["setpoint_delay"] = np.array([setpoint_delay])
             options.append(Guess(values, costs))
-        guesses.append(min(options, key=_cost))
+        guesses.append(min(options, key=Guess.cost))
     # The sum of both delays is certain, but armature and damping make up for their shares.
     # Setpoints that were logged late are the last explanation.
-    least = min(map(_cost, guesses)) + ALIKE
-    alike = sorted([guess for guess in guesses if guess.cost < least], key=_cost)
+    least = min(map(Guess.cost, guesses)) + ALIKE
+    alike = sorted([guess for guess in guesses if guess.cost() < least], key=Guess.cost)
     usual = [guess for guess in alike if guess.values["setpoint_delay"][0] > -1e-9]
     return usual or alike
-
-
-def _cost(guess: Guess) -> float:
-    return guess.cost
 
 
 def _force(part: LogData, qpos: Float64, qvel: Float64, qacc: Float64 | None = None) -> Float64:
@@ -229,8 +223,6 @@ def _commanded(part: LogData, has_slew: bool) -> Float64:
     for step in range(steps):
         setpoint = motion.command[np.clip(step - late, 0, steps - 1)]
         efforts[step] = control.advance(setpoint, q[step], v[step], zero)
-    if motion.feedforward is not None:
-        efforts += motion.feedforward[:, None]
     return efforts.swapaxes(0, 1)
 
 
@@ -274,9 +266,9 @@ def better_reading(data: LogData, names: Sequence[str]) -> str:
 
     present = guess(first)
     odd = np.flatnonzero(present.odd).tolist()
-    costs = {words: guess(log).cost for words, log in _readings(first, names, odd)}
+    costs = {words: guess(log).cost() for words, log in _readings(first, names, odd)}
     best = min(costs.values())
-    if best > min(present.cost - EVIDENCE, WORST):
+    if best > min(present.cost() - EVIDENCE, WORST):
         return ""
     return next(words for words, cost in costs.items() if cost < best + ALIKE)
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.sim.identification.fit import INTERVAL, STEP, Fit, Problem, Solution
+from batchpid.sim.identification.fit import INTERVAL, STEP, Fit
 from batchpid.sim.identification.simulator import LogControl, changed_params
 from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknown, Unknowns
 from batchpid.sim.robot.robot import Robot
@@ -27,10 +28,10 @@ if TYPE_CHECKING:
 
 KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
-LEAST_GAIN = 0.1
+LEAST_SHARE = 0.1
 """Least share of the remaining squared error that a further effect has to explain to be named."""
-FEW = 20
-"""Most evaluations of the fit of a mass."""
+ALIKE = 0.5
+"""Least ratio of what a link's mass explains to what the best one does, to be considered, too."""
 EXPLAINS = 0.5
 """Share of the position error with ideal motors that a file may leave."""
 
@@ -41,30 +42,28 @@ class Identification:
 
     fit: Fit
     """The fit; ``fit.intervals`` are the intervals of ``unknowns``."""
-    errors: tuple[Float64, Float64, Float64]
-    """Root mean square of the position error by joint (joints,) on the held-out part of the logs:
-    of the robot as described and as identified, simulated from the logged state, and the latter
-    with the initial state of each window fitted.
-    """
-    advice: str
-    """Sentence on an effect that would lower the error most, or on its absence."""
     still: tuple[str, ...]
     """Joints that did not move."""
 
-    @classmethod
-    def of(cls, fit: Fit, still: list[str]) -> Identification:
-        """Return the result of a fit."""
-        point = fit.solution.point
-        described = replace(fit.problem, unknowns=replace(fit.problem.unknowns, entries=()))
-        errors = (
+    @cached_property
+    def errors(self) -> tuple[Float64, Float64, Float64]:
+        """Root mean square of the position error by joint (joints,) on the held-out part of the
+        logs: of the robot as described and as identified, simulated from the logged state, and the
+        latter with the initial state of each window fitted.
+        """
+        problem = self.fit.problem
+        point = self.fit.solution.point
+        described = replace(problem, unknowns=replace(problem.unknowns, entries=()))
+        return (
             described.error(np.zeros(0), free_states=False),
-            fit.problem.error(point, free_states=False),
-            fit.problem.error(point),
+            problem.error(point, free_states=False),
+            problem.error(point),
         )
-        words = advice(fit.fitted, fit.solution)
-        # Worker processes end with the fit.
-        fit = fit._replace(problem=replace(fit.problem, run=map))
-        return cls(fit, errors, words, tuple(still))
+
+    @cached_property
+    def advice(self) -> str:
+        """Sentence on an effect that would lower the error most, or on its absence."""
+        return advice(self.fit)
 
     @property
     def unknowns(self) -> Unknowns:
@@ -143,7 +142,9 @@ class Identification:
         entry = self.unknowns.entries[at]
         value = float(self.values[at])
         half = INTERVAL * float(self.fit.intervals.deviation[at])
-        low = max(value - half, entry.floor) if entry.is_positive else value - half
+        low = value - half
+        if KINDS[entry.kind].positive:
+            low = max(low, entry.floor)
         return value, low, value + half
 
     def _place(self, entry: Unknown) -> str | None:
@@ -169,14 +170,13 @@ class Identification:
         """Write :meth:`actuators` to a .yaml or .json file, with intervals, errors and the
         confidence region.
         """
-        rows = []
-        for at, row in enumerate(self.fit.intervals.correlation):
-            rows.append([float(f"{value:.5f}") for value in row[: at + 1]])
+        # With standard normal z, estimate + root @ z are draws from the region.
+        scale = self.fit.intervals.deviation
+        covariance = self.fit.intervals.correlation * scale * scale[:, None]
         region = {
             "unknowns": [[entry.kind, self._place(entry)] for entry in self.unknowns.entries],
             "estimate": self.values.tolist(),
-            "standard_deviation": self.fit.intervals.deviation.tolist(),
-            "correlation": rows,
+            "root": np.linalg.cholesky(covariance).tolist(),
         }
         about = self.document() | {KEY: region}
         bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
@@ -233,14 +233,13 @@ class Identification:
         windows = [window for window in self.fit.problem.windows if window.log == 0]
         after = replace(self.fit.problem, windows=windows)
         before = replace(after, unknowns=replace(self.unknowns, entries=()))
-        pairs = zip(
-            before.evaluate(np.zeros(0), free_states=False).residuals,
-            after.evaluate(self.fit.solution.point, free_states=False).residuals,
-            strict=True,
-        )
+        tables = []
+        for problem, point in ((before, np.zeros(0)), (after, self.fit.solution.point)):
+            still = np.zeros((0, len(point)))
+            tables.append(problem.evaluate(point, still, free_states=False, held_out=True))
         errors = []
-        for window, (first, last) in zip(windows, pairs, strict=True):
-            errors.append((window.time, window.fitted, first, last))
+        for window, first, last in zip(windows, *tables, strict=True):
+            errors.append((window.time, window.fitted, first[..., 0], last[..., 0]))
         names = [self.robot.joint_names[joint] for joint in self.joints]
         units = [self.robot.units[joint] for joint in self.joints]
         title = f"{self.robot.name}: position error, shaded where it was not fitted"
@@ -277,7 +276,7 @@ class Identification:
     def _cell(self, at: int) -> str:
         value, _, high = self.row(at)
         half = high - value
-        if half > abs(value) and self.unknowns.entries[at].is_positive:
+        if half > abs(value) and KINDS[self.unknowns.entries[at].kind].positive:
             return f"< {high:.2g}"
         # As many digits as the first one of the interval has, and one more.
         digits = np.log10(max(abs(value), half) / half)
@@ -312,66 +311,55 @@ def _columns(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
     return columns
 
 
-def advice(problem: Problem, solution: Solution) -> str:
+def advice(fit: Fit) -> str:
     """Return a sentence on the effect that would explain most of the remaining error of a fit, by
     its derivatives: each further effect is added alone to the unknowns of the fit.
     """
+    problem = fit.problem
     unknowns = problem.unknowns
-    effects = dict[str, list[Unknown]]()
-    for link in problem.data[0].plant.heavy_links:
-        effects[link] = [Unknown("mass", None, 1.0, 1.0, link=link)]
-    joints = range(len(unknowns.joints))
-    for kind, start in (("offset", 0.0), ("load_friction", 1e-4), ("kd", 1.0)):
-        size = float(KINDS[kind].size)
-        effects[kind] = [Unknown(kind, joint, start, size) for joint in joints]
-    if problem.data[0].drive.params is None:
-        del effects["kd"]
-    present = {entry.kind for entry in unknowns.entries}
-    effects = {name: new for name, new in effects.items() if new[0].kind not in present}
-    further = [entry for new in effects.values() for entry in new]
-    wide = replace(unknowns, entries=(*unknowns.entries, *further))
-    count = len(solution.point)
-    coordinates = [entry.coordinate(entry.start) for entry in further]
-    point = np.concatenate([solution.point, coordinates])
-    steps = STEP * np.eye(len(point))
-    wider = replace(problem, unknowns=wide)
-    residual, matrix = wider.system(wider.evaluate(point, steps), point, solution.size)
-    # Without the prior of the further unknowns: any size of an effect is as likely.
-    weight = (1 + residual**2 / 4) ** -0.25
-    weight[len(residual) - len(further) :] = 0.0
-    residual = weight * residual
-    triangle: Any = np.linalg.qr(np.column_stack([weight[:, None] * matrix, residual]), mode="r")
-    gains = dict[str, float]()
-    column = count
-    for name, new in effects.items():
-        columns = [*range(count), *range(column, column + len(new))]
-        column += len(new)
-        change, *_ = np.linalg.lstsq(triangle[:, columns], -triangle[:, -1], rcond=1e-10)
-        left = triangle[:, -1] + triangle[:, columns] @ change
-        gains[name] = 1 - float(left @ left) / float(residual @ residual)
-    name = max(gains, key=lambda name: gains[name], default="")
-    if not name or gains[name] < LEAST_GAIN:
-        return "no further effect that was tried would explain a tenth of the remaining error"
-    kind = effects[name][0].kind
-    if kind != "mass":
-        words = f"{kind} would explain {100 * gains[name]:.0f} % of the remaining squared error"
-        return f"{words} (extras: {kind})"
-    # A heavier link is a lighter other one with weaker motors: fits tell which changes least.
     links = problem.data[0].plant.heavy_links
-    changes = dict[float, str]()
-    for link in sorted(links, key=lambda link: -gains[link])[:2]:
-        wider = replace(
-            problem, unknowns=replace(unknowns, entries=(*unknowns.entries, *effects[link]))
-        )
-        fit = wider.solve(np.append(solution.point, 1.0), FEW, solution.size)
-        values = wider.unknowns.values(fit.point[None])[0]
-        factors = [KINDS[entry.kind].neutral == 1.0 for entry in wider.unknowns.entries]
-        percent = 100 * (values[-1] - 1)
-        more = "heavier" if percent > 0 else "lighter"
-        words = f"link {link} {abs(percent):.0f} % {more}"
-        changes[np.abs(np.log(values[factors])).sum()] = words
-    words = changes[min(changes)]
-    return f"{words} would explain most of the error (extras: mass), or the strengths: weigh it"
+    further = [Unknown("mass", None, 1.0, 1.0, link=link) for link in links]
+    for joint in range(len(unknowns.joints)):
+        further.append(Unknown("offset", joint, 0.0, 0.01))
+        further.append(Unknown("load_friction", joint, 1e-4, 0.05))
+    present = {entry.kind for entry in unknowns.entries}
+    further = [entry for entry in further if entry.kind not in present]
+    names = [entry.link or entry.kind for entry in further]
+    point = np.append(fit.solution.point, [entry.coordinate(entry.start) for entry in further])
+    wide = replace(problem, unknowns=replace(unknowns, entries=(*unknowns.entries, *further)))
+    evaluation = wide.evaluate(point, STEP * np.eye(len(point)))
+    residual, matrix = wide.system(evaluation, point, fit.solution.size)
+    # Without the prior of the further unknowns: any size of an effect is as likely.
+    rows = len(residual) - len(further)
+    table = np.column_stack([matrix, residual])[:rows]
+    weight = (1 + residual[:rows] ** 2 / 4) ** -0.25
+    triangle: Any = np.linalg.qr(weight[:, None] * table, mode="r")
+    target = triangle[:, -1]
+    shares = dict[str, float]()
+    changes = dict[str, Float64]()
+    for name in dict.fromkeys(names):
+        columns = np.append(np.ones(len(unknowns.entries), bool), np.array(names) == name)
+        slopes = triangle[:, :-1][:, columns]
+        change, *_ = np.linalg.lstsq(slopes, -target, rcond=1e-10)
+        shares[name] = 1 - float(((target + slopes @ change) ** 2).sum() / (target @ target))
+        changes[name] = change
+    best = max(shares, key=lambda name: shares[name], default="")
+    if not best or shares[best] < LEAST_SHARE:
+        return "no further effect that was tried would explain a tenth of the remaining error"
+    if best in KINDS:
+        percent = 100 * shares[best]
+        return f"{best} would explain {percent:.0f} % of the squared error (extras: {best})"
+    # A heavier link is a lighter other one with weaker motors: the likely one has factors near 1.
+    factors = [KINDS[entry.kind].neutral == 1.0 for entry in (*unknowns.entries, further[0])]
+    sizes = dict[float, str]()
+    for link, share in shares.items():
+        if link not in KINDS and share > ALIKE * shares[best]:
+            values = np.append(fit.solution.point, 1.0) + changes[link]
+            sizes[float(np.abs(values - 1)[factors].sum())] = link
+    link = sizes[min(sizes)]
+    more = "heavier" if changes[link][-1] > 0 else "lighter"
+    words = f"link {link} {more} than described would explain most of the error (extras: mass)"
+    return f"{words}, or the strengths: weigh it"
 
 
 def draw_motors(
@@ -380,8 +368,8 @@ def draw_motors(
     """Return ``count`` sets of motors of ``robot``, drawn from the confidence region in an
     actuators file.
 
-    With the estimate m, standard deviations d and correlations R, a draw is m + d * (R^1/2 z) with
-    normal z, within the bounds of the unknowns. Effects outside of the region keep their values in
+    With the estimate m and the root L of the covariance L L^T, a draw is m + L z with normal z,
+    within the bounds of the unknowns. Effects outside of the region keep their values in
     the file. Friction and damping are in addition to the robot's description. For
     ``robot.tuned(actuators=...)`` or a Runner with as many envs.
 
@@ -396,18 +384,12 @@ def draw_motors(
     nominal = load_robot_actuators(str(path), robot)
     try:
         region = documents.read(path)["about"][KEY]
-        correlation = np.zeros((len(region["unknowns"]),) * 2)
-        for at, row in enumerate(region["correlation"]):
-            correlation[at, : at + 1] = row
-            correlation[: at + 1, at] = row
         entries = []
         for kind, place in region["unknowns"]:
             joint = robot.joint_names.index(place) if KINDS[kind].per == "joint" else None
             entries.append(Unknown(kind, joint, 0.0, 1.0))
-        values, vectors = np.linalg.eigh(correlation)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
         normal = np.random.default_rng(seed).normal(size=(count, len(entries)))
-        points = region["estimate"] + region["standard_deviation"] * (normal @ root.T)
+        points = region["estimate"] + normal @ np.transpose(region["root"])
     except (KeyError, IndexError, TypeError, ValueError) as bad:
         problem = f"is missing or cannot be read ({bad})"
         remedy = "write the file with `batchpid identify` of this robot"

@@ -110,8 +110,6 @@ class Stretch(NamedTuple):
     """
     past: int
     """Number of steps before the start, equal in all stretches of a simulation."""
-    feedforward: Float64 | None
-    """Efforts that are added to the efforts of the law (past + steps, joints)."""
     step: Any
     """Sim step whose end is at or after each measured row (rows,)."""
     before: Float64
@@ -119,9 +117,9 @@ class Stretch(NamedTuple):
 
 
 class Plant:
-    """Logged ``joints`` of ``robot``, with a known ``payload`` at its tool [kg]."""
+    """Logged ``joints`` of ``robot``; those that are ``free`` (joints,) have no limits."""
 
-    def __init__(self, robot: Robot, joints: tuple[int, ...], payload: float = 0.0) -> None:
+    def __init__(self, robot: Robot, joints: tuple[int, ...], free: Any = False) -> None:
         logged = list(joints)
         coupling = robot.coupling
         moves = np.isin(coupling.leader, joints)
@@ -132,13 +130,12 @@ class Plant:
             ratio = coupling.multiplier[joint]
             followers.append(Follower(number[joint], leader, ratio, coupling.offset[joint]))
         tree = robot.rigid_tree.fixed_at(coupling.positions(robot.start), moves)
-        self._payload = payload
         self._tool = robot.rigid_tree.tool
         self._description = replace(tree, coupling=Coupling.of(tree.dof, followers))
         self._trees = dict[Masses, RigidTree]()
         self.columns = number[logged] if followers else None
         """Joints of the tree that are logged; None for all."""
-        free = robot.continuous[logged]
+        free = free | robot.continuous[logged]
         self.low = np.where(free, -np.inf, robot.lower[logged])[None]
         self.high = np.where(free, np.inf, robot.upper[logged])[None]
 
@@ -153,15 +150,13 @@ class Plant:
         bodies = np.array(tree.link_bodies)
         mass = np.array(tree.mass)
         inertia = np.array(tree.inertia)
-        payload = self._payload
         for link, value in masses:
             if link == PAYLOAD:
-                payload += value
-                continue
-            members = bodies == bodies[tree.index(link)]
-            mass[members] *= value
-            inertia[members] *= value
-        mass[tree.index(self._tool)] += payload
+                mass[tree.index(self._tool)] += value
+            else:
+                members = bodies == bodies[tree.index(link)]
+                mass[members] *= value
+                inertia[members] *= value
         # An evaluation has some tens of robots; the next one has others.
         if len(self._trees) > 100:
             self._trees.clear()
@@ -394,47 +389,39 @@ def simulate(
     dt = drive.timestep
     many = len(stretches)
     count = len(states)
+    past = stretches[0].past
     rows = candidates.repeated(many)
-    offset = rows.actuators.position_offset
-    offset = 0.0 if offset is None else offset
+    offset: Any = rows.actuators.position_offset
+    if offset is None:
+        offset = 0.0
     starts = np.array([[stretch.qpos, stretch.qvel] for stretch in stretches])
     q = np.concatenate(starts[:, 0] + states[:, None, 0]) - offset
     v = np.concatenate(starts[:, 1] + states[:, None, 1])
+    commands = _padded([stretch.command for stretch in stretches])
     # State of the robots: dynamics, compensation, control with the efforts before the first step.
     dynamics = Dynamics(plant, rows.masses, q, v)
     dynamics.update()
     measured = np.array(q + offset)
-    speed = np.zeros_like(v) if drive.compensate == "gravity" else v
     described = None
     if drive.compensate != "none":
+        speed = np.zeros_like(v) if drive.compensate == "gravity" else v
         described = Dynamics(plant, [()] * len(q), measured, speed)
         described.update()
-    commands = _padded([stretch.command for stretch in stretches])
-    past = stretches[0].past
     efforts = None
     if drive.params is None and past:
         efforts = np.tile(commands[past - 1 :: -1][:past], (1, count, 1))
         if described is not None and drive.through:
-            efforts = efforts + described.force
+            efforts += described.force
     control = SimulatedControl(drive, rows, dynamics, q, v, efforts)
-    forwards = None
-    if any(stretch.feedforward is not None for stretch in stretches):
-        tables = []
-        for stretch in stretches:
-            zero = np.zeros_like(stretch.command)
-            tables.append(zero if stretch.feedforward is None else stretch.feedforward)
-        forwards = _padded(tables)
     # Setpoints of each robot are late by whole steps and a share of a step.
     late = rows.setpoint_delay / dt
     whole = np.floor(late).astype(int)
     share = (late - whole)[:, None]
-    last = len(commands) - 1
     stretch_of = np.tile(np.arange(many), count)
     # Inertias that are added to the mass matrix: armature, and damping, which is implicit.
     added = np.array(control.armature)
     if control.friction.viscous is not None:
         added += dt * control.friction.viscous
-    native = native_rows.in_use()
     zero = np.zeros_like(q)
     track = np.empty((len(commands) - past, 2, *q.shape))
     with np.errstate(all="ignore"):
@@ -443,10 +430,10 @@ def simulate(
                 dynamics.update()
             if step % REFRESH_STEPS == 0:
                 control.refresh(dynamics.matrix)
-            command = commands[np.clip(past + step - whole, 0, last), stretch_of]
+            newest = np.minimum(past + step - whole, len(commands) - 1)
+            command = commands[np.maximum(newest, 0), stretch_of]
             if share.any():
-                older = commands[np.clip(past + step - whole - 1, 0, last), stretch_of]
-                command += share * (older - command)
+                command += share * (commands[np.maximum(newest - 1, 0), stretch_of] - command)
             # What the robot compensates is added to the command, or cancels forces exactly.
             force = dynamics.force
             passive = zero
@@ -457,19 +444,8 @@ def simulate(
                     passive = described.force
                 else:
                     force = force - described.force
-            if forwards is not None:
-                passive = passive + np.tile(forwards[past + step], (count, 1))
             effort = control.advance(command, q, v, passive) - force
-            if native is not None:
-                native.move(
-                    *q.shape, dt, q, v, dynamics.matrix, effort, added, plant.low, plant.high
-                )
-            else:
-                inertia = dynamics.matrix + added[:, :, None] * np.eye(q.shape[1])
-                v += dt * np.linalg.solve(inertia, effort[..., None])[..., 0]
-                q += dt * v
-                v[...] = np.where((q < plant.low) | (q > plant.high), 0.0, v)
-                np.clip(q, plant.low, plant.high, out=q)
+            _move(plant, dt, q, v, dynamics.matrix, effort, added)
             track[step, 0] = q + offset
             track[step, 1] = v
     track = track.reshape(len(track), 2, count, many, q.shape[1])
@@ -480,6 +456,27 @@ def simulate(
         place = np.where(np.abs(place) < DIVERGED, place, np.inf)
         positions.append(place.swapaxes(0, 1))
     return positions
+
+
+def _move(
+    plant: Plant,
+    dt: float,
+    q: Float64,
+    v: Float64,
+    matrix: Float64,
+    effort: Float64,
+    added: Float64,
+) -> None:
+    """Move the robots by one step, in place."""
+    native = native_rows.in_use()
+    if native is not None:
+        native.move(*q.shape, dt, q, v, matrix, effort, added, plant.low, plant.high)
+        return
+    inertia = matrix + added[:, :, None] * np.eye(q.shape[1])
+    v += dt * np.linalg.solve(inertia, effort[..., None])[..., 0]
+    q += dt * v
+    v[...] = np.where((q < plant.low) | (q > plant.high), 0.0, v)
+    np.clip(q, plant.low, plant.high, out=q)
 
 
 def _padded(tables: Sequence[Float64]) -> Float64:

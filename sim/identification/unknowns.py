@@ -52,7 +52,7 @@ KINDS = {
     "effort_scale": Kind("log", "joint", 1.0, 0.3, 1.0, "strength"),
     "bias": Kind("motor", "joint", "effort", 10.0, field="bias", positive=False),
     "delay": Kind("motor", "robot", 2e-3, 3.0, field="command_delay", most=0.1),
-    "setpoint_delay": Kind("log", "robot", 5e-3, 10.0, positive=False),
+    "setpoint_delay": Kind("log", "robot", 5e-3, 10.0, most=0.2),
     "payload": Kind("robot", "robot", 0.1, 4.0),
     "load_friction": Kind("motor", "joint", 0.05, 2.0, field="load_friction", most=0.9),
     "static": Kind("motor", "joint", "friction", 2.0, field="static"),
@@ -82,8 +82,6 @@ EXTRAS = {
     "slew": ("slew",),
 }
 """Kinds that a fit has on request."""
-LAW = ("gain", "kd", "saturation", "slew")
-"""Extras of a law."""
 DESCRIBED = {"damping": "damping", "friction": "friction"}
 """Kinds to which the robot's description contributes, and the name there. Values of a fit include
 that part.
@@ -106,11 +104,6 @@ class Unknown:
     link: str | None = None
 
     @property
-    def is_positive(self) -> bool:
-        """True if the coordinate is a logarithm."""
-        return KINDS[self.kind].positive
-
-    @property
     def prior(self) -> tuple[float, float]:
         """Mean and standard deviation of the prior, coordinates.
 
@@ -125,7 +118,7 @@ class Unknown:
     def coordinate(self, value: float) -> float:
         """Return the coordinate of a value in the fit."""
         share = (value - self.floor) / self.size
-        if not self.is_positive:
+        if not KINDS[self.kind].positive:
             return share
         share = max(share, 0.1 * ROUND)
         return share - ROUND**2 / share
@@ -133,7 +126,7 @@ class Unknown:
     def values(self, coordinates: Float64) -> Float64:
         """Return the values at some coordinates."""
         shares = coordinates
-        if self.is_positive:
+        if KINDS[self.kind].positive:
             shares = 0.5 * (coordinates + np.sqrt(coordinates**2 + 4 * ROUND**2))
         return np.minimum(self.floor + self.size * shares, KINDS[self.kind].most)
 
@@ -173,7 +166,7 @@ class Unknowns:
                 floor = 0.0
                 if name in DESCRIBED:
                     floor = getattr(robot, DESCRIBED[name])[joints[column]]
-                start = size if kind.positive else 0.0
+                start = size * kind.positive
                 if name in starts:
                     start = starts[name][column]
                 if kind.positive:
@@ -184,43 +177,41 @@ class Unknowns:
     @property
     def start(self) -> Float64:
         """Point at the start of a fit."""
-        start: Float64 = self.points(np.array([[entry.start for entry in self.entries]]))[0]
-        return start
+        return self.points(np.array([entry.start for entry in self.entries])[None])[0]
 
     @property
     def prior(self) -> Float64:
         """Means and standard deviations of the prior (2, unknowns)."""
-        return np.array([entry.prior for entry in self.entries]).reshape(-1, 2).T
-
-    @property
-    def _delays(self) -> list[int]:
-        """Places of the delays of setpoints and efforts; none unless both are unknown.
-
-        The coordinate of the first one is their sum. Logs show the sum far better than its parts,
-        and a fit follows a valley that is straight.
-        """
-        kinds = [entry.kind for entry in self.entries]
-        both = ("setpoint_delay", "delay")
-        return [kinds.index(kind) for kind in both] if {*both} <= {*kinds} else []
+        rows = [entry.prior for entry in self.entries]
+        return np.array(rows, dtype=np.float64).reshape(-1, 2).T
 
     def values(self, points: Float64) -> Float64:
-        """Return the values (n, unknowns) at ``points`` (n, unknowns)."""
+        """Return the values (n, unknowns) at ``points`` (n, unknowns).
+
+        The coordinate of a delay of setpoints holds for the sum with that of efforts: logs show the
+        sum far better than its parts, and a fit follows a valley that is straight.
+        """
         values = np.array(points)
-        for at, entry in enumerate(self.entries):
-            values[:, at] = entry.values(points[:, at])
-        if self._delays:
-            setpoint, effort = self._delays
-            values[:, setpoint] -= values[:, effort]
+        delay = np.zeros(len(points))
+        for column, entry in enumerate(self.entries):
+            coordinate = points[:, column]
+            if entry.kind == "setpoint_delay":
+                coordinate = coordinate - delay / entry.size
+            values[:, column] = entry.values(coordinate)
+            if entry.kind == "delay":
+                delay = values[:, column]
         return values
 
     def points(self, values: Float64) -> Float64:
         """Return the coordinates (n, unknowns) of ``values`` (n, unknowns)."""
         points = np.array(values)
-        if self._delays:
-            setpoint, effort = self._delays
-            points[:, setpoint] += points[:, effort]
-        for at, entry in enumerate(self.entries):
-            points[:, at] = [entry.coordinate(value) for value in points[:, at]]
+        delay = np.zeros(len(values))
+        for column, entry in enumerate(self.entries):
+            points[:, column] = [entry.coordinate(value) for value in values[:, column]]
+            if entry.kind == "setpoint_delay":
+                points[:, column] += delay / entry.size
+            if entry.kind == "delay":
+                delay = values[:, column]
         return points
 
     def tables(self, values: Float64) -> dict[str, Float64]:
@@ -233,13 +224,12 @@ class Unknowns:
             row = getattr(self.robot, described)[list(self.joints)]
             if row.any():
                 tables[name] = np.tile(row, (len(values), 1)).astype(float)
-        for at, entry in enumerate(self.entries):
+        for column, entry in enumerate(self.entries):
             kind = KINDS[entry.kind]
-            if kind.target == "robot":
-                continue
-            table = tables.setdefault(entry.kind, np.full(shape, kind.neutral))
-            columns = slice(None) if entry.joint is None else entry.joint
-            table[:, columns] = values[:, at, None] if entry.joint is None else values[:, at]
+            if kind.target != "robot":
+                table = tables.setdefault(entry.kind, np.full(shape, kind.neutral))
+                where = slice(None) if entry.joint is None else slice(entry.joint, entry.joint + 1)
+                table[:, where] = values[:, column, None]
         return tables
 
     def candidates(self, values: Float64) -> PlantCandidates:
@@ -259,9 +249,9 @@ class Unknowns:
         if "command_delay" in fields:
             fields["max_delay"] = fields["command_delay"].max(keepdims=True)
         masses = [list[tuple[str, float]]() for _ in values]
-        for at, entry in enumerate(self.entries):
+        for column, entry in enumerate(self.entries):
             if KINDS[entry.kind].target == "robot":
-                for row, value in zip(masses, values[:, at].tolist(), strict=True):
+                for row, value in zip(masses, values[:, column].tolist(), strict=True):
                     row.append((entry.link or PAYLOAD, value))
         return PlantCandidates(Actuators(**fields), law, setpoint_delay, list(map(tuple, masses)))
 

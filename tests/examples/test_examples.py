@@ -123,7 +123,7 @@ def test_the_integral_removes_the_error_of_an_uncompensated_drive(run, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["torque", "servo", "velocity", "mit"])
+@pytest.mark.parametrize("kind", ["torque", "servo", "velocity"])
 def test_the_motor_of_each_kind_of_controller_is_identified(run, tmp_path, kind):
     (line,) = [
         each

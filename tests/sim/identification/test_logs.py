@@ -97,9 +97,7 @@ FAULTS = {
     },
     r"one row per 5 s": table(time=1e3 * TIME),
     r"has 40 rows": {name: values[:40] for name, values in table().items()},
-    r"has a feedforward, which efforts include": (
-        table("effort") | {f"feedforward:{joint}": TIME for joint in JOINTS}
-    ),
+    r"has a feedforward": (table("effort") | {f"feedforward:{joint}": TIME for joint in JOINTS}),
 }
 
 

@@ -49,7 +49,7 @@ def stretch_of(commands, start) -> Stretch:
     """Return a stretch whose rows are the ends of ticks."""
     table = np.repeat(commands, STEPS, axis=0)
     ends = np.arange(STEPS - 1, len(table), STEPS)
-    return Stretch(start, np.zeros(2), table, 0, None, ends, np.zeros(len(ends)))
+    return Stretch(start, np.zeros(2), table, 0, ends, np.zeros(len(ends)))
 
 
 def simulated(
