@@ -35,7 +35,7 @@ from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependen
 from batchpid.gains import presets
 from batchpid.gains.design import design_gains
 from batchpid.gains.stability import spectral_radius, stability_bound
-from batchpid.io.params_files import (
+from batchpid.io.documents import (
     dumps_params,
     load_about,
     load_params,

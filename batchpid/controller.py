@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document
-from batchpid.arrays.read_only import read_only
+from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.records import frozen
 from batchpid.backends import JAXBackend, NumPyBackend, declined
 from batchpid.checks.validate import (
@@ -49,7 +49,7 @@ class BatchPID:
     backend
         "numpy": computed by the native extension where that was built, with the bytes of NumPy but
         without its floating-point warnings. Or "jax": compiled once, with the state's buffers
-        donated from call to call, and on a CPU block by block where the batch is large.
+        donated from call to call.
     terms
         Keep the :class:`batchpid.Terms` of the last call, at the cost of computing them.
     joint_names
@@ -281,22 +281,11 @@ class BatchPID:
 
     def _check_out(self, out: Any) -> None:
         dtype = self._params.dtype
-        remedy = "leave it out, or give np.empty((num_envs, joints), params.dtype)"
-        if self._backend != "numpy":
-            problem = f"is not for backend {self._backend!r}"
-            remedy = "leave it out"
-        elif not isinstance(out, np.ndarray):
-            problem = f"is a {type(out).__name__}, not an array of NumPy"
-        elif out.dtype != dtype or out.shape != self._shape:
-            problem = f"is {out.dtype} {out.shape}, not {dtype} {self._shape}"
-        elif not (out.flags.c_contiguous and out.flags.writeable and out.flags.aligned):
-            if not out.flags.writeable:
-                problem = "cannot be written to"
-            else:
-                problem = "is not contiguous"
-        else:
-            return
-        raise InvalidArgumentError("out", problem, remedy=remedy)
+        fits = isinstance(out, np.ndarray) and out.dtype == dtype and out.shape == self._shape
+        if self._backend != "numpy" or not fits or not out.flags.carray:
+            problem = "is not a contiguous, writeable array of NumPy, or not for this backend"
+            remedy = f"leave it out, or give np.empty({self._shape}, {str(dtype)!r})"
+            raise InvalidArgumentError("out", problem, remedy=remedy)
 
     def _array(self, name: str, value: Any, exact: bool = False) -> Array:
         """Return ``value`` as an array of the backend that broadcasts to (envs, joints), or is

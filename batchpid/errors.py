@@ -1,4 +1,4 @@
-"""Errors of batchpid: one root, whose children carry their data.
+"""Errors of batchpid: one root, whose children carry their data; and its warnings.
 
 A message says what is wrong, where (argument, joint, env), the value, and the remedy.
 """
@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import copyreg
 import reprlib
-from typing import Any
+import sys
+import warnings
+from types import FrameType
+from typing import Any, ClassVar
 
 _SHORT = reprlib.Repr()
 _SHORT.maxstring, _SHORT.maxother = 500, 200
+_INSIDE = ("batchpid.", "importlib.")
 
 
 class BatchPIDError(Exception):
@@ -143,3 +147,46 @@ class InUseError(BatchPIDError, RuntimeError):
     """The object is in use: by another thread, a signal handler, or the process from which this one
     was forked.
     """
+
+
+class SingleOwner:
+    """Base of objects that can be neither copied nor pickled: two would close each other's
+    processes and files.
+    """
+
+    instead: ClassVar[str] = "make another one"
+    """Alternative to a copy, for the error message."""
+
+    def __reduce__(self) -> Any:
+        """Refuse; copy.copy, copy.deepcopy and pickle call it.
+
+        Raises
+        ------
+        NotCopyableError
+            Always.
+        """
+        name = type(self).__name__
+        raise NotCopyableError(
+            f"a {name} can be neither copied nor pickled, since it owns processes, scenes or files;"
+            f" {self.instead}"
+        )
+
+
+def warn(message: str, category: type[Warning]) -> None:
+    """Issue a warning at the line of the caller's own program, however deep in batchpid it arises."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and _is_inside(frame):
+        frame = frame.f_back
+    place = frame.f_globals
+    warnings.warn_explicit(
+        message,
+        category,
+        frame.f_code.co_filename,
+        frame.f_lineno,
+        place.get("__name__", "sys"),
+        place.setdefault("__warningregistry__", {}),
+    )
+
+
+def _is_inside(frame: FrameType) -> bool:
+    return f"{frame.f_globals.get('__name__', '')}.".startswith(_INSIDE)

@@ -19,15 +19,14 @@ transient response", Trans. AIEE 72 (1953); total variation of the effort after 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
+from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import broadcast, number, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 
@@ -64,27 +63,11 @@ class StepMetrics(NamedTuple):
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")
 
-    def over_envs(self, statistic: Callable[[Float64], Any]) -> StepMetrics:
-        """Return each figure reduced over envs to (joints,) by ``statistic``, a function of one
-        joint's figures.
-
-        Undefined figures (NaN) are left out; a joint that has no other stays NaN.
-        """
-
-        def reduce(figure: Float64) -> Float64:
-            # Joints may lack different envs, so each column is reduced by itself.
-            columns = (column[~np.isnan(column)] for column in figure.T)
-            return np.array([statistic(column) if column.size else np.nan for column in columns])
-
-        return StepMetrics(*map(reduce, self))
-
     def worst(self) -> StepMetrics:
-        """Return the worst case over envs, (joints,)."""
-        return self.over_envs(np.max)
-
-    def median(self) -> StepMetrics:
-        """Return the median over envs, (joints,); inf if half of them or more are inf."""
-        return self.over_envs(lambda column: np.quantile(column, 0.5, method="higher"))
+        """Return the worst case over envs, (joints,); undefined figures (NaN) are left out where
+        another env has one.
+        """
+        return StepMetrics(*map(np.fmax.reduce, self))
 
 
 @np.errstate(divide="ignore", invalid="ignore")
@@ -142,12 +125,9 @@ def step_metrics(
     # Everything takes the shape of the measurement.
     r = broadcast("setpoint", setpoint, y.shape)
     floor = broadcast("absolute_band", absolute_band, y.shape[1:])
-    if effort is None:
-        u = None
-    else:
-        u = broadcast("effort", effort, y.shape)
+    u = broadcast("effort", np.nan if effort is None else effort, y.shape)
     if saturated is None:
-        limited = None
+        limited: Rows = np.full(y.shape, np.nan)
     else:
         limited = read_array("saturated", saturated, "b")
     if start is not None:
@@ -184,7 +164,6 @@ def step_metrics(
     def judged(figure: ArrayLike) -> Float64:
         return np.where(finite, figure, np.inf)
 
-    nothing = np.full(size.shape, np.nan)
     return StepMetrics(
         rise_time=judged(np.where(moves, rise, np.nan)),
         overshoot=judged(overshoot),
@@ -193,9 +172,9 @@ def step_metrics(
         peak_deviation=judged(beyond),
         iae=judged(np.trapezoid(np.abs(error), t, axis=0)),
         itae=judged(np.trapezoid(t[:, None, None] * np.abs(error), t, axis=0)),
-        effort_peak=nothing if u is None else _or_inf(np.abs(u).max(0)),
-        effort_variation=nothing if u is None else _or_inf(np.abs(np.diff(u, axis=0)).sum(0)),
-        saturation_share=nothing if limited is None else np.mean(limited, axis=0),
+        effort_peak=judged(np.abs(u).max(0)),
+        effort_variation=judged(np.abs(np.diff(u, axis=0)).sum(0)),
+        saturation_share=np.mean(limited, axis=0),
     )
 
 
@@ -224,10 +203,6 @@ def _settling_time(t: Float64, error: Float64, tolerance: Float64) -> Float64:
     share = np.clip((edge - before) / (after - before), 0.0, 1.0)
     settled = np.where(outside[-1], np.inf, t[k] + share * (t[k + 1] - t[k]))
     return np.where(outside.any(0), settled, 0.0)
-
-
-def _or_inf(figure: Float64) -> Float64:
-    return np.where(np.isfinite(figure), figure, np.inf)
 
 
 def _row(table: Float64, k: Rows) -> Float64:

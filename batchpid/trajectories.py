@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.display import array_summary
-from batchpid.checks.validate import at_least, broadcast, entries, positive, read_array, time_step
+from batchpid.arrays.records import array_summary
+from batchpid.checks.validate import at_least, broadcast, positive, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.frames import compose
 
@@ -52,40 +52,18 @@ class Trajectory(NamedTuple):
         """Number of ticks."""
         return len(self.time)
 
-    def then(self, other: Trajectory) -> Trajectory:
-        """Return this trajectory followed by ``other``, which has the same tick and shape.
-
-        Raises
-        ------
-        InvalidArgumentError
-            The tick or the shape differs.
-        """
-        # Times are ticks times dt: sums of times would collect rounding.
-        dt = self.time[0]
-        if other.position.shape[1:] != self.position.shape[1:]:
-            problem = (
-                f"moves {other.position.shape[1:]} (..., joints), not {self.position.shape[1:]}"
-            )
-            raise InvalidArgumentError("other", problem, remedy="give both the same shape")
-        if not math.isclose(other.time[0], dt, rel_tol=1e-9):
-            remedy = f"use dt={dt:g} in both"
-            raise InvalidArgumentError(
-                "other", "has another tick", value=float(other.time[0]), remedy=remedy
-            )
-        time = dt * np.arange(1, self.ticks + other.ticks + 1)
-        return Trajectory(
-            time, *(np.concatenate(pair) for pair in zip(self[1:], other[1:], strict=True))
-        )
-
     def hold(self, duration: float) -> Trajectory:
         """Return this trajectory with its last position held for ``duration`` [s], rounded up to
         whole ticks.
         """
-        # Rest has the last position, and no rate.
-        ticks = _count(positive("duration", duration, "s"), self.time[0])
-        still = np.broadcast_to(self.position[-1], (ticks, *self.position.shape[1:]))
+        # Times are ticks times dt: sums of times would collect rounding.
+        dt = self.time[0]
+        ticks = _count(positive("duration", duration, "s"), dt)
+        time = dt * np.arange(1, self.ticks + ticks + 1)
+        still = np.repeat(self.position[-1:], ticks, axis=0)
         rest = np.zeros_like(still)
-        return self.then(Trajectory(self.time[0] * np.arange(1, ticks + 1), still, rest, rest))
+        parts = zip(self[1:], (still, rest, rest), strict=True)
+        return Trajectory(time, *map(np.concatenate, parts))
 
 
 def minimum_jerk(
@@ -116,8 +94,8 @@ def minimum_jerk(
     Raises
     ------
     InvalidArgumentError
-        Naming the argument and joint; also where neither a duration nor a finite limit is given, or
-        both are.
+        Naming the argument and joint; also where neither a duration nor a limit is given, or both
+        are.
     """
     # Each env takes the longest time that any of its joints needs.
     x0, move = _move(start, target)
@@ -135,14 +113,6 @@ def minimum_jerk(
             math.inf if max_acceleration is None else max_acceleration,
             move,
             finite=False,
-        )
-        limited = np.isfinite(np.minimum(v, a))
-        entries(
-            "max_velocity",
-            v,
-            limited,
-            "and max_acceleration are both infinite",
-            remedy="limit one of them",
         )
         distance = np.abs(move)
         needed = np.maximum(

@@ -30,8 +30,7 @@ from peers import PEERS, installed_peers
 from policy import ResidualPolicy
 from workload import Case, Workload, run_round
 
-from batchpid.io.files import write_atomically
-from batchpid.io.versions import package_versions
+from batchpid.io.files import package_versions, write_atomically
 from batchpid.sim import Robot
 from batchpid.sim.cli.report import table
 from batchpid.sim.engine import native

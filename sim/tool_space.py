@@ -12,19 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.digest import digest
-from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
-from batchpid.arrays.records import frozen
+from batchpid.arrays.records import frozen, summary
 from batchpid.checks.validate import array, choice, flag, instance, names
-from batchpid.checks.warn import warn
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import InvalidArgumentError, warn
 from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import BAND, known_joints
 from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec
-from batchpid.task_space import native_law, native_rows
+from batchpid.task_space import native_rows
 from batchpid.task_space.frames import moved, pose_error
 from batchpid.task_space.native_law import BoundOSC
 from batchpid.task_space.osc_params import AXES
@@ -295,12 +293,7 @@ class OperationalSpace:
         to ``posture``.
         """
         assert self._friction is not None
-        arrays = {"pose": dynamics.pose, "jacobian": dynamics.jacobian, "chain": dynamics.chain}
-        arrays |= {"setpoint": setpoint[:, :7], "twist": twist, "posture": posture, "qpos": qpos}
         coulomb, band = self._friction
-        effort = native_law.friction(arrays, coulomb, band)
-        if effort is not None:
-            return effort
         # Joint velocities of least squares that move the tool towards its setpoint.
         error = pose_error(setpoint[:, :7], dynamics.pose)
         j = dynamics.jacobian

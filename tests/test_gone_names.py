@@ -98,6 +98,8 @@ GONE = (
     r"object_digest",
     r"open_dataset",
     r"osc_files",
+    r"(params_files|io[./]versions|checks[./](warn|single_owner)|arrays[./](display|read_only))\b",
+    r"over_envs",
     r"osc_options",
     r"osc_presets",
     r"partial_file",

@@ -14,6 +14,7 @@ from batchpid.arrays.array_types import Array, ArrayModule, DType
 from batchpid.arrays.choices import CHOICE_TYPES
 
 T = TypeVar("T", bound=tuple[Any, ...])
+V = TypeVar("V")
 TURN = 2 * math.pi
 _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
 
@@ -163,3 +164,12 @@ def tiny_of(dtype: DType) -> float:
     relevant number.
     """
     return float(np.sqrt(np.finfo(dtype).tiny))
+
+
+def read_only(array: V) -> V:
+    """Return a read-only view of a NumPy array; return any other object unchanged."""
+    if not isinstance(array, np.ndarray):
+        return array
+    view = array.view()
+    view.flags.writeable = False
+    return view

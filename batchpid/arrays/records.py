@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from typing import Any, ClassVar, ParamSpec, TypeVar
@@ -21,7 +22,6 @@ from typing import Any, ClassVar, ParamSpec, TypeVar
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document, DType, Rows
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.trees import mapped, parts
@@ -32,6 +32,7 @@ P = ParamSpec("P")
 R = TypeVar("R", bound="Record")
 T = TypeVar("T")
 MOST_JOINTS = 100_000
+WIDTH = 130
 Ends = tuple[Array, Array]
 """A lower and an upper limit, each None for none."""
 
@@ -108,16 +109,12 @@ class Record(tuple[Any, ...]):
         else:
             joints = len(joint_names)
         shapes = (1, joints), (num_envs, joints)
-        if joint_names:
-            of = f", of {', '.join(joint_names)}"
-        else:
-            of = ""
         for name, leaf in self.leaves().items():
             if name in self.WHOLE:
                 continue
             if leaf.shape not in shapes:
                 problem = f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}"
-                remedy = f"give one row, or one row per env{of}"
+                remedy = "give one row, or one row per env"
                 raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy=remedy)
             if not is_traced(leaf):
                 field = self.FIELDS.get(name, Field(low=-math.inf))
@@ -128,37 +125,20 @@ class Record(tuple[Any, ...]):
         return array_summary(self, "envs", "joints")
 
 
-def with_fields(
-    fields: Mapping[str, Field], **choices: str
-) -> Callable[[Callable[P, T]], Callable[P, T]]:
+def with_fields(*fields: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Decorate a constructor that takes the declared ``fields`` as ``**options``, besides its own
-    arguments.
-
-    Its signature shows the fields, with their defaults, and the ``choices`` with theirs. Other
-    keywords are refused, with the nearest name.
+    arguments: other keywords are refused, with the nearest name.
     """
-    defaults = {name: field.default for name, field in fields.items()} | choices
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
-        # The declared fields take the place of **options.
-        declared_signature = inspect.signature(function)
-        shown = [
-            one for one in declared_signature.parameters.values() if one.kind is not one.VAR_KEYWORD
-        ]
-        shown += [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default)
-            for name, default in defaults.items()
-            if name not in declared_signature.parameters
-        ]
-        # help(), editors and the tests of wrong calls read the whole signature.
-        signature = declared_signature.replace(parameters=shown)
+        declared = inspect.getfullargspec(function)
+        arguments = [*declared.args, *declared.kwonlyargs, *fields]
 
         @wraps(function)
         def build(*args: P.args, **options: P.kwargs) -> T:
-            check_keywords(function.__name__, options, signature.parameters)
+            check_keywords(function.__name__, options, arguments)
             return function(*args, **options)
 
-        build.__signature__ = signature  # type: ignore[attr-defined]
         return build
 
     return decorate
@@ -318,3 +298,54 @@ def is_everywhere(array: Array, value: float | bool | str) -> bool:
 
 def _can_be_written(leaf: Array) -> bool:
     return isinstance(leaf, np.ndarray) and (leaf.flags.writeable or not leaf.flags.owndata)
+
+
+def span(values: Array) -> str:
+    """Return the range of an array's entries, as in "40 to 87"; "3 of 12" for bools."""
+    if is_traced(values):
+        return "traced"
+    try:
+        array = np.asarray(values)
+        if array.dtype == bool:
+            return f"{array.sum()} of {array.size}"
+        # The range is that of the other entries; "nan" follows it.
+        present = array[~np.isnan(array)]
+    except (TypeError, ValueError, RuntimeError):
+        return type(values).__name__
+    parts = []
+    if present.size:
+        parts.append(" to ".join(dict.fromkeys(f"{e:.4g}" for e in (present.min(), present.max()))))
+    if present.size < array.size:
+        parts.append("nan")
+    return " or ".join(parts) or "empty"
+
+
+def summary(name: str, parts: Iterable[str]) -> str:
+    """Return ``name(part, part, ...)``, on as many lines as needed."""
+    return "\n".join(
+        textwrap.wrap(
+            f"{name}({', '.join(parts)})", WIDTH, subsequent_indent="    ", break_on_hyphens=False
+        )
+    )
+
+
+def array_summary(arrays: Any, *axes: str) -> str:
+    """Return the type of a named tuple, the sizes of the ``axes`` of its arrays, and the range of
+    each.
+    """
+    leaves = {name: leaf for name, leaf in arrays._asdict().items() if leaf is not None}
+    ranges = [
+        f"{name} {type(leaf).__name__ if isinstance(leaf, tuple) else span(leaf)}"
+        for name, leaf in leaves.items()
+    ]
+    return summary(type(arrays).__name__, [*_sizes(arrays, axes), *ranges])
+
+
+def _sizes(leaves: Iterable[Any], axes: tuple[str, ...]) -> list[str]:
+    """Return the largest size of each axis with its name, as in ["64 envs", "9 joints"]."""
+    shapes = [leaf.shape for leaf in leaves if len(getattr(leaf, "shape", ())) == len(axes)]
+    sizes = (max(lengths) for lengths in zip(*shapes, strict=True))
+    return [
+        f"{size} {axis if size != 1 else axis[:-1]}"
+        for size, axis in zip(sizes, axes, strict=False)
+    ]

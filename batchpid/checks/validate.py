@@ -43,13 +43,8 @@ def number(argument: str, value: object, low: float, high: float, unit: str) -> 
     """Return ``value`` as a finite float within [low, high]; an infinite bound does not limit."""
     value = _scalar(argument, value, unit)
     if not low <= value <= high or math.isinf(value):  # NaN is in no range
-        if math.isfinite(high):
-            ends = f"from {low:g} to {high:g}"
-        else:
-            ends = f">= {low:g}"
-        raise InvalidArgumentError(
-            argument, "out of range", value=value, remedy=f"use a number {ends} ({unit})"
-        )
+        remedy = f"use a number from {low:g} to {high:g} ({unit})"
+        raise InvalidArgumentError(argument, "out of range", value=value, remedy=remedy)
     return value
 
 
@@ -108,10 +103,8 @@ def flag(argument: str, value: object) -> bool:
 def instance(argument: str, value: object, kind: type[T], remedy: str) -> T:
     """Return ``value`` if it is a ``kind``."""
     if not isinstance(value, kind):
-        article = "an" if kind.__name__[0] in "AEIO" else "a"
-        raise InvalidArgumentError(
-            argument, f"must be {article} {kind.__name__}", value=value, remedy=remedy
-        )
+        problem = f"must be of type {kind.__name__}"
+        raise InvalidArgumentError(argument, problem, value=value, remedy=remedy)
     return value
 
 
@@ -124,16 +117,11 @@ def names(argument: str, value: Any, count: int | None = None) -> list[str]:
             argument, "must be a list of names", value=value, remedy="pass a list of strings"
         )
     if count is not None and len(value) != count:
-        raise InvalidArgumentError(
-            argument,
-            f"has {len(value)} names, needs {count}",
-            value=value,
-            remedy="name every joint once",
-        )
+        remedy = f"give {count} names"
+        raise InvalidArgumentError(argument, "has another number", value=value, remedy=remedy)
     if len(set(value)) != len(value):
-        raise InvalidArgumentError(
-            argument, "repeats a name", value=value, remedy="name every joint once"
-        )
+        remedy = "name each once"
+        raise InvalidArgumentError(argument, "repeats a name", value=value, remedy=remedy)
     return list(value)
 
 
@@ -193,13 +181,7 @@ def broadcast(
     remedy: str = "give one value, one per joint, or one per env and joint",
 ) -> NDArray[np.float64]:
     """Return ``value`` as float64, broadcast to ``shape``."""
-    return _broadcast(argument, read_array(argument, value), shape, remedy)
-
-
-def _broadcast(
-    argument: str, result: NDArray[Any], shape: tuple[int, ...], remedy: str
-) -> NDArray[np.float64]:
-    result = result.astype(np.float64, copy=False)
+    result = read_array(argument, value).astype(np.float64, copy=False)
     if result.shape == shape:
         return result
     try:
@@ -244,7 +226,7 @@ def array(
         )
     flat = result.reshape(-1)
     if not is_read or result.shape != shape:
-        result = _broadcast(argument, result, shape, remedy)
+        result = broadcast(argument, result, shape, remedy)
     # The sum of squares costs a third, and is finite for most; BLAS uses threads for a longer one.
     is_sound = flat.size < 10_000 and math.isfinite(flat.dot(flat))
     if finite and not is_sound and not (good := np.isfinite(result)).all():
@@ -335,13 +317,8 @@ def joint_speeds(
     argument: str, value: ArrayLike, joint_names: Sequence[str]
 ) -> NDArray[np.float64]:
     """Return ``value`` as one positive number per joint (dof,)."""
-    speeds: NDArray[np.float64] = array(argument, value, (1, len(joint_names)), joint_names)[
-        0
-    ].copy()
-    entries(
-        argument, speeds, speeds > 0, "must be > 0", joint_names, remedy="leave it out for none"
-    )
-    return speeds
+    rows = array(argument, value, (1, len(joint_names)), joint_names)
+    return at_least(argument, rows[0].copy(), 0.0, joint_names, above=True)
 
 
 def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_]:

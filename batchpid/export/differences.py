@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Array, Bool, Document, Float64
-from batchpid.checks.validate import at_least, instance, names, read_array, time_step
+from batchpid.checks.validate import array, at_least, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.anti_windup import named
 from batchpid.law.computed_torque import check_gain_units
@@ -73,25 +73,19 @@ class Differences(list[str]):
     def _in_efforts(self, params: PIDParams, inertia: ArrayLike | None) -> PIDParams:
         """Return the params with gains in effort units."""
         if inertia is not None:
-            poses = _inertia(inertia, self.joints)
+            inertia = _inertia(inertia, self.joints)
         if params.gain_units is None:
             return params
         if inertia is None:
             problem = "is missing for gains per mass_matrix"
             remedy = "pass inertia=, the diagonal of the mass matrix, or gains in effort units"
             raise InvalidArgumentError("inertia", problem, remedy=remedy)
-        # The gains fit the first pose; the others show how far they are off elsewhere.
-        ratio = poses / poses[0]
-        text = f"gains per mass_matrix are efforts at one inertia: {self.listed(poses[0])} kg m^2"
-        text += " or kg"
-        if len(ratio) > 1:
-            ends = f"{ratio.min():.3g} to {ratio.max():.3g}"
-            text += f"; in other poses the inertia is {ends} times that"
-        self.append(f"gain_units: {text}, and joints disturb each other")
+        text = f"gains per mass_matrix are efforts at one inertia: {self.listed(inertia)} kg m^2"
+        self.append(f"gain_units: {text} or kg, and joints disturb each other")
         scaled: Document = {"gain_units": None}
         for name, leaf in params.leaves().items():
             if name in ("kp", "ki", "kd", "integral_min", "integral_max"):
-                scaled[name] = (leaf * poses[0]).astype(params.dtype)
+                scaled[name] = (leaf * inertia).astype(params.dtype)
         return params._replace(**scaled)
 
     def value(self, option: str, off: float = 0.0) -> Float64:
@@ -175,12 +169,9 @@ def strategies(params: PIDParams) -> list[str]:
 
 
 def _inertia(inertia: ArrayLike, joints: list[str]) -> Float64:
-    """Return inertias (poses, joints) > 0."""
-    rows = np.atleast_2d(read_array("inertia", inertia)).astype(np.float64)
-    if rows.ndim != 2 or rows.shape[1] != len(joints) or not len(rows):
-        remedy = f"pass ({len(joints)},), or (poses, {len(joints)}) with that of the gains first"
-        raise InvalidArgumentError("inertia", f"has shape {rows.shape}", remedy=remedy)
-    return at_least("inertia", rows, np.finfo(float).tiny, joints)
+    """Return inertias (joints,) > 0."""
+    row = array("inertia", inertia, (len(joints),), joints)
+    return at_least("inertia", row, np.finfo(float).tiny, joints)
 
 
 EFFECTS = {

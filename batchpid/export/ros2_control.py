@@ -65,8 +65,8 @@ def to_ros2_control(
     name
         Of the controller.
     inertia
-        Diagonal of the mass matrix (joints,) or (poses, joints) [kg m^2 or kg]: gains per mass
-        matrix are converted at the first pose.
+        Diagonal of the mass matrix (joints,) [kg m^2 or kg], with which gains per mass matrix are
+        converted.
 
     Raises
     ------

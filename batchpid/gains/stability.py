@@ -152,26 +152,13 @@ def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) ->
         slow = np.geomspace(slowest, np.pi / 4, _FREQUENCIES)
         z = np.exp(1j * np.append(slow, np.linspace(np.pi / 4, np.pi, _FREQUENCIES)[1:]))
         loop = _loop(z, m[at], unit[at], local, dt)
-        ratio[at], where = _crossing(z, np.linalg.eigvals(loop))
-        inertia = m[at] + dt * z[where] / (z[where] - 1) * np.diag(local[3])
-        participation[at] = _participation(loop[where], inertia, min(float(ratio[at]), 1e300))
+        ratio[at], row = _crossing(z, np.linalg.eigvals(loop))
+        # Kinetic energy of the mode that passes -180 degrees at the ratio.
+        values, modes = np.linalg.eig(loop[row])
+        mode = modes[:, np.argmin(np.abs(values + ratio[at]))]
+        energy = np.abs(mode * (m[at] @ mode))
+        participation[at] = energy / energy.sum()
     return StabilityBound(ratio, participation)
-
-
-def _participation(loop: Rows, inertia: Rows, ratio: float) -> Float64:
-    """Return the share of each joint's motor (joints,) in the mode of ``loop`` that passes -180
-    degrees at ``ratio``.
-
-    It is the sensitivity of the mode's eigenvalue to a factor of the motor's effort: with right and
-    left eigenvectors x and y, and the effort ``inertia`` x of the motion, |y^H inertia^-1| |inertia
-    x|. All arrays are (joints, joints).
-    """
-    values, right = np.linalg.eig(loop)
-    mode = int(np.argmin(np.abs(values + ratio)))
-    left = np.linalg.pinv(right)[mode]
-    share = np.abs(np.linalg.solve(inertia.T, left) * (inertia @ right[:, mode]))
-    normed: Float64 = share / share.sum()
-    return normed
 
 
 def _loop(z: Rows, m: Float64, unit: Float64, columns: list[Float64], dt: float) -> Rows:
@@ -212,14 +199,10 @@ def _crossing(z: Rows, values: Rows) -> tuple[float, int]:
     if ((first.real < 0) & (first.imag > 0)).any():
         return np.inf, 0
     falls = (now.real < 0) & (then.real < 0) & (now.imag < 0) & (then.imag >= 0)
-    if not falls.any():
-        return 0.0, len(values) - 1
-    above, below = (-entry.imag / np.where(falls, -entry.real, 1.0) for entry in (now, then))
-    share = np.where(falls, above / np.where(falls, above - below, 1.0), 0.0)
-    sizes = [np.log(np.maximum(np.abs(entry), 1e-300)) for entry in (now, then)]
-    crossed = np.where(falls, np.exp(sizes[0] + share * (sizes[1] - sizes[0])), 0.0)
-    row = int(crossed.max(1).argmax())
-    return float(crossed.max()), row
+    # Between two frequencies the loci are straight.
+    share = now.imag / np.where(falls, now.imag - then.imag, 1.0)
+    crossed = np.where(falls, -now.real - share * (then.real - now.real), 0.0)
+    return float(crossed.max()), int(crossed.max(1).argmax())
 
 
 def spectral_radius(

@@ -1,71 +1,63 @@
-"""Documents that people read and edit, as YAML or JSON: a head, and one entry per joint, by
-name.
+"""Documents that people read and edit, as YAML or JSON: a head, and one entry per joint, by name.
+
+A file of params has this form; the keys are the options of :func:`batchpid.make_params`::
+
+    format: batchpid-params-1
+    dtype: float64
+    non_finite: propagate
+    joints:
+      shoulder: {kp: 40.0, ki: 5.0, kd: 2.0, effort_max: 87.0, anti_windup: conditional}
+      elbow: {kp: 20.0, ki: 5.0, kd: 2.0}
 """
 
 from __future__ import annotations
 
 import json
-import math
 import os
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.records import Record
 from batchpid.checks.validate import choice, file_path, instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
+from batchpid.law.params import FIELDS, PIDParams, make_params
 
 R = TypeVar("R", bound=Record)
 
 SUFFIXES = {".yaml": "yaml", ".yml": "yaml", ".json": "json"}
 
 
+@dataclass(frozen=True)
 class RecordFile(Generic[R]):
     """Files of one kind of record: a head, and one entry per joint, by name.
 
     The keys of an entry are the options of the record's constructor; a list gives one value per
     env. Numbers are written with as many digits as it takes to read the same number back. An option
     left out of a joint is off there.
-
-    Parameters
-    ----------
-    format
-        Name and version of the form, as in "batchpid-params-1".
-    record, make
-        Type of the records, and their constructor.
-    head
-        Options for all joints together.
-    fields
-        Options of a joint.
-    required
-        Options that every joint must have.
-    partial
-        Whether a file may leave joints out, whose options are then off.
     """
 
-    def __init__(
-        self,
-        format: str,
-        record: type[R],
-        make: Callable[..., R],
-        head: tuple[str, ...],
-        fields: Mapping[str, Field],
-        required: tuple[str, ...] = (),
-        partial: bool = False,
-    ) -> None:
-        self.format = format
-        self.record = record
-        self.make = make
-        self.head = ("dtype", *head)
-        self.fields = fields
-        self.required = required
-        self.partial = partial
+    format: str
+    """Name and version of the form, as in "batchpid-params-1"."""
+    record: type[R]
+    make: Callable[..., R]
+    """Constructor of the records."""
+    head: tuple[str, ...]
+    """Options for all joints together."""
+    fields: Mapping[str, Field]
+    """Options of a joint."""
+    required: tuple[str, ...] = ()
+    """Options that every joint must have."""
+    partial: bool = False
+    """Whether a file may leave joints out, whose options are then off."""
 
     def dumps(
         self,
@@ -249,18 +241,9 @@ def _column(source: str, name: str, field: Field, joints: Mapping[str, Document]
 
 
 def read(path: str | os.PathLike[str]) -> Any:
-    """Return the document in a file; raise InvalidArgumentError if it cannot be read."""
+    """Return the document in a file. Raises InvalidArgumentError for a text that is none."""
     path = file_path("path", path, SUFFIXES)
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        problem = f"cannot be read: {error.strerror or error}"
-        raise InvalidArgumentError(
-            str(path), problem, remedy="check its name and your rights"
-        ) from None
-    return parse(str(path), content, SUFFIXES[path.suffix.lower()])
+    return parse(str(path), path.read_bytes(), SUFFIXES[path.suffix.lower()])
 
 
 @contextmanager
@@ -293,7 +276,7 @@ def parse(source: str, text: str | bytes, format: str) -> Any:
 def render(document: Document, format: str) -> str:
     """Return a document as text in ``format``, "yaml" or "json"."""
     if choice("format", format, ("yaml", "json")) == "json":
-        return json.dumps(_without_infinities(document), indent=2, allow_nan=False) + "\n"
+        return json.dumps(document, indent=2) + "\n"
     import yaml
 
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
@@ -302,7 +285,7 @@ def render(document: Document, format: str) -> str:
 def is_number(entry: Any) -> bool:
     """Return whether an entry is a number, an infinity included."""
     whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
-    return whole or isinstance(entry, float) or entry in ("inf", "-inf")
+    return whole or isinstance(entry, float)
 
 
 def error(
@@ -323,19 +306,6 @@ def plain(column: Rows) -> Any:
     return values
 
 
-def _without_infinities(value: Any) -> Any:
-    """Return the document with infinities as the strings "inf" and "-inf": JSON has no number for
-    them.
-    """
-    if isinstance(value, dict):
-        return {key: _without_infinities(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_without_infinities(entry) for entry in value]
-    if isinstance(value, float) and math.isinf(value):
-        return str(value)
-    return value
-
-
 def _parse_json(text: str) -> Any:
     def unique(pairs: list[tuple[str, Any]]) -> Document:
         if len(dict(pairs)) < len(pairs):
@@ -349,15 +319,7 @@ def _parse_yaml(text: str) -> Any:
     import yaml  # here, since params in memory need NumPy alone
 
     class Loader(yaml.SafeLoader):
-        """SafeLoader without aliases, which can make a short file explode, and without keys given
-        twice.
-        """
-
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            if self.check_event(yaml.AliasEvent):
-                event: Any = self.peek_event()  # type: ignore[no-untyped-call]
-                raise ValueError(f"aliases are not allowed, {event.start_mark}")
-            return super().compose_node(parent, index)
+        """SafeLoader that refuses keys given twice."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
             mapping = super().construct_mapping(node, deep=True)
@@ -366,3 +328,25 @@ def _parse_yaml(text: str) -> Any:
             return mapping
 
     return yaml.load(text, Loader=Loader)  # a SafeLoader: plain data only
+
+
+class _ParamsFile(RecordFile[PIDParams]):
+    def arguments(self, source: str, joints: Mapping[str, Document]) -> Document:
+        """Return the options; a time of back-calculation that only some joints have is an error."""
+        options = super().arguments(source, joints)
+        for joint, entry in joints.items() if "tracking_time" in options else ():
+            tracks = "back_calculation" in str(entry.get("anti_windup"))
+            if tracks and "tracking_time" not in entry:
+                problem = "is missing, while other joints have it"
+                raise error(source, "tracking_time", problem, "give it too", joint)
+        return options
+
+
+PARAMS = _ParamsFile(
+    "batchpid-params-1", PIDParams, make_params, ("dtype", *CHOICES), FIELDS, required=("kp",)
+)
+dumps_params = PARAMS.dumps
+loads_params = PARAMS.loads
+save_params = PARAMS.save
+load_params = PARAMS.load
+load_about = PARAMS.load_about

@@ -1,14 +1,18 @@
-"""Files: atomic writes, and descriptors."""
+"""Files: atomic writes, descriptors, and the versions that they note."""
 
 from __future__ import annotations
 
 import errno
 import os
+import platform
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
+
+PACKAGES = ("batchpid", "numpy", "sapien", "jax", "h5py", "cmaes", "mujoco", "gymnasium")
+"""Packages on which a result may depend."""
 
 
 @contextmanager
@@ -85,3 +89,16 @@ def write_atomically(
 def _temporary(path: Path) -> Path:
     """Return the path of a new hidden file in the same folder, with the same suffix."""
     return path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
+
+
+def package_versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
+    """Return the versions of Python and of the installed ``packages``, by name."""
+    from importlib.metadata import PackageNotFoundError, version  # slow to import
+
+    versions = {"python": platform.python_version()}
+    for package in packages:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return versions

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
+from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import instance
 from batchpid.law.implicit import as_explicit, implicit_gains
 from batchpid.law.input_checks import checked_dt

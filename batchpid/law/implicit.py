@@ -45,33 +45,17 @@ E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (Springer, 1
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import namespace
 from batchpid.law.params import PIDParams
 
 
-class ImplicitGains(NamedTuple):
-    """Gains of the explicit law that make it implicit at one time step; None is off."""
+def implicit_gains(params: PIDParams, dt: Array) -> tuple[Array, ...]:
+    """Return the gains kp*, ki*, kd*, b* and c*, c* of a given setpoint rate, and 1 / D, of
+    implicit ``params`` at ``dt`` [s]; None is off.
 
-    kp: Array
-    ki: Array
-    kd: Array
-    b: Array
-    c: Array
-    """c* of the setpoint's difference quotient, which no integral takes: c kd / (kd + dt kp + dt^2
-    ki).
-    """
-    c_given: Array
-    """c* of a setpoint rate that is given."""
-    acceleration_share: Array
-    """1 / D: the weight of a setpoint acceleration that is given."""
-
-
-def implicit_gains(params: PIDParams, dt: Array) -> ImplicitGains:
-    """Return the gains kp*, ki*, kd*, b* and c*, and 1 / D, of implicit ``params`` at ``dt``
-    [s].
+    The first c* is that of the setpoint's difference quotient, which no integral takes: c kd / (kd
+    + dt kp + dt^2 ki). 1 / D is the weight of a setpoint acceleration that is given.
     """
     kp = params.kp
     ki = params.ki
@@ -91,14 +75,14 @@ def implicit_gains(params: PIDParams, dt: Array) -> ImplicitGains:
         has = whole > 0
         return xp.where(has, part / xp.where(has, whole, 1), otherwise)
 
-    return ImplicitGains(
-        kp=stiffness * per_step,
-        ki=None if ki is None else ki * per_step,
-        kd=damping * per_step,
-        b=None if b is None else share(b * kp + 2 * ki_dt, stiffness, b),
-        c=None if c is None else share(on_rate, damping, 0),
-        c_given=share(on_rate - dt * ki_dt, damping, 0),
-        acceleration_share=per_step,
+    return (
+        stiffness * per_step,
+        None if ki is None else ki * per_step,
+        damping * per_step,
+        None if b is None else share(b * kp + 2 * ki_dt, stiffness, b),
+        None if c is None else share(on_rate, damping, 0),
+        share(on_rate - dt * ki_dt, damping, 0),
+        per_step,
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array, DType
-from batchpid.arrays.choices import CHOICES, HoldEffort
+from batchpid.arrays.choices import HoldEffort
 from batchpid.arrays.elementwise import in_dtype_of
 from batchpid.checks.validate import instance, read_array, time_step
 from batchpid.errors import InvalidArgumentError
@@ -62,16 +62,10 @@ def check_alone(law: Any, measurement_rate: Array) -> None:
     that is not given.
     """
     if law.gain_units is not None:
-        unit = next(
-            name
-            for name, entry in CHOICES["gain_units"].items()
-            if type(entry) is type(law.gain_units)
-        )
         raise InvalidArgumentError(
             "params.gain_units",
             "are accelerations: without the robot's mass matrix the law cannot turn them into"
             " efforts",
-            value=unit,
             remedy=(
                 "use gains in efforts, such as robot.designed('effort'), or a batchpid.sim.Runner"
             ),
@@ -154,15 +148,10 @@ def checked_state(state: PIDState, needed: PIDState) -> PIDState:
 def checked_mask(mask: Array, state: PIDState) -> Array:
     """Return ``mask`` as bools, one for each env of ``state``."""
     array = _as_array("mask", mask, "b")
-    if array.dtype.kind != "b":
-        raise InvalidArgumentError(
-            "mask", f"must be bools, not {array.dtype}", remedy="give one bool per env"
-        )
     envs = np.broadcast_shapes(*(leaf.shape for leaf in state if leaf is not None))[:1]
-    if array.ndim != 1 or (envs and array.shape != envs):
-        raise InvalidArgumentError(
-            "mask", f"has shape {array.shape}, needs {envs}", remedy="give one bool per env"
-        )
+    if array.dtype.kind != "b" or array.ndim != 1 or (envs and array.shape != envs):
+        problem = f"is {array.dtype} {array.shape}, not bools {envs}"
+        raise InvalidArgumentError("mask", problem, remedy="give one bool per env")
     return array
 
 

@@ -146,7 +146,7 @@ class PIDParams(Record, _ParamsFields):
                 raise InvalidArgumentError(f"params.{name}", problem, remedy="use one dtype")
 
 
-@with_fields(FIELDS, **DEFAULTS)
+@with_fields(*FIELDS, *DEFAULTS)
 def make_params(
     joints: int,
     kp: Array,

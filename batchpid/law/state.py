@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import namespace
-from batchpid.arrays.records import Record
+from batchpid.arrays.records import Record, array_summary
 
 
 class _PIDStateFields(NamedTuple):

@@ -36,8 +36,8 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule, Document
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, clip, in_dtype_of, namespace, push_history, wrap
+from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import check_time_step
 from batchpid.motors import delay
 from batchpid.motors import sensor_noise as noise

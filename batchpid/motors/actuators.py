@@ -22,9 +22,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document, DType
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.field_tables import Field, declared, in_group
-from batchpid.arrays.records import LeafBuilder, Record, with_fields
+from batchpid.arrays.records import LeafBuilder, Record, array_summary, with_fields
 from batchpid.checks.validate import entries, integer, is_traced, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.documents import RecordFile
@@ -153,7 +152,7 @@ class Actuators(Record, _ActuatorsFields):
         return array_summary(self._replace(seed=None), "envs", "joints")
 
 
-@with_fields(FIELDS)
+@with_fields(*FIELDS)
 def make_actuators(
     joints: int,
     *,
@@ -346,7 +345,7 @@ ACTUATORS = RecordFile(
     "batchpid-actuators-1",
     Actuators,
     make_actuators,
-    ("seed", "max_delay"),
+    ("dtype", "seed", "max_delay"),
     {**FIELDS, "continuous": Field(neutral=False)},
     partial=True,
 )

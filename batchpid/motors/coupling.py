@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Float64, Rows
-from batchpid.arrays.elementwise import namespace, take_columns
-from batchpid.arrays.read_only import read_only
+from batchpid.arrays.elementwise import namespace, read_only, take_columns
 
 
 class Follower(NamedTuple):

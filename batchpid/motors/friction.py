@@ -45,8 +45,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
+from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import check_time_step
 
 SHARE = 0.7

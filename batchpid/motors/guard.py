@@ -65,7 +65,7 @@ class GuardState(NamedTuple):
     """v [rad/s or m/s]."""
 
 
-@with_fields(FIELDS)
+@with_fields(*FIELDS)
 def make_guard(
     joints: int,
     *,

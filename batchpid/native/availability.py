@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from functools import cache
 
-from batchpid.checks.warn import warn
+from batchpid.errors import warn
 from batchpid.native.array_program import interpreter
 from batchpid.native.extensions import PROGRAM, TASK_SPACE, Extension, StaleExtensionError, load
 

@@ -4,8 +4,6 @@
 
 #include "extension.h"
 
-#include <memory>
-
 #include "program.h"
 
 namespace batchpid {

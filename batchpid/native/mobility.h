@@ -3,9 +3,6 @@
 
 #pragma once
 
-#include <algorithm>
-
-#include "batchpid/native/lanes.h"
 #include "batchpid/native/tool.h"
 
 namespace batchpid {

@@ -3,16 +3,8 @@
 
 #pragma once
 
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-#include <limits>
-#include <vector>
-
-#include "batchpid/native/lanes.h"
 #include "batchpid/native/mobility.h"
 #include "batchpid/native/tables.h"
-#include "batchpid/native/tool.h"
 
 namespace batchpid {
 

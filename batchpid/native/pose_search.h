@@ -3,14 +3,6 @@
 
 #pragma once
 
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-#include <limits>
-#include <vector>
-
-#include "batchpid/native/lanes.h"
-#include "batchpid/native/rigid_body.h"
 #include "batchpid/native/tables.h"
 #include "batchpid/native/tool.h"
 

@@ -1,18 +1,9 @@
 // Kinematics, dynamics, inverse kinematics and operational-space control of many robots of one kind, for Python.
 
-#include <algorithm>
 #include <iterator>
-#include <memory>
-#include <utility>
-#include <vector>
 
-#include "batchpid/native/extension.h"
-#include "batchpid/native/lanes.h"
-#include "batchpid/native/tool.h"
 #include "batchpid/native/osc_law.h"
 #include "batchpid/native/pose_search.h"
-#include "batchpid/native/rigid_body.h"
-#include "batchpid/native/tables.h"
 
 using namespace batchpid;
 
@@ -139,10 +130,6 @@ struct Step : Call {
     }
     return true;
   }
-  // Arguments: those of `open`, and damping, Coulomb friction and band of the joints.
-  bool open_with_friction(PyObject *const *arguments) {
-    return open(arguments) && friction.open_all(arguments + 6 + LAW, {dof, dof, dof}, rows, 3);
-  }
 };
 
 // Room for the step of WIDTH robots. A bound step keeps it: to make it takes longer than to step four robots.
@@ -196,24 +183,13 @@ PyObject *law(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
-// friction(*arguments of Step::open_with_friction): write the friction, instead of the effort.
-PyObject *friction(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  Step once;
-  if (!once.open_with_friction(arguments)) return nullptr;
-  StepRoom room(once);
-  for (std::int64_t first = 0; first < once.rows; first += WIDTH) {
-    room.law.load(first);
-    room.friction.write(first, room.law.given());
-    once.law[EFFORT].store(first, room.friction.out.data());
-  }
-  Py_RETURN_NONE;
-}
-
-// bind(*arguments of Step::open_with_friction) -> (object, address of Call)
+// bind(*arguments of Step::open, damping, Coulomb friction and band of the joints) -> (object, address of Call)
 PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto bound = std::make_unique<BoundStep>();
   bound->run = write_bound_step;
-  if (!bound->open_with_friction(arguments)) return nullptr;
+  if (!bound->open(arguments)) return nullptr;
+  std::int64_t const dof = bound->dof;
+  if (!bound->friction.open_all(arguments + 6 + LAW, {dof, dof, dof}, bound->rows, 3)) return nullptr;
   bound->room = std::make_unique<StepRoom>(*bound);
   PyObject *address = PyLong_FromVoidPtr(static_cast<Call *>(bound.get()));
   return Py_BuildValue("NN", capsule_of(std::move(bound)), address);
@@ -274,7 +250,6 @@ PyMethodDef METHODS[] = {
     {"tree", make_tree, METH_VARARGS, nullptr},
     {"kinematics", method(kinematics), METH_FASTCALL, nullptr},
     {"law", method(law), METH_FASTCALL, nullptr},
-    {"friction", method(friction), METH_FASTCALL, nullptr},
     {"bind", method(bind), METH_FASTCALL, nullptr},
     {"search", method(search), METH_FASTCALL, nullptr},
     {"move", method(move), METH_FASTCALL, nullptr},

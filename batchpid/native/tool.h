@@ -3,9 +3,6 @@
 
 #pragma once
 
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
 #include <vector>
 
 #include "batchpid/native/lanes.h"

@@ -10,7 +10,7 @@ from batchpid.task_space.inverse_kinematics import (
     InverseKinematicsWarning,
     inverse_kinematics,
 )
-from batchpid.task_space.operational_space import init, osc, reset, track
+from batchpid.task_space.operational_space import init, osc, reset
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
 from batchpid.task_space.osc_state import (
@@ -59,5 +59,4 @@ __all__ = [
     "osc",
     "reset",
     "task_dynamics",
-    "track",
 ]

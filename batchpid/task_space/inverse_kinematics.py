@@ -25,10 +25,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Bool, Float64, Rows
-from batchpid.arrays.display import array_summary
+from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import array, choice, entries, instance, integer, positive
-from batchpid.checks.warn import warn
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import InvalidArgumentError, warn
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import pose_error, pose_of
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree

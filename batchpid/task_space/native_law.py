@@ -80,23 +80,6 @@ def law(
     return (state if integral is None else state._replace(integral=integral)), terms
 
 
-def friction(arrays: Mapping[str, Any], coulomb: Array, band: Array) -> Float64 | None:
-    """Return the friction (envs, dof) on the way to a setpoint, from arrays by their names in LAW.
-
-    The result is None where native code is not used.
-    """
-    qpos = arrays["qpos"]
-    if (native := native_rows.for_rows(qpos, *arrays.values(), coulomb, band)) is None:
-        return None
-    # Arrays that friction does not read have no entry, and go as None.
-    rubbing_effort = np.empty(qpos.shape)
-    dynamics_arrays = map({**arrays, "effort": rubbing_effort}.get, LAW)
-    native_rows.call(
-        native.friction, *qpos.shape, False, *_WITHOUT_TREE, *dynamics_arrays, None, coulomb, band
-    )
-    return rubbing_effort
-
-
 def _of_tree(
     native: Any, tree: RigidTree, link: str, point: Array, k: OSCCoefficients
 ) -> tuple[tuple[Any, ...], Float64]:

@@ -56,7 +56,7 @@ from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_law
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
-from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
+from batchpid.task_space.osc_coefficients import OSCCoefficients
 from batchpid.task_space.osc_params import MAKE_PARAMS, OSCParams
 from batchpid.task_space.osc_state import (
     OSCInputs,
@@ -68,7 +68,7 @@ from batchpid.task_space.osc_state import (
     task_dynamics,
 )
 from batchpid.task_space.projections import Projections, projections
-from batchpid.task_space.symmetric import product, quiet, solve
+from batchpid.task_space.symmetric import product, quiet
 
 
 def init(params: OSCParams, qpos: Array) -> OSCState:
@@ -278,62 +278,3 @@ def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
     others = s1 * p.task_of_others + s2 * p.posture_of_others
     effort = clip(base + s1 * task + s2 * null + others, low, high, xp)
     return effort, base + task + null + others, s1, s2
-
-
-def track(
-    params: OSCParams,
-    state: OSCState,
-    setpoint: Array,
-    qpos: Array,
-    qvel: Array,
-    effort: Array,
-    dt: Array,
-    dynamics: TaskDynamics,
-    *,
-    twist: Array = None,
-    acceleration: Array = None,
-    feedforward: Array = None,
-) -> OSCState:
-    """Return a state with which the next step, on the same inputs, gives ``effort`` (envs, dof) [N
-    m or N].
-
-    ``effort`` is the last one of another controller, such as a joint PID, or of other gains. In the
-    model it gives the joints the acceleration q'' = M^-1 (effort - h - feedforward). The integral
-    is chosen so that the task asks for the tool's share of q''; the posture is chosen so that the
-    joints ask for the rest, in the null space and outside the chain. A load that the model does not
-    know is thus held by the integral and the posture.
-
-    The next effort differs from ``effort`` where the integral or an effort is at its limit, a joint
-    has no posture stiffness, an axis is not selected, or the pose is near a singularity. For a
-    transfer back to a joint PID, call :func:`batchpid.track` with the last effort.
-
-    Raises
-    ------
-    InvalidArgumentError
-        The params are of another type, or have no integral.
-    """
-    k = discretise(params, dt)
-    mass = dynamics.mass_matrix
-    bias = dynamics.bias
-    if params.integral_gain is None:
-        problem = "is off, so no integral can carry the effort over"
-        raise InvalidArgumentError(
-            "params.integral_gain", problem, remedy="give integral_gain; 0 is allowed"
-        )
-    inputs = OSCInputs(setpoint, qpos, qvel, twist, acceleration)
-    xp = namespace(*k, *dynamics, *inputs, effort)
-    with quiet():
-        if feedforward is None:
-            available = bias
-        else:
-            available = bias + feedforward
-        # The acceleration that the model expects of the effort.
-        qacc = solve(mass, (effort - available)[..., None])[..., 0]
-        # A joint without stiffness cannot ask for anything by its posture.
-        stiff = k.posture_kp > 0
-        rest = qacc - posture_acceleration(k, dynamics, qpos, qpos, qvel)[0]
-        posture = qpos + xp.where(stiff, rest / xp.where(stiff, k.posture_kp, 1.0), 0.0)
-        task = in_frame(k, dynamics, inputs)
-        demand = product(task.dynamics.jacobian, qacc) + task.dynamics.jacobian_rate
-        integral = demand - task_acceleration(k, task)
-        return OSCState(posture, clip(integral, -k.integral_limit, k.integral_limit, xp))

@@ -23,8 +23,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import check_time_step, instance
 from batchpid.task_space.osc_params import MAKE_PARAMS, OSCParams
 

@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.arrays.choices import CHOICES, NamedChoice
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field, declared
-from batchpid.arrays.records import Record, checked_ends, frozen, with_fields
+from batchpid.arrays.records import Record, array_summary, checked_ends, frozen, with_fields
 from batchpid.checks.validate import AxisKind, array, choice, entries, instance, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
@@ -117,7 +116,7 @@ class OSCParams(Record, _OSCParamsFields):
         return array_summary(self, "envs", "axes")
 
 
-@with_fields(FIELDS)
+@with_fields(*FIELDS)
 def make_osc_params(
     tree: RigidTree, *, frame: str = "world", discretization: str = "explicit", **options: ArrayLike
 ) -> OSCParams:

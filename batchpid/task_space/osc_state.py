@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.records import array_summary
 from batchpid.task_space.frames import in_axes, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_quantities import evaluated

@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Array, Document, Float64, Rows
-from batchpid.arrays.display import summary
-from batchpid.arrays.elementwise import namespace
-from batchpid.arrays.read_only import read_only
+from batchpid.arrays.elementwise import namespace, read_only
+from batchpid.arrays.records import summary
 from batchpid.checks.validate import choice, entries, names, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling

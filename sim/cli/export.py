@@ -35,8 +35,6 @@ USED = {
 """Flags that have an effect for each target, of those that only some have."""
 COMMENTS = {"c": "/* {} */", "mjcf": "<!-- {} -->", "urdf": "<!-- {} -->"}
 """Comment of a target's language; of the others "# {}"."""
-POSES = 64
-"""Sampled poses, for the range of the inertia."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +171,7 @@ def _controllers(
         [robot.joint_names[joint] for joint in np.flatnonzero(leaders)],
         dt,
         name=name or "joint_trajectory_controller",
-        inertia=_inertia(robot)[:, leaders],
+        inertia=_inertia(robot)[leaders],
     )
     if limits:
         text = "guard: setpoints are not limited in the target"
@@ -204,9 +202,6 @@ def _mjcf(robot: Robot, params: bp.PIDParams | None, dt: float, limits: bool) ->
 
 
 def _inertia(robot: Robot) -> np.ndarray:
-    """Return the inertia of the joints (poses, dof), 1 for followers, at the start pose, then at
-    sampled poses.
-    """
-    matrices = robot.mass_matrix(np.vstack([robot.start, robot.sample(POSES)]))
-    matrices = robot.coupling.mass_matrix(matrices)
-    return np.diagonal(matrices, axis1=1, axis2=2)
+    """Return the inertia of the joints (dof,), 1 for followers, at the start pose."""
+    matrix = robot.mass_matrix(robot.start)[0]
+    return np.diagonal(robot.coupling.mass_matrix(matrix))

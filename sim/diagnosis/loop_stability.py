@@ -17,8 +17,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64
-from batchpid.checks.warn import warn
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import InvalidArgumentError, warn
 from batchpid.gains.stability import Oscillation, oscillation
 from batchpid.law.implicit import as_explicit
 from batchpid.sim.robot.description import RobotDescription

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64, Rows
-from batchpid.checks.warn import warn
+from batchpid.errors import warn
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 
 LAG, MOVING = 0.05, 0.5

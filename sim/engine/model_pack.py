@@ -11,7 +11,7 @@ import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64, Rows
-from batchpid.checks.single_owner import SingleOwner
+from batchpid.errors import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.native_model import NativeModel, passive_force_of

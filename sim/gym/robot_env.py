@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Document, Float32
-from batchpid.checks.single_owner import SingleOwner
+from batchpid.errors import SingleOwner
 from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
 from batchpid.sim.robot.robot import Robot
 

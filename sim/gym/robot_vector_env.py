@@ -18,9 +18,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Bool, Document, Float32, Float64, Rows
-from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import array, check_keywords, choice, env_mask, flag, integer, number
-from batchpid.errors import CallOrderError, InvalidArgumentError
+from batchpid.errors import CallOrderError, InvalidArgumentError, SingleOwner
 from batchpid.sim.options.options import RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import LARGEST
 from batchpid.sim.robot.robot import Robot

@@ -17,8 +17,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import choice, flag, instance, integer, number
-from batchpid.checks.warn import warn
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.errors import InvalidArgumentError, MissingDependencyError, warn
 from batchpid.sim.identification.fit import Problem, fit, windows_of
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
 from batchpid.sim.identification.logs import Reading, read_logs

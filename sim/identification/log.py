@@ -15,8 +15,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.elementwise import TURN
-from batchpid.checks.warn import warn
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import InvalidArgumentError, warn
 from batchpid.sim.robot.robot import Robot
 
 CommandKind = Literal["setpoint", "effort"]

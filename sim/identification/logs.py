@@ -22,8 +22,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import file_path
-from batchpid.checks.warn import warn
-from batchpid.errors import MissingDependencyError
+from batchpid.errors import MissingDependencyError, warn
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
 from batchpid.sim.recording.recording_files import RecordingError, read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv

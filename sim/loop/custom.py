@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64, Rows
+from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.jax_settings import own_settings
-from batchpid.arrays.read_only import read_only
 from batchpid.arrays.trees import flatten, unflatten
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions

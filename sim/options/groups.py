@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.field_tables import Field, plain
-from batchpid.arrays.read_only import read_only
 from batchpid.checks.validate import choice, instance, joint_speeds, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.physics import MujocoSolver, Physics

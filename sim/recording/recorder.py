@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from batchpid.arrays.array_types import Rows
-from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import flag, instance
-from batchpid.errors import ClosedError, InvalidArgumentError
+from batchpid.errors import ClosedError, InvalidArgumentError, SingleOwner
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import RecordingError

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.arrays.digest import digest
-from batchpid.arrays.read_only import read_only
+from batchpid.arrays.elementwise import read_only
 from batchpid.errors import RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.robot.inertia import DENSITY

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Document, Float64
 from batchpid.arrays.digest import digest
-from batchpid.arrays.read_only import read_only
+from batchpid.arrays.elementwise import read_only
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.robot.findings import Finding

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from batchpid.checks.warn import warn
-from batchpid.errors import RobotError
+from batchpid.errors import RobotError, warn
 
 SEVERITIES = ("warning", "note")  # probably an error; good to know
 

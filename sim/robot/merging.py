@@ -18,7 +18,7 @@ from functools import lru_cache
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.read_only import read_only
+from batchpid.arrays.elementwise import read_only
 from batchpid.sim.robot.collision_shapes import inertia_of
 from batchpid.sim.robot.parts import Joint, Placement
 from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Tables

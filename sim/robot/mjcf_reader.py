@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjModel
-from batchpid.arrays.read_only import read_only
+from batchpid.arrays.elementwise import read_only
 from batchpid.motors import make_actuators
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.mjcf_actuators import read_couplings, read_motors

@@ -15,7 +15,7 @@ import batchpid as bp
 from batchpid import assets
 from batchpid.arrays.array_types import Document
 from batchpid.arrays.choices import CHOICES
-from batchpid.arrays.read_only import read_only
+from batchpid.arrays.elementwise import read_only
 from batchpid.checks.validate import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.sim.robot.description import RobotDescription

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.read_only import read_only
+from batchpid.arrays.elementwise import read_only
 from batchpid.sim.robot.collision_shapes import half_extents
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.merging import Separate, link_inertias, merge_links, place_links

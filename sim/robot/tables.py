@@ -25,7 +25,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
-from batchpid.arrays.read_only import read_only
+from batchpid.arrays.elementwise import read_only
 from batchpid.motors import Actuators
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.parts import DisabledPair, FileDefaults, Joint, MjcfFile, Placement

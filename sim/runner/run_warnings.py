@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import batchpid as bp
-from batchpid.checks.warn import warn
+from batchpid.errors import warn
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
 from batchpid.sim.loop.faults import EventLog, FaultWarning, MissedContactWarning

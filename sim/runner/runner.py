@@ -22,11 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import check_keywords, choice, instance
-from batchpid.checks.warn import warn
-from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
-from batchpid.io.versions import package_versions
+from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
+from batchpid.io.files import package_versions
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault, MissedContact

@@ -30,7 +30,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.io.versions import package_versions
+from batchpid.io.files import package_versions
 from batchpid.sim.loop.faults import MissedContactWarning
 from batchpid.sim.options.groups import EngineName
 from batchpid.sim.randomization.randomization import Randomization

@@ -12,7 +12,7 @@ import os
 import numpy as np
 
 from batchpid.arrays.array_types import Rows
-from batchpid.checks.single_owner import SingleOwner
+from batchpid.errors import SingleOwner
 from batchpid.io.files import standard_streams_occupied
 from batchpid.sim.loop.arrays import Layout
 

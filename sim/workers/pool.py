@@ -17,8 +17,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import batchpid as bp
-from batchpid.checks.single_owner import SingleOwner
-from batchpid.errors import ClosedError
+from batchpid.errors import ClosedError, SingleOwner
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Failure, order
 from batchpid.sim.options.options import RunnerOptions

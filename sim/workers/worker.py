@@ -24,8 +24,7 @@ from typing import Any
 
 import cloudpickle
 
-from batchpid.checks.single_owner import SingleOwner
-from batchpid.errors import InvalidArgumentError, WorkerError
+from batchpid.errors import InvalidArgumentError, SingleOwner, WorkerError
 from batchpid.io.files import standard_streams_occupied
 from batchpid.sim.engine import native
 from batchpid.sim.loop.arrays import Arrays

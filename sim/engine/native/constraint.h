@@ -5,9 +5,6 @@
 #include "batchpid/native/program.h"
 #include "model.h"
 
-#include <cmath>
-#include <cstdint>
-
 namespace batchpid {
 
 // Python fills in the fields (Constraint in interface.py) and owns what they point to.

@@ -3,10 +3,6 @@
 // It calls functions that SAPIEN's shared library exports. Their addresses and the objects' pointers come from Python
 // (sim/engine/native/__init__.py), so that nothing of SAPIEN, PhysX or Eigen is needed to compile this file.
 
-#include "gateway.h"
-
-#include "batchpid/native/extension.h"
-#include "sim_step.h"
 #include "tick.h"
 #include "xla_call.h"
 

@@ -7,8 +7,6 @@
 
 #include <atomic>
 #include <csetjmp>
-#include <cstdint>
-#include <cstring>
 #include <mutex>
 
 namespace batchpid {

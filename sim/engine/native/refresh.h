@@ -2,7 +2,6 @@
 
 #pragma once
 
-#include "batchpid/native/rigid_body.h"
 #include "model.h"
 
 namespace batchpid {

@@ -6,10 +6,6 @@
 #include "gateway.h"
 #include "mujoco_step.h"
 
-#include <algorithm>
-#include <cmath>
-#include <vector>
-
 namespace batchpid {
 
 // Largest position of a robot that has not failed [rad or m].

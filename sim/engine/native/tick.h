@@ -5,13 +5,9 @@
 
 #pragma once
 
-#include "batchpid/native/extension.h"
 #include "batchpid/native/make_program.h"
 #include "refresh.h"
 #include "sim_step.h"
-
-#include <cmath>
-#include <cstring>
 
 #pragma GCC visibility push(hidden)
 

@@ -6,7 +6,6 @@
 
 #pragma once
 
-#include "model.h"
 #include "sim_step.h"
 
 namespace batchpid::xla {

@@ -1,6 +1,4 @@
-"""Integral, limits of joints, implicit gains, bumpless transfer and presets of operational-space
-control.
-"""
+"""Integral, limits of joints, implicit gains and presets of operational-space control."""
 
 from __future__ import annotations
 
@@ -8,7 +6,6 @@ import numpy as np
 import pytest
 from trees import TOOLS, planar, states, tree_of
 
-import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.task_space import frames
 
@@ -159,37 +156,3 @@ def test_implicit_gains_act_on_the_end_of_the_step():
     np.testing.assert_allclose(
         share * (new.integral - state.integral), ki * dt * (e - dt * twist), atol=1e-9
     )
-
-
-@pytest.mark.parametrize("how", ["explicit", "implicit"])
-def test_transfer_from_a_joint_pid_and_back_is_bumpless(how):
-    tree, rows, dt = tree_of("panda"), 6, 1e-3
-    qpos, qvel = states(tree, rows, 2)
-    d = ts.task_dynamics(tree, qpos, 0.1 * qvel, HAND)
-    pid = bp.make_params(tree.dof, 400.0, 50.0, 40.0)
-    state, effort = bp.step(
-        pid,
-        bp.init(pid, qpos),
-        qpos + 0.1,
-        qpos,
-        dt,
-        measurement_rate=0.1 * qvel,
-        feedforward=d.bias,
-    )
-    options = {"damping": 30.0, "discretization": how, "smallest_eigenvalue": 1e-6}
-    params = ts.make_osc_params(tree, integral_gain=0.0, **options)
-    inputs = np.add(d.pose, [0.03, 0, 0, 0, 0, 0, 0]), qpos, 0.1 * qvel
-    twist = np.full((rows, 6), 0.1)
-    found = ts.track(params, ts.init(params, qpos), *inputs, effort, dt, d, twist=twist)
-    after, terms = ts.osc(ts.discretise(params, dt), found, d, ts.OSCInputs(*inputs, twist))
-    again = terms.effort
-    np.testing.assert_allclose(again, effort, atol=1e-6)
-    joint = bp.track(pid, state, qpos, qpos, again, measurement_rate=0.1 * qvel, feedforward=d.bias)
-    _, back = bp.step(pid, joint, qpos, qpos, dt, measurement_rate=0.1 * qvel, feedforward=d.bias)
-    np.testing.assert_allclose(back, again, atol=1e-9)
-    stiffer = params._replace(
-        stiffness=2 * params.stiffness, posture_stiffness=3 * params.posture_stiffness
-    )
-    found = ts.track(stiffer, after, *inputs, again, dt, d)
-    _, terms = ts.osc(ts.discretise(stiffer, dt), found, d, ts.OSCInputs(*inputs))
-    np.testing.assert_allclose(terms.effort, again, atol=1e-6)

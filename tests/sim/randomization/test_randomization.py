@@ -211,7 +211,7 @@ def test_it_is_what_its_dict_describes():
         ({"actuators": {"delay": Uniform(0, 1)}}, "actuators: unknown option"),
         ({"actuators": {"command_delay": Uniform(0, 2)}}, "command_delay, joint .*: out of range"),
         ({"actuators": {"effort_limit": Uniform(0, 2)}}, "actuators.effort_limit: is off"),
-        ({"payload": 0.5}, "payload: must be a Distribution"),
+        ({"payload": 0.5}, "payload: must be of type Distribution"),
         ({"params": Uniform(0, 1)}, "params: is not a mapping"),
         ({"seed": -1}, "seed: out of range"),
         ({"per": "tick"}, "per: unknown option"),
