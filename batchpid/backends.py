@@ -16,11 +16,6 @@ from batchpid.law.state import PIDState, Terms
 from batchpid.native.availability import obstacle
 from batchpid.native.compiled import CompiledLaw
 
-LARGE = 2**18
-"""Number of envs from which JAX's CPU backend steps block by block: it maps larger buffers again at
-every call.
-"""
-
 
 def declined(*_: Any) -> Any:
     """Return NotImplemented, as a fast call does that leaves its work to Python."""
@@ -104,14 +99,9 @@ class JAXBackend:
         require_jax()
         import jax
 
-        from batchpid.law import blocks
-
         self.jax, self.terms = jax, terms
         self.dtype: Any = None
         self._compiled: dict[Any, Any] = {}
-        self._spare: PIDState | None = (
-            None  # the state before the last, whose buffers may be overwritten
-        )
 
         def step(
             params: PIDParams, state: PIDState, *inputs: Array
@@ -119,14 +109,7 @@ class JAXBackend:
             new, results = pid.advance(discretise(params, dt), state, *inputs)
             return new, results.effort, results.filled() if terms else None
 
-        def step_in_blocks(
-            params: PIDParams, spare: PIDState, state: PIDState, *inputs: Array
-        ) -> Array:
-            out = (spare, jax.numpy.zeros_like(inputs[1]))
-            return blocks.advance_in_blocks(discretise(params, dt), state, *inputs, out=out)
-
         self._step = self._compile(step, donate_argnums=3)
-        self._step_in_blocks = self._compile(step_in_blocks, donate_argnums=3)
 
     def _compile(self, function: Any, **options: Any) -> Any:
         """Return a function of params and more, compiled as one of packed params: layout, shared,
@@ -156,9 +139,7 @@ class JAXBackend:
             ]
             stacked = np.stack(shared) if shared else np.empty((0, 1, shape[1]), params.dtype)
             self.packed = ((tree, is_shared), jnp.asarray(stacked), separate)
-        # Buffers of other params have another shape or dtype, and are of no use.
         self.dtype = self.packed[1].dtype
-        self._spare = None
 
     def array(self, value: Array) -> Array:
         """Return ``value`` as an array of this backend."""
@@ -184,17 +165,4 @@ class JAXBackend:
         is None.
         """
         with own_settings(self.dtype):
-            if y.shape[0] < LARGE or self.terms or not self._on_one_cpu(y):
-                return *self._step(*self.packed, state, r, y, *rates), declined
-            spare = (
-                self.jax.tree.map(self.jax.numpy.zeros_like, state)
-                if self._spare is None
-                else self._spare
-            )
-            new, effort = self._step_in_blocks(*self.packed, spare, state, r, y, *rates)
-        self._spare = state
-        return new, effort, None, declined
-
-    def _on_one_cpu(self, y: Array) -> bool:
-        devices = y.devices() if isinstance(y, self.jax.Array) else self.jax.local_devices()[:1]
-        return [device.platform for device in devices] == ["cpu"]
+            return *self._step(*self.packed, state, r, y, *rates), declined

@@ -49,7 +49,7 @@ class BatchPID:
     backend
         "numpy": computed by the native extension where that was built, with the bytes of NumPy but
         without its floating-point warnings. Or "jax": compiled once, with the state's buffers
-        donated from call to call, and on a CPU block by block where the batch is large.
+        donated from call to call.
     terms
         Keep the :class:`batchpid.Terms` of the last call, at the cost of computing them.
     joint_names
@@ -293,11 +293,7 @@ class BatchPID:
         """
         if isinstance(value, np.ndarray) or not hasattr(value, "dtype"):
             value = read_array(name, value)
-        try:
-            array = self._engine.array(value)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            problem = f"cannot be read as an array of numbers: {error}"
-            raise InvalidArgumentError(name, problem, remedy="pass an array of numbers") from None
+        array = self._engine.array(value)
         if array.shape == self._shape:
             return array
         if exact:

@@ -125,12 +125,9 @@ def step_metrics(
     # Everything takes the shape of the measurement.
     r = broadcast("setpoint", setpoint, y.shape)
     floor = broadcast("absolute_band", absolute_band, y.shape[1:])
-    if effort is None:
-        u = None
-    else:
-        u = broadcast("effort", effort, y.shape)
+    u = broadcast("effort", np.nan if effort is None else effort, y.shape)
     if saturated is None:
-        limited = None
+        limited: Rows = np.full(y.shape, np.nan)
     else:
         limited = read_array("saturated", saturated, "b")
     if start is not None:
@@ -167,7 +164,6 @@ def step_metrics(
     def judged(figure: ArrayLike) -> Float64:
         return np.where(finite, figure, np.inf)
 
-    nothing = np.full(size.shape, np.nan)
     return StepMetrics(
         rise_time=judged(np.where(moves, rise, np.nan)),
         overshoot=judged(overshoot),
@@ -176,9 +172,9 @@ def step_metrics(
         peak_deviation=judged(beyond),
         iae=judged(np.trapezoid(np.abs(error), t, axis=0)),
         itae=judged(np.trapezoid(t[:, None, None] * np.abs(error), t, axis=0)),
-        effort_peak=nothing if u is None else _or_inf(np.abs(u).max(0)),
-        effort_variation=nothing if u is None else _or_inf(np.abs(np.diff(u, axis=0)).sum(0)),
-        saturation_share=nothing if limited is None else np.mean(limited, axis=0),
+        effort_peak=judged(np.abs(u).max(0)),
+        effort_variation=judged(np.abs(np.diff(u, axis=0)).sum(0)),
+        saturation_share=np.mean(limited, axis=0),
     )
 
 
@@ -207,10 +203,6 @@ def _settling_time(t: Float64, error: Float64, tolerance: Float64) -> Float64:
     share = np.clip((edge - before) / (after - before), 0.0, 1.0)
     settled = np.where(outside[-1], np.inf, t[k] + share * (t[k + 1] - t[k]))
     return np.where(outside.any(0), settled, 0.0)
-
-
-def _or_inf(figure: Float64) -> Float64:
-    return np.where(np.isfinite(figure), figure, np.inf)
 
 
 def _row(table: Float64, k: Rows) -> Float64:

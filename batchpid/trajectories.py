@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.records import array_summary
-from batchpid.checks.validate import at_least, broadcast, entries, positive, read_array, time_step
+from batchpid.checks.validate import at_least, broadcast, positive, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.frames import compose
 
@@ -94,8 +94,8 @@ def minimum_jerk(
     Raises
     ------
     InvalidArgumentError
-        Naming the argument and joint; also where neither a duration nor a finite limit is given, or
-        both are.
+        Naming the argument and joint; also where neither a duration nor a limit is given, or both
+        are.
     """
     # Each env takes the longest time that any of its joints needs.
     x0, move = _move(start, target)
@@ -113,14 +113,6 @@ def minimum_jerk(
             math.inf if max_acceleration is None else max_acceleration,
             move,
             finite=False,
-        )
-        limited = np.isfinite(np.minimum(v, a))
-        entries(
-            "max_velocity",
-            v,
-            limited,
-            "and max_acceleration are both infinite",
-            remedy="limit one of them",
         )
         distance = np.abs(move)
         needed = np.maximum(

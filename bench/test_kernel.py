@@ -9,9 +9,7 @@ time of a step. ``of triad`` is its share of the bandwidth of a[i] = b[i] + s c[
 the same size, counted as 3 arrays and measured in the same test on all cores (numba), or of a copy
 on the GPU where JAX has one. Compilation is never timed. "native", "numpy" and "jax" are
 :class:`batchpid.BatchPID`, the first two with and without the extension; efforts of "native" are
-written into kept arrays (``out=``). "jax in blocks" is
-:func:`batchpid.law.blocks.advance_in_blocks` under shard_map with a device for each core, whose
-efforts overwrite the efforts of the step before last.
+written into kept arrays (``out=``).
 """
 
 import os
@@ -27,7 +25,6 @@ import simple_pid
 from tutorial import SimplePID
 
 import batchpid as bp
-from batchpid.law.blocks import advance_in_blocks
 from batchpid.native.availability import SWITCH
 
 numba = pytest.importorskip("numba")
@@ -163,40 +160,6 @@ def jax_step(num_envs):
     return call
 
 
-def jax_step_in_blocks(num_envs):
-    """Return a call with a share of the envs on each device; outputs overwrite the outputs of the
-    call before last.
-    """
-    mesh = jax.make_mesh((jax.device_count(),), ("envs",), axis_types=(jax.sharding.AxisType.Auto,))
-    by_env = jax.P("envs")
-    r, y0, y1, ff = (jax.device_put(x, jax.NamedSharding(mesh, by_env)) for x in inputs(num_envs))
-    k = jax.tree.map(jnp.asarray, bp.discretise(PARAMS, DT))
-
-    def step(out, k, state, r, y, ff):
-        return advance_in_blocks(k, state, r, y, None, None, ff, out=out)
-
-    sharded = jax.shard_map(
-        step,
-        mesh=mesh,
-        in_specs=(by_env, jax.P(), *[by_env] * 4),
-        out_specs=by_env,
-        check_vma=False,
-    )
-    step = jax.jit(sharded, donate_argnums=0)
-    params = jax.tree.map(jnp.asarray, PARAMS)
-    state, turn = bp.init(params, y1), [y0, y1]
-    out = (bp.init(params, y1), jnp.zeros_like(y1))
-
-    def call():
-        nonlocal state, out
-        turn.reverse()
-        new, effort = jax.block_until_ready(step(out, k, state, r, turn[0], ff))
-        state, out = new, (state, effort)
-        return effort
-
-    return call
-
-
 def numba_step(num_envs):
     r, y0, y1, ff = inputs(num_envs)
     k = bp.discretise(PARAMS, DT)
@@ -254,7 +217,6 @@ KERNELS = {
     "native": native_step,
     "numpy": numpy_step,
     "jax": jax_step,
-    "jax in blocks": jax_step_in_blocks,
     "numba by hand": numba_step,
 }
 SCALARS = {"tutorial": scalar_step(tutorial), "simple-pid": scalar_step(simple)}
@@ -269,8 +231,6 @@ def found():
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("num_envs", SIZES)
 def test_step(benchmark, compare, most, best, machine_bandwidth, found, kernel, num_envs):
-    if kernel == "jax in blocks" and num_envs < 2**16:
-        pytest.skip("for large batches")
     num_envs = min(num_envs, most.rows)
     call = KERNELS[kernel](num_envs)
     first = np.array(call())
@@ -353,17 +313,16 @@ def test_scalar_loop(benchmark, most, kernel, num_envs):
     benchmark.extra_info["ns per env"] = round(1e9 * benchmark.stats.stats.min / num_envs, 1)
 
 
-@pytest.mark.parametrize("kernel", ["jax", "jax in blocks"])
-def test_against_the_scalar_loop_in_one_run(benchmark, compare, most, best, kernel):
+def test_against_the_scalar_loop_in_one_run(benchmark, compare, most, best):
     """JAX at 2^20 x 9 takes less than a tenth of the time of the tutorial's scalar loop, per
     env.
     """
     few, many = min(4096, most.rows), min(2**20, most.rows)
     slow = best(SCALARS["tutorial"](few)) / few
-    benchmark.pedantic(KERNELS[kernel](many), rounds=min(5, most.rounds), warmup_rounds=2)
+    benchmark.pedantic(jax_step(many), rounds=min(5, most.rounds), warmup_rounds=2)
     ratio = slow / (benchmark.stats.stats.min / many)
     benchmark.extra_info["times the scalar loop"] = round(ratio)
-    compare(f"law, {many} envs", kernel, "tutorial's scalar loop", ratio, least=10)
+    compare(f"law, {many} envs", "jax", "tutorial's scalar loop", ratio, least=10)
 
 
 @pytest.mark.parametrize("num_envs", [64, 4096])

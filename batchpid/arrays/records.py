@@ -109,16 +109,12 @@ class Record(tuple[Any, ...]):
         else:
             joints = len(joint_names)
         shapes = (1, joints), (num_envs, joints)
-        if joint_names:
-            of = f", of {', '.join(joint_names)}"
-        else:
-            of = ""
         for name, leaf in self.leaves().items():
             if name in self.WHOLE:
                 continue
             if leaf.shape not in shapes:
                 problem = f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}"
-                remedy = f"give one row, or one row per env{of}"
+                remedy = "give one row, or one row per env"
                 raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy=remedy)
             if not is_traced(leaf):
                 field = self.FIELDS.get(name, Field(low=-math.inf))
@@ -281,8 +277,7 @@ def frozen(record: R) -> R:
     returned.
     """
     # Most records are frozen already, and cost one look.
-    exposed = [leaf for leaf in record if isinstance(leaf, np.ndarray) and _can_be_written(leaf)]
-    if not exposed:
+    if not any(map(_can_be_written, record)):
         return record
     copied: R = mapped(lambda leaf: frozen_array(leaf) if _can_be_written(leaf) else leaf, record)
     return copied

@@ -43,13 +43,8 @@ def number(argument: str, value: object, low: float, high: float, unit: str) -> 
     """Return ``value`` as a finite float within [low, high]; an infinite bound does not limit."""
     value = _scalar(argument, value, unit)
     if not low <= value <= high or math.isinf(value):  # NaN is in no range
-        if math.isfinite(high):
-            ends = f"from {low:g} to {high:g}"
-        else:
-            ends = f">= {low:g}"
-        raise InvalidArgumentError(
-            argument, "out of range", value=value, remedy=f"use a number {ends} ({unit})"
-        )
+        remedy = f"use a number from {low:g} to {high:g} ({unit})"
+        raise InvalidArgumentError(argument, "out of range", value=value, remedy=remedy)
     return value
 
 
@@ -132,7 +127,7 @@ def names(argument: str, value: Any, count: int | None = None) -> list[str]:
 
 def file_path(argument: str, value: object, suffixes: Collection[str] = ()) -> Path:
     """Return ``value`` as a path that ends in one of ``suffixes``, if any are given."""
-    if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
+    if not isinstance(value, str | os.PathLike):
         raise InvalidArgumentError(
             argument, "must be a path", value=value, remedy="pass the file's name"
         )
@@ -363,7 +358,4 @@ def _scalar(argument: str, value: object, unit: str) -> float:
         raise InvalidArgumentError(
             argument, "must be a number", value=value, remedy=f"pass a float ({unit})"
         )
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf
+    return float(value)

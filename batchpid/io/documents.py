@@ -17,6 +17,7 @@ import os
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -35,46 +36,28 @@ R = TypeVar("R", bound=Record)
 SUFFIXES = {".yaml": "yaml", ".yml": "yaml", ".json": "json"}
 
 
+@dataclass(frozen=True)
 class RecordFile(Generic[R]):
     """Files of one kind of record: a head, and one entry per joint, by name.
 
     The keys of an entry are the options of the record's constructor; a list gives one value per
     env. Numbers are written with as many digits as it takes to read the same number back. An option
     left out of a joint is off there.
-
-    Parameters
-    ----------
-    format
-        Name and version of the form, as in "batchpid-params-1".
-    record, make
-        Type of the records, and their constructor.
-    head
-        Options for all joints together.
-    fields
-        Options of a joint.
-    required
-        Options that every joint must have.
-    partial
-        Whether a file may leave joints out, whose options are then off.
     """
 
-    def __init__(
-        self,
-        format: str,
-        record: type[R],
-        make: Callable[..., R],
-        head: tuple[str, ...],
-        fields: Mapping[str, Field],
-        required: tuple[str, ...] = (),
-        partial: bool = False,
-    ) -> None:
-        self.format = format
-        self.record = record
-        self.make = make
-        self.head = ("dtype", *head)
-        self.fields = fields
-        self.required = required
-        self.partial = partial
+    format: str
+    """Name and version of the form, as in "batchpid-params-1"."""
+    record: type[R]
+    make: Callable[..., R]
+    """Constructor of the records."""
+    head: tuple[str, ...]
+    """Options for all joints together."""
+    fields: Mapping[str, Field]
+    """Options of a joint."""
+    required: tuple[str, ...] = ()
+    """Options that every joint must have."""
+    partial: bool = False
+    """Whether a file may leave joints out, whose options are then off."""
 
     def dumps(
         self,
@@ -360,7 +343,7 @@ class _ParamsFile(RecordFile[PIDParams]):
 
 
 PARAMS = _ParamsFile(
-    "batchpid-params-1", PIDParams, make_params, tuple(CHOICES), FIELDS, required=("kp",)
+    "batchpid-params-1", PIDParams, make_params, ("dtype", *CHOICES), FIELDS, required=("kp",)
 )
 dumps_params = PARAMS.dumps
 loads_params = PARAMS.loads

@@ -42,7 +42,7 @@ def replacing(path: str | os.PathLike[str], overwrite: bool = True) -> Iterator[
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():  # a device, which root could replace
         raise OSError(errno.EINVAL, "not a regular file", str(path))
-    temporary = _temporary(path)
+    temporary = path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
     try:
         yield temporary
         with temporary.open("rb") as file:
@@ -86,26 +86,14 @@ def write_atomically(
             file.write(content.encode() if isinstance(content, str) else content)
 
 
-def _temporary(path: Path) -> Path:
-    """Return the path of a new hidden file in the same folder, with the same suffix."""
-    return path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
-
-
 def package_versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
-    """Return the versions of Python and of the installed ``packages``, by name; for batchpid, its
-    ``__version__``.
-    """
+    """Return the versions of Python and of the installed ``packages``, by name."""
     from importlib.metadata import PackageNotFoundError, version  # slow to import
-
-    import batchpid
 
     versions = {"python": platform.python_version()}
     for package in packages:
         try:
-            if package == "batchpid":
-                versions[package] = batchpid.__version__
-            else:
-                versions[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
             continue
     return versions

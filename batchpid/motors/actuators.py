@@ -343,7 +343,7 @@ ACTUATORS = RecordFile(
     "batchpid-actuators-1",
     Actuators,
     make_actuators,
-    ("seed", "max_delay"),
+    ("dtype", "seed", "max_delay"),
     {**FIELDS, "continuous": Field(neutral=False)},
     partial=True,
 )

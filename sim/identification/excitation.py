@@ -10,7 +10,7 @@ about a center::
 
 so that it is limited by the joint's range at low frequencies, by velocity and by effort at higher
 ones. s_j runs from 0 to 1 and back as a cosine, shifted by the joint's share of the time, so that
-all joints move differently. The window w rises from 0 and falls back within a tenth of the time:
+all joints move differently. The window w rises in the first tenth of the time and falls in the last:
 the motion begins and ends at rest at c. Low frequencies show friction, gravity and strength, high
 ones inertia and delay.
 

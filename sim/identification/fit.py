@@ -47,9 +47,9 @@ is not fitted.
 HELD_OUT = 0.25
 """Share of each log, at its end, that is held out."""
 MOST_WINDOWS = 500
-"""Largest number of windows; of more, evenly spaced ones are used."""
+"""Largest number of windows; if there are more, evenly spaced ones are used."""
 MOST_NUMBERS = 2**24
-"""Largest number of entries of the derivatives; of more, evenly spaced rows are fitted."""
+"""Largest number of entries of the derivatives; if there are more, evenly spaced rows are fitted."""
 ENVS = 2048
 """Most simulations at once."""
 STEP = 1e-3
@@ -61,7 +61,7 @@ FARTHEST = 3.0
 OUTLIER = 2.0
 """Ratio of a residual to its size above which its weight in the loss decreases."""
 ROUNDS = 4
-"""Most fits, each with residuals of the size that the one before has left."""
+"""Largest number of fits; each scales the residuals by the size that the last one left."""
 SETTLED = 0.5
 """Ratio of that size to the one before from which no further fit follows."""
 SHORT = 1e-3
@@ -223,8 +223,8 @@ class Problem:
 def fit(
     problems: Sequence[Problem], evaluations: int, progress: Callable[[], Any] | None = None
 ) -> Fit:
-    """Return the fit from the problem whose start explains the logs best: first of all unknowns,
-    then of those that the logs show.
+    """Fit from the start with the least error: all unknowns once, then only those that the logs
+    show.
     """
 
     def start_error(problem: Problem) -> float:
@@ -306,8 +306,8 @@ def solve(
 
 
 def intervals(problem: Problem, solution: Solution) -> Intervals:
-    """Return the intervals at a solution, from derivatives by the values: their coordinates have
-    none where an effect is off.
+    """Return the intervals at a solution, from derivatives by the values, not the coordinates: near
+    0 a coordinate hardly changes its value.
     """
     unknowns = problem.unknowns
     entries = unknowns.entries

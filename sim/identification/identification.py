@@ -15,6 +15,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
+from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import choice, flag, instance, integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, warn
 from batchpid.sim.identification.fit import Problem, fit, windows_of
@@ -30,20 +31,23 @@ from batchpid.sim.identification.regression import (
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import Dynamics, LogControl, Plant
 from batchpid.sim.identification.unknowns import BASIC, EXTRAS, KINDS, Unknowns
+from batchpid.sim.loop.step_values import ModelledFriction
 from batchpid.sim.options.groups import Compensation
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_options import BAND
 
 STILL = {"rad": 1e-3, "m": 1e-4}
 """Standard deviation of the positions up to which a joint did not move."""
 FOLLOWS = 0.01
-"""Ratio of the standard deviation of positions to the setpoints', up to which a joint counts as
-stuck.
+"""A joint is stuck if the standard deviation of its positions is at most this share of its
+setpoints'.
 """
 BEYOND = 3.0
 """Effort over the robot's limit from which it looks like another unit."""
 DETOUR = 0.1
-"""Least decrease of the regression's cost for a compensation that does not pass through the motors.
+"""Decrease of the regression's cost from which the compensation counts as exact, not through the
+motors.
 """
 
 
@@ -113,8 +117,8 @@ def identify(
         kinds.append("payload")
     evaluations = integer("evaluations", evaluations, 2, 1000)
     read = _read(robot, logs, params, reading)
-    joints, still = _moving(robot, read)
-    robot, data = _simulated(robot, read, joints, params, compensate, timestep)
+    moves, still = _moving(robot, read)
+    robot, data = _prepared(robot, read, moves, params, compensate, timestep)
     data, guesses = _regress(robot, data, "slew" in extras)
     unknowns = [_unknowns(robot, data, guess, kinds) for guess in guesses]
     windows = windows_of(data)
@@ -141,8 +145,10 @@ def _read(
     if all(log.settings.held_out for log in read):
         raise InvalidArgumentError("logs", "are missing or held out", remedy="name some to fit")
     for log in read:
-        if log.joints != read[0].joints or log.kind != read[0].kind:
-            problem = f"holds other joints or commands than {read[0].source}"
+        first = read[0]
+        alike = (first.joints, first.kind, first.measured)
+        if (log.joints, log.kind, log.measured) != alike:
+            problem = f"holds other joints or commands than {first.source}"
             raise log.error(problem, "fit them one by one")
     return read
 
@@ -167,7 +173,7 @@ def _moving(robot: Robot, logs: list[Log]) -> tuple[Bool, tuple[str, ...]]:
     return moves, still
 
 
-def _simulated(
+def _prepared(
     robot: Robot,
     logs: list[Log],
     moves: Bool,
@@ -175,12 +181,14 @@ def _simulated(
     compensate: str | None,
     timestep: float | None,
 ) -> tuple[Robot, list[LogData]]:
-    """Return the robot that rests where it did not move, and the moving joints of each log with
-    their plant and control.
+    """Return the robot with its still joints at their mean positions, and the moving joints of each
+    log with plant and control.
     """
     forces = _option("compensate", compensate, logs, "gravity+coriolis+friction")
-    forces = str(forces).removesuffix("+friction")
-    choice("compensate", forces, ("gravity+coriolis", "gravity", "none"))
+    choice(
+        "compensate", forces, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none")
+    )
+    forces, is_friction, _ = forces.partition("+friction")
     dt = number("timestep", _option("timestep", timestep, logs, 1 / 2000), 1e-5, 0.01, "seconds")
     # Joints that did not move are held at their mean position, with the unlogged ones.
     joints = np.array(logs[0].joints)
@@ -190,6 +198,12 @@ def _simulated(
     qpos = np.concatenate([log.qpos for log in logs])[:, moves]
     joints = joints[moves]
     free = (qpos.min(0) < robot.lower[joints]) | (qpos.max(0) > robot.upper[joints])
+    # A Runner compensates the friction of the description, too.
+    modelled = None
+    if is_friction and robot.friction[joints].any():
+        band = np.array([BAND[robot.units[joint]] for joint in joints])
+        turns = robot.continuous[joints] / TURN
+        modelled = ModelledFriction(robot.friction[joints], band, turns)
     plants = dict[Robot, Plant]()
     data = list[LogData]()
     for log in logs:
@@ -200,7 +214,8 @@ def _simulated(
         if key not in plants:
             plants[key] = Plant(_resting(key, start), tuple(joints.tolist()), free)
         part = log.part(joints=moves)
-        data.append(LogData(part, smooth(part, dt), plants[key], LogControl(dt, law, forces)))
+        drive = LogControl(dt, law, forces, modelled=modelled)
+        data.append(LogData(part, smooth(part, dt), plants[key], drive))
     return _resting(robot, start), data
 
 
@@ -210,7 +225,7 @@ def _resting(robot: Robot, start: Float64) -> Robot:
 
 
 def _option(name: str, value: Any, logs: list[Log], default: Any) -> Any:
-    """Return an option as the recordings say, or its ``value``, or the default."""
+    """Return ``value``, else that of the recordings, which must not differ, else the default."""
     for log in logs:
         recorded = getattr(log, name)
         if value is None:
@@ -257,7 +272,8 @@ def _of_joints(params: bp.PIDParams | None, robot: Robot, log: Log) -> bp.PIDPar
 def _regress(
     robot: Robot, data: list[LogData], has_slew: bool
 ) -> tuple[list[LogData], list[Guess]]:
-    """Return the logs with the path of the compensation, and the motors by the regression.
+    """Return the logs, marked whether the compensation passes through the motors, and the guesses
+    of the regression.
 
     Raises InvalidArgumentError where a log makes far more sense in another reading.
     """

@@ -40,7 +40,7 @@ class LogWarning(UserWarning):
 
 
 class LogSettings(NamedTuple):
-    """Settings of one log among several; None: as all."""
+    """Settings of one log; None: as given to ``identify``."""
 
     robot: Robot | None = None
     """The robot, with the same joints as all."""
@@ -50,7 +50,7 @@ class LogSettings(NamedTuple):
     """True to hold out the whole log, False to fit it all; None: its last quarter is held out."""
 
 
-ALIKE = LogSettings()
+NO_SETTINGS = LogSettings()
 """Settings of a log that has none of its own."""
 
 
@@ -81,7 +81,7 @@ class Log:
     """True if the efforts of ``command`` were measured and not commanded: they have no delay."""
     params: bp.PIDParams | None = None
     """Params that drove the robot, where the log says it."""
-    settings: LogSettings = ALIKE
+    settings: LogSettings = NO_SETTINGS
     lines: Rows | None = None
     """Number of each row's line in a file (rows,)."""
     is_checked: bool = False

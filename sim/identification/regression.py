@@ -37,7 +37,7 @@ CUTOFF = 15.0
 DELAYS = np.arange(0.0, 0.03, 1e-3)
 LOOP_DELAYS = DELAYS[:9]
 SETPOINT_DELAYS = np.arange(-0.05, 0.06, 5e-3)
-"""Delays of efforts, of efforts within a loop of setpoints, and of setpoints, that are tried [s]. A
+"""Delays that are tried [s]: of logged efforts, of the efforts of a PID law, and of setpoints. A
 delay of setpoints is negative where they were logged late. Loops have short delays of efforts.
 """
 EDGE = 0.15
@@ -59,7 +59,7 @@ ALIKE = 1.4
 residuals.
 """
 TRIED = 10.0
-"""Length of a log from which other readings are tried [s]."""
+"""Other readings are tried on this first part of a log [s]."""
 LEAST_SHARE = 0.05
 """Share of a joint's effort that moves the links, below which its strength is not identifiable: the
 motor's inertia and friction take the rest, which determines their ratios to the strength only.
@@ -186,7 +186,7 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
             values["setpoint_delay"] = np.array([setpoint_delay])
             options.append(Guess(values, costs))
         guesses.append(min(options, key=Guess.cost))
-    # The sum of both delays is certain, but armature and damping make up for their shares.
+    # Logs show the sum of both delays; armature and damping can hide how it is divided.
     # Setpoints that were logged late are the last explanation.
     least = min(map(Guess.cost, guesses)) + ALIKE
     alike = sorted([guess for guess in guesses if guess.cost() < least], key=Guess.cost)
@@ -240,7 +240,7 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     center = columns.mean(0)
     columns = columns - center
     size = np.sqrt((columns**2).mean(0)) + 1e-12
-    # An effort that is far larger than the links need says nothing of its scale: it is 1.
+    # Where links need a small share of the effort, its strength cannot be found: it stays 1.
     weight = 1e3 if size[4] < LEAST_SHARE * size[3] else WEIGHT
     prior = np.sqrt(len(target)) * weight * size[3] + 1e-12
     rows = np.vstack([columns, [0.0, 0.0, 0.0, prior, prior]])

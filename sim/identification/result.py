@@ -16,7 +16,7 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.sim.identification.fit import INTERVAL, STEP, Fit
+from batchpid.sim.identification.fit import INTERVAL, OUTLIER, STEP, Fit
 from batchpid.sim.identification.simulator import LogControl, changed_params
 from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknown, Unknowns
 from batchpid.sim.robot.robot import Robot
@@ -31,7 +31,7 @@ KEY = "confidence_region"
 LEAST_SHARE = 0.1
 """Least share of the remaining squared error that a further effect has to explain to be named."""
 ALIKE = 0.5
-"""Least ratio of what a link's mass explains to what the best one does, to be considered, too."""
+"""Links are considered if they explain at least this share of what the best one does."""
 EXPLAINS = 0.5
 """Share of the position error with ideal motors that a file may leave."""
 
@@ -332,7 +332,7 @@ def advice(fit: Fit) -> str:
     # Without the prior of the further unknowns: any size of an effect is as likely.
     rows = len(residual) - len(further)
     table = np.column_stack([matrix, residual])[:rows]
-    weight = (1 + residual[:rows] ** 2 / 4) ** -0.25
+    weight = (1 + (residual[:rows] / OUTLIER) ** 2) ** -0.25
     triangle: Any = np.linalg.qr(weight[:, None] * table, mode="r")
     target = triangle[:, -1]
     shares = dict[str, float]()
@@ -349,7 +349,7 @@ def advice(fit: Fit) -> str:
     if best in KINDS:
         percent = 100 * shares[best]
         return f"{best} would explain {percent:.0f} % of the squared error (extras: {best})"
-    # A heavier link is a lighter other one with weaker motors: the likely one has factors near 1.
+    # A heavier link looks like a lighter other one with weaker motors: take factors near 1.
     factors = [KINDS[entry.kind].neutral == 1.0 for entry in (*unknowns.entries, further[0])]
     sizes = dict[float, str]()
     for link, share in shares.items():
@@ -358,7 +358,7 @@ def advice(fit: Fit) -> str:
             sizes[float(np.abs(values - 1)[factors].sum())] = link
     link = sizes[min(sizes)]
     more = "heavier" if changes[link][-1] > 0 else "lighter"
-    words = f"link {link} {more} than described would explain most of the error (extras: mass)"
+    words = f"link {link} {more} than described would explain much of the error (extras: mass)"
     return f"{words}, or the strengths: weigh it"
 
 
@@ -371,7 +371,7 @@ def draw_motors(
     With the estimate m and the root L of the covariance L L^T, a draw is m + L z with normal z,
     within the bounds of the unknowns. Effects outside of the region keep their values in
     the file. Friction and damping are in addition to the robot's description. For
-    ``robot.tuned(actuators=...)`` or a Runner with as many envs.
+    ``tune(robot, motors=...)`` or a Runner with as many envs.
 
     Raises
     ------

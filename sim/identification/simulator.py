@@ -42,6 +42,7 @@ from batchpid.sim.loop.step_values import (
     Layout,
     Measured,
     Model,
+    ModelledFriction,
     PIDLaw,
     Step,
     StepState,
@@ -69,6 +70,8 @@ class LogControl(NamedTuple):
     """Forces that the robot compensates: "gravity+coriolis", "gravity" or "none"."""
     through: bool = True
     """True if the compensation passes through the motors, as in a Runner; False if it is exact."""
+    modelled: ModelledFriction | None = None
+    """Friction that the law compensates."""
 
 
 class PlantCandidates(NamedTuple):
@@ -111,7 +114,7 @@ class Stretch(NamedTuple):
     past: int
     """Number of steps before the start, equal in all stretches of a simulation."""
     step: Any
-    """Sim step whose end is at or after each measured row (rows,)."""
+    """First sim step that ends at or after each row (rows,)."""
     before: Float64
     """Time from the row to that end [s] (rows,)."""
 
@@ -274,6 +277,7 @@ class SimulatedControl:
             Coupling.of(qpos.shape[1]),
             k,
             friction=self.friction,
+            modelled=None if law is None else drive.modelled,
             guard=guard,
             motors=motors,
         )

@@ -29,7 +29,7 @@ class Kind(NamedTuple):
     """Kind of unknown, in SI units."""
 
     target: Literal["motor", "law", "robot", "log"]
-    """Part of a candidate that it changes. Only motors are in the saved file."""
+    """Part of a candidate that it changes. Only motors become actuators."""
     per: Literal["joint", "robot", "link"]
     size: str | float
     """Typical size: a number, or the name of a typical value of each joint."""
@@ -70,7 +70,7 @@ all gains of the law, "kd" of kd alone, "saturation" the law's effort limit over
 "slew" the limit of the setpoints' rate, "mass" a factor of a link's mass and inertia.
 """
 BASIC = ("armature", "damping", "friction", "strength", "bias", "delay")
-"""Kinds that a fit of efforts has."""
+"""Kinds that every fit has."""
 EXTRAS = {
     "load_friction": ("load_friction",),
     "stribeck": ("static", "stribeck"),
@@ -177,7 +177,8 @@ class Unknowns:
     @property
     def start(self) -> Float64:
         """Point at the start of a fit."""
-        return self.points(np.array([entry.start for entry in self.entries])[None])[0]
+        values = np.array([[entry.start for entry in self.entries]])
+        return self.points(values).reshape(-1)
 
     @property
     def prior(self) -> Float64:

@@ -42,8 +42,7 @@ Backend = Literal["numpy", "jax"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
 Place = Literal["snapshot", "recording", "scene", "restored", "processes", "next commands"]
-"""Place that keeps an option, or the reason for which a snapshot may be restored in a runner with
-another value of it.
+"""Where an option is kept, or why a snapshot can be restored in a runner with another value.
 
 - "snapshot": it must be the same in the runner that restores the snapshot;
 - "recording": a field of :class:`batchpid.sim.RunInfo`;

@@ -159,7 +159,6 @@ COMBINATIONS = [
     ),
     (trajectories.minimum_jerk, "duration", {"duration": None}),
     (trajectories.minimum_jerk, "duration", {"duration": 1.0, "max_velocity": 1.0}),
-    (trajectories.minimum_jerk, "max_velocity", {"max_velocity": [1.0, math.inf]}),
     (trajectories.trapezoidal, "max_velocity", {"max_velocity": [1.0, -1.0]}),
     (trajectories.trapezoidal, "max_acceleration", {"max_acceleration": math.inf}),
     (metrics.step_metrics, "measurement", {"measurement": np.zeros((1, 1, 2))}),

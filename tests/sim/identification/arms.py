@@ -30,6 +30,7 @@ DT = 0.001
 FALLING = np.array([0.5, 0.3])
 STEPS = 5
 """Sim steps of a tick."""
+OPTIONS = {"workers": 0, "timestep": DT, "substeps": STEPS, "engine": "mujoco"}
 
 
 def load(folder, text: str = URDF) -> Robot:
@@ -59,17 +60,9 @@ def run(
     efforts.
     """
     actuators = bp.make_actuators(2, **(TRUTH | options.pop("actuators", {})))
-    options = {
-        "workers": 0,
-        "timestep": DT,
-        "substeps": STEPS,
-        "engine": "mujoco",
-        "control": control,
-    } | options
+    options = OPTIONS | {"control": control, "compensate": compensate} | options
     params = None if control == "effort" else gains()
-    with Runner(
-        robot, 1, params=params, compensate=compensate, actuators=actuators, **options
-    ) as runner:
+    with Runner(robot, 1, params=params, actuators=actuators, **options) as runner:
         runner.reset(FALLING if control == "effort" else setpoints[0])
         return runner.rollout(setpoints)
 
@@ -87,14 +80,8 @@ def effort_run(robot: Robot, driven: tuple[float, float] = (1.0, 1.0)):
     """
     setpoints, rows = motion(), []
     actuators = bp.make_actuators(2, **TRUTH)
-    options = {
-        "workers": 0,
-        "timestep": DT,
-        "substeps": STEPS,
-        "engine": "mujoco",
-        "compensate": "none",
-    }
-    with Runner(robot, 1, control="effort", actuators=actuators, **options) as runner:
+    options = OPTIONS | {"control": "effort", "compensate": "none"}
+    with Runner(robot, 1, actuators=actuators, **options) as runner:
         seen = runner.reset(np.zeros(2))
         for setpoint in setpoints:
             rows.append(

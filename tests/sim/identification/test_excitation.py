@@ -59,32 +59,19 @@ def arm(folder, height=0.15, effort=60.0, bend=60.0, wall=None):
     """Return an arm of two bars that turn about y above the ground; a wall in front of it is fixed
     to its base.
     """
-    lift = (
-        f'<origin xyz="0 0 {height}"/><axis xyz="0 1 0"/><limit lower="-2" upper="2"'
-        f' effort="{effort}" velocity="9"/>'
-    )
-    place = (
-        f'<origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="{bend}"'
-        ' velocity="9"/>'
-    )
-    parts = [
-        '<link name="base"/>',
-        f'<link name="upper">{BAR}</link><link name="lower">{BAR}</link>',
-        (
-            '<joint name="lift" type="revolute"><parent link="base"/><child'
-            f' link="upper"/>{lift}</joint>'
-        ),
-        (
-            '<joint name="bend" type="revolute"><parent link="upper"/><child'
-            f' link="lower"/>{place}</joint>'
-        ),
-    ]
+
+    def joint(name, parent, child, place, effort):
+        links = f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{place}"/>'
+        limit = f'<limit lower="-2" upper="2" effort="{effort}" velocity="9"/>'
+        return f'<joint name="{name}" type="revolute">{links}<axis xyz="0 1 0"/>{limit}</joint>'
+
+    parts = [f'<link name="base"/><link name="upper">{BAR}</link><link name="lower">{BAR}</link>']
+    parts.append(joint("lift", "base", "upper", f"0 0 {height}", effort))
+    parts.append(joint("bend", "upper", "lower", "0.3 0 0", bend))
     if wall is not None:
         shape = '<collision><geometry><box size="0.1 1 4"/></geometry></collision>'
-        parts.append(
-            f'<link name="wall">{shape}</link><joint name="hold" type="fixed"><parent link="base"/>'
-            f'<child link="wall"/><origin xyz="{wall} 0 0"/></joint>'
-        )
+        parts.append(f'<link name="wall">{shape}</link><joint name="hold" type="fixed">')
+        parts.append(f'<parent link="base"/><child link="wall"/><origin xyz="{wall} 0 0"/></joint>')
     path = folder / "arm.urdf"
     path.write_text(f'<robot name="arm">{"".join(parts)}</robot>')
     return bp.sim.Robot.load(path, self_collision="urdf")

@@ -139,17 +139,7 @@ def test_candidates_and_stretches_do_not_affect_each_other(tmp_path):
     states[1, 1] = 0.1
     tables = simulate(plant, drive, made, states, stretches)
     for number, stretch in enumerate(stretches):
-        for row in range(3):
-            one = made._replace(
-                actuators=made.actuators._replace(
-                    **{
-                        name: leaf[row : row + 1]
-                        for name, leaf in made.actuators._asdict().items()
-                        if leaf is not None and name != "max_delay"
-                    }
-                ),
-                setpoint_delay=np.zeros(1),
-                masses=((),),
-            )
+        for row, strength in enumerate(made.actuators.strength):
+            one = candidates(**TRUTH | {"strength": strength})
             (alone,) = simulate(plant, drive, one, states[row : row + 1], [stretch])
             np.testing.assert_allclose(alone[0], tables[number][row], atol=1e-9)
