@@ -293,11 +293,7 @@ class BatchPID:
         """
         if isinstance(value, np.ndarray) or not hasattr(value, "dtype"):
             value = read_array(name, value)
-        try:
-            array = self._engine.array(value)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            problem = f"cannot be read as an array of numbers: {error}"
-            raise InvalidArgumentError(name, problem, remedy="pass an array of numbers") from None
+        array = self._engine.array(value)
         if array.shape == self._shape:
             return array
         if exact:

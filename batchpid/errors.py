@@ -114,13 +114,12 @@ class MissingDependencyError(BatchPIDError, ImportError):
         self.purpose = purpose
         self.extra = extra
         # Extras come from a checkout, as long as batchpid is on no index.
-        requirement = package if extra is None else f".[{extra}]"
         if extra is None:
-            place = ""
+            source = package
         else:
-            place = " in the checkout of batchpid"
+            source = f"'.[{extra}]' in the checkout of batchpid"
         super().__init__(
-            f"{purpose} needs the package {package!r}; install it with: pip install '{requirement}'{place}"
+            f"{purpose} needs the package {package!r}; install it with: pip install {source}"
         )
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -277,8 +277,7 @@ def frozen(record: R) -> R:
     returned.
     """
     # Most records are frozen already, and cost one look.
-    exposed = [leaf for leaf in record if isinstance(leaf, np.ndarray) and _can_be_written(leaf)]
-    if not exposed:
+    if not any(map(_can_be_written, record)):
         return record
     copied: R = mapped(lambda leaf: frozen_array(leaf) if _can_be_written(leaf) else leaf, record)
     return copied

@@ -42,7 +42,7 @@ def replacing(path: str | os.PathLike[str], overwrite: bool = True) -> Iterator[
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():  # a device, which root could replace
         raise OSError(errno.EINVAL, "not a regular file", str(path))
-    temporary = _temporary(path)
+    temporary = path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
     try:
         yield temporary
         with temporary.open("rb") as file:
@@ -84,11 +84,6 @@ def write_atomically(
             content(file)
         else:
             file.write(content.encode() if isinstance(content, str) else content)
-
-
-def _temporary(path: Path) -> Path:
-    """Return the path of a new hidden file in the same folder, with the same suffix."""
-    return path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
 
 
 def package_versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:

@@ -68,7 +68,8 @@ def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coe
     With ``num_envs`` they have the shape of :func:`spread`. Raises InvalidArgumentError for params
     of another type, and unless dt is positive and finite; an array of JAX is not checked.
     """
-    dt = checked_dt(dt, instance("params", params, PIDParams, "build them with make_params").dtype)
+    instance("params", params, PIDParams, "build them with make_params")
+    dt = checked_dt(dt)
     # The implicit law is the explicit one with other gains and three further coefficients.
     c = params.setpoint_weight_derivative
     c_given = None

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, DType
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.choices import HoldEffort
 from batchpid.arrays.elementwise import in_dtype_of
 from batchpid.checks.validate import instance, read_array, time_step
@@ -155,22 +155,13 @@ def checked_mask(mask: Array, state: PIDState) -> Array:
     return array
 
 
-def checked_dt(dt: Array, dtype: DType) -> Array:
-    """Return ``dt`` if it is positive and finite, a number as a float, and NumPy's array in the
-    params' ``dtype``.
+def checked_dt(dt: Array) -> Array:
+    """Return ``dt`` if it is positive and finite, a number as a float.
 
     A number of NumPy would give its own dtype to the efforts. Values of JAX's arrays are not read.
     """
-    # One step for each env is checked entry by entry.
-    if isinstance(dt, np.ndarray) and dt.ndim:
-        if dt.dtype.kind not in "iuf" or not ((dt > 0) & (dt < np.inf)).all():
-            raise InvalidArgumentError(
-                "dt", "must be positive and finite", value=dt, remedy="use numbers > 0 (s)"
-            )
-        time_step("dt", float(dt.max(initial=0)))
-        return dt.astype(dtype, copy=False)
     if isinstance(dt, np.ndarray | np.generic):
-        dt = dt.item()
+        dt = dt.tolist()
     if hasattr(dt, "__array_namespace__"):
         return dt
     return time_step("dt", dt)
