@@ -147,6 +147,7 @@ GONE = (
     r"ToolTuning",
     r"try_writing",
     r"ts\.presets",
+    r"ts\.track",
     r"tune_tool",
     r"usual_variation",
     r"--variation",

@@ -114,6 +114,7 @@ class Header:
             raise InvalidArgumentError("prefix", problem, value=prefix, remedy=remedy)
         params.check(1, self.joints)
         check_gain_units(params)
+        # Guard and tree have to belong to the same joints, in the same order.
         if guard is not None:
             guard.check(1, self.joints)
         if tree is not None:
@@ -223,13 +224,6 @@ class Header:
             law, terms = pid.advance(k, law, setpoint, measurement, *optional)
         return [*leaves((law, held)), terms.effort]
 
-    def extent(self, name: str) -> str:
-        """Return the number of entries of an input."""
-        n = self.names.size
-        if name == "mass_matrix":
-            return f"{n} * {n}"
-        return n
-
     def _frame(self, tables: str, body: str, state: Document) -> str:
         """Return the whole header around the code of a step."""
         p = self.names.prefix
@@ -241,16 +235,19 @@ class Header:
             "mass_matrix": "M at about y [kg m^2 or kg], by rows",
             **RATES,
         }
+        sizes = {"mass_matrix": f"{n} * {n}"}
         arguments = "".join(
-            f",\n    const {t} {name}[{self.extent(name)}] /* {units[name]} */"
+            f",\n    const {t} {name}[{sizes.get(name, n)}] /* {units[name]} */"
             for name in self.inputs
         )
         functions = "".join(helpers(self.names, body))
         if self.tree is not None:
             functions += rigid_body(self.names, self.tree)
+        # A class of C++ wraps the same functions.
         passed = "".join(f", {name}" for name in self.inputs)
         pointers = "".join(f"const {t} *{name}, " for name in self.inputs)
         fields = "".join(f"  {t} {name}[{n}];\n" for name in state) or "  char unused;\n"
+        # A restart keeps what the integral has learnt; a start does not.
         every = self._started(state)
         lasting = self._started({name: leaf for name, leaf in state.items() if name != "integral"})
         # An input without effect would be a warning of the compiler.

@@ -113,10 +113,6 @@ class Differences(list[str]):
         named = [f"{joint} {text}" for joint, text in zip(self.joints, texts, strict=True)]
         return ", ".join(np.array(named)[chosen])
 
-    def listed_names(self, where: Bool) -> str:
-        """Return the names of the joints in the mask ``where``, as text."""
-        return ", ".join(np.array(self.joints)[where])
-
     def add(
         self,
         option: str,

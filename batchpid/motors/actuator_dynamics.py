@@ -37,7 +37,6 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule, Document
 from batchpid.arrays.elementwise import TURN, clip, in_dtype_of, namespace, push_history, wrap
-from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import check_time_step
 from batchpid.motors import delay
 from batchpid.motors import sensor_noise as noise
@@ -73,11 +72,6 @@ class MotorCoefficients(NamedTuple):
     velocity_noise: Array = None
     turns: Array = None
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
-
-    def __repr__(self) -> str:
-        parts = ("command", "position_delay", "velocity_delay", "envelope", "commands")
-        hidden: Document = dict.fromkeys(parts)
-        return array_summary(self._replace(**hidden), "envs", "joints")
 
 
 def init(

@@ -245,13 +245,11 @@ def make_actuators(
 
 def _check_together(leaves: Document, joint_names: Sequence[str] | None) -> None:
     """Raise InvalidArgumentError for effects that lack another one, or contradict it."""
-    if (leaves["saturation_effort"] is None) != (leaves["no_load_speed"] is None):
-        if leaves["no_load_speed"] is None:
-            missing = "no_load_speed"
-        else:
-            missing = "saturation_effort"
+    # One end does not make a line.
+    missing = [name for name in ("saturation_effort", "no_load_speed") if leaves[name] is None]
+    if len(missing) == 1:
         remedy = "give both ends of the torque-speed line, or none"
-        raise InvalidArgumentError(missing, "is missing", remedy=remedy)
+        raise InvalidArgumentError(missing[0], "is missing", remedy=remedy)
     static = leaves["static"]
     coulomb = leaves["coulomb"]
     if static is None:

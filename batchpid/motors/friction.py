@@ -46,7 +46,6 @@ from typing import Any, NamedTuple
 
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
-from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import check_time_step
 
 SHARE = 0.7
@@ -95,9 +94,6 @@ class FrictionState(NamedTuple):
     """K w: the factor of v' [N m s/rad or N s/m]."""
     sliding: Array = None
     """1.0 if the joint was sliding in the last step, else 0.0."""
-
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
 
 
 def init(

@@ -32,18 +32,10 @@ def interpreter() -> Any:
     """
     native = load(PROGRAM)
     native.use(np.ndarray, np.empty)
-    # Two kinds of arrays, writable and read-only, that a program meets.
-    rows = np.empty((2, 3))
-    fixed = np.empty((4, 1), np.float32)
-    fixed.flags.writeable = False
-    for entry in (rows, fixed):
-        if native.look(entry) != (
-            entry.ctypes.data,
-            *entry.shape,
-            entry.dtype.num,
-            entry.flags.writeable,
-        ):
-            raise StaleExtensionError(f"cannot read the arrays of NumPy {np.__version__}")
+    # The extension reads the fields of arrays in memory, whose layout is NumPy's.
+    entry = np.empty((4, 3), np.float32)
+    if native.look(entry) != (entry.ctypes.data, *entry.shape, entry.dtype.num, True):
+        raise StaleExtensionError(f"cannot read the arrays of NumPy {np.__version__}")
     return native
 
 
@@ -137,6 +129,7 @@ class ArrayProgram:
         full
             Bit mask of the further inputs that must be (rows, columns).
         """
+        # The result of a step is a new array where the caller gives none.
         native = interpreter()
         new = (self.shape, self.dtype)
         fixed = self._program, self.shape[0], tuple(inputs), tuple(outputs)

@@ -78,6 +78,7 @@ class CompiledLaw:
         arguments = [entry for entry in inputs if entry is not None]
         state = PIDState(*(None if leaf is None else self._whole(leaf) for leaf in state))
         program, lasting = self._program(state, inputs)
+        # What a step returns of the state is written over what it read.
         fixed = [leaf for leaf in state if leaf is not None]
         written = [state[at] for at in lasting]
         masks = program.masks[len(lasting) :]

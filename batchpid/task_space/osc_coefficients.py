@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import namespace
-from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import check_time_step, instance
 from batchpid.task_space.osc_params import MAKE_PARAMS, OSCParams
 
@@ -57,9 +56,6 @@ class OSCCoefficients(NamedTuple):
     effort_max: Array
     turns: Array
     frame: Any
-
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "axes")
 
 
 def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:

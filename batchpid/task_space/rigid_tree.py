@@ -13,14 +13,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Array, Document, Float64, Rows
+from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.arrays.elementwise import namespace, read_only
-from batchpid.arrays.records import summary
 from batchpid.checks.validate import choice, entries, names, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
@@ -141,14 +140,9 @@ class RigidTree:
         links = tuple(names("links", list(self.links)))
         count = len(links)
         types = tuple(choice("joint_types", one, JOINT_TYPES) for one in self.joint_types)
-        if len(types) != count or types[:1] != ("fixed",):
-            problem = (
-                f"has {len(types)} entries for {count} links, or does not begin with 'fixed', for"
-                " the base"
-            )
-            raise InvalidArgumentError(
-                "joint_types", problem, remedy="give the type of the joint above each link"
-            )
+        if len(types) != count or types[0] != "fixed":
+            remedy = f"give {count}, the type of the joint above each link: 'fixed' for the base"
+            raise InvalidArgumentError("joint_types", "does not fit the links", remedy=remedy)
         moving = tuple(
             names("joint_names", list(self.joint_names), sum(one != "fixed" for one in types))
         )
@@ -157,27 +151,19 @@ class RigidTree:
         first = (parent < np.arange(count)) & (parent >= np.minimum(np.arange(count), 1) - 1)
         entries("parent", parent, first, "does not come before its child", links, kind="entry")
         # One copy of each table, in float64: later writes by the caller change nothing.
-        shapes = {
-            "position": (3,),
-            "wxyz": (4,),
-            "axis": (3,),
-            "mass": (),
-            "center": (3,),
-            "inertia": (3, 3),
-        }
-        tables: dict[str, Rows] = {
-            name: _array(name, getattr(self, name), (count, *shape))
-            for name, shape in shapes.items()
-        }
-        for name in ("armature", "lower", "upper"):
-            row: Any = np.asarray(getattr(self, name))
-            tables[name] = _array(
-                name, row if row.shape else np.full(len(moving), row), (len(moving),)
-            )
         # Gravity belongs to the world, and to no link or joint.
-        tables["gravity"] = _array("gravity", self.gravity, (3,))
+        shapes: dict[str, tuple[int, ...]] = {
+            "position": (count, 3),
+            "wxyz": (count, 4),
+            "axis": (count, 3),
+            "mass": (count,),
+            "center": (count, 3),
+            "inertia": (count, 3, 3),
+            "gravity": (3,),
+        }
+        shapes |= dict.fromkeys(("armature", "lower", "upper"), (len(moving),))
+        tables = {name: _array(name, getattr(self, name), shape) for name, shape in shapes.items()}
         entries("mass", tables["mass"], tables["mass"] >= 0, "must be >= 0", links, kind="entry")
-        entries("armature", tables["armature"], tables["armature"] >= 0, "must be >= 0", moving)
         # A quaternion must be a unit one; an axis only needs a direction.
         lengths = {name: np.linalg.norm(tables[name], axis=1) for name in ("wxyz", "axis")}
         unit = np.abs(lengths["wxyz"] - 1) < 1e-6
@@ -186,13 +172,7 @@ class RigidTree:
         entries("axis", lengths["axis"], pointing, "has no direction", links, kind="entry")
         tables["wxyz"] /= lengths["wxyz"][:, None]
         tables["axis"] /= np.where(lengths["axis"] > 0, lengths["axis"], 1.0)[:, None]
-        # Followers are known by the coupling, which must count the same joints.
         coupling = Coupling.of(len(moving)) if self.coupling is None else self.coupling
-        if len(coupling.leader) != len(moving):
-            problem = f"couples {len(coupling.leader)} joints, but {len(moving)} move"
-            raise InvalidArgumentError(
-                "coupling", problem, remedy="give one entry for each joint that moves"
-            )
         for table in (parent, *tables.values()):
             table.setflags(write=False)
         # The class is frozen, so the checked tables go past its setter.
@@ -204,10 +184,6 @@ class RigidTree:
             parent=parent,
             coupling=coupling,
         )
-
-    def __repr__(self) -> str:
-        parts = [f"{len(self.links)} links", f"{self.dof} joints", f"{self.mass.sum():.4g} kg"]
-        return summary(type(self).__name__, [*parts, "links " + " ".join(self.links)])
 
     @property
     def dof(self) -> int:
@@ -370,22 +346,10 @@ class RigidTree:
             frames[link] = np.column_stack([turn.T, np.zeros(3)])
         on_base = [link for link, of in enumerate(body) if of < 0]
         mass, center, tensor = self._inertias([*links_of, on_base], frames)
-        of_joints = mass[:-1], center[:-1], tensor[:-1]
-        leaves = (
-            *local,
-            slides,
-            *of_joints,
-            moves,
-            frames,
-            self.armature,
-            self.gravity,
-            mass[-1],
-            center[-1],
-            tensor[-1],
-        )
-        for leaf in leaves:
-            leaf.setflags(write=False)
-        return tuple(body), tuple(parents), Bodies(*leaves)
+        of_joints = slides, mass[:-1], center[:-1], tensor[:-1]
+        of_base = mass[-1], center[-1], tensor[-1]
+        leaves = *local, *of_joints, moves, frames, self.armature, self.gravity, *of_base
+        return tuple(body), tuple(parents), Bodies(*map(read_only, leaves))
 
     @cached_property
     def tables(self) -> tuple[NDArray[np.int32], Float64]:
@@ -476,8 +440,10 @@ def _along_x(axis: Float64) -> Float64:
 
 
 def _array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
-    """Return a copy of ``value`` as float64."""
+    """Return a copy of ``value`` as float64; a number stands for all entries."""
     table = np.array(read_array(name, value), np.float64)
+    if not table.shape:
+        table = np.full(shape, table)
     if table.shape != shape:
         problem = f"has shape {table.shape}, not {shape}"
         raise InvalidArgumentError(

@@ -158,18 +158,17 @@ def from_tips(tree: RigidTree, parts: Array, xp: ArrayModule) -> Array:
     return xp.stack(sums, axis=-2)
 
 
-def frame_of_link(tree: RigidTree, bodies: Bodies, frames: Array, index: int) -> Array:
-    """Return the frame (..., 3, 4) of a link, from the frames of the bodies."""
-    body = tree.link_bodies[index]
-    part = bodies.link_frames[index]
-    if body >= 0:
-        return turned(frames[..., body, :, :], part)
-    return part + namespace(frames).zeros_like(frames[..., 0, :, :])
-
-
 def tool_frame(tree: RigidTree, bodies: Bodies, frames: Array, index: int, point: Array) -> Array:
-    """Return the frame (..., 3, 4) of a link with its origin at ``point`` (..., 3) of the link."""
-    frame = frame_of_link(tree, bodies, frames, index)
+    """Return the frame (..., 3, 4) of a link, from the frames of the bodies, with its origin at
+    ``point`` (..., 3) of the link.
+    """
+    body = tree.link_bodies[index]
+    frame = bodies.link_frames[index]
+    # A link of the base does not move, but has a frame in each row.
+    if body >= 0:
+        frame = turned(frames[..., body, :, :], frame)
+    else:
+        frame = frame + namespace(frames).zeros_like(frames[..., 0, :, :])
     if point is None:
         return frame
     xp = namespace(frame, point)

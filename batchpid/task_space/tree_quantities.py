@@ -12,10 +12,8 @@ from collections.abc import Sequence
 
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import namespace
-from batchpid.checks.validate import choice
-from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
-from batchpid.task_space.frames import in_axes, matrix_of, pose_of
+from batchpid.task_space.frames import pose_of
 from batchpid.task_space.rigid_tree import Bodies, RigidTree
 from batchpid.task_space.symmetric import product, quiet, solve
 from batchpid.task_space.tree_dynamics import check_masses, effort_of, mass_matrix_of
@@ -28,9 +26,6 @@ from batchpid.task_space.tree_kinematics import (
     tool_frame,
     velocities_of,
 )
-
-FRAMES = ("world", "tool")
-"""Axes of Jacobians and accelerations: the axes of the world or of the link."""
 
 
 def evaluated(
@@ -91,31 +86,19 @@ def link_poses(
 
     With a ``point`` (3,) in the frame of the links [m], the positions of this point.
     """
-    if isinstance(links, str):
-        problem = "must be a list of names"
-        remedy = f"pass [{links!r}]"
-        raise InvalidArgumentError("links", problem, value=links, remedy=remedy)
     prepared(tree, qpos=qpos)
     names = tree.links if links is None else links
     poses = [evaluated(tree, ("pose",), qpos, None, link, point)["pose"] for link in names]
     return namespace(*poses).stack(poses, axis=-2)
 
 
-def jacobian(
-    tree: RigidTree, qpos: Array, link: str, *, point: Array = None, frame: str = "world"
-) -> Array:
-    """Return the Jacobian (..., 6, dof) of a point of ``link`` at ``qpos`` (..., dof).
+def jacobian(tree: RigidTree, qpos: Array, link: str, *, point: Array = None) -> Array:
+    """Return the Jacobian (..., 6, dof) of a point of ``link`` at ``qpos`` (..., dof), in the axes
+    of the world.
 
-    Parameters
-    ----------
-    point
-        Point in the link's frame, (3,) or (..., 3) [m]; default its origin.
-    frame
-        Axes of the twist: "world" or "tool", the axes of the link.
+    ``point`` is in the link's frame, (3,) or (..., 3) [m]; default its origin.
     """
-    choice("frame", frame, FRAMES)
-    results = evaluated(tree, ("pose", "jacobian"), qpos, None, link, point)
-    return _in_frame(frame, results["pose"], results["jacobian"])
+    return evaluated(tree, ("jacobian",), qpos, None, link, point)["jacobian"]
 
 
 def jacobian_rate(
@@ -125,17 +108,13 @@ def jacobian_rate(
     link: str,
     *,
     point: Array = None,
-    frame: str = "world",
 ) -> Array:
     """Return J' q' (..., 6): the acceleration [m/s^2, rad/s^2] that a point of ``link`` has by
     velocities alone.
 
-    ``qpos`` and ``qvel`` are (..., dof). With frame "tool" the same vectors are given in the axes
-    of the link. Other arguments as in :func:`jacobian`.
+    ``qpos`` and ``qvel`` are (..., dof); ``point`` is as in :func:`jacobian`.
     """
-    choice("frame", frame, FRAMES)
-    results = evaluated(tree, ("pose", "jacobian_rate"), qpos, qvel, link, point)
-    return _in_frame(frame, results["pose"], results["jacobian_rate"][..., None])[..., 0]
+    return evaluated(tree, ("jacobian_rate",), qpos, qvel, link, point)["jacobian_rate"]
 
 
 def mass_matrix(tree: RigidTree, qpos: Array, bodies: Bodies | None = None) -> Array:
@@ -198,10 +177,3 @@ def forward_dynamics(tree: RigidTree, qpos: Array, qvel: Array, effort: Array) -
     with quiet():
         net = tree.efforts(u) - results["bias"]
         return tree.rates(solve(results["mass_matrix"], net[..., None])[..., 0])
-
-
-def _in_frame(frame: str, pose: Array, columns: Array) -> Array:
-    """Return twists (..., 6, n) in the axes of the world, or of a tool at ``pose`` (..., 7)."""
-    if frame == "world":
-        return columns
-    return in_axes(matrix_of(pose[..., 3:]), columns)

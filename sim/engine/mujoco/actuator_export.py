@@ -215,7 +215,7 @@ class MjcfActuators:
             ),
         ):
             if (joints := joints & self._independent).any():
-                drive.append(f"{text}: {drive.listed_names(joints)}")
+                drive.append(f"{text}: {', '.join(np.array(drive.joints)[joints])}")
 
 
 def numbers_text(*numbers: Float64 | float) -> str:

@@ -63,9 +63,7 @@ def test_kinematics_and_dynamics(name, rows, seed, pointed):
     link = tree.links[rng.integers(len(tree.links))] if seed % 2 else tool
     for function in (
         lambda: ts.jacobian(tree, qpos, link, point=point),
-        lambda: ts.jacobian(tree, qpos, link, point=point, frame="tool"),
         lambda: ts.jacobian_rate(tree, qpos, qvel, link, point=point),
-        lambda: ts.jacobian_rate(tree, qpos, qvel, link, point=point, frame="tool"),
         lambda: ts.mass_matrix(tree, qpos),
         lambda: ts.bias(tree, qpos, qvel),
         lambda: ts.inverse_dynamics(tree, qpos, qvel, qvel[::-1]),

@@ -13,7 +13,6 @@ from trees import NAMES, planar, robot_of, states, tool_of, tree_of
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.sim import Robot, to_urdf
-from batchpid.task_space import frames
 
 POINT = np.array([0.1, -0.2, 0.3])
 
@@ -70,22 +69,6 @@ def test_mujoco_computes_the_same(case, native, monkeypatch):
             assert relative(ours[row], theirs) < 1e-12
 
 
-def test_jacobians_in_the_tools_axes_are_those_of_the_world_turned(case):
-    tree, tool, _ = case
-    qpos, qvel = states(tree, 10)
-    turn = frames.matrix_of(ts.link_poses(tree, qpos, [tool])[:, 0, 3:])
-    for function, given in ((ts.jacobian, (qpos,)), (ts.jacobian_rate, (qpos, qvel))):
-        world, in_tool = (
-            function(tree, *given, tool, point=POINT, frame=frame) for frame in ("world", "tool")
-        )
-        if function is ts.jacobian:
-            world, in_tool = ((rows * qvel[:, None]).sum(-1) for rows in (world, in_tool))
-        for part in (slice(3), slice(3, 6)):
-            np.testing.assert_allclose(
-                frames.rotate(turn, in_tool[:, part]), world[:, part], atol=1e-12
-            )
-
-
 def test_inverse_and_forward_dynamics_undo_each_other(case):
     tree, _, _ = case
     tree = dataclasses.replace(tree, armature=np.linspace(0.1, 0.3, tree.dof))
@@ -103,7 +86,7 @@ def test_inverse_and_forward_dynamics_undo_each_other(case):
 def functions(tree, tool):
     return (
         lambda q, v: ts.link_poses(tree, q),
-        lambda q, v: ts.jacobian(tree, q, tool, frame="tool"),
+        lambda q, v: ts.jacobian(tree, q, tool),
         lambda q, v: ts.jacobian_rate(tree, q, v, tool),
         lambda q, v: ts.mass_matrix(tree, q),
         lambda q, v: ts.bias(tree, q, v),
