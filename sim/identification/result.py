@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
-LEAST_SHARE = 0.1
-"""Least share of the remaining squared error that a further effect has to explain to be named."""
-ALIKE = 0.5
-"""Links are considered if they explain at least this share of what the best one does."""
+LEAST_SHARE, LEAST_SHARE_OF_MASS = 0.1, 0.5
+"""Least share of the remaining squared error that an effect, or the mass of a link, has to explain
+to be named.
+"""
 EXPLAINS = 0.5
 """Share of the position error with ideal motors that a file may leave."""
 
@@ -341,24 +341,25 @@ def advice(fit: Fit) -> str:
         columns = np.append(np.ones(len(unknowns.entries), bool), np.array(names) == name)
         slopes = triangle[:, :-1][:, columns]
         change, *_ = np.linalg.lstsq(slopes, -target, rcond=1e-10)
-        shares[name] = 1 - float(((target + slopes @ change) ** 2).sum() / (target @ target))
-        changes[name] = change
-    best = max(shares, key=lambda name: shares[name], default="")
-    if not best or shares[best] < LEAST_SHARE:
+        share = 1 - float(((target + slopes @ change) ** 2).sum() / (target @ target))
+        if share > (LEAST_SHARE if name in KINDS else LEAST_SHARE_OF_MASS):
+            shares[name] = share
+            changes[name] = change
+    if not shares:
         return "no further effect that was tried would explain a tenth of the remaining error"
+    best = max(shares, key=lambda name: shares[name])
     if best in KINDS:
         percent = 100 * shares[best]
         return f"{best} would explain {percent:.0f} % of the squared error (extras: {best})"
     # A heavier link looks like a lighter other one with weaker motors: take factors near 1.
     factors = [KINDS[entry.kind].neutral == 1.0 for entry in (*unknowns.entries, further[0])]
     sizes = dict[float, str]()
-    for link, share in shares.items():
-        if link not in KINDS and share > ALIKE * shares[best]:
-            values = np.append(fit.solution.point, 1.0) + changes[link]
-            sizes[float(np.abs(values - 1)[factors].sum())] = link
+    for link in shares.keys() - KINDS.keys():
+        values = np.append(fit.solution.point, 1.0) + changes[link]
+        sizes[float(np.abs(values - 1)[factors].sum())] = link
     link = sizes[min(sizes)]
     more = "heavier" if changes[link][-1] > 0 else "lighter"
-    words = f"link {link} {more} than described would explain much of the error (extras: mass)"
+    words = f"link {link} {more} than described would explain most of the error (extras: mass)"
     return f"{words}, or the strengths: weigh it"
 
 
