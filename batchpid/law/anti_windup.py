@@ -25,7 +25,11 @@ def masks(build: LeafBuilder, names: str | Sequence[object]) -> list[Bool | None
     Raises InvalidArgumentError for names that are not among ANTI_WINDUP, or of a wrong shape.
     """
     remedy = f"use one of {', '.join(map(repr, ANTI_WINDUP))}"
-    array = np.asarray(names, dtype=object)
+    try:
+        array = np.asarray(names, dtype=object)
+    except (TypeError, ValueError, RuntimeError) as error:
+        problem = f"cannot be read as an array: {error}"
+        raise InvalidArgumentError("anti_windup", problem, remedy=remedy) from None
     array = build.rows("anti_windup", array)
     good = np.array([isinstance(name, str) and name in ANTI_WINDUP for name in array.flat], bool)
     good = good.reshape(array.shape)
