@@ -127,7 +127,7 @@ def names(argument: str, value: Any, count: int | None = None) -> list[str]:
 
 def file_path(argument: str, value: object, suffixes: Collection[str] = ()) -> Path:
     """Return ``value`` as a path that ends in one of ``suffixes``, if any are given."""
-    if not isinstance(value, str | os.PathLike):
+    if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
         raise InvalidArgumentError(
             argument, "must be a path", value=value, remedy="pass the file's name"
         )

@@ -66,6 +66,7 @@ def check_alone(law: Any, measurement_rate: Array) -> None:
             "params.gain_units",
             "are accelerations: without the robot's mass matrix the law cannot turn them into"
             " efforts",
+            value="mass_matrix",
             remedy=(
                 "use gains in efforts, such as robot.designed('effort'), or a batchpid.sim.Runner"
             ),

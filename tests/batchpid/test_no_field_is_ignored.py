@@ -172,7 +172,7 @@ def test_coefficients_of_accelerations_need_the_robots_inertia():
     params, y = bp.make_params(2, 4.0, 1.0, 1.0, gain_units="mass_matrix"), np.zeros((1, 2))
     k, state = bp.discretise(params, DT), bp.init(params, y)
     with pytest.raises(
-        InvalidArgumentError, match=r"gain_units.*mass_matrix.*designed\('effort'\)"
+        InvalidArgumentError, match=r"gain_units.*mass matrix.*designed\('effort'\)"
     ):
         bp.advance(k, state, y, y)
     advance_with_mass_matrix(k, state, y, y, np.eye(2)[None])

@@ -112,6 +112,3 @@ def test_randomization_is_a_file(panda, tmp_path):
     path.write_text("payload: {uniform: [-1, 0]}")
     with pytest.raises(InvalidArgumentError, match=r"payload, entry 'payload': must be .*got -1"):
         load_randomization(path, panda)
-    path.write_text("a: &a [1, 1]\npayload: [*a, *a]")
-    with pytest.raises(InvalidArgumentError, match="alias"):
-        load_randomization(path, panda)
