@@ -72,7 +72,7 @@ class Inspection:
         lines.append("\n" + table(rows, ("link", "mass", "from"), "lrl"))
         if len(rows) < len(masses):
             hidden = len(masses) - len(rows)
-            lines.append(f"Not shown: {hidden} links with little mass or none (--all).")
+            lines.append(f"Links with little mass or none, not shown: {hidden} (--all).")
         lines += ["", *self._contact_lines()]
         return "\n".join(lines)
 

@@ -221,7 +221,7 @@ class Problem:
 
 
 def fit(
-    problems: Sequence[Problem], evaluations: int, progress: Callable[[], Any] | None = None
+    problems: Sequence[Problem], evaluations: int, progress: Callable[[], object] | None = None
 ) -> Fit:
     """Fit from the start with the least error: all unknowns once, then only those that the logs
     show.
@@ -252,7 +252,7 @@ def solve(
     start: Float64,
     evaluations: int,
     size: Float64 | None = None,
-    progress: Callable[[], Any] | None = None,
+    progress: Callable[[], object] | None = None,
 ) -> Solution:
     """Return the fit from a point ``start``, with residuals of a ``size`` (joints,), or that at the
     start.

@@ -63,7 +63,7 @@ def identify(
     reading: Reading | None = None,
     evaluations: int = 60,
     workers: int = 0,
-    progress: Callable[[], Any] | None = None,
+    progress: Callable[[], object] | None = None,
 ) -> Identification:
     """Find the motors of ``robot`` from logs of its motion.
 

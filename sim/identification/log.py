@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple, SupportsIndex
 
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError, warn
 from batchpid.sim.robot.robot import Robot
@@ -105,7 +105,10 @@ class Log:
         return np.where(moves, place, self.qpos[:count].mean(0)), np.where(moves, slope, 0.0)
 
     def part(
-        self, rows: Any = slice(None), commands: Any = slice(None), joints: Any = slice(None)
+        self,
+        rows: slice | Bool = slice(None),
+        commands: slice | Bool = slice(None),
+        joints: slice | Bool = slice(None),
     ) -> Log:
         """Return the log of some rows, commands and joints: slices or masks."""
         return replace(
@@ -127,9 +130,9 @@ class Log:
             return self.command[np.clip(index, 0, len(self.command) - 1)]
         return interpolated(time, self.command_time, self.command)
 
-    def place(self, row: Any) -> str:
+    def place(self, row: SupportsIndex) -> str:
         """Return the name of a row."""
-        return f"row {row + 1}" if self.lines is None else f"line {self.lines[row]}"
+        return f"row {int(row) + 1}" if self.lines is None else f"line {self.lines[row]}"
 
     def error(self, problem: str, remedy: str, value: object = None) -> InvalidArgumentError:
         """Return the error of this log."""

@@ -115,7 +115,7 @@ def test_masses_and_their_sources(batchpid, tmp_path):
         "arm": ["6", "kg", "collision shapes at 1000 kg/m^3"],
         "hand": ["1", "kg", "<inertial>, repaired"],
     }
-    assert "Not shown: 2 links with little mass or none (--all)." in flat(out)
+    assert "Links with little mass or none, not shown: 2 (--all)." in flat(out)
     every = batchpid("inspect", path, "--all")[1]
     assert {"frame", "speck"} <= {line.split(" ")[0] for line in every.splitlines()}
 
