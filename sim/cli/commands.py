@@ -223,7 +223,7 @@ def _settings(robot: Robot, values: Document) -> Iterator[str]:
     """Yield the words of the first line: base, joints, engine, gains, rate and number of robots."""
     if not robot.fixed_base:
         yield "free base"
-    yield f"{robot.dof} joints"
+    yield f"{robot.dof} dof"
     if "engine" in values:
         # A comparison may have two engines.
         engines = values["engine"] or ("mujoco",)

@@ -33,7 +33,7 @@ def test_the_header_is_that_of_the_function(batchpid, tmp_path):
     )
     assert (status, out.read_text()) == (0, exported.text)
     lines = [
-        "panda: 9 joints, gains tuned, 1000 Hz",
+        "panda: 9 dof, gains tuned, 1000 Hz",
         "The file has no differences.",
         f"written: {out}",
     ]
