@@ -181,7 +181,10 @@ def broadcast(
     remedy: str = "give one value, one per joint, or one per env and joint",
 ) -> NDArray[np.float64]:
     """Return ``value`` as float64, broadcast to ``shape``."""
-    result = read_array(argument, value).astype(np.float64, copy=False)
+    if type(value) is np.ndarray and value.dtype == np.float64:  # nearly always in a tick
+        result = value
+    else:
+        result = read_array(argument, value).astype(np.float64, copy=False)
     if result.shape == shape:
         return result
     try:

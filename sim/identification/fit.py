@@ -58,6 +58,8 @@ STATE_STEPS = 1e-3, 1e-2
 """Changes of initial positions and velocities."""
 FARTHEST = 3.0
 """Bound of the residuals [rad or m], reached where a simulation diverges."""
+RESOLUTION = 1e-5
+"""Least size of residuals [rad or m]: encoders show no less."""
 OUTLIER = 2.0
 """Ratio of a residual to its size above which its weight in the loss decreases."""
 ROUNDS = 4
@@ -206,7 +208,7 @@ class Problem:
         """
         errors = np.abs(_residuals(self.windows, evaluation, fitted=True))
         errors = np.minimum(errors, np.quantile(errors, 0.9, axis=0))
-        return _root_mean_square(errors) + 1e-9
+        return _root_mean_square(errors) + RESOLUTION
 
     def error(self, point: Float64, free_states: bool = True) -> Float64:
         """Return the root mean square (joints,) of the position error at the held-out rows; at all

@@ -75,8 +75,17 @@ def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
     assert np.abs((found[..., 3:] * at[3:]).sum(-1)).min() > 1 - 1e-5
 
 
-@pytest.mark.parametrize(("backend", "native"), [("numpy", "1"), ("numpy", "0"), ("jax", "1")])
-@pytest.mark.parametrize("discretization", ["explicit", "implicit"])
+@pytest.mark.parametrize(
+    ("discretization", "backend", "native"),
+    [
+        ("explicit", "numpy", "1"),
+        ("explicit", "numpy", "0"),
+        ("implicit", "numpy", "1"),
+        ("implicit", "numpy", "0"),
+        ("implicit", "jax", "1"),
+        pytest.param("explicit", "jax", "1", marks=pytest.mark.slow),
+    ],
+)
 def test_a_pose_moves_with_its_twist_within_a_tick(
     panda, discretization, backend, native, monkeypatch
 ):
