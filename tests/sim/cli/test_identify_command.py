@@ -27,8 +27,13 @@ def log(tmp_path):
     (tmp_path / "pendulum.urdf").write_text(PENDULUM)
     robot = Robot.load(tmp_path / "pendulum.urdf")
     gains, motion = robot.designed("effort"), excite(robot, 1.0, lowest=1.0, rate=200)
-    options = {"workers": 0, "compensate": "gravity+coriolis", "engine": "mujoco"}
-    options |= {"timestep": 1 / 1000, "substeps": 5}
+    options = {
+        "workers": 0,
+        "compensate": "gravity",
+        "engine": "mujoco",
+        "timestep": 0.001,
+        "substeps": 5,
+    }
     motors = bp.make_actuators(robot.dof, strength=0.9, coulomb=0.5)
     with Runner(robot, 1, params=gains, actuators=motors, **options) as runner:
         runner.reset(motion.position[0])
