@@ -35,7 +35,7 @@ from batchpid.sim import Robot
 from batchpid.sim.cli.report import table
 from batchpid.sim.engine import native
 from batchpid.sim.engine.protocol import EnginePack, load_engine
-from batchpid.sim.loop import env_group, numpy_executor
+from batchpid.sim.loop import env_group
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options.options import RunnerOptions
@@ -158,10 +158,11 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     options = RunnerOptions(robot, share, physics=workload.physics)
     layout = Arrays.layout(1, share, robot.dof, robot.dof, options.observed)
     shared = SharedArrays(layout)
-    with ExitStack() as stack:
-        for module in (env_group, numpy_executor):  # in NumPy, with a call for each phase
-            stack.enter_context(patch.object(module, "steps_natively", return_value=False))
+    # In NumPy, with a call for each phase.
+    with patch.object(env_group, "runs_natively", return_value=False):
         loop = Loop(options, robot.params(), slice(0, share), Arrays.from_fields(shared.arrays))
+    for group in loop.groups:
+        group._executor._engine._is_native = False
     loop.reset(
         np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, robot.dof))
     )
