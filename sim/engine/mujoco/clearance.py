@@ -1,9 +1,9 @@
 """Tables for native proofs that shapes of a robot do not touch (``clearance.h``), of models built
 from URDFs.
 
-Such a model has one joint a body, through the body's origin, shapes of the kinds in
-``clearance.h``, and no moving bodies but the robot's. Models of MJCF files can hold any element, so
-MuJoCo checks all of their contacts.
+Such a model has at most one joint a body, through the body's origin; bodies without one are welded
+to their parents. It has shapes of the kinds in ``clearance.h``, and nothing moves but the robot.
+Models of MJCF files can hold any element, so MuJoCo checks all of their contacts.
 """
 
 from __future__ import annotations
@@ -107,13 +107,24 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:
     joint[bodies] = np.arange(dof)
     joint = joint[model.body_weldid]
     parents = joint[model.body_parentid[bodies]]
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+
+    def local(points: Float64, carriers: NDArray[Any]) -> Float64:
+        """Return world points in the frames of the bodies to which their carriers are welded."""
+        tops = model.body_weldid[carriers]
+        turns = data.xmat[tops].reshape(-1, 3, 3)
+        places: Float64 = np.einsum("nji,nj->ni", turns, points - data.xpos[tops])
+        return places
+
+    centers = local(data.geom_xpos, model.geom_bodyid)
     bounds, travel = speed_bounds(
         robot.joints,
         parents,
-        model.body_pos[bodies],
+        local(data.xpos[bodies], model.body_parentid[bodies]),
         model.jnt_axis[model.dof_jntid[robot.qvel]],
         joint[model.geom_bodyid],
-        np.column_stack([model.geom_pos, model.geom_rbound]),
+        np.column_stack([centers, model.geom_rbound]),
     )
     moved = np.zeros((model.nbody, dof), bool)
     for at, parent in enumerate(parents):
