@@ -280,18 +280,20 @@ class BatchPID:
         }
 
     def _check_out(self, out: Any) -> None:
+        if self._backend != "numpy":
+            problem = "is for backend 'numpy' alone"
+            raise InvalidArgumentError("out", problem, remedy="leave it out")
         dtype = self._params.dtype
         fits = isinstance(out, np.ndarray) and out.dtype == dtype and out.shape == self._shape
-        if self._backend != "numpy" or not fits or not out.flags.carray:
-            problem = "is not a contiguous, writeable array of NumPy, or not for this backend"
-            remedy = f"leave it out, or give np.empty({self._shape}, {str(dtype)!r})"
-            raise InvalidArgumentError("out", problem, remedy=remedy)
+        if not fits or not out.flags.carray:
+            problem = f"must be a contiguous, writeable array of {dtype} {self._shape}"
+            raise InvalidArgumentError("out", problem, remedy="give one, or leave it out")
 
     def _array(self, name: str, value: Any, exact: bool = False) -> Array:
         """Return ``value`` as an array of the backend that broadcasts to (envs, joints), or is
         ``exact``-ly that.
         """
-        if isinstance(value, np.ndarray) or not hasattr(value, "dtype"):
+        if isinstance(value, np.ndarray) or not hasattr(value, "__array_namespace__"):
             value = read_array(name, value)
         array = self._engine.array(value)
         if array.shape == self._shape:

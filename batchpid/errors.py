@@ -1,4 +1,5 @@
-"""Errors of batchpid: one root, whose children carry their data; and its warnings.
+"""Errors of batchpid, each with its data; warnings at the caller's line; and the base of objects
+that cannot be copied.
 
 A message says what is wrong, where (argument, joint, env), the value, and the remedy.
 """

@@ -126,6 +126,8 @@ def step_metrics(
     r = broadcast("setpoint", setpoint, y.shape)
     floor = broadcast("absolute_band", absolute_band, y.shape[1:])
     u = broadcast("effort", np.nan if effort is None else effort, y.shape)
+    # Figures without efforts are NaN; those of efforts with a NaN lose every comparison.
+    is_sound = np.isfinite(u).all(0) | (effort is None)
     if saturated is None:
         limited: Rows = np.full(y.shape, np.nan)
     else:
@@ -172,8 +174,8 @@ def step_metrics(
         peak_deviation=judged(beyond),
         iae=judged(np.trapezoid(np.abs(error), t, axis=0)),
         itae=judged(np.trapezoid(t[:, None, None] * np.abs(error), t, axis=0)),
-        effort_peak=judged(np.abs(u).max(0)),
-        effort_variation=judged(np.abs(np.diff(u, axis=0)).sum(0)),
+        effort_peak=np.where(is_sound, np.abs(u).max(0), np.inf),
+        effort_variation=np.where(is_sound, np.abs(np.diff(u, axis=0)).sum(0), np.inf),
         saturation_share=np.mean(limited, axis=0),
     )
 

@@ -89,13 +89,13 @@ def minimum_jerk(
     max_velocity, max_acceleration
         Instead of ``duration``: limits > 0 of every joint, (joints,) or (envs, joints). Each env
         takes the shortest T that respects them on all of its joints; an infinite limit does not
-        apply.
+        apply, but each joint needs one that does.
 
     Raises
     ------
     InvalidArgumentError
         Naming the argument and joint; also where neither a duration nor a limit is given, or both
-        are.
+        are, and where both limits of a joint are infinite.
     """
     # Each env takes the longest time that any of its joints needs.
     x0, move = _move(start, target)
@@ -105,15 +105,16 @@ def minimum_jerk(
     if duration is not None:
         total = _limits("duration", duration, move)
     else:
-        v = _limits(
-            "max_velocity", math.inf if max_velocity is None else max_velocity, move, finite=False
+        v, a = (
+            _limits(name, math.inf if limit is None else limit, move, finite=False)
+            for name, limit in (
+                ("max_velocity", max_velocity),
+                ("max_acceleration", max_acceleration),
+            )
         )
-        a = _limits(
-            "max_acceleration",
-            math.inf if max_acceleration is None else max_acceleration,
-            move,
-            finite=False,
-        )
+        if np.isinf(np.minimum(v, a)).any():
+            problem = "and max_acceleration are both infinite for a joint"
+            raise InvalidArgumentError("max_velocity", problem, remedy="limit one of them")
         distance = np.abs(move)
         needed = np.maximum(
             _PEAK_VELOCITY * distance / v, np.sqrt(_PEAK_ACCELERATION * distance / a)
@@ -289,11 +290,9 @@ def _move(start: ArrayLike, target: ArrayLike) -> tuple[Float64, Float64]:
     return x0, x1 - x0
 
 
-def _limits(
-    name: str, value: ArrayLike, move: Float64, finite: bool = True, low: float = 0.0
-) -> Float64:
-    """Return ``value`` > ``low``, shaped as ``move``."""
-    return at_least(name, broadcast(name, value, move.shape), low, above=True, infinite=not finite)
+def _limits(name: str, value: ArrayLike, move: Float64, finite: bool = True) -> Float64:
+    """Return ``value`` > 0, shaped as ``move``."""
+    return at_least(name, broadcast(name, value, move.shape), 0.0, above=True, infinite=not finite)
 
 
 def _ticks(dt: float, total: Float64) -> Float64:

@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 GONE = (
     # one a line, as a regular expression; sorted by their letters
     r"accept_differences",
+    r"advance_in_blocks|law[./]blocks|step_in_blocks",
     r"actuator_presets",
     r"\bapply_set\b",
     r"batchpid\[(bench|data|logs|mjx|peers|record|render|robots|ruckig|sb3|train)\]",

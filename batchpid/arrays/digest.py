@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -20,13 +19,14 @@ from batchpid.errors import InvalidArgumentError
 _KINDS = "biufcSU"
 """Kinds of dtypes whose bytes are their content: no objects."""
 _PADDED = (np.longdouble, np.clongdouble)
+"""Types whose bytes hold padding, which is not content."""
 
 
 def digest(*values: Array) -> str:
     """Return the digest of ``values``, 64 hexadecimal digits.
 
-    Values may be None, bools, numbers, strings, bytes, arrays, and sequences, sets, mappings, named
-    tuples and dataclasses of these. Numbers of different types, and arrays of different dtypes,
+    Values may be None, bools, ints, floats, strings, bytes, arrays, and sequences, sets, mappings,
+    named tuples and dataclasses of these. Numbers of different types, and arrays of different dtypes,
     have different digests. Byte order, strides, and the order of sets and mappings do not matter.
     Raises InvalidArgumentError for a value of another type, or an array of objects; the message
     names its place, such as ``[0]['kp']``.
@@ -42,18 +42,17 @@ def _digest(value: Any, where: str) -> bytes:
     if kind is bytes:
         return _hashed("bytes", value)
     if hasattr(value, "__array_namespace__"):
-        # Equal numbers have one digest, whatever their byte order and strides.
+        # Byte order and strides do not change the digest.
         array = np.asarray(value)
         dtype = array.dtype.newbyteorder("<")
         if dtype.kind in _KINDS and dtype.type not in _PADDED:
             content = array.astype(dtype, order="C", copy=False).tobytes()
             return _hashed(f"{dtype.str} {array.shape}", content)
-    if hasattr(kind, "_fields"):
-        parts = dict(zip(kind._fields, value, strict=True))
-        return _hashed(f"{kind.__module__}.{kind.__qualname__}", _digest(parts, where))
-    if is_dataclass(value) and not isinstance(value, type):
-        parts = {entry.name: getattr(value, entry.name) for entry in fields(value)}
-        return _hashed(f"{kind.__module__}.{kind.__qualname__}", _digest(parts, where))
+    title = f"{kind.__module__}.{kind.__qualname__}"
+    names = getattr(kind, "_fields", getattr(kind, "__dataclass_fields__", None))
+    if names is not None:
+        parts = {name: getattr(value, name) for name in names}
+        return _hashed(title, _digest(parts, where))
     # The digests of parts all have the same length, so that no separator is needed.
     if kind in (list, tuple):
         entries = [_digest(part, f"{where}[{index}]") for index, part in enumerate(value)]
@@ -66,7 +65,9 @@ def _digest(value: Any, where: str) -> bytes:
             _digest(key, where) + _digest(part, f"{where}[{key!r}]") for key, part in value.items()
         ]
         return _hashed("mapping", b"".join(sorted(pairs)))
-    problem = f"is a {kind.__module__}.{kind.__qualname__}, which has no digest"
+    if hasattr(kind, "dtype"):
+        title += f" of {value.dtype}"
+    problem = f"is a {title}, which has no digest"
     remedy = "pass numbers, strings and arrays, or tuples, mappings and dataclasses of these"
     raise InvalidArgumentError(f"values{where}", problem, remedy=remedy)
 

@@ -1,4 +1,6 @@
-"""Operations on rows of the law, for NumPy and JAX arrays, and for the symbols of a trace."""
+"""Operations on rows of the law, for NumPy and JAX arrays and for the symbols of a trace; and
+read-only views.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Records of arrays: named tuples whose fields are declared once, and their constructors.
+"""Records of arrays: named tuples whose fields are declared once, their constructors, and their
+representations.
 
 A record inherits from a ``NamedTuple``: ``class Guard(Record, GuardFields)``. So it is a pytree
 that JAX knows without registration. A leaf is an array (1 | envs, joints), None (off), or a choice
@@ -33,6 +34,7 @@ R = TypeVar("R", bound="Record")
 T = TypeVar("T")
 MOST_JOINTS = 100_000
 WIDTH = 130
+"""Longest line of a representation."""
 Ends = tuple[Array, Array]
 """A lower and an upper limit, each None for none."""
 
@@ -307,7 +309,7 @@ def span(values: Array) -> str:
         array = np.asarray(values)
         if array.dtype == bool:
             return f"{array.sum()} of {array.size}"
-        # The range is that of the other entries; "nan" follows it.
+        # The range leaves NaN out; "nan" follows it.
         present = array[~np.isnan(array)]
     except (TypeError, ValueError, RuntimeError):
         return type(values).__name__

@@ -12,7 +12,7 @@ import os
 import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -117,8 +117,8 @@ def names(argument: str, value: Any, count: int | None = None) -> list[str]:
             argument, "must be a list of names", value=value, remedy="pass a list of strings"
         )
     if count is not None and len(value) != count:
-        remedy = f"give {count} names"
-        raise InvalidArgumentError(argument, "has another number", value=value, remedy=remedy)
+        problem = f"must hold {count} names"
+        raise InvalidArgumentError(argument, problem, value=value, remedy="give one for each")
     if len(set(value)) != len(value):
         remedy = "name each once"
         raise InvalidArgumentError(argument, "repeats a name", value=value, remedy=remedy)
@@ -289,14 +289,8 @@ def at_least(
     bounds = ["finite"] * (not infinite) + [f"{'>' if above else '>='} {low:g}"] * math.isfinite(
         low
     )
-    entries(
-        argument,
-        values,
-        good,
-        f"must be {' and '.join(bounds) or 'a number'}",
-        joint_names,
-        kind=kind,
-    )
+    problem = f"must be {' and '.join(bounds) or 'a number'}"
+    entries(argument, values, good, problem, joint_names, kind=kind)
     return values
 
 
@@ -336,10 +330,6 @@ def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_
     return mask
 
 
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
 def check_keywords(owner: str, given: Collection[str], known: Collection[str]) -> None:
     """Raise InvalidArgumentError for the first name in ``given`` that is not among the ``known``
     ones of ``owner``.
@@ -361,4 +351,7 @@ def _scalar(argument: str, value: object, unit: str) -> float:
         raise InvalidArgumentError(
             argument, "must be a number", value=value, remedy=f"pass a float ({unit})"
         )
-    return float(value)
+    try:
+        return float(value)
+    except OverflowError:  # an int beyond all floats
+        return math.inf

@@ -62,7 +62,9 @@ class StabilityBound(NamedTuple):
     alternating signs from step to step.
     """
     participation: Float64
-    """(..., joints): share of each joint in the least stable mode; sums to 1."""
+    """(..., joints): share of each joint in the least stable mode (with delay or lag: in its kinetic
+    energy); sums to 1.
+    """
 
 
 class Oscillation(NamedTuple):
@@ -140,7 +142,7 @@ def stability_bound(
 
 
 def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) -> StabilityBound:
-    """Return the bound of loops whose efforts are late; ``columns`` are the rows of :func:`_loop`
+    """Return the bound of loops whose efforts are late; ``columns`` are as in :func:`_loop`, each
     (..., joints).
     """
     ratio = np.zeros(m.shape[:-2])

@@ -13,6 +13,7 @@ A file of params has this form; the keys are the options of :func:`batchpid.make
 from __future__ import annotations
 
 import json
+import math
 import os
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -241,7 +242,9 @@ def _column(source: str, name: str, field: Field, joints: Mapping[str, Document]
 
 
 def read(path: str | os.PathLike[str]) -> Any:
-    """Return the document in a file. Raises InvalidArgumentError for a text that is none."""
+    """Return the document in a file. Raises InvalidArgumentError for a text that is no such
+    document.
+    """
     path = file_path("path", path, SUFFIXES)
     return parse(str(path), path.read_bytes(), SUFFIXES[path.suffix.lower()])
 
@@ -276,7 +279,7 @@ def parse(source: str, text: str | bytes, format: str) -> Any:
 def render(document: Document, format: str) -> str:
     """Return a document as text in ``format``, "yaml" or "json"."""
     if choice("format", format, ("yaml", "json")) == "json":
-        return json.dumps(document, indent=2) + "\n"
+        return json.dumps(_without_infinities(document), indent=2, allow_nan=False) + "\n"
     import yaml
 
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
@@ -285,7 +288,7 @@ def render(document: Document, format: str) -> str:
 def is_number(entry: Any) -> bool:
     """Return whether an entry is a number, an infinity included."""
     whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
-    return whole or isinstance(entry, float)
+    return whole or isinstance(entry, float) or entry in ("inf", "-inf")
 
 
 def error(
@@ -306,6 +309,17 @@ def plain(column: Rows) -> Any:
     return values
 
 
+def _without_infinities(value: Any) -> Any:
+    """Return the document with infinities as "inf" and "-inf": JSON has no number for them."""
+    if isinstance(value, dict):
+        return {key: _without_infinities(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_without_infinities(entry) for entry in value]
+    if value in (math.inf, -math.inf):
+        return str(value)
+    return value
+
+
 def _parse_json(text: str) -> Any:
     def unique(pairs: list[tuple[str, Any]]) -> Document:
         if len(dict(pairs)) < len(pairs):
@@ -319,7 +333,14 @@ def _parse_yaml(text: str) -> Any:
     import yaml  # here, since params in memory need NumPy alone
 
     class Loader(yaml.SafeLoader):
-        """SafeLoader that refuses keys given twice."""
+        """SafeLoader without aliases, which can make a short file explode, and without keys given
+        twice.
+        """
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise ValueError(f"aliases are not allowed{self.peek_event().start_mark}")
+            return super().compose_node(parent, index)
 
         def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
             mapping = super().construct_mapping(node, deep=True)

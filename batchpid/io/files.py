@@ -1,4 +1,4 @@
-"""Files: atomic writes, descriptors, and the versions that they note."""
+"""Files: atomic writes, descriptors, and the versions of packages that are written into them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import errno
 import os
 import platform
 import secrets
+import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -92,8 +93,7 @@ def package_versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
 
     versions = {"python": platform.python_version()}
     for package in packages:
-        try:
+        with suppress(PackageNotFoundError):
             versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return versions
+    # This package may run from a checkout whose metadata are older, or are missing.
+    return versions | {"batchpid": sys.modules["batchpid"].__version__}

@@ -51,11 +51,11 @@ from batchpid.law.params import PIDParams
 
 
 def implicit_gains(params: PIDParams, dt: Array) -> tuple[Array, ...]:
-    """Return the gains kp*, ki*, kd*, b* and c*, c* of a given setpoint rate, and 1 / D, of
-    implicit ``params`` at ``dt`` [s]; None is off.
+    """Return (kp*, ki*, kd*, b*, c*, c* of a setpoint rate that is given, 1 / D) of implicit
+    ``params`` at ``dt`` [s]; an entry whose option is off is None.
 
-    The first c* is that of the setpoint's difference quotient, which no integral takes: c kd / (kd
-    + dt kp + dt^2 ki). 1 / D is the weight of a setpoint acceleration that is given.
+    The first c* weighs the difference quotient of setpoints, which has no part in the integral: it
+    is c kd / (kd + dt kp + dt^2 ki). 1 / D weighs a setpoint acceleration that is given.
     """
     kp = params.kp
     ki = params.ki

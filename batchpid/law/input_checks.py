@@ -151,15 +151,15 @@ def checked_mask(mask: Array, state: PIDState) -> Array:
     array = _as_array("mask", mask, "b")
     envs = np.broadcast_shapes(*(leaf.shape for leaf in state if leaf is not None))[:1]
     if array.dtype.kind != "b" or array.ndim != 1 or (envs and array.shape != envs):
-        problem = f"is {array.dtype} {array.shape}, not bools {envs}"
+        problem = f"is {array.dtype} {array.shape}, not bool {envs}"
         raise InvalidArgumentError("mask", problem, remedy="give one bool per env")
     return array
 
 
 def checked_dt(dt: Array) -> Array:
-    """Return ``dt`` if it is positive and finite, a number as a float.
+    """Return ``dt`` as a float if it is positive and finite; an array of JAX is returned unread.
 
-    A number of NumPy would give its own dtype to the efforts. Values of JAX's arrays are not read.
+    A number of NumPy would give its own dtype to the efforts.
     """
     if isinstance(dt, np.ndarray | np.generic):
         dt = dt.tolist()

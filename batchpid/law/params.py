@@ -257,7 +257,7 @@ def make_params(
         build, options.get("tracking_time"), back, *[leaves[name] for name in GAINS]
     )
     is_everywhere = conditional is not None and conditional.all()
-    # A choice is no array.
+    # A choice is not an array.
     for name in FIELDS & leaves.keys():
         leaves[name] = build.freeze(leaves[name])
     return PIDParams(

@@ -66,7 +66,8 @@ def test_values_do_not_run_into_each_other():
         ({"ab": "c"},),
     ]
     parts = [(Pair("ab", "c"),), (Other("ab", "c"),), (Record("ab", "c"),)]
-    alike = [*texts, *parts, (1,), (1.0,), (True,), (0.0,), (-0.0,), (None,), ()]
+    nested = [("1",), (b"1",), ([],), ({},), ([[1], 2],), ([1, [2]],)]
+    alike = [*texts, *parts, *nested, (1,), (1.0,), (True,), (0.0,), (-0.0,), (None,), ()]
     assert len({digest(*values) for values in alike}) == len(alike)
 
 

@@ -242,5 +242,5 @@ def test_jax_names_them_while_it_traces():
     assert step(np.ones((4, 3)), np.ones(4, bool)).shape == (4, 3)
     with pytest.raises(bp.InvalidArgumentError, match=r"^setpoint: has shape"):
         step(np.ones((4, 2)), np.ones(4, bool))
-    with pytest.raises(bp.InvalidArgumentError, match=r"^mask: is int32"):
+    with pytest.raises(bp.InvalidArgumentError, match=r"^mask: is int"):
         step(np.ones((4, 3)), np.ones(4, int))

@@ -73,6 +73,9 @@ def test_effort_figures():
     assert m.effort_peak[0, 0] == 2
     assert m.effort_variation[0, 0] == 5
     assert m.saturation_share[0, 0] == 0.25
+    for effort, figure in ((u * np.nan, np.inf), (None, np.nan)):
+        m = step_metrics(1.0, [0.0], np.zeros((4, 1, 1)), effort=effort)
+        np.testing.assert_array_equal([m.effort_peak, m.effort_variation], figure)
 
 
 def test_joint_that_should_not_move_uses_the_absolute_band():
@@ -127,4 +130,4 @@ def test_statistics_over_envs_leave_out_what_is_undefined():
     )
     m = StepMetrics(*figures)
     assert m.worst().rise_time[0] == np.inf
-    assert StepMetrics(*[np.full(shape, np.nan)] * len(figures)).worst().iae.shape == (1,)
+    assert np.isnan(StepMetrics(*[np.full(shape, np.nan)] * len(figures)).worst().iae)

@@ -48,6 +48,13 @@ def test_numbers_survive_a_file_exactly(tmp_path_factory, gains, suffix):
     assert same(bp.load_params(path)[0], params)
 
 
+def test_json_is_standard():
+    params = bp.make_params(2, 1.0, effort_limit=[1.0, np.inf])
+    text = bp.dumps_params(params, ["a", "b"], format="json")
+    assert "Infinity" not in text
+    assert same(bp.loads_params(text)[0], params)
+
+
 def test_joints_are_matched_by_name(tmp_path):
     path = tmp_path / "params.yaml"
     bp.save_params(path, bp.make_params(JOINTS, [1.0, 2.0, 3.0], ki=[[1, 2, 3], [4, 5, 6]]), NAMES)
@@ -138,7 +145,7 @@ def test_about_survives_and_does_not_affect_the_params(tmp_path, suffix):
             "1" + "0" * 5000,
             ".nan",
             "{<<: 1}",
-            "!!python/object/apply:os.abort []",
+            "[&a 1.0, *a]",
         ),
         *("{a: " * 2_000, "- " * 2_000, "'" + "a\n" * 2_000, "\x00"),
     ],

@@ -135,6 +135,8 @@ COMBINATIONS = [
     *((ts.make_osc_params, name, {name: "other"}) for name in osc_params.TASK_CHOICES),
     (motors.dumps_actuators, "actuators", {"record": {}}),
     (bp.drive_target, "state", {"state": 3}),
+    (trajectories.minimum_jerk, "max_velocity", {"max_velocity": math.inf}),
+    (trajectories.minimum_jerk, "dt", {"dt": 10**400, "duration": 1.0}),
     (bp.drive_target, "measurement_rate", {"measurement_rate": np.ones((1, 3))}),
     (bp.drive_target, "params.deadband", {"params": bp.make_params(2, 4.0, deadband=0.1)}),
     (batchpid.export.to_c, "params", {"params": bp.make_params(2, np.ones((2, 2)))}),
