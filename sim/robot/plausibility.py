@@ -74,8 +74,7 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
         # A link may be longer than its shapes.
         size = max(mass.size, next_joint[name])
         if mass.size > 0 and not SPARSEST <= mass.mass / size**3 <= DENSEST:
-            kind = "light" if mass.mass < SPARSEST * size**3 else "heavy"
-            text = f"no link of such a size is so {kind}"
+            text = "no link of such a size has such a mass"
             remedy = "give <mass> in kg and <collision> in metres"
             detail = f"{mass.mass:.3g} kg over {size:.3g} m"
             yield Finding("warning", "mass", text, remedy, link=name, detail=detail)

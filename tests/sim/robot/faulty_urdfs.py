@@ -49,7 +49,6 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
         "xml",
         "XML declaration",
     ),
-    "byte order mark and a blank": ("\ufeff\n" + one_joint(), "xml", "XML declaration"),
     "wrong encoding": (one_joint().replace("?>", " encoding='utf-16'?>"), "xml", "not well-formed"),
     "hyphens in a comment": (robot(BASE, ARM, HINGE, "<!-- a -- b -->"), "xml", "hyphen"),
     "several roots": (one_joint() + "<gazebo/>", "xml", "Extra content"),
@@ -217,11 +216,6 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
         "inertia",
         "'arm' .*0 0 0 .*ball of its mass",
     ),
-    "inertia of 1e300": (
-        one_joint(arm=TENSOR.format("1e300", *"00101")),
-        "inertia",
-        "'arm' .*ball",
-    ),
     "one entry everywhere": (
         one_joint(arm=TENSOR.format(*["1e-6"] * 6)),
         "inertia",
@@ -262,11 +256,6 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
         shaped('<box size="1 1 0"/>'),
         "collision",
         "'arm': a collision shape is left out: <box size",
-    ),
-    "large box": (
-        shaped('<box size="1e300 1 1"/>'),
-        "collision",
-        "'arm': a collision shape is left out",
     ),
     "NaN sphere": (shaped('<sphere radius="nan"/>'), "collision", "'arm': .*<sphere radius='nan'>"),
     "scale of 0": (

@@ -71,13 +71,13 @@ def found(described: Robot) -> dict[str, str]:
         (
             {"size": 1000.0},
             "mass",
-            r"link '.' \(3 kg over 424 m\): no link of such a size is so light; give <mass> in kg",
+            r"link '.' \(3 kg over 424 m\): no link of such a size has such a mass; give <mass> in kg",
         ),
         ({"size": 0.001}, "scale", r"robot: no robot has such small.* 0.00042 m.*1.2 m"),
         (
             {"mass": 3000.0},
             "mass",
-            r"\(3e\+03 kg over 0.424 m\): no link of such a size is so heavy",
+            r"\(3e\+03 kg over 0.424 m\): no link of such a size has such",
         ),
         ({"gyration": 100.0}, "inertia", r"\(100 m\): no link has so much inertia.*kg m\^2"),
     ],

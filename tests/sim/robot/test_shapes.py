@@ -119,14 +119,6 @@ def test_shapes_of_one_colour_are_joined_at_their_origins(tmp_path):
     np.testing.assert_allclose(first.vertices.max(0), [0.2, 0.1, 0.55], atol=1e-12)
 
 
-def test_collision_shapes_stand_in_for_missing_visuals(tmp_path):
-    collision = visual(BOX, kind="collision")
-    drawn = surfaces(
-        load(tmp_path, a=visual('<mesh filename="lost.stl"/>') + collision, b=collision)
-    )
-    assert [surface.link for surface in drawn] == ["a", "b"]
-
-
 def test_a_robot_without_shapes_is_drawn_by_rods_between_its_joints(tmp_path):
     tip = INERTIAL.replace("<mass", '<origin xyz="0.5 0 0"/><mass')
     parts = (
