@@ -136,10 +136,12 @@ def rollout(
         center = robot.target
     else:
         _refuse("tool", tool, "is for control 'osc'")
-        chosen = gain_set(robot, gains or ("drive" if control == "drive" else None))
-        options["params"] = chosen.params
-        if chosen.control == "drive":
-            options["control"] = "drive"
+        # Without gains the Runner has its own default, which knows the loops of an MJCF file.
+        if gains is not None:
+            chosen = gain_set(robot, gains)
+            options["params"] = chosen.params
+            if chosen.control == "drive":
+                options["control"] = "drive"
 
     # Setpoints: of a file, or one that is held.
     notes: list[str] = []

@@ -132,8 +132,7 @@ class Normal(Distribution):
         super().__post_init__()
         mean = number("mean", self.mean, -math.inf, math.inf, _UNIT)
         std = number("std", self.std, _TINY, math.inf, _UNIT)
-        low = float(self.low)
-        high = float(self.high)
+        low, high = read_array("low", [self.low, self.high]).tolist()
         # Draws outside are repeated, which a tail would do for long.
         below, above = (math.erf((end - mean) / (math.sqrt(2.0) * std)) for end in (low, high))
         share = 0.5 * (above - below)
@@ -204,6 +203,9 @@ def read_distribution(name: str, value: object) -> Distribution:
         if kind not in options:
             continue
         numbers = options.pop(kind)
+        if not isinstance(numbers, Sequence):
+            problem = f"{kind} needs a list of numbers"
+            break
         if kind == Choice.kind:
             numbers = [numbers]
         # Python names the argument that is missing, or one too many.

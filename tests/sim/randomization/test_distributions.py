@@ -129,10 +129,8 @@ def test_operations(operation, expected):
             lambda: read({"uniform": [1, 2, 3]}),
             "qpos: is not a distribution: .*arguments",
         ),
-        (
-            lambda: read({"uniform": 1}),
-            "qpos: is not a distribution: .*iterable",
-        ),
+        (lambda: read({"uniform": 1}), "qpos: uniform needs a list of numbers"),
+        (lambda: read({"normal": [0, 1], "low": "x"}), "qpos: low: "),
         (
             lambda: read({"uniform": [0, 1], "mode": "add"}),
             "qpos: is not a distribution: .*keyword argument 'mode'",

@@ -242,8 +242,18 @@ def test_a_kill_loses_at_most_a_second(number, tmp_path):
         np.testing.assert_array_equal(file["qpos"][:count], recording.qpos)
 
 
-def test_plot_refuses_an_empty_recording(tmp_path, capsys):
+@pytest.mark.parametrize("words", [["plot"], ["view", "--play"]])
+def test_commands_refuse_an_empty_recording(words, tmp_path, capsys):
     with make() as runner, Recorder(tmp_path / "empty.h5", runner):
         pass
-    assert main(["plot", str(tmp_path / "empty.h5")]) == 2
+    assert main([*words, str(tmp_path / "empty.h5")]) == 2
     assert "holds no tick" in capsys.readouterr().err
+
+
+def test_a_tick_that_is_not_received_leaves_an_incomplete_recording(tmp_path):
+    with make() as runner, Recorder(tmp_path / "run.h5", runner) as recorder:
+        runner.step(ROBOT.start)
+        runner.send(ROBOT.start)
+        recorder.close()
+    recording = read_recording(tmp_path / "run.h5")
+    assert (len(recording.time), recording.info.complete) == (1, False)
