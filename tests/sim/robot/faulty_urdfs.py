@@ -57,7 +57,7 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
     "undeclared prefix": (
         robot(BASE, ARM, HINGE, "<xacro:macro/>"),
         "unknown-element",
-        "left out: 1 <xacro:macro>; remove",
+        "left out: 1 <xacro:macro>; expand",
     ),
     "unknown elements": (
         robot(BASE, ARM, HINGE, "<plugin/><plugin/>"),
@@ -103,6 +103,11 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
         "'hinge': .*no direction: the x axis",
     ),
     "axis of two numbers": (one_joint().replace("0 1 0", "0 1"), "axis", "'hinge': .*x axis"),
+    "two limits": (
+        one_joint(LIMIT + LIMIT),
+        "repeated-element",
+        "'hinge': <joint> has several <limit>: the first is used",
+    ),
     "no limit": (one_joint(""), "limits", "'hinge': no position limits"),
     "no range": (limited(effort="1", velocity="1"), "limits", "'hinge': no position limits"),
     "NaN limit": (
@@ -113,7 +118,7 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
     "limit of 1e300": (
         limited(lower="0", upper="1e300"),
         "limits",
-        "'hinge': <limit upper='1e300'> is not a number",
+        "'hinge': <limit upper='1e300'> is not a number within",
     ),
     "swapped limits": (
         limited(lower="2", upper="1"),
@@ -243,6 +248,11 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
         "'arm': .*none of box",
     ),
     "unknown shape": (shaped("<plane/>"), "collision", "'arm': .*none of box"),
+    "two shapes": (
+        shaped('<sphere radius="1"/><box size="1 1 1"/>'),
+        "repeated-element",
+        "link 'arm': <geometry> has several shapes",
+    ),
     "negative box": (
         shaped('<box size="-1 1 1"/>'),
         "collision",

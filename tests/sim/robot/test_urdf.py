@@ -41,7 +41,7 @@ BAD = {
     ),
     "misspelt link": (
         robot(BASE, ARM, TIP, joint("hinge", "base", "amr"), joint("k", "arm", "tip")),
-        r"one root link.*joints name \['amr'\], not in the file: correct",
+        r"one root link.*joints name, not in the file: \['amr'\]",
     ),
     "xacro": (
         robot(BASE, ARM, joint("${side}_hinge", "base", "arm")),
