@@ -22,7 +22,6 @@ from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import BAND, known_joints
 from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec
-from batchpid.task_space import native_rows
 from batchpid.task_space.frames import moved, pose_error
 from batchpid.task_space.native_law import BoundOSC
 from batchpid.task_space.osc_params import AXES
@@ -264,17 +263,10 @@ class OperationalSpace:
         parts = [pose, twist - change, setpoint[:, 13:]]
         return namespace(setpoint).concatenate(parts, axis=-1)
 
-    @property
-    def is_native(self) -> bool:
-        """Whether native code has this law."""
-        return type(self) is OperationalSpace
-
-    def bound(self, qpos: Array, qvel: Array, passive: Array, left: Array) -> BoundOSC | None:
+    def bound(self, qpos: Array, qvel: Array, passive: Array, left: Array) -> BoundOSC:
         """Return this controller as a native call on these arrays (envs, dof), and the time to the
-        end of the tick (); None where it must run in Python.
+        end of the tick ().
         """
-        if not self.is_native or native_rows.in_use() is None:
-            return None
         # Native code reads the caller's arrays where they are.
         return BoundOSC(
             self._k,

@@ -262,9 +262,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         mask = np.ones(self.num_envs, bool)
         if "reset_mask" in options:
             mask = env_mask("options['reset_mask']", options["reset_mask"], self.num_envs)
-        if not mask.any():
-            remedy = "use e.g. mask = terminated | truncated"
-            raise InvalidArgumentError("options['reset_mask']", "selects no env", remedy=remedy)
         seeds: list[int] | None = None
         if seed is not None:
             if np.ndim(seed) == 0:

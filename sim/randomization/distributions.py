@@ -72,12 +72,13 @@ class Distribution(ABC):
 
     def to_dict(self) -> Document:
         """Return it as plain values: ``{"uniform": [low, high], "operation": "scale"}``."""
+        # A choice has a tuple of values.
         values: list[object] = []
         document: Document = {self.kind: values}
         for entry in fields(self):
             value = getattr(self, entry.name)
             if not entry.kw_only:
-                values.append(value)
+                values += np.ravel(value).tolist()
             elif value != entry.default:
                 document[entry.name] = value
         return document
@@ -173,10 +174,6 @@ class Choice(Distribution):
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
         return np.array(self.values)[generator.integers(len(self.values), size=size)]
-
-    def to_dict(self) -> Document:
-        """Return it as plain values: ``{"choice": [0, 1]}``."""
-        return super().to_dict() | {self.kind: list(self.values)}
 
 
 KINDS: dict[str, type[Distribution]] = {
@@ -346,10 +343,6 @@ def read_field(name: str, value: object) -> Field:
     """Return the field that a file describes: a distribution, or a mapping of names to
     distributions.
     """
-    if isinstance(value, Mapping):
-        names = value
-    else:
-        names = {}
-    if not names or not all(isinstance(part, Mapping) for part in names.values()):
-        return read_distribution(name, value)
-    return {str(key): read_distribution(f"{name}.{key}", part) for key, part in names.items()}
+    if isinstance(value, Mapping) and all(isinstance(part, Mapping) for part in value.values()):
+        return {str(key): read_distribution(f"{name}.{key}", part) for key, part in value.items()}
+    return read_distribution(name, value)
