@@ -22,7 +22,6 @@ from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import BAND, known_joints
 from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec
-from batchpid.task_space import native_rows
 from batchpid.task_space.frames import moved, pose_error
 from batchpid.task_space.native_law import BoundOSC
 from batchpid.task_space.osc_params import AXES
@@ -47,9 +46,9 @@ class OperationalSpace:
     The bias is the runner's passive force, as ``compensate`` selects, plus the efforts of the
     joints' known damping and friction. Friction is compensated for the motion to the setpoint. Its
     direction is dq = J^T (J J^T + 1e-4)^-1 e, with the error e of the pose. Jacobian and mass
-    matrix are computed from the kinematic tree. The state is the posture of each env, which a reset restores,
-    and the integral. An env that has failed holds the pose of the posture. A runner sets time step
-    and ``compensate``; elsewhere they are 1/2000 s and "none".
+    matrix are computed from the kinematic tree. The state is the posture of each env, which a reset
+    restores, and the integral. An env that has failed holds the pose of the posture. A runner sets
+    time step and ``compensate``; elsewhere they are 1/2000 s and "none".
 
     Parameters
     ----------
@@ -62,8 +61,8 @@ class OperationalSpace:
     twist, acceleration
         Whether setpoints give the velocity of the tool (m/s and rad/s), and its acceleration, in
         the world: a tool that moves follows its setpoint without the delay kd/kp, and on a circle
-        without the error r w^2/kp. They hold, as the pose does, at the end of the tick; within the
-        tick the pose moves with the twist. Without twist it is held.
+        without the error r w^2/kp. Pose, twist and acceleration are those at the end of the tick;
+        before that the pose moves with the twist. Without twist the pose is constant in the tick.
     wrench
         Whether setpoints give the wrench of the tool on its surroundings (N and N m), in the axes
         of the params' frame.
@@ -191,7 +190,11 @@ class OperationalSpace:
     def __call__(
         self, state: ts.OSCState, setpoint: Array, qpos: Array, qvel: Array, passive: Array
     ) -> tuple[Array, Array]:
-        """Return the state and the efforts (envs, dof) [N m or N]."""
+        """Return the state and the efforts (envs, dof) [N m or N].
+
+        ``setpoint`` is taken as it is: within a tick the pose moves only where this method is not
+        overridden.
+        """
         return self._advance(state, setpoint, qpos, qvel, passive)[:2]
 
     @property
@@ -230,12 +233,14 @@ class OperationalSpace:
             mass_matrix = dynamics.mass_matrix + added.astype(qpos.dtype)
             dynamics = dynamics._replace(mass_matrix=mass_matrix)
         if self._friction is not None:
-            friction = self._friction_to(setpoint, parts.get("twist"), posture, qpos, dynamics)
+            friction = self._friction_to(
+                setpoint, parts.get("twist"), posture, qpos, dynamics, *self._friction
+            )
             feedforward = friction if feedforward is None else feedforward + friction
         inputs = ts.OSCInputs(setpoint[:, :7], qpos, qvel, **parts, feedforward=feedforward)
         # The state holds the posture of the episode, without the setpoints of single joints.
         new, terms = ts.osc(
-            self._coefficients(setpoint),
+            self._k,
             state._replace(posture=posture),
             dynamics,
             inputs,
@@ -245,8 +250,8 @@ class OperationalSpace:
         return new._replace(posture=state.posture), terms.effort, saturated
 
     def _carried(self, setpoint: Array, left: Array) -> Array:
-        """Return setpoints at the time ``left`` [s] before the end of their tick, to which they
-        move with their twist: :func:`batchpid.sim.loop.control_step.carried` for poses.
+        """Return the setpoints of the moment ``left`` [s] before the end of the tick: the pose
+        moves with its twist, as joints do in :func:`batchpid.sim.loop.control_step.carried`.
         """
         if "twist" not in self._parts:
             return setpoint
@@ -258,17 +263,10 @@ class OperationalSpace:
         parts = [pose, twist - change, setpoint[:, 13:]]
         return namespace(setpoint).concatenate(parts, axis=-1)
 
-    @property
-    def is_native(self) -> bool:
-        """Whether native code has this law; a subclass may change it."""
-        return type(self) is OperationalSpace
-
-    def bound(self, qpos: Array, qvel: Array, passive: Array, left: Array) -> BoundOSC | None:
+    def bound(self, qpos: Array, qvel: Array, passive: Array, left: Array) -> BoundOSC:
         """Return this controller as a native call on these arrays (envs, dof), and the time to the
-        end of the tick (); None where it must run in Python.
+        end of the tick ().
         """
-        if not self.is_native or native_rows.in_use() is None:
-            return None
         # Native code reads the caller's arrays where they are.
         return BoundOSC(
             self._k,
@@ -282,18 +280,19 @@ class OperationalSpace:
             left,
         )
 
-    def _coefficients(self, setpoint: Array) -> ts.OSCCoefficients:
-        """Return the coefficients of the law for setpoints (envs, size)."""
-        return self._k
-
     def _friction_to(
-        self, setpoint: Array, twist: Array, posture: Array, qpos: Array, dynamics: ts.TaskDynamics
+        self,
+        setpoint: Array,
+        twist: Array,
+        posture: Array,
+        qpos: Array,
+        dynamics: ts.TaskDynamics,
+        coulomb: Array,
+        band: Array,
     ) -> Array:
         """Return the friction (envs, dof) on the way to the setpoint; joints outside the chain go
         to ``posture``.
         """
-        assert self._friction is not None
-        coulomb, band = self._friction
         # Joint velocities of least squares that move the tool towards its setpoint.
         error = pose_error(setpoint[:, :7], dynamics.pose)
         j = dynamics.jacobian
@@ -301,9 +300,9 @@ class OperationalSpace:
         ahead = error if twist is None else error + LOOKAHEAD * twist
         rows = namespace(j).swapaxes(j, -1, -2)
         eye = 1e-4 * namespace(j).eye(6)
-        moved = gram(j, solve(gram(rows, rows) + eye.astype(j.dtype), ahead[..., None]))[..., 0]
+        motion = gram(j, solve(gram(rows, rows) + eye.astype(j.dtype), ahead[..., None]))[..., 0]
         chain = dynamics.chain
-        return compensation(coulomb, chain * moved + (1 - chain) * others, None, band)
+        return compensation(coulomb, chain * motion + (1 - chain) * others, None, band)
 
     def in_runner(self, timestep: float, compensate: str) -> OperationalSpace:
         """Return this controller for the time step [s] and the option ``compensate`` of a
@@ -338,17 +337,6 @@ class OperationalSpace:
                 )
 
     def tool_pose(self, qpos: Array) -> NDArray[np.float32]:
-        """Return the poses of the tool (..., 7) at ``qpos`` (..., dof)."""
-        return tool_pose(self.tree, self.link, self.point, qpos)
-
-
-def default_tool(robot: Robot) -> str:
-    """Return the last link of the robot's longest chain, or the hand if that chain ends in
-    fingers.
-    """
-    return robot.rigid_tree.tool
-
-
-def tool_pose(tree: ts.RigidTree, link: str, point: Array, qpos: Array) -> NDArray[np.float32]:
-    """Return the poses of a tool (..., 7) at ``qpos`` (..., dof), as they are observed."""
-    return ts.link_poses(tree, qpos, [link], point=point)[..., 0, :].astype(np.float32)
+        """Return the poses of the tool (..., 7) at ``qpos`` (..., dof), as they are observed."""
+        poses = ts.link_poses(self.tree, qpos, [self.link], point=self.point)
+        return poses[..., 0, :].astype(np.float32)

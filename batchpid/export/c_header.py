@@ -247,7 +247,7 @@ class Header:
         passed = "".join(f", {name}" for name in self.inputs)
         pointers = "".join(f"const {t} *{name}, " for name in self.inputs)
         fields = "".join(f"  {t} {name}[{n}];\n" for name in state) or "  char unused;\n"
-        # A restart keeps what the integral has learnt; a start does not.
+        # A restart keeps the integral; a start sets it to 0, within its limits.
         every = self._started(state)
         lasting = self._started({name: leaf for name, leaf in state.items() if name != "integral"})
         # An input without effect would be a warning of the compiler.

@@ -4,7 +4,8 @@ as tables.
 The efforts of velocities and accelerations are computed by the recursive Newton-Euler algorithm, in
 the axes of the world and about its origin (R. Featherstone, Rigid Body Dynamics Algorithms,
 Springer, 2008, section 5.3). Without acceleration they are the bias. For a unit acceleration of one
-joint, at rest and without gravity, they are a row of the mass matrix (section 6.1). The last bits differ from NumPy's.
+joint, at rest and without gravity, they are a row of the mass matrix (section 6.1). The last bits
+differ from NumPy's.
 """
 
 from __future__ import annotations

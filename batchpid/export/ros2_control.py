@@ -169,6 +169,8 @@ def _compare_anti_windup(law: Differences) -> None:
     excludes = (low > 0) | (high < 0)
     law.add("anti_windup", f"{text} exclude 0", (strategy == "conditional") & excludes)
     law.add("anti_windup", "without ki the integral does not track", back & ~integrates)
+    text = "back-calculation is left out in a step with an error of exactly 0"
+    law.add("anti_windup", text, law.limited & back & integrates)
     times = law.value("tracking_time", math.inf)
     text = "shorter than dt, the integral over-corrects"
     law.add("tracking_time", text, back & (times < law.dt), times, "s")

@@ -140,7 +140,7 @@ class Actuators(Record, _ActuatorsFields):
         present = self.options()
         if not options.keys().isdisjoint(DELAYS):
             present.pop("max_delay", None)
-        # Traced numbers bring a dtype of their own.
+        # Traced numbers have a dtype.
         if any(is_traced(value) for value in options.values()):
             present.pop("dtype", None)
         if not self.num_joints and "joints" not in options:

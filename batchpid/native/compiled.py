@@ -78,7 +78,7 @@ class CompiledLaw:
         arguments = [entry for entry in inputs if entry is not None]
         state = PIDState(*(None if leaf is None else self._whole(leaf) for leaf in state))
         program, lasting = self._program(state, inputs)
-        # What a step returns of the state is written over what it read.
+        # A step writes the new state over the old one.
         fixed = [leaf for leaf in state if leaf is not None]
         written = [state[at] for at in lasting]
         masks = program.masks[len(lasting) :]
@@ -95,7 +95,7 @@ class CompiledLaw:
             for entry in arguments
         ]
         program(*fixed, *read, out=(*written, *shown, effort))
-        # Terms are new arrays at each step, so there is no fast function for them.
+        # The fast function writes into the same arrays at every step; terms need new ones.
         if self._terms:
             return state, effort, Terms(*shown)._replace(effort=effort), None
         bits = sum((entry is not None) << at for at, entry in enumerate(inputs))

@@ -35,7 +35,7 @@ class Namespace:
         """
         if isinstance(value, Symbol):
             return value
-        # A plain number of Python has no dtype, and takes that of the arrays.
+        # A Python number takes the dtype of the arrays.
         if isinstance(value, np.generic) and np.result_type(value, self.dtype) != self.dtype:
             raise TypeError(f"a program of {self.dtype} cannot hold a scalar of {value.dtype}")
         return self.literals.setdefault(repr(float(value)), (float(value), Symbol(self)))[1]

@@ -14,7 +14,7 @@ typedef double Unaligned __attribute__((vector_size(WIDTH * sizeof(double)), ali
 
 // Transpose WIDTH vectors.
 inline void transpose(Lanes *v) {
-#if __has_builtin(__builtin_shufflevector)
+#if defined(__clang__) || __GNUC__ >= 12  // the first GCC with __builtin_shufflevector
   Lanes::Packed const a = v[0].of, b = v[1].of, c = v[2].of, d = v[3].of;
   auto const ab = __builtin_shufflevector(a, b, 0, 4, 2, 6), cd = __builtin_shufflevector(c, d, 0, 4, 2, 6);
   auto const ab_odd = __builtin_shufflevector(a, b, 1, 5, 3, 7), cd_odd = __builtin_shufflevector(c, d, 1, 5, 3, 7);

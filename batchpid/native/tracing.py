@@ -168,7 +168,7 @@ def _assembled(
             places[result] = free.pop()
         numbers = [places[operand] for operand in operands]
         rows.append([OPERATIONS.index(name), places[result], *numbers, *(2 * numbers[:1])][:5])
-        # Freed last, so that no result takes a register of its own operands.
+        # Freed last: a result must not use the register of an operand.
         free += {places[one] for one in operands if last_use[one] == at and one not in lasting}
     table = np.array(rows, np.int32)
     ends = np.array([places[result] for result in results], np.int32)

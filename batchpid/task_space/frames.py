@@ -2,8 +2,8 @@
 
 A frame is a matrix (..., 3, 4): the axes of the frame as columns, and its position. A pose (..., 7)
 is a position and a unit quaternion (w, x, y, z), the order that SAPIEN and viser use. Functions of
-quaternions that follow :func:`compose` are for NumPy alone. Products are written as sums of elementwise
-products: their rounding does not depend on the number of rows, as a library's does.
+quaternions that follow :func:`compose` are for NumPy alone. Products are written as sums of
+elementwise products: their rounding does not depend on the number of rows, as a library's does.
 
 Spatial inertias: R. Featherstone, Rigid Body Dynamics Algorithms (2008), section 2.13.
 """

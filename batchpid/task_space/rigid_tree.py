@@ -10,17 +10,18 @@ the base, which is fixed or floats.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Array, Document, Float64
+from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.elementwise import namespace, read_only
-from batchpid.checks.validate import choice, entries, names, read_array
+from batchpid.checks.validate import array, at_least, choice, entries, names, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.task_space.frames import (
@@ -140,39 +141,47 @@ class RigidTree:
         links = tuple(names("links", list(self.links)))
         count = len(links)
         types = tuple(choice("joint_types", one, JOINT_TYPES) for one in self.joint_types)
-        if len(types) != count or types[0] != "fixed":
+        if len(types) != count or types[:1] != ("fixed",):
             remedy = f"give {count}, the type of the joint above each link: 'fixed' for the base"
             raise InvalidArgumentError("joint_types", "does not fit the links", remedy=remedy)
         moving = tuple(
             names("joint_names", list(self.joint_names), sum(one != "fixed" for one in types))
         )
         # Parents first, so that one pass from the base outwards serves every recursion.
-        parent = np.array(_array("parent", self.parent, (count,)), np.intp)
+        parent = np.array(_array("parent", self.parent, links), np.intp)
         first = (parent < np.arange(count)) & (parent >= np.minimum(np.arange(count), 1) - 1)
         entries("parent", parent, first, "does not come before its child", links, kind="entry")
         # One copy of each table, in float64: later writes by the caller change nothing.
-        # Gravity belongs to the world, and to no link or joint.
-        shapes: dict[str, tuple[int, ...]] = {
-            "position": (count, 3),
-            "wxyz": (count, 4),
-            "axis": (count, 3),
-            "mass": (count,),
-            "center": (count, 3),
-            "inertia": (count, 3, 3),
-            "gravity": (3,),
+        columns = {
+            "position": (3,),
+            "wxyz": (4,),
+            "axis": (3,),
+            "mass": (),
+            "center": (3,),
+            "inertia": (3, 3),
         }
-        shapes |= dict.fromkeys(("armature", "lower", "upper"), (len(moving),))
-        tables = {name: _array(name, getattr(self, name), shape) for name, shape in shapes.items()}
-        entries("mass", tables["mass"], tables["mass"] >= 0, "must be >= 0", links, kind="entry")
+        tables = {
+            name: _array(name, getattr(self, name), links, *columns[name]) for name in columns
+        }
+        # Gravity belongs to the world, and to no link or joint.
+        tables["gravity"] = _array("gravity", self.gravity, "xyz")
+        for name in ("armature", "lower", "upper"):
+            # A number stands for all joints; an infinite limit of position counts as no limit.
+            number = getattr(self, name)
+            tables[name] = array(name, number, (len(moving),), moving, finite=False).copy()
+        at_least("mass", tables["mass"], 0.0, links, kind="entry")
+        at_least("armature", tables["armature"], 0.0, moving)
         # A quaternion must be a unit one; an axis only needs a direction.
-        lengths = {name: np.linalg.norm(tables[name], axis=1) for name in ("wxyz", "axis")}
-        unit = np.abs(lengths["wxyz"] - 1) < 1e-6
-        entries("wxyz", lengths["wxyz"], unit, "is not a unit quaternion", links, kind="entry")
-        pointing = (lengths["axis"] > 0) | (np.array(types) == "fixed")
-        entries("axis", lengths["axis"], pointing, "has no direction", links, kind="entry")
-        tables["wxyz"] /= lengths["wxyz"][:, None]
-        tables["axis"] /= np.where(lengths["axis"] > 0, lengths["axis"], 1.0)[:, None]
+        norms = np.linalg.norm(tables["wxyz"], axis=1)
+        unit = np.abs(norms - 1) < 1e-6
+        entries("wxyz", norms, unit, "is not a unit quaternion", links, kind="entry")
+        tables["wxyz"] /= norms[:, None]
+        lengths = np.linalg.norm(tables["axis"], axis=1)
+        pointing = (lengths > 0) | (np.array(types) == "fixed")
+        entries("axis", lengths, pointing, "has no direction", links, kind="entry")
+        tables["axis"] /= np.where(lengths > 0, lengths, 1.0)[:, None]
         coupling = Coupling.of(len(moving)) if self.coupling is None else self.coupling
+        _array("coupling", coupling.leader, moving)
         for table in (parent, *tables.values()):
             table.setflags(write=False)
         # The class is frozen, so the checked tables go past its setter.
@@ -221,11 +230,15 @@ class RigidTree:
             link = int(self.parent[link])
         return self.links[tip]
 
-    @cached_property
+    @property
     def held(self) -> RigidTree:
         """Same tree on a fixed base, with all joints independent."""
         if self.fixed_base and self.coupling.is_identity:
             return self
+        return self._held
+
+    @cached_property
+    def _held(self) -> RigidTree:
         return replace(self, fixed_base=True, coupling=Coupling.of(self.dof))
 
     def fixed_at(self, qpos: Float64, moves: NDArray[np.bool_]) -> RigidTree:
@@ -247,20 +260,26 @@ class RigidTree:
             else:
                 position[link] += q * turn @ self.axis[link]
             types[link] = "fixed"
-        names = tuple(name for name, stays in zip(self.joint_names, moves, strict=True) if stays)
+        names = tuple(compress(self.joint_names, moves))
         rows = {name: getattr(self, name)[moves] for name in ("armature", "lower", "upper")}
-        places: Document = {"position": position, "wxyz": wxyz, "joint_types": tuple(types)}
-        return replace(self, **places, **rows, joint_names=names, coupling=Coupling.of(len(names)))
+        return replace(
+            self,
+            position=position,
+            wxyz=wxyz,
+            joint_types=tuple(types),
+            **rows,
+            joint_names=names,
+            coupling=Coupling.of(len(names)),
+        )
 
     @property
     def independent(self) -> NDArray[np.bool_]:
         """Mask (dof,) of the joints that are not followers."""
         return self.coupling.independent
 
-    def positions(self, qpos: Float64) -> Float64:
+    def positions(self, qpos: Array) -> Array:
         """Return ``qpos`` (..., dof) with the followers moved to match their leaders."""
-        positions: Float64 = self.coupling.positions(qpos)
-        return positions
+        return self.coupling.positions(qpos)
 
     def rates(self, qvel: Array) -> Array:
         """Return ``qvel`` (..., dof) with the rates of followers computed from their leaders'."""
@@ -285,12 +304,9 @@ class RigidTree:
         The last row, body -1, is the base.
         """
         # A joint that is coupled to one of the chain moves the tool, too.
-        rows: Float64 = np.concatenate([self.bodies.moves, np.zeros((1, self.dof))])
-        rows = (rows @ (self.coupling.leader[:, None] == self.coupling.leader) > 0).astype(
-            np.float64
-        )
-        rows.setflags(write=False)
-        return rows
+        rows = np.concatenate([self.bodies.moves, np.zeros((1, self.dof))])
+        leader = self.coupling.leader
+        return read_only((rows @ (leader[:, None] == leader) > 0).astype(np.float64))
 
     @property
     def link_bodies(self) -> tuple[int, ...]:
@@ -357,7 +373,7 @@ class RigidTree:
         rows of numbers (dof, 25): rotation, position, mass, center, tensor.
         """
         bodies = self.bodies
-        slides = bodies.slides[:, 0].astype(np.int32)
+        joints = np.column_stack([self.body_parents, bodies.slides[:, 0]]).astype(np.int32)
         parts = (
             bodies.at_zero[:, :, :3],
             bodies.at_zero[:, :, 3],
@@ -366,15 +382,13 @@ class RigidTree:
             bodies.tensor,
         )
         rows = np.hstack([part.reshape(self.dof, -1) for part in parts])
-        return read_only(
-            np.column_stack([np.array(self.body_parents, np.int32), slides])
-        ), read_only(rows)
+        return read_only(joints), read_only(rows)
 
     def inertias(self, bodies: Bodies | None = None) -> Float64:
         """Return mass, center of mass and inertia tensor of each body, then of the base (..., dof +
         1, 13).
         """
-        of = self.bodies if bodies is None else bodies
+        of = bodies or self.bodies
         parts = of.mass, of.center, of.tensor.reshape(*of.center.shape[:-1], 9)
         rows = np.concatenate(parts, axis=-1)
         base = np.concatenate(
@@ -401,13 +415,13 @@ class RigidTree:
         mass = rows[..., :1]
         center = rows[..., 1:4]
         tensor = rows[..., 4:].reshape(*rows.shape[:-1], 3, 3)
-        base = {
-            "base_mass": mass[:, -1],
-            "base_center": center[:, -1],
-            "base_tensor": tensor[:, -1],
-        }
         return self.bodies._replace(
-            mass=mass[:, :-1], center=center[:, :-1], tensor=tensor[:, :-1], **base
+            mass=mass[:, :-1],
+            center=center[:, :-1],
+            tensor=tensor[:, :-1],
+            base_mass=mass[:, -1],
+            base_center=center[:, -1],
+            base_tensor=tensor[:, -1],
         )
 
     def _inertias(
@@ -439,17 +453,15 @@ def _along_x(axis: Float64) -> Float64:
     return np.column_stack([axis, across, np.cross(axis, across)])
 
 
-def _array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
-    """Return a copy of ``value`` as float64; a number stands for all entries."""
+def _array(name: str, value: ArrayLike, rows: Sequence[str], *columns: int) -> Float64:
+    """Return a copy of ``value`` (rows, columns) as float64, finite."""
     table = np.array(read_array(name, value), np.float64)
-    if not table.shape:
-        table = np.full(shape, table)
+    shape = len(rows), *columns
     if table.shape != shape:
         problem = f"has shape {table.shape}, not {shape}"
         raise InvalidArgumentError(
             name, problem, remedy="give one row for each link, or one entry for each joint"
         )
-    # An infinite limit of position counts as no limit.
-    if name not in ("lower", "upper") and not np.isfinite(table).all():
-        raise InvalidArgumentError(name, "is not finite", remedy="pass finite numbers")
+    finite = np.isfinite(table).reshape(len(rows), -1).all(1)
+    entries(name, table, finite, "is not finite", rows, kind="entry")
     return table

@@ -237,8 +237,6 @@ def _settings(robot: Robot, values: Document) -> Iterator[str]:
         yield f"control {values['control']}"
     elif "moves" in values:
         yield f"gains {', '.join(default_sets(robot))}"
-    elif "generations" in values:
-        yield "gains designed"
     # Logs have the gains that drove their robot.
     elif "gains" in values and "logs" not in values:
         yield f"gains {default_gains(robot)}"

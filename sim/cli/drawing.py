@@ -75,11 +75,16 @@ def plot(
     kind
         Step responses, efforts against their limits, or errors of following.
     """
-    rollout = read_recording(recording)
+    return Recording(recording, _read(recording), robot, kind)
+
+
+def _read(path: Path) -> Rollout:
+    """Return the run in a file. Raises InvalidArgumentError for one without ticks."""
+    rollout = read_recording(path)
     if not len(rollout.time):
         remedy = "its run was cut short: run it again"
-        raise InvalidArgumentError("recording", f"{recording} holds no tick", remedy=remedy)
-    return Recording(recording, rollout, robot, kind)
+        raise InvalidArgumentError("recording", f"{path} holds no tick", remedy=remedy)
+    return rollout
 
 
 def recording_line(path: Path, rollout: Rollout) -> str:
@@ -136,10 +141,14 @@ def _live(
     """Return the running robots."""
     from batchpid.sim.view import LiveSimulation
 
-    chosen = gain_set(robot, gains)
-    if chosen.control != "pid":
-        raise InvalidArgumentError("gains", "must be PID gains", value=gains, remedy="name others")
-    return LiveSimulation(robot, num_envs, params=chosen.params, **options)
+    # Without gains the Runner has its own default, which knows the loops of an MJCF file.
+    if gains is not None:
+        chosen = gain_set(robot, gains)
+        if chosen.control != "pid":
+            remedy = "name others"
+            raise InvalidArgumentError("gains", "must be PID gains", value=gains, remedy=remedy)
+        options["params"] = chosen.params
+    return LiveSimulation(robot, num_envs, **options)
 
 
 def _recorded(path: Path, robot: Robot | None) -> Playback:
@@ -147,7 +156,7 @@ def _recorded(path: Path, robot: Robot | None) -> Playback:
     from batchpid.sim.view import Playback
     from batchpid.sim.view.scene import MAX_ROBOTS
 
-    rollout = read_recording(path)
+    rollout = _read(path)
     print(recording_line(path, rollout))
     if rollout.num_envs > MAX_ROBOTS:
         print(f"showing the first {MAX_ROBOTS} of {rollout.num_envs} envs")

@@ -3,70 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from batchpid.arrays.array_types import Document
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
+from batchpid.sim.identification.result import Identification
 from batchpid.sim.options.groups import Compensation
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     import batchpid as bp
-    from batchpid.sim.identification.result import Identification
 
 EVALUATIONS = 45
 """Length of the bar: a fit usually ends before."""
-
-
-@dataclass(frozen=True)
-class Identified:
-    """Identification that is written where it explains the logs."""
-
-    result: Identification
-    force: bool
-
-    def report(self) -> str:
-        """Return the report of the identification.
-
-        Raises InvalidArgumentError, after the report is printed, for logs that it does not explain.
-        """
-        if self.result.explains or self.force:
-            return self.result.report()
-        print(self.result.report())
-        problem = (
-            "are explained to less than half of the error of ideal motors, and no file is written"
-        )
-        remedy = f"{self.result.advice}; --force writes the file nevertheless"
-        raise InvalidArgumentError("logs", problem, remedy=remedy)
-
-    def save(self, path: Path) -> None:
-        """Write the actuators to one file and the identified gains to another."""
-        import batchpid as bp
-
-        self.result.save(path)
-        gains = self.result.gains()
-        if gains is not None:
-            names = [self.result.robot.joint_names[joint] for joint in self.result.joints]
-            bp.save_params(path.with_name(f"{path.stem}-gains.yaml"), gains, names)
-
-    def document(self) -> Document:
-        """Return the estimates with their intervals."""
-        return self.result.document()
-
-    def figure(self) -> Figure:
-        """Draw the errors before and after."""
-        return self.result.figure()
-
-    def corrected_urdf(self) -> str:
-        """Return the URDF with the masses that were found."""
-        return self.result.corrected_urdf()
 
 
 def identify_logs(
@@ -85,7 +37,7 @@ def identify_logs(
     workers: Annotated[int, Field(low=0, high=1000)] = 0,
     force: bool = False,
     progress: Callable[[Any], Any] | None = None,
-) -> Identified:
+) -> Identification:
     """Identify a robot's motors from logs of its motion, from this robot or another simulator.
 
     Finds armature, damping, friction, strength and bias of each joint, the delays of efforts and
@@ -147,7 +99,12 @@ def identify_logs(
         workers=workers,
         progress=lambda: next(evaluations, None),
     )
-    return Identified(result, force)
+    if result.explains or force:
+        return result
+    print(result.report())
+    problem = "are explained to less than half of the error of the robot as described"
+    remedy = f"{result.advice}; --force writes the file nevertheless"
+    raise InvalidArgumentError("logs", f"{problem}, and no file is written", remedy=remedy)
 
 
 def _gains(robot: Robot, name: str) -> bp.PIDParams:

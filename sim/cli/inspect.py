@@ -23,8 +23,6 @@ SOURCES = {
     "none": "-",
 }
 """Words for the sources of masses."""
-LIGHT = 1e-4
-"""Share of the total mass up to which a link is light."""
 NO_GROUND = "No ground: links other than the fixed base reach it at the start pose."
 LEGS = "A robot with legs? Its base is fixed: --base free, or fixed_base=False, puts it on a floor."
 LIMB = 3
@@ -66,13 +64,9 @@ class Inspection:
         lines.append("\n" + table(list(joint_rows(joints)), HEADERS, "lllrrrrrl"))
         rows = []
         for name, link in masses.items():
-            if self.all or link.mass > LIGHT * total:
-                mass = f"{link.mass:.4g} kg" if link.mass else "none"
-                rows.append([name, mass, SOURCES[link.source]])
+            mass = f"{link.mass:.4g} kg" if link.mass else "none"
+            rows.append([name, mass, SOURCES[link.source]])
         lines.append("\n" + table(rows, ("link", "mass", "from"), "lrl"))
-        if len(rows) < len(masses):
-            hidden = len(masses) - len(rows)
-            lines.append(f"Links with little mass or none, not shown: {hidden} (--all).")
         lines += ["", *self._contact_lines()]
         return "\n".join(lines)
 
@@ -125,7 +119,7 @@ def inspect_robot(
     gains
         Gains to check, as for `batchpid rollout`. Default: tuned where the robot has them.
     all
-        List fixed joints, light links, and pairs of links that do not collide, too.
+        List fixed joints and pairs of links that do not collide, too.
     """
     findings = robot.check(setpoint=robot.target, control="drive")  # without gains
     if gains is None and not robot.has_tuned:

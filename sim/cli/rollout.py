@@ -22,7 +22,6 @@ from batchpid.sim.cli.flags import BOUNDS
 from batchpid.sim.cli.report import RunReport
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.tool_space import default_tool
 from batchpid.sim.tuning.comparison import gain_set
 
 NumEnvs = Annotated[int, BOUNDS["num_envs"]]
@@ -130,17 +129,19 @@ def rollout(
     if control == "osc":
         _refuse("gains", gains, "are for the control of joints")
         _refuse("trajectory", trajectory, "has joint setpoints, and excludes --control osc")
-        operational = OperationalSpace(robot, tool or default_tool(robot), posture=robot.target)
+        operational = OperationalSpace(robot, tool or robot.rigid_tree.tool, posture=robot.target)
         options["control"] = operational
         columns = operational.command.names
         goal = operational.tool_pose(robot.target)
         center = robot.target
     else:
         _refuse("tool", tool, "is for control 'osc'")
-        chosen = gain_set(robot, gains or ("drive" if control == "drive" else None))
-        options["params"] = chosen.params
-        if chosen.control == "drive":
-            options["control"] = "drive"
+        # Without gains the Runner has its own default, which knows the loops of an MJCF file.
+        if gains is not None:
+            chosen = gain_set(robot, gains)
+            options["params"] = chosen.params
+            if chosen.control == "drive":
+                options["control"] = "drive"
 
     # Setpoints: of a file, or one that is held.
     notes: list[str] = []

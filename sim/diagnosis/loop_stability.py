@@ -192,7 +192,7 @@ class StabilityCheck:
         if is_beyond and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
             env = ""
-            if report.env:
+            if params.num_envs > 1 or report.env:
                 env = f", env {report.env}"
             warn(
                 f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the"

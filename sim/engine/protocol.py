@@ -318,8 +318,8 @@ class Engine:
 
 
 def require(engine: Engine, capability: Capability, argument: str) -> None:
-    """Raise InvalidArgumentError for ``argument`` if ``engine`` lacks a ``capability`` of
-    SAPIEN's.
+    """Raise InvalidArgumentError for ``argument`` if ``engine`` lacks ``capability``, which SAPIEN
+    has.
     """
     if capability not in engine.capabilities:
         problem = f"needs the capability {capability!r}, which engine {engine.name!r} does not have"

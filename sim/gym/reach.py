@@ -89,6 +89,7 @@ class ReachVectorEnv(RobotVectorEnv):
         self.tolerance = number("tolerance", tolerance, 0.0, 1e3, "rad or m")
         self._max_increment = max_increment
         super().__init__(num_envs, robot, **options)
+        self._action_names = self.joint_names
         if self.runner.options.own_command is not None:
             self.close()
             problem = "has setpoints that are not of joints"

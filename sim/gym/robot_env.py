@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Document, Float32
 from batchpid.errors import SingleOwner
-from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
+from batchpid.sim.gym.robot_vector_env import RobotVectorEnv, check_free
 from batchpid.sim.robot.robot import Robot
 
 
@@ -35,13 +35,13 @@ class RobotEnv(SingleOwner, gymnasium.Env):
             options["robot"] = robot
         options.setdefault("workers", 0)
         # gymnasium.make adds the time limit and the resets.
-        self._envs = self.task(
-            1,
-            max_episode_steps=None,
-            autoreset_mode=AutoresetMode.DISABLED,
-            render_mode=render_mode,
-            **options,
-        )
+        chosen: Document = {
+            "num_envs": 1,
+            "max_episode_steps": None,
+            "autoreset_mode": AutoresetMode.DISABLED,
+        }
+        check_free(self, options, chosen)
+        self._envs = self.task(render_mode=render_mode, **chosen, **options)
         self.runner = self._envs.runner
         self.render_mode = render_mode
         self.metadata = self._envs.metadata  # type: ignore[misc]

@@ -27,6 +27,13 @@ from batchpid.sim.runner.runner import Runner
 from batchpid.sim.signals.quantities import Observation
 
 
+def check_free(owner: object, options: Document, chosen: Document) -> None:
+    """Raise InvalidArgumentError for an option among those that ``owner`` has chosen."""
+    for option in options.keys() & chosen.keys():
+        problem = f"is chosen by {type(owner).__name__}"
+        raise InvalidArgumentError(option, problem, remedy="leave it out, or make a subclass")
+
+
 class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     """Task of N robots: a :class:`gymnasium.vector.VectorEnv` over the Runner. A task is a subclass
     with hooks.
@@ -124,9 +131,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         substeps = round(1 / (rate * timestep))
         self.step_seconds = substeps * timestep
         chosen = {"substeps": substeps, **self.runner_options()}
-        for option in options.keys() & chosen.keys():
-            problem = f"is chosen by {type(self).__name__}"
-            raise InvalidArgumentError(option, problem, remedy="leave it out, or make a subclass")
+        check_free(self, options, chosen)
         # Spaces come first: an invalid one is an error before any process starts.
         self.single_observation_space, self.single_action_space = self.spaces()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -141,6 +146,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._starts = np.tile(self.robot.start, (self.num_envs, 1))
         self._setpoint = np.zeros((self.num_envs, self.runner.command.size))
         self.action = np.zeros(self.action_space.shape or ())
+        self._action_names: Sequence[str] = [str(column) for column in range(self.action.shape[1])]
         self._observation = np.zeros(self.observation_space.shape or (), np.float32)
         self._success = np.zeros(self.num_envs, bool)
         self._diverged = np.zeros(self.num_envs, bool)
@@ -183,7 +189,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """
         if self.runner.options.sets_positions:
             return qpos
-        return np.asarray(self.runner.command.neutral)
+        return np.broadcast_to(self.runner.command.neutral, self._setpoint.shape)
 
     def command(self, action: Float64, setpoint: Float64) -> ArrayLike:
         """Return the setpoints of the Runner (envs, command size) for the actions (envs, size).
@@ -256,9 +262,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         mask = np.ones(self.num_envs, bool)
         if "reset_mask" in options:
             mask = env_mask("options['reset_mask']", options["reset_mask"], self.num_envs)
-        if not mask.any():
-            remedy = "use e.g. mask = terminated | truncated"
-            raise InvalidArgumentError("options['reset_mask']", "selects no env", remedy=remedy)
         seeds: list[int] | None = None
         if seed is not None:
             if np.ndim(seed) == 0:
@@ -290,8 +293,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """
         self._expect_no_step("step_async")
         space: Any = self.single_action_space
-        names = [str(column) for column in range(space.shape[0])]
-        action = array("actions", actions, self.action.shape, names, kind="entry")
+        action = array("actions", actions, self.action.shape, self._action_names, kind="entry")
         action = np.clip(action, space.low, space.high)
         begins = self._done.copy()
         if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
@@ -403,6 +405,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if randomization is not None and randomization.qpos is not None:
             self._starts = np.where(mask[:, None], observed.qpos, self._starts)
         first = self.first_setpoint(self._starts)
+        first = self._returned("first_setpoint", first, self._setpoint.shape, mask)
         self._setpoint = np.where(mask[:, None], first, self._setpoint)
         self._observe(observed)
 
@@ -413,24 +416,27 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         space: Any = self.single_observation_space
         self.observed = observed
         self._diverged = ~observed.ok
-        rows = np.array(self.observe(observed))
-        rows[self._diverged] = 0.0
-        rows = self._returned("observe", rows, self._observation.shape)
+        rows = self.observe(observed)
+        rows = self._returned("observe", rows, self._observation.shape, observed.ok)
         rows = np.clip(rows.astype(np.float32), space.low, space.high)
         self._observation = np.where(observed.ok[:, None], rows, self._observation)
         success = self.success(self._observation)
         success = self._returned("success", success, observed.ok.shape)
         self._success = observed.ok & success.astype(bool)
 
-    def _returned(self, hook: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
-        """Return a hook's value as an array; raise InvalidArgumentError for another shape, NaN or
-        infinity.
+    def _returned(
+        self, hook: str, value: ArrayLike, shape: tuple[int, ...], mask: Bool | None = None
+    ) -> Float64:
+        """Return a hook's value as an array, 0 in envs that are not in ``mask``; raise
+        InvalidArgumentError for another shape, NaN or infinity.
         """
         rows = np.asarray(value, np.float64)
         name = f"{type(self).__name__}.{hook}"
         if rows.shape != shape:
             problem = f"returned an array of shape {rows.shape}"
             raise InvalidArgumentError(name, problem, remedy=f"return one of shape {shape}")
+        if mask is not None:
+            rows = np.where(mask[:, None], rows, 0.0)
         if not np.isfinite(rows).all():
             index = tuple(np.argwhere(~np.isfinite(rows))[0].tolist())
             problem = f"returned a number that is not finite, at index {index}"
@@ -439,7 +445,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
 
     def _expect_no_step(self, call: str) -> None:
         """Raise CallOrderError if a step has begun and has not been waited for."""
-        if self._is_stepping:
+        # An error in a worker ends the step and closes the runner, which says so.
+        if self._is_stepping and not self.runner.closed:
             raise CallOrderError(f"{call}: a step is under way; call step_wait() first")
 
     def _info(self, mask: Bool) -> Document:

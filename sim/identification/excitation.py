@@ -38,8 +38,8 @@ REACH = {"rad": 0.8, "m": 0.1}
 VELOCITY_SHARE, EFFORT_SHARE = 0.6, 0.7
 """Shares of the limits of velocity and effort that the motion takes."""
 CLEARANCE = 0.01
-"""Least distance from contact [m]; half of the distance at the center for links that are nearer
-there.
+"""Least distance of all links from contact [m]; half of the smallest one at the center, if that is
+less.
 """
 _EDGE = 0.1
 _DRAWS = 20
@@ -102,6 +102,8 @@ def excite(
         while obstacle and share[movable].min() >= _LEAST:
             motion = _chirp(robot, center, share, time, lowest, highest, phase)
             obstacle, joints = _obstacle(robot, motion)
+            if joints and not share[joints].any():
+                break
             share[joints] *= _SHRINK
         if obstacle:
             obstacles[obstacle] += 1

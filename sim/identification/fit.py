@@ -48,8 +48,8 @@ HELD_OUT = 0.25
 """Share of each log, at its end, that is held out."""
 MOST_WINDOWS = 500
 """Largest number of windows; if there are more, evenly spaced ones are used."""
-MOST_NUMBERS = 2**24
-"""Largest number of entries of the derivatives; if there are more, evenly spaced rows are fitted."""
+MOST_ROWS = 40_000
+"""Largest number of rows of all logs; if there are more, evenly spaced ones are used."""
 ENVS = 2048
 """Most simulations at once."""
 STEP = 1e-3
@@ -66,7 +66,7 @@ ROUNDS = 4
 """Largest number of fits; each scales the residuals by the size that the last one left."""
 SETTLED = 0.5
 """Ratio of that size to the one before from which no further fit follows."""
-SHORT = 1e-3
+SHORT = 2e-3
 """Delay of setpoints below which it counts as none [s]."""
 PARTS = 10
 """Number of parts of the logs for the jackknife."""
@@ -106,8 +106,8 @@ class Intervals(NamedTuple):
 
     deviation: Float64
     """Standard deviations (unknowns,)."""
-    correlation: Float64
-    """(unknowns, unknowns)."""
+    root: Float64
+    """Root L of the covariance L L^T (unknowns, unknowns)."""
     shown: Bool
     """Unknowns that the logs say something about (unknowns,)."""
 
@@ -116,7 +116,7 @@ class Fit(NamedTuple):
     """A fit of the unknowns that the logs show."""
 
     hidden: Unknowns
-    """Unknowns that the logs do not identify; they have the values of ideal motors."""
+    """Unknowns that the logs do not identify; they have the values of the description."""
     problem: Problem
     solution: Solution
     intervals: Intervals
@@ -190,12 +190,10 @@ class Problem:
         """Return residuals and derivatives (n, unknowns), by changes of STEP, of the fitted rows
         over their ``size``, then of the prior.
         """
-        rows = sum(int(window.fitted.sum()) for window in self.windows)
-        every = 1 + rows * len(size) * len(point) // MOST_NUMBERS
         tables = []
         for window, table in zip(self.windows, evaluation, strict=True):
             if len(table):
-                weighted = table[window.fitted][::every] / size[:, None]
+                weighted = table[window.fitted] / size[:, None]
                 tables.append(weighted.reshape(-1, 1 + len(point)))
         table = np.concatenate(tables)
         mean, spread = self.unknowns.prior
@@ -234,7 +232,7 @@ def fit(
         size = problem.size(problem.evaluate(start, np.zeros((0, len(start)))))
         return float(np.linalg.norm(size))
 
-    problem = min(problems, key=start_error)
+    problem = problems[0] if len(problems) == 1 else min(problems, key=start_error)
     unknowns = problem.unknowns
     solution = solve(problem, unknowns.start, evaluations, None, progress)
     uncertainty = intervals(problem, solution)
@@ -323,11 +321,12 @@ def intervals(problem: Problem, solution: Solution) -> Intervals:
     evaluation = problem.evaluate(point, further - point)
     residual, matrix = problem.system(evaluation, solution.point, solution.size)
     # Rows are weighted as by the loss; the last ones are of the prior.
-    residual = residual[: -len(point)]
+    rows = len(residual) - len(point)
+    residual = residual[:rows]
     weight = (1 + (residual / OUTLIER) ** 2) ** -0.25
     residual = weight * residual
-    matrix = weight[:, None] * matrix[: -len(point)] * (STEP * sizes / change)
-    square = float(residual @ residual) / max(len(residual) - len(point), 1)
+    matrix = weight[:, None] * matrix[:rows] * (STEP * sizes / change)
+    square = float(residual @ residual) / max(rows - len(point), 1)
     hessian = matrix.T @ matrix + np.diag(square / prior**2)
     inverse = np.linalg.inv(hessian)
     shifts = []
@@ -339,12 +338,13 @@ def intervals(problem: Problem, solution: Solution) -> Intervals:
     variance = np.maximum(jackknife, curvature) + (inverse @ matrix.T @ residual) ** 2
     deviation = np.sqrt(np.minimum(variance, prior**2)) * sizes
     deviation = np.maximum(deviation, LEAST * np.abs(values))
-    scale = np.sqrt(np.diagonal(inverse))
-    # A delay of setpoints that may be 0 is left out: that of efforts explains the rest.
+    # Correlations are those of the curvature.
+    scale = deviation / np.sqrt(np.diagonal(inverse))
+    root = scale[:, None] * np.linalg.cholesky(inverse)
+    # A short delay of setpoints is left out: that of efforts explains the rest.
     late = np.array([entry.kind == "setpoint_delay" for entry in entries])
-    absent = late & (values < np.maximum(INTERVAL * deviation, SHORT))
-    shown = (np.sqrt(curvature) < SHOWN * prior) & ~absent
-    return Intervals(deviation, inverse / scale[:, None] / scale, shown)
+    shown = (np.sqrt(curvature) < SHOWN * prior) & ~(late & (values < SHORT))
+    return Intervals(deviation, root, shown)
 
 
 def _residuals(windows: Sequence[Window], evaluation: Sequence[Float64], fitted: bool) -> Float64:
@@ -388,12 +388,13 @@ def windows_of(data: Sequence[LogData]) -> list[Window]:
     part begins.
     """
     windows = list[Window]()
+    every = 1 + sum(len(part.log.time) for part in data) // MOST_ROWS
     for number, part in enumerate(data):
         total = len(part.motion.qpos) - 1
         share = {None: 1 - HELD_OUT, False: 1.0, True: 0.0}[part.log.settings.held_out]
         split = round(share * total)
         if part.drive.params is not None:
-            windows.append(_window(number, part, 0, total, split))
+            windows.append(_window(number, part, (0, total), split, every))
             continue
         # Windows of the fitted part, then of the held-out part; the filter begins at the edge.
         edge = round(0.05 / part.drive.timestep)
@@ -401,21 +402,24 @@ def windows_of(data: Sequence[LogData]) -> list[Window]:
         length = min(round(WINDOW / part.drive.timestep), max(total - first, split - edge))
         starts = [*range(edge, split - length + 1, length)]
         starts += range(first, total - length + 1, length)
-        windows += [_window(number, part, start, start + length, split) for start in starts]
+        windows += [
+            _window(number, part, (start, start + length), split, every) for start in starts
+        ]
     return windows[:: 1 + len(windows) // MOST_WINDOWS]
 
 
-def _window(number: int, data: LogData, first: int, last: int, split: int) -> Window:
-    """Return the window from sim step ``first`` to ``last`` of a log's grid, whose rows are held out
-    from the step ``split`` on.
+def _window(number: int, data: LogData, steps: tuple[int, int], split: int, every: int) -> Window:
+    """Return the window between two sim ``steps`` of a log's grid, of one row of ``every``; rows are
+    held out from the step ``split`` on.
     """
+    first, last = steps
     log, motion, _, drive = data
     dt = drive.timestep
     settle = 0.0
     if drive.params is not None:
         settle = min(SETTLE, 0.2 * log.seconds) / dt
     place = (log.time - log.time[0]) / dt
-    rows = np.flatnonzero((place > first + settle + 1e-6) & (place <= last + 1e-6))
+    rows = np.flatnonzero((place > first + settle + 1e-6) & (place <= last + 1e-6))[::every]
     place = place[rows]
     step = np.maximum(np.ceil(place - 1e-6).astype(int), first + 1)
     past = round(PAST / dt)

@@ -35,7 +35,7 @@ from batchpid.sim.loop.step_values import ModelledFriction
 from batchpid.sim.options.groups import Compensation
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.robot_options import BAND
+from batchpid.sim.robot.robot_options import BAND, known_joints
 
 STILL = {"rad": 1e-3, "m": 1e-4}
 """Standard deviation of the positions up to which a joint did not move."""
@@ -91,7 +91,7 @@ def identify(
     reading
         Units and names in the files.
     evaluations
-        Largest number of evaluations of the fit.
+        Largest number of evaluations of each fit: of all unknowns, and of those that are shown.
     workers
         Number of processes, 0 for this one.
     progress
@@ -112,7 +112,7 @@ def identify(
     if find_spec("scipy") is None:
         raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
-    kinds = [choice("extras", name, [*EXTRAS]) for name in extras]
+    kinds = [choice("extras", name, [*EXTRAS]) for name in dict.fromkeys(extras)]
     if flag("payload", payload):
         kinds.append("payload")
     evaluations = integer("evaluations", evaluations, 2, 1000)
@@ -194,16 +194,16 @@ def _prepared(
     joints = np.array(logs[0].joints)
     start = robot.start
     start[joints[~moves]] = np.concatenate([log.qpos for log in logs]).mean(0)[~moves]
-    # A joint that went beyond its limits turns freely: its positions were unwrapped.
+    # Joints whose positions leave the limits have none in the simulation.
     qpos = np.concatenate([log.qpos for log in logs])[:, moves]
     joints = joints[moves]
     free = (qpos.min(0) < robot.lower[joints]) | (qpos.max(0) > robot.upper[joints])
-    # A Runner compensates the friction of the description, too.
+    # A Runner compensates the friction of the description and of the robot's motors, too.
     modelled = None
-    if is_friction and robot.friction[joints].any():
+    friction = (robot.friction + known_joints(robot).coulomb)[joints]
+    if is_friction and friction.any():
         band = np.array([BAND[robot.units[joint]] for joint in joints])
-        turns = robot.continuous[joints] / TURN
-        modelled = ModelledFriction(robot.friction[joints], band, turns)
+        modelled = ModelledFriction(friction, band, robot.continuous[joints] / TURN)
     plants = dict[Robot, Plant]()
     data = list[LogData]()
     for log in logs:
@@ -277,20 +277,21 @@ def _regress(
 
     Raises InvalidArgumentError where a log makes far more sense in another reading.
     """
-    guesses = _guesses(data, has_slew)
+    guesses = regress(_fitted(data), has_slew)
     if data[0].drive.compensate != "none":
         # A robot that adds the compensation by itself may do so exactly, whatever its motors.
         exact = [part._replace(drive=part.drive._replace(through=False)) for part in data]
-        others = _guesses(exact, has_slew)
+        others = regress(_fitted(exact), has_slew)
         if others[0].cost() < guesses[0].cost() - DETOUR:
             data = exact
             guesses = others
-    log = data[0].log
+    first = _fitted(data)[0]
+    log = first.log
     limits = robot.effort_limit[list(log.joints)]
     beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > BEYOND * limits
     words = ""
     if guesses[0].odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
-        words = better_reading(data[0], [robot.joint_names[joint] for joint in log.joints])
+        words = better_reading(first, [robot.joint_names[joint] for joint in log.joints])
     delay = float(guesses[0].values["setpoint_delay"][0])
     if delay < -1e-9 and not words:
         words = f"setpoints that were logged about {-1e3 * delay:.0f} ms late"
@@ -300,17 +301,25 @@ def _regress(
     return data, guesses
 
 
-def _guesses(data: list[LogData], has_slew: bool) -> list[Guess]:
-    return regress([part for part in data if not part.log.settings.held_out], has_slew)
+def _fitted(data: list[LogData]) -> list[LogData]:
+    """Return the logs that are not held out as a whole."""
+    return [part for part in data if not part.log.settings.held_out]
 
 
 def _unknowns(robot: Robot, data: list[LogData], guess: Guess, extras: Sequence[str]) -> Unknowns:
     """Return the unknowns with starts from the regression, and typical sizes from the motion."""
+    data = _fitted(data)
     log, _, plant, drive = data[0]
     starts = dict(guess.values)
     kinds = list(BASIC)
     if drive.params is not None:
         kinds.append("setpoint_delay")
+    for name in extras:
+        kinds += EXTRAS.get(name, (name,))
+        if KINDS[kinds[-1]].target == "law" and drive.params is None:
+            problem = "is of a law, and the logs hold efforts"
+            remedy = "leave it out, or give the params of the law"
+            raise InvalidArgumentError("extras", problem, value=name, remedy=remedy)
     if log.measured:
         # Measured efforts are late by nothing, and say nothing of the motor's strength.
         kinds.remove("delay")
@@ -319,12 +328,6 @@ def _unknowns(robot: Robot, data: list[LogData], guess: Guess, extras: Sequence[
     if "gain" in extras:
         kinds.remove("strength")
         starts["gain"] = starts["strength"]
-    for name in extras:
-        kinds += EXTRAS.get(name, (name,))
-        if KINDS[kinds[-1]].target == "law" and drive.params is None:
-            problem = "is of a law, and the logs hold efforts"
-            remedy = "leave it out, or give the params of the law"
-            raise InvalidArgumentError("extras", problem, value=name, remedy=remedy)
     motions = [part.motion for part in data]
     qpos, qvel, qacc, command = (np.concatenate(tables) for tables in zip(*motions, strict=True))
     poses = np.ascontiguousarray(qpos[:: 1 + len(qpos) // 200])

@@ -36,7 +36,7 @@ BEGIN = 0.03
 
 
 class LogWarning(UserWarning):
-    """A log was changed when it was read, or shows an effect that the model of the robot lacks."""
+    """A log was changed when it was read, or a joint did not move."""
 
 
 class LogSettings(NamedTuple):
@@ -159,9 +159,9 @@ def checked(robot: Robot, log: Log) -> list[Log]:
         A value is not finite, times decrease, there are too few rows, or positions are in another
         unit.
     """
+    _check_finite(robot, log)
     if log.is_checked:
         return [log]
-    _check_finite(robot, log)
     log = _in_order(log)
     period = float(np.median(np.diff(log.time))) if len(log.time) > 1 else 0.0
     units = "time is in seconds, or the column is time_ms, time_us or time_ns"
@@ -187,7 +187,10 @@ def checked(robot: Robot, log: Log) -> list[Log]:
 
 
 def _check_finite(robot: Robot, log: Log) -> None:
-    columns = {"time": log.time}
+    if len(log.command_time) != len(log.command) or not len(log.time):
+        remedy = "give a time for each command"
+        raise log.error(f"has {len(log.time)} rows and {len(log.command)} commands", remedy)
+    columns = {"time": log.time, "command_time": log.command_time}
     for number, joint in enumerate(log.joints):
         columns[f"qpos:{robot.joint_names[joint]}"] = log.qpos[:, number]
         columns[f"{log.kind}:{robot.joint_names[joint]}"] = log.command[:, number]

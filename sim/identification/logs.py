@@ -2,10 +2,11 @@
 bags.
 
 Columns are ``time`` [s] (or ``time_ms``, ``time_us``, ``time_ns``), ``qpos:JOINT``, and
-``setpoint:JOINT``, ``effort:JOINT`` or ``measured_effort:JOINT``; others are ignored. A bag is a
-bag of ROS 1 or ROS 2 or an MCAP file with messages ``sensor_msgs/JointState``, which hold values of
-joints by name, in any order. In the topic of measurements efforts are measured efforts. In the
-topic of commands positions are setpoints, and efforts are commanded efforts.
+``setpoint:JOINT``, ``effort:JOINT`` or ``measured_effort:JOINT``. ``feedforward:JOINT`` is refused,
+others are ignored. A bag is a bag of ROS 1 or ROS 2 or an MCAP file with messages
+``sensor_msgs/JointState``, which hold values of joints by name, in any order. In the topic of
+measurements efforts are measured efforts. In the topic of commands positions are setpoints, and
+efforts are commanded efforts.
 """
 
 from __future__ import annotations
@@ -175,7 +176,7 @@ def _build(
     time = SECONDS[unit] * columns[name]
     by = columns_by_joint(robot, source, columns, QUANTITIES, reading.prefix)
     if by["feedforward"]:
-        remedy = "log the complete efforts, or leave the columns out where they are 0"
+        remedy = "log the complete efforts, without the columns of the feedforward"
         raise error(source, "has a feedforward, which a fit does not simulate", remedy)
     # Measured efforts stand for commands that were not logged.
     measured = not by["effort"]
@@ -256,6 +257,8 @@ def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
     if others:
         warn(f"{path}: {left_out}: no joint of the robot, left out", LogWarning)
     stamps = [sorted(rows) for (_, name), rows in samples.items() if name.startswith("qpos")]
+    if not stamps:
+        raise error(str(path), "has no positions", f"is {reading.topic} the topic of measurements?")
     first = max(joint[0] for joint in stamps)
     last = min(joint[-1] for joint in stamps)
     time = np.array([stamp - first for stamp in max(stamps, key=len) if first <= stamp <= last])

@@ -42,6 +42,8 @@ delay of setpoints is negative where they were logged late. Loops have short del
 """
 EDGE = 0.15
 """Time left out at both ends of a log, where the filter begins [s]."""
+LONGEST = 60.0
+"""Length of a log that is used [s]."""
 MOST_ROWS = 4000
 """Most rows of a regression."""
 STRENGTHS = 0.2, 3.0
@@ -146,7 +148,10 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
     delays = LOOP_DELAYS
     tables = list[Any]()
     for part in data:
-        motion, drive = part.motion, part.drive
+        drive = part.drive
+        # The beginning of a long log is enough for a start.
+        motion = Motion(*(table[: round(LONGEST / dt)] for table in part.motion))
+        part = part._replace(motion=motion)
         edge = min(round(EDGE / dt), len(motion.qpos) // 5)
         rows = np.arange(edge, len(motion.qpos) - edge, every)
         # Efforts that the links need, and efforts of the motors by delay of the setpoints.

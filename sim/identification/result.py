@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +34,7 @@ LEAST_SHARE, LEAST_SHARE_OF_MASS = 0.1, 0.5
 to be named.
 """
 EXPLAINS = 0.5
-"""Share of the position error with ideal motors that a file may leave."""
+"""Share of the position error of the robot as described that a file may leave."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +101,7 @@ class Identification:
 
     @property
     def explains(self) -> bool:
-        """True if less than half of the error with ideal motors is left."""
+        """True if less than half of the error of the robot as described is left."""
         before, after = self.held_out_error
         return after < EXPLAINS * before
 
@@ -168,18 +169,19 @@ class Identification:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write :meth:`actuators` to a .yaml or .json file, with intervals, errors and the
-        confidence region.
+        confidence region; and :meth:`gains`, if the law was identified, to NAME-gains.yaml.
         """
-        # With standard normal z, estimate + root @ z are draws from the region.
-        scale = self.fit.intervals.deviation
-        covariance = self.fit.intervals.correlation * scale * scale[:, None]
         region = {
             "unknowns": [[entry.kind, self._place(entry)] for entry in self.unknowns.entries],
             "estimate": self.values.tolist(),
-            "root": np.linalg.cholesky(covariance).tolist(),
+            "root": self.fit.intervals.root.tolist(),
         }
         about = self.document() | {KEY: region}
         bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
+        gains = self.gains()
+        if gains is not None:
+            names = [self.robot.joint_names[joint] for joint in self.joints]
+            bp.save_params(Path(path).with_name(f"{Path(path).stem}-gains.yaml"), gains, names)
 
     def document(self) -> Document:
         """Return the result as plain values: estimate and 95 % interval of each unknown, and the
@@ -254,11 +256,12 @@ class Identification:
         lines += [f"{place or 'robot'}: {', '.join(cells)}" for place, cells in rows.items()]
         if self.drive.compensate != "none":
             path = "through its motors" if self.drive.through else "apart from its motors"
-            lines.append(f"the robot compensates {self.drive.compensate} {path}")
+            friction = "" if self.drive.modelled is None else "+friction"
+            lines.append(f"the robot compensates {self.drive.compensate}{friction} {path}")
         before, after = self.held_out_error
         lines.append(
             "position error on the held-out part, simulated from the logged state:"
-            f" {before:.3g} with ideal motors, {after:.3g} with these"
+            f" {before:.3g} as described, {after:.3g} with these"
         )
         if self.drive.params is None:
             free = _rms(self.errors[2])
@@ -268,7 +271,7 @@ class Identification:
         lines.append(f"by joint: {', '.join(errors)}")
         if self.not_identified:
             names = ", ".join(self.not_identified)
-            lines.append(f"not shown by these logs, hence as ideal: {names}")
+            lines.append(f"not shown by these logs or not needed, hence as described: {names}")
         if not self.converged:
             lines.append("the fit has not converged: the values are the best so far")
         return "\n".join([*lines, self.advice])
@@ -300,7 +303,7 @@ def _columns(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
             continue
         if kind.positive:
             described = getattr(robot, DESCRIBED[name])[joints] if name in DESCRIBED else 0.0
-            table = np.maximum(table - described, 1e-3 * kind.neutral)
+            table = np.clip(table - described, 1e-3 * kind.neutral, kind.most)
         column = np.full((len(values), robot.dof), kind.neutral)
         column[:, joints] = table
         if kind.per == "robot":
@@ -321,10 +324,10 @@ def advice(fit: Fit) -> str:
     further = [Unknown("mass", None, 1.0, 1.0, link=link) for link in links]
     for joint in range(len(unknowns.joints)):
         further.append(Unknown("offset", joint, 0.0, 0.01))
-        further.append(Unknown("load_friction", joint, 1e-4, 0.05))
+        further.append(Unknown("load_friction", joint, 1e-6, 1e-5))
     present = {entry.kind for entry in unknowns.entries}
     further = [entry for entry in further if entry.kind not in present]
-    names = [entry.link or entry.kind for entry in further]
+    names = [(entry.kind, entry.link) for entry in further]
     point = np.append(fit.solution.point, [entry.coordinate(entry.start) for entry in further])
     wide = replace(problem, unknowns=replace(unknowns, entries=(*unknowns.entries, *further)))
     evaluation = wide.evaluate(point, STEP * np.eye(len(point)))
@@ -335,32 +338,31 @@ def advice(fit: Fit) -> str:
     weight = (1 + (residual[:rows] / OUTLIER) ** 2) ** -0.25
     triangle: Any = np.linalg.qr(weight[:, None] * table, mode="r")
     target = triangle[:, -1]
-    shares = dict[str, float]()
-    changes = dict[str, Float64]()
+    # Share of the squared error that each effect explains, and the changes of the unknowns.
+    effects = dict[tuple[str, str | None], tuple[float, Float64]]()
     for name in dict.fromkeys(names):
-        columns = np.append(np.ones(len(unknowns.entries), bool), np.array(names) == name)
+        columns = [True] * len(unknowns.entries) + [other == name for other in names]
         slopes = triangle[:, :-1][:, columns]
         change, *_ = np.linalg.lstsq(slopes, -target, rcond=1e-10)
         share = 1 - float(((target + slopes @ change) ** 2).sum() / (target @ target))
-        if share > (LEAST_SHARE if name in KINDS else LEAST_SHARE_OF_MASS):
-            shares[name] = share
-            changes[name] = change
-    if not shares:
+        if share > (LEAST_SHARE if name[1] is None else LEAST_SHARE_OF_MASS):
+            effects[name] = share, change
+    if not effects:
         return "no further effect that was tried would explain a tenth of the remaining error"
-    best = max(shares, key=lambda name: shares[name])
-    if best in KINDS:
-        percent = 100 * shares[best]
-        return f"{best} would explain {percent:.0f} % of the squared error (extras: {best})"
+    kind, link = max(effects, key=lambda name: effects[name][0])
+    if link is None:
+        percent = 100 * effects[kind, link][0]
+        return f"{kind} would explain {percent:.0f} % of the squared error (extras: {kind})"
     # A heavier link looks like a lighter other one with weaker motors: take factors near 1.
     factors = [KINDS[entry.kind].neutral == 1.0 for entry in (*unknowns.entries, further[0])]
     sizes = dict[float, str]()
-    for link in shares.keys() - KINDS.keys():
-        values = np.append(fit.solution.point, 1.0) + changes[link]
-        sizes[float(np.abs(values - 1)[factors].sum())] = link
-    link = sizes[min(sizes)]
-    more = "heavier" if changes[link][-1] > 0 else "lighter"
-    words = f"link {link} {more} than described would explain most of the error (extras: mass)"
-    return f"{words}, or the strengths: weigh it"
+    for (_, link), (_, change) in effects.items():
+        if link is not None:
+            values = np.append(fit.solution.point, 1.0) + change
+            more = "heavier" if change[-1] > 0 else "lighter"
+            sizes[float(np.abs(values - 1)[factors].sum())] = f"{link} {more}"
+    words = f"link {sizes[min(sizes)]} than described would explain most of the error"
+    return f"{words} (extras: mass), or the strengths: weigh it"
 
 
 def draw_motors(

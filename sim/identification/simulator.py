@@ -53,8 +53,8 @@ from batchpid.task_space.rigid_tree import RigidTree
 
 DIVERGED = 1e4
 """Position beyond which a simulation has diverged [rad or m]."""
-PAYLOAD = "payload"
-"""Name of the payload among masses of links."""
+PAYLOAD = ""
+"""Name of the payload among masses of links: no link has it."""
 Masses = tuple[tuple[str, float], ...]
 """Factors of the masses of some links, and the mass of the payload [kg] under PAYLOAD."""
 
@@ -84,7 +84,7 @@ class PlantCandidates(NamedTuple):
     and "slew" (limit of the setpoints' rate).
     """
     setpoint_delay: Float64
-    """Delay of the setpoints (n,), negative where they were logged late [s]."""
+    """Delay of the setpoints (n,) [s]."""
     masses: Sequence[Masses]
 
     def repeated(self, times: int) -> PlantCandidates:
@@ -301,7 +301,7 @@ class SimulatedControl:
     def advance(self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64) -> Any:
         """Return the efforts of motors and friction (n, joints), which the next call may reuse.
 
-        ``command`` are setpoints or efforts, ``passive`` the compensated force and the feedforward.
+        ``command`` are setpoints or efforts, ``passive`` the compensated force.
         """
         inputs = command, qpos, qvel, passive
         if obstacle():
@@ -394,8 +394,8 @@ def simulate(
     many = len(stretches)
     count = len(states)
     past = stretches[0].past
-    rows = candidates.repeated(many)
-    offset: Any = rows.actuators.position_offset
+    robots = candidates.repeated(many)
+    offset: Any = robots.actuators.position_offset
     if offset is None:
         offset = 0.0
     starts = np.array([[stretch.qpos, stretch.qvel] for stretch in stretches])
@@ -403,7 +403,7 @@ def simulate(
     v = np.concatenate(starts[:, 1] + states[:, None, 1])
     commands = _padded([stretch.command for stretch in stretches])
     # State of the robots: dynamics, compensation, control with the efforts before the first step.
-    dynamics = Dynamics(plant, rows.masses, q, v)
+    dynamics = Dynamics(plant, robots.masses, q, v)
     dynamics.update()
     measured = np.array(q + offset)
     described = None
@@ -416,9 +416,9 @@ def simulate(
         efforts = np.tile(commands[past - 1 :: -1][:past], (1, count, 1))
         if described is not None and drive.through:
             efforts += described.force
-    control = SimulatedControl(drive, rows, dynamics, q, v, efforts)
+    control = SimulatedControl(drive, robots, dynamics, q, v, efforts)
     # Setpoints of each robot are late by whole steps and a share of a step.
-    late = rows.setpoint_delay / dt
+    late = robots.setpoint_delay / dt
     whole = np.floor(late).astype(int)
     share = (late - whole)[:, None]
     stretch_of = np.tile(np.arange(many), count)
@@ -427,14 +427,17 @@ def simulate(
     if control.friction.viscous is not None:
         added += dt * control.friction.viscous
     zero = np.zeros_like(q)
-    track = np.empty((len(commands) - past, 2, *q.shape))
+    # Positions and velocities are stored at the steps of rows: a long log has many others.
+    stored = np.unique(np.concatenate([stretch.step for stretch in stretches]))
+    track = np.empty((len(stored), 2, *q.shape))
+    place = 0
     with np.errstate(all="ignore"):
-        for step in range(len(track)):
+        for step in range(len(commands) - past):
             if step:
                 dynamics.update()
             if step % REFRESH_STEPS == 0:
                 control.refresh(dynamics.matrix)
-            newest = np.minimum(past + step - whole, len(commands) - 1)
+            newest = past + step - whole
             command = commands[np.maximum(newest, 0), stretch_of]
             if share.any():
                 command += share * (commands[np.maximum(newest - 1, 0), stretch_of] - command)
@@ -450,15 +453,18 @@ def simulate(
                     force = force - described.force
             effort = control.advance(command, q, v, passive) - force
             _move(plant, dt, q, v, dynamics.matrix, effort, added)
-            track[step, 0] = q + offset
-            track[step, 1] = v
+            if place < len(stored) and step == stored[place]:
+                track[place, 0] = q + offset
+                track[place, 1] = v
+                place += 1
     track = track.reshape(len(track), 2, count, many, q.shape[1])
     positions = []
     for number, stretch in enumerate(stretches):
-        place, rate = track[stretch.step, :, :, number].swapaxes(0, 1)
-        place = place - stretch.before[:, None, None] * rate
-        place = np.where(np.abs(place) < DIVERGED, place, np.inf)
-        positions.append(place.swapaxes(0, 1))
+        rows = np.searchsorted(stored, stretch.step)
+        qpos, qvel = track[rows, :, :, number].swapaxes(0, 1)
+        qpos = qpos - stretch.before[:, None, None] * qvel
+        qpos = np.where(np.abs(qpos) < DIVERGED, qpos, np.inf)
+        positions.append(qpos.swapaxes(0, 1))
     return positions
 
 

@@ -246,7 +246,7 @@ class Unknowns:
             else:
                 fields[KINDS[name].field] = table
         if "static" in fields:
-            fields["static"] = fields["static"] + fields["coulomb"]
+            fields["static"] = fields["static"] + fields.get("coulomb", 0.0)
         if "command_delay" in fields:
             fields["max_delay"] = fields["command_delay"].max(keepdims=True)
         masses = [list[tuple[str, float]]() for _ in values]

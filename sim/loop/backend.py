@@ -14,7 +14,7 @@ def native_obstacle(options: RunnerOptions) -> str:
     """Return why the sim steps of a tick cannot be one native call, without XLA; "" if they can."""
     control = options.control
     if isinstance(control, OperationalSpace):
-        if not control.is_native:
+        if type(control) is not OperationalSpace:
             return "the law of a subclass of OperationalSpace is one of Python"
     elif not isinstance(control, str):
         return "the controller is one of Python"

@@ -30,7 +30,7 @@ from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.quantities import own_command
-from batchpid.sim.tool_space import OperationalSpace, default_tool
+from batchpid.sim.tool_space import OperationalSpace
 
 EngineName = Literal["sapien", "mujoco"]
 DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
@@ -420,7 +420,7 @@ class Control(OptionGroup):
                 remedy = "load the robot with fixed_base=True, or control its joints"
                 raise InvalidArgumentError("control", problem, remedy=remedy)
             if tool is None:
-                tool = default_tool(robot)
+                tool = robot.rigid_tree.tool
             # From here on it is a controller like the caller's own.
             control = OperationalSpace(robot, choice("tool", tool, robot.kinematic_tree().links))
         elif callable(control) and callable(getattr(control, "init", None)):

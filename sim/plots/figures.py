@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,7 +23,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.checks.validate import file_path
+from batchpid.checks.validate import choice, file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 from batchpid.sim.signals.quantities import OBSERVED
@@ -39,8 +39,8 @@ SETPOINT = "#2f8f4e"
 LIMIT = "#b23a48"
 SMALL = 7.0
 """Font size of ticks and units."""
-Joints: TypeAlias = Sequence[int | str] | None
-"""Joints to draw, by index or name; None or empty for all."""
+BAND = 0.02
+"""Half width of the settling band around the last setpoint, as a fraction of the median move."""
 
 
 class Picture(Figure):
@@ -55,8 +55,7 @@ class Picture(Figure):
 def step_responses(
     rollout: Rollout,
     *,
-    joints: Joints = None,
-    band: float = 0.02,
+    joints: Sequence[str] = (),
     mark: int | None = None,
     title: str = "",
 ) -> Figure:
@@ -70,9 +69,7 @@ def step_responses(
     Parameters
     ----------
     joints
-        Indices or names; default all.
-    band
-        Half width of the settling band around the last setpoint, as a fraction of the median move.
+        Names; default all.
     mark
         An env to draw in a colour apart.
 
@@ -90,7 +87,7 @@ def step_responses(
     # Joints come first, entries of another command after them.
     for joint, (above, below) in zip(chosen, blocks, strict=False):
         _draw_limits(above, run.info.lower[joint], run.info.upper[joint])
-        _draw_setpoint(above, run, joint, band)
+        _draw_setpoint(above, run, joint)
         _draw_fan(above, run.time, run.qpos[..., joint], mark)
         _show_positions(above, [run], joint)
         _draw_efforts(below, run, joint, mark)
@@ -109,27 +106,22 @@ def step_responses(
     return figure
 
 
-def efforts(rollout: Rollout, *, joints: Joints = None) -> Figure:
-    """Draw, for each joint, efforts against their limit.
-
-    Parameters as in :func:`step_responses`.
-    """
+def efforts(rollout: Rollout) -> Figure:
+    """Draw, for each joint, efforts against their limit."""
     run = _blank_failed(rollout)
-    figure, chosen, blocks = _joint_axes([run], joints, 1)
+    figure, chosen, blocks = _joint_axes([run], (), 1)
     for joint, (axes,) in zip(chosen, blocks, strict=True):
         _draw_efforts(axes, run, joint, None)
     _add_legend(figure)
     return figure
 
 
-def following_errors(rollout: Rollout, *, joints: Joints = None) -> Figure:
+def following_errors(rollout: Rollout) -> Figure:
     """Draw, for each joint, position minus setpoint at the ends of the ticks, where a setpoint
     holds.
-
-    Parameters as in :func:`step_responses`.
     """
     run = _blank_failed(rollout)
-    figure, chosen, blocks = _joint_axes([run], joints, 1)
+    figure, chosen, blocks = _joint_axes([run], (), 1)
     for joint, (axes,) in zip(chosen, blocks, strict=True):
         error = run.qpos[..., joint] - run.setpoint[..., joint]
         _draw_fan(axes, run.time, error, None)
@@ -159,7 +151,7 @@ def comparison(
         remedy = f"compare runs with the joints {', '.join(info.joint_names)}"
         raise InvalidArgumentError("second", problem, remedy=remedy)
     runs = [_blank_failed(first), _blank_failed(second)]
-    figure, chosen, blocks = _joint_axes(runs, None, 2, title)
+    figure, chosen, blocks = _joint_axes(runs, (), 2, title)
     for joint, (above, below) in zip(chosen, blocks, strict=True):
         for run, colour, label in zip(runs, (ENV, SECOND), labels, strict=True):
             _draw_band(above, run.time, run.qpos[..., joint], colour, label)
@@ -230,7 +222,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
 
 def _joint_axes(
     runs: Sequence[Rollout],
-    joints: Joints,
+    joints: Sequence[str],
     rows: int,
     title: str = "",
     labels: Sequence[str] = (),
@@ -239,13 +231,7 @@ def _joint_axes(
     ``labels``.
     """
     names = runs[0].info.joint_names
-    chosen = []
-    for joint in joints or names:
-        index = names.index(joint) if joint in names else joint
-        if index not in range(len(names)):
-            remedy = f"use {', '.join(names)}"
-            raise InvalidArgumentError("joints", "no such joint", value=joint, remedy=remedy)
-        chosen.append(int(index))
+    chosen = [names.index(choice("joints", joint, names)) for joint in joints or names]
     titles = [*(names[index] for index in chosen), *labels]
     figure, blocks = _grid(titles, rows, title, max(run.time[-1] for run in runs))
     return figure, chosen, blocks
@@ -324,7 +310,7 @@ def _draw_band(axes: Axes, time: Rows, values: Rows, colour: str, label: str) ->
     axes.plot(time, median, color=colour, lw=1.4, label=f"{label}: median, 10 to 90 %")
 
 
-def _draw_setpoint(axes: Axes, run: Rollout, joint: int, band: float) -> None:
+def _draw_setpoint(axes: Axes, run: Rollout, joint: int) -> None:
     """Draw the setpoint of a joint, and the settling band around its last value."""
     setpoint = run.setpoint[..., joint]
     _draw_line(axes, run.time, setpoint)
@@ -333,8 +319,8 @@ def _draw_setpoint(axes: Axes, run: Rollout, joint: int, band: float) -> None:
     move = move[np.isfinite(move)]
     # Envs with different setpoints have no common band.
     if move.size and np.ptp(last) == 0:
-        half = band * float(np.median(move))
-        label = f"settling band, {band:.0%} of the move"
+        half = BAND * float(np.median(move))
+        label = f"settling band, {BAND:.0%} of the move"
         axes.axhspan(last[0] - half, last[0] + half, color=SETPOINT, alpha=0.2, lw=0, label=label)
 
 

@@ -72,12 +72,13 @@ class Distribution(ABC):
 
     def to_dict(self) -> Document:
         """Return it as plain values: ``{"uniform": [low, high], "operation": "scale"}``."""
+        # A choice has a tuple of values.
         values: list[object] = []
         document: Document = {self.kind: values}
         for entry in fields(self):
             value = getattr(self, entry.name)
             if not entry.kw_only:
-                values.append(value)
+                values += np.ravel(value).tolist()
             elif value != entry.default:
                 document[entry.name] = value
         return document
@@ -132,8 +133,7 @@ class Normal(Distribution):
         super().__post_init__()
         mean = number("mean", self.mean, -math.inf, math.inf, _UNIT)
         std = number("std", self.std, _TINY, math.inf, _UNIT)
-        low = float(self.low)
-        high = float(self.high)
+        low, high = read_array("low", [self.low, self.high]).tolist()
         # Draws outside are repeated, which a tail would do for long.
         below, above = (math.erf((end - mean) / (math.sqrt(2.0) * std)) for end in (low, high))
         share = 0.5 * (above - below)
@@ -175,10 +175,6 @@ class Choice(Distribution):
         """Return independent draws (size,)."""
         return np.array(self.values)[generator.integers(len(self.values), size=size)]
 
-    def to_dict(self) -> Document:
-        """Return it as plain values: ``{"choice": [0, 1]}``."""
-        return super().to_dict() | {self.kind: list(self.values)}
-
 
 KINDS: dict[str, type[Distribution]] = {
     kind.kind: kind for kind in (Uniform, LogUniform, Normal, Choice)
@@ -204,6 +200,9 @@ def read_distribution(name: str, value: object) -> Distribution:
         if kind not in options:
             continue
         numbers = options.pop(kind)
+        if not isinstance(numbers, Sequence):
+            problem = f"{kind} needs a list of numbers"
+            break
         if kind == Choice.kind:
             numbers = [numbers]
         # Python names the argument that is missing, or one too many.
@@ -344,10 +343,6 @@ def read_field(name: str, value: object) -> Field:
     """Return the field that a file describes: a distribution, or a mapping of names to
     distributions.
     """
-    if isinstance(value, Mapping):
-        names = value
-    else:
-        names = {}
-    if not names or not all(isinstance(part, Mapping) for part in names.values()):
-        return read_distribution(name, value)
-    return {str(key): read_distribution(f"{name}.{key}", part) for key, part in names.items()}
+    if isinstance(value, Mapping) and all(isinstance(part, Mapping) for part in value.values()):
+        return {str(key): read_distribution(f"{name}.{key}", part) for key, part in value.items()}
+    return read_distribution(name, value)

@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from copy import deepcopy
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -115,13 +114,14 @@ class Randomization:
 
     def __post_init__(self) -> None:
         # The class is frozen; its __dict__ is not. Mappings stay as they are now.
-        vars(self).update(deepcopy(vars(self)), seed=integer("seed", self.seed, 0, LARGEST))
+        vars(self).update(_copied(vars(self)), seed=integer("seed", self.seed, 0, LARGEST))
         choice("per", self.per, ("episode", "env"))
         for group in GROUPS:
             mapping(group, getattr(self, group))
         for name, value in self.distributions.items():
             distributions: list[object] = [value]
-            if isinstance(value, Mapping) and name not in SINGLE:
+            # A mapping without names draws nothing, and is refused.
+            if value and isinstance(value, Mapping) and name not in SINGLE:
                 distributions = list(value.values())
             for part in distributions:
                 remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to such"
@@ -235,7 +235,7 @@ class Randomization:
 
         Actuators come from :func:`batchpid.sim.randomization.checks.prepared_actuators`.
         """
-        if draws is None or record is None:
+        if draws is None or record is None or not getattr(self, group):
             return record
         values: Document = {}
         for name in getattr(self, group):
@@ -264,7 +264,7 @@ class Randomization:
 
     def to_dict(self) -> Document:
         """Return the fields that are drawn as plain values, for :meth:`from_dict`."""
-        document = {entry.name: _plain(getattr(self, entry.name)) for entry in fields(self)}
+        document = _copied(vars(self), plain=True)
         return {name: value for name, value in document.items() if value not in (None, {})}
 
     @classmethod
@@ -294,10 +294,11 @@ def _first_episodes(streams: Rows) -> Episodes:
     return np.stack([streams, np.zeros_like(streams)], 1)
 
 
-def _plain(value: object) -> object:
+def _copied(value: Any, plain: bool = False) -> Any:
+    """Return a copy of the mappings in ``value``, with distributions as ``plain`` values or not."""
     if isinstance(value, Mapping):
-        return {name: _plain(part) for name, part in value.items()}
-    if isinstance(value, Distribution):
+        return {name: _copied(part, plain) for name, part in value.items()}
+    if plain and isinstance(value, Distribution):
         return value.to_dict()
     return value
 

@@ -131,7 +131,8 @@ class Recorder(SingleOwner):
     def close(self, complete: bool = True) -> None:
         """Write the remaining rows and close the file. May be called again, as after an interrupt.
 
-        ``complete`` says whether the recording has all ticks of its run.
+        ``complete`` says whether the recording has all ticks of its run; it has not after a
+        ``send`` without its ``recv``.
 
         Raises
         ------
@@ -145,6 +146,7 @@ class Recorder(SingleOwner):
                 self.prepare()
         finally:
             if self._info is not None and self._error is None:
+                complete = complete and not self._runner._sent
                 self._finish(replace(self._info, complete=complete))
             self._runner.recorder = None
             self._is_closed = True

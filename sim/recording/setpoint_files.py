@@ -249,11 +249,11 @@ def _substeps(source: str, time: Float64, lines: list[int], timestep: float) -> 
     """
     # The median, since a row may be missing. Times of files are rounded.
     period = float(np.median(np.diff(time) if len(time) > 1 else time))
+    if abs(period) > LONGEST:
+        remedy = f"give one every {LONGEST:g} s at least; time is in seconds"
+        raise error(source, f"has rows every {period:g} s", remedy)
     substeps = max(1, round(period / timestep))
     dt = substeps * timestep
-    if dt > LONGEST:
-        remedy = f"give one every {LONGEST:g} s at least; time is in seconds"
-        raise error(source, f"has rows every {dt:g} s", remedy)
     first = int(time[0] > 0.5 * dt)
     expected = dt * np.arange(first, first + len(time))
     late = np.abs(time - expected) > SHARE * timestep
@@ -262,4 +262,7 @@ def _substeps(source: str, time: Float64, lines: list[int], timestep: float) -> 
         problem = f"line {lines[row]}: time is {time[row]:.9g} s, and not {expected[row]:.9g} s"
         remedy = f"begin at 0 or {dt:g} s, with rows whole sim steps of {timestep:g} s apart"
         raise error(source, problem, remedy)
+    if first + len(time) == 1:
+        problem = f"line {lines[0]}: the only row is at 0 s"
+        raise error(source, problem, "give a row for the end of each tick")
     return substeps, first == 0

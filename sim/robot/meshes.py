@@ -120,9 +120,9 @@ def _problem(path: Path, changed: int, size: int) -> str | None:
     try:
         with open(path, "rb") as file:
             data = file.read(SIZE_LIMIT + 1)
-        if not data or len(data) > SIZE_LIMIT:
-            if not data:
-                return "empty"
+        if not data:
+            return "empty"
+        if len(data) > SIZE_LIMIT:
             return f"larger than {SIZE_LIMIT >> 20} MiB"
         if data.startswith(LFS_POINTER):
             return LFS_PROBLEM

@@ -35,6 +35,11 @@ _PREFIXES = (
     "tendon_",
     "hfield_",
     "qpos",
+    "key_",
+    "site_",
+    "wrap_",
+    "mesh_vert",
+    "flex",
 )
 """Beginnings of the names of the model's arrays that the simulation depends on."""
 _FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
@@ -60,8 +65,9 @@ class Compiled(NamedTuple):
     def content(self) -> str:
         """Digest of the elements that move, collide or act."""
         model = self.model
-        arrays = {name: getattr(model, name) for name in dir(model) if name.startswith(_PREFIXES)}
-        # Meshes change the sizes and boxes of their geoms.
+        names = [name for name in dir(model) if name.startswith(_PREFIXES)]
+        # The last bits may differ between kinds of processors.
+        arrays = {name: np.round(1.0 * getattr(model, name), 9) + 0.0 for name in names}
         return digest(arrays, model.names, str(model.opt))
 
 
@@ -103,7 +109,7 @@ def compile_scene(path: Path, is_whole: bool) -> Compiled:
         problem = " ".join(str(error).split())
         raise RobotError(
             f"{path}: MuJoCo cannot compile the file: {problem}; correct it, or restore the file"
-            " that it names"
+            " that it names, e.g. by git lfs pull"
         ) from error
 
 
@@ -131,6 +137,9 @@ def _strip(spec: Any, path: Path) -> tuple[str, ...]:
             continue
         if is_solid:
             missing[absent[geom.meshname]] = None
+        for pair in list(spec.pairs):
+            if geom.name in (pair.geomname1, pair.geomname2):
+                spec.delete(pair)
         spec.delete(geom)
     for site in spec.sites:
         site.material = ""

@@ -211,7 +211,7 @@ class TableReader:
             if not is_ground and not is_solid:
                 absent.append(f"{kind} {label(model.geom(geom))}")
         if absent:
-            text = f"{ALONE} shapes that are not of the robot: {', '.join(absent)}"
+            text = f"{ALONE} planes, height fields and shapes of the world: {', '.join(absent)}"
             remedy = "in SAPIEN add them with build= of Runner"
             self._findings.append(Finding("warning", "collision", text, remedy))
 

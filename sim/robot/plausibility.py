@@ -11,8 +11,6 @@ example-robot-data 6.0.0 and of the bundled ones:
   30,000 (1030) kg/m^3; the size is the diagonal of its shapes, or the distance to the next joint if
   that is longer;
 - its radius of gyration exceeds twice L and twice its size (0.6);
-- a joint bears more than a mass of 1000 L^3 kg at the distance L (10 L^3), by gravity or by
-  inertia;
 - a limit or mimic offset of a hinge is from 4 pi to 1000 rad (10 rad), as if degrees were read as
   radians.
 
@@ -28,9 +26,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from batchpid.sim.robot.description import POSES, RobotDescription
+from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
-from batchpid.task_space.rigid_tree import GRAVITY
 
 LARGEST, SMALLEST = 20.0, 1 / 200
 """Bounds of the ratio of the shapes' size to the reach."""
@@ -38,8 +35,6 @@ SPARSEST, DENSEST = 0.1, 30_000.0
 """Bounds of the mass of a link per cubic size [kg/m^3]."""
 GYRATION = 2.0
 """Bound of a radius of gyration over the reach, and over the size of the link."""
-LOAD = 1000.0
-"""Bound of the mass at the end of the reach that a joint bears, over the cubic reach [kg/m^3]."""
 SHORT = 0.3
 """Least reach [m] that is assumed, e.g. for robots with all joints at one point."""
 JUDGED = 0.01
@@ -54,7 +49,7 @@ _UNITS = "give sizes in metres, meshes in millimetres with <mesh scale='0.001 0.
 
 
 def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
-    """Yield a finding for each implausible size, mass, inertia, load and angle."""
+    """Yield a finding for each implausible size, mass, inertia and angle."""
     masses = robot.link_masses
     (reach, next_joint) = _distances(robot)
     length = max(reach, SHORT)
@@ -79,8 +74,7 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
         # A link may be longer than its shapes.
         size = max(mass.size, next_joint[name])
         if mass.size > 0 and not SPARSEST <= mass.mass / size**3 <= DENSEST:
-            kind = "light" if mass.mass < SPARSEST * size**3 else "heavy"
-            text = f"no link of such a size is so {kind}"
+            text = "no link of such a size has such a mass"
             remedy = "give <mass> in kg and <collision> in metres"
             detail = f"{mass.mass:.3g} kg over {size:.3g} m"
             yield Finding("warning", "mass", text, remedy, link=name, detail=detail)
@@ -92,27 +86,7 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
             remedy = "give <inertia> in kg m^2, about the centre of mass"
             detail = f"{mass.gyration:.3g} m"
             yield Finding("warning", "inertia", text, remedy, link=name, detail=detail)
-    yield from _loads(robot, max(reach, 1.0))
     yield from _degrees(robot)
-
-
-def _loads(robot: RobotDescription, length: float) -> Iterator[Finding]:
-    """Yield a finding for each joint with a load beyond the weight of any robot of this ``length``
-    [m].
-    """
-    poses = robot.sample(POSES, seed=0)
-    gravity = np.abs(robot.holding_efforts(poses)).max(0)
-    inertia = np.diagonal(robot.mass_matrix(poses), axis1=1, axis2=2).max(0)
-    # A slide bears the mass itself, whatever its distance.
-    arms = np.where([joint.type == "prismatic" for joint in robot.joints], 1.0, length)
-    masses = np.maximum(gravity / (-GRAVITY[2] * arms), inertia / arms**2)
-    for at in np.flatnonzero(masses > LOAD * length**3):
-        text = f"no robot whose chain of joints is up to {length:.3g} m long has such a load"
-        remedy = f"correct <mass> and <inertia>; for links without, {_UNITS}"
-        detail = (
-            f"gravity {gravity[at]:.3g} {robot.joints[at].effort_unit}, inertia {inertia[at]:.3g}"
-        )
-        yield Finding("warning", "load", text, remedy, robot.joint_names[at], detail=detail)
 
 
 def _degrees(robot: RobotDescription) -> Iterator[Finding]:

@@ -79,12 +79,12 @@ def surfaces(
         name = body.name
         solid = [(shape, None) for shape in robot.tables.shapes_of(name)]
         parts: dict[Rgba, list[Any]] = {}
-        unreadable: list[_UnreadableMesh] = []
+        unreadable: list[OSError] = []
         # Collision shapes are drawn where the visuals cannot be.
         for elements in (visuals.get(name, []), solid):
             try:
                 meshes = [_mesh(shape, robot, deviation) for shape, _ in elements]
-            except _UnreadableMesh as error:
+            except OSError as error:
                 unreadable.append(error)
                 continue
             if meshes and all(mesh is not None for mesh in meshes):
@@ -92,12 +92,8 @@ def surfaces(
                     parts.setdefault(rgba or _default_colour(name), []).append(mesh)
                 break
         if findings is not None:
-            if parts:
-                shown = "collision shapes are drawn instead"
-            else:
-                shown = "it is not drawn"
             for mesh, reason in (error.args for error in unreadable):
-                text = f"mesh cannot be read ({reason}): {shown}"
+                text = f"mesh cannot be read ({reason}): collision shapes are drawn, if any"
                 findings.append(
                     Finding("warning", "visual-mesh", text, _REMEDY, link=name, detail=repr(mesh))
                 )
@@ -178,30 +174,26 @@ def segments_of(radius: float, deviation: float) -> int:
     return min(MOST, max(FEWEST, math.ceil(math.pi / math.acos(1 - deviation / radius))))
 
 
-class _UnreadableMesh(Exception):
-    """Mesh file that is not found or cannot be read: its name and the reason."""
-
-
 def _read_mesh(name: str, robot: RobotDescription) -> Any:
     """Return the result of ``trimesh`` for a mesh file of the robot, in metres. Raises
-    _UnreadableMesh.
+    OSError with the name and the reason.
     """
     path = find_mesh(name, robot.path, robot.package_dirs)
     if path is None:
-        raise _UnreadableMesh(name, "not found")
+        raise OSError(name, "not found")
     try:
         loaded = read_mesh(path)
     except Exception as error:
-        raise _UnreadableMesh(name, f"{type(error).__name__}: {error}") from error
+        raise OSError(name, f"{type(error).__name__}: {error}") from error
     if not len(loaded.faces):
-        raise _UnreadableMesh(name, "no triangles")
+        raise OSError(name, "no triangles")
     return loaded
 
 
 def _mesh(shape: Shape | None, robot: RobotDescription, deviation: float) -> Any:
     """Return the ``trimesh.Trimesh`` of a shape in its link's frame, or None without one.
 
-    Raises _UnreadableMesh.
+    Raises OSError with the name of a mesh that cannot be read, and the reason.
     """
     from trimesh import Trimesh, creation
 

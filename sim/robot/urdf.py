@@ -19,6 +19,7 @@ from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
 from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
+from batchpid.sim.robot.mjcf_model import unique
 from batchpid.sim.robot.mjcf_reader import read_mjcf
 from batchpid.sim.robot.parts import MOVING_TYPES, Joint, Mimic
 from batchpid.sim.robot.tables import (
@@ -30,7 +31,7 @@ from batchpid.sim.robot.tables import (
     Tables,
     breadth_first,
 )
-from batchpid.sim.robot.xml import fault, numbers, parse_xml, read_numbers
+from batchpid.sim.robot.xml import LARGEST, fault, numbers, parse_xml, read_numbers
 from batchpid.task_space.frames import from_rpy
 
 MOST_READ = 4096  # links and joints of a file
@@ -146,13 +147,14 @@ class _Reader:
         self._findings = findings
         self._missing: list[str] = []
         self._drop_unused(root)
+        self._report_repeated(root)
         self._refuse_xacro(root)
         self._links = self._name_links(root)
         self._joints = self._name_joints(root)
         if not self._joints:
             remedy = f"a xacro has to be expanded first: {_EXPAND}"
             raise RobotError(f"{path}: a robot without joints cannot be controlled; {remedy}")
-        self._added = self._match_links()
+        self._match_links()
 
     def _warn(
         self,
@@ -186,8 +188,19 @@ class _Reader:
             severity = "warning" if is_xacro else "note"
             listed = ", ".join(f"{count} <{tag}>" for tag, count in unknown.most_common(8))
             text = f"elements that the simulation does not use are left out: {listed}"
-            remedy = "remove them, or expand a xacro first"
+            remedy = _EXPAND if is_xacro else "remove them, or expect no effect"
             self._findings.append(Finding(severity, "unknown-element", text, remedy))
+
+    def _report_repeated(self, root: etree._Element) -> None:
+        """Report elements of which the first is read."""
+        for part in (*root.findall("link"), *root.findall("joint")):
+            for parent in part.iter():
+                tags = ("shapes" if child.tag in SHAPES else f"<{child.tag}>" for child in parent)
+                for tag, count in Counter(tags).items():
+                    if count > 1 and tag != "<collision>":
+                        text = f"<{parent.tag}> has several {tag}: the first is used"
+                        owner = {part.tag: _text(part, "name")}
+                        self._warn("repeated-element", text, "remove the others", **owner)
 
     def _refuse_xacro(self, root: etree._Element) -> None:
         for element in root.iter():
@@ -220,21 +233,16 @@ class _Reader:
             if name in joints and _ends(joints[name]) == ends:
                 self._warn("repeated-name", "given twice: the first is kept", "remove it", name)
                 continue
-            base = new = name or "{}_to_{}".format(*ends)
-            # The number of a new name is the first that nobody has.
-            number = 2
-            while new in joints or (new != name and new in names):
-                new = f"{base}_{number}"
-                number += 1
-            if new != name:
+            new = name
+            if not name or name in joints:
+                new = unique(name or "{}_to_{}".format(*ends), names)
                 text = f"no name, or one that is used twice: called {new!r}"
                 self._warn("repeated-name", text, "name it in the URDF", name or None)
             joints[new] = element
         return joints
 
-    def _match_links(self) -> list[str]:
-        """Add links that only joints name, remove links that no joint names; return the former."""
-        added = []
+    def _match_links(self) -> None:
+        """Add links that only joints name, remove links that no joint names."""
         joined = {}
         for name, element in self._joints.items():
             ends = _ends(element)
@@ -247,14 +255,12 @@ class _Reader:
         for name in joined:
             if name not in self._links:
                 self._links[name] = etree.Element("link")
-                added.append(name)
                 text = "named by joints, but not in the file: added, without mass and shape"
                 self._warn("missing-link", text, "correct the name, or add the link", link=name)
         for name in [name for name in self._links if name not in joined]:
             text = "held by no joint: left out"
             self._warn("loose-link", text, "join it, or remove it", link=name)
             del self._links[name]
-        return added
 
     def free_base(self, fixed_base: bool | None) -> tuple[float, ...] | None:
         """Remove a floating joint that leads from a link without mass and shapes at the root to all
@@ -293,11 +299,10 @@ class _Reader:
             )
         roots = [name for name in self._links if name not in parents]
         if len(roots) != 1:
-            remedy = "a robot must be one tree"
-            if self._added:
-                remedy = f"joints name {self._added}, not in the file: correct the names"
+            missing = [name for name, link in self._links.items() if not link.attrib]
             raise RobotError(
-                f"{self._path}: needs exactly one root link, found {roots or 'a loop'}; {remedy}"
+                f"{self._path}: needs exactly one root link, found {roots or 'a loop'}; a robot must"
+                f" be one tree; links that joints name, not in the file: {missing}"
             )
         # Siblings are in the order of their joints.
         shapes: list[Shape] = []
@@ -305,13 +310,14 @@ class _Reader:
         for joint in joints.values():
             place = read_origin(self._joints[joint.name], f"{self._path}: joint {joint.name!r}")
             bodies.append(self._read_link(Body(joint.child_link, joint, *place), shapes))
+        tables = breadth_first(bodies, shapes)
         # Links of a loop are below no root, and so left behind.
-        if len(breadth_first(bodies, ()).bodies) != len(bodies):
+        if len(tables.bodies) != len(bodies):
             raise RobotError(
                 f"{self._path}: some joints form a loop apart from the root {roots[0]!r}; a robot"
                 " must be one tree"
             )
-        return breadth_first(bodies, shapes)
+        return tables
 
     # -- Joints
 
@@ -362,7 +368,8 @@ class _Reader:
                 values = (math.inf,)
             limits[f"{key}_limit"] = values[0]
         if placeholders:
-            text = f"<limit {' '.join(placeholders)}> is a placeholder and counts as not given"
+            text = f"<limit {' '.join(placeholders)}> is a placeholder or no number within"
+            text += f" +-{LARGEST:g}: no limit"
             self._warn("placeholder", text, "give <limit effort= velocity=> of the motor", name)
         is_unknown = all(map(math.isinf, limits.values()))
         safety = joint.find("safety_controller")
@@ -378,7 +385,8 @@ class _Reader:
         for key, endless in (("lower", -math.inf), ("upper", math.inf)):
             values = numbers(limit, key, "0", limit=True)
             if values is None:
-                text = f"<limit {key}={_text(limit, key)!r}> is not a number: no {key} limit"
+                text = f"<limit {key}={_text(limit, key)!r}> is not a number within +-{LARGEST:g}:"
+                text += f" no {key} limit"
                 self._warn("limits", text, GIVE_RANGE, name)
                 values = (endless,)
             ends.append(values[0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from pathlib import Path
 
@@ -60,8 +60,9 @@ def to_urdf(
     root = _write(robot, mass_factors or {})
     differences = [sentence.partition(": ")[2] for sentence in summary(robot.repairs)]
     if not is_mjcf(source := parse_xml(path)):
-        differences += _copy_unused(source, root, path, packages)
-    differences += _lacking(robot)
+        _copy_unused(source, root, path, packages)
+    if robot.actuators is not None:
+        differences.append("motors and sensors (actuators) are not in a URDF")
     if folder is not None:
         for mesh in root.iter("mesh"):
             if os.path.isabs(name := mesh.get("filename", "")):
@@ -150,17 +151,14 @@ def _text(values: Iterable[float]) -> str:
 
 def _copy_unused(
     source: etree._Element, root: etree._Element, path: Path, packages: tuple[Path, ...]
-) -> list[str]:
-    """Copy the elements without effect here into ``root``; return the visual meshes that are not
-    found.
-    """
+) -> None:
+    """Copy the elements without effect here into ``root``."""
     owners = {
         (tag, element.get("name")): element
         for tag in ("link", "joint")
         for element in root.findall(tag)
     }
     copied = set()
-    missing = []
     for parent in (source, *source.findall("link"), *source.findall("joint")):
         owner = (parent.tag, (parent.get("name") or "").strip())
         target = root if parent is source else owners.get(owner)
@@ -170,27 +168,5 @@ def _copy_unused(
         target.extend(deepcopy([child for child in parent if child.tag in COPIED]))
     # Paths were relative to the source, which the new file may not be near.
     for mesh in root.iterfind("link/visual/geometry/mesh"):
-        if (file := find_mesh(mesh.get("filename", ""), path, packages)) is None:
-            missing.append(mesh.get("filename", ""))
-        else:
+        if (file := find_mesh(mesh.get("filename", ""), path, packages)) is not None:
             mesh.set("filename", str(file))
-    if missing:
-        return [f"visual meshes not found, written as they were: {', '.join(sorted({*missing}))}"]
-    return []
-
-
-def _lacking(robot: RobotDescription) -> Iterator[str]:
-    """Yield sentences about infinite limits, for which a URDF has no number, and about
-    actuators.
-    """
-    endless = {
-        "effort limit": robot.effort_limit,
-        "velocity limit": robot.velocity_limit,
-        "position limit": np.where(robot.continuous, 0.0, robot.upper - robot.lower),
-    }
-    for kind, limits in endless.items():
-        names = [robot.joint_names[joint] for joint in np.flatnonzero(np.isinf(limits))]
-        if names:
-            yield f"no {kind}, which other programs may require: {', '.join(names)}"
-    if robot.actuators is not None:
-        yield "motors and sensors (actuators) are not in a URDF"

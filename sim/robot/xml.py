@@ -124,18 +124,21 @@ def numbers(
     element: etree._Element | None, key: str, default: str, limit: bool = False
 ) -> tuple[float, ...] | None:
     """Return the numbers in an attribute, as many as there are in ``default``, which replaces a
-    missing or empty one; commas count as blanks.
+    missing or empty one; commas may stand between them.
 
     None unless they are finite and at most LARGEST in magnitude; a joint ``limit`` may be infinite.
     """
-    text = "" if element is None else element.get(key, "").strip()
-    words = (text or default).replace(",", " ").split()
+    text = ("" if element is None else element.get(key, "").strip()) or default
+    count = len(default.split())
+    # In other places a comma may be that of a decimal fraction.
+    if len(text.split(",")) == count:
+        text = text.replace(",", " ")
     try:
-        values = tuple(map(float, words))
+        values = tuple(map(float, text.split()))
     except ValueError:
         return None
-    # Python alone reads 1_0 as a number.
-    if len(values) != len(default.split()) or "_" in text:
+    # Python alone reads 1_0 and digits of other scripts as numbers.
+    if len(values) != count or "_" in text or not text.isascii():
         return None
     if all(abs(value) <= LARGEST or (limit and math.isinf(value)) for value in values):
         return values

@@ -204,7 +204,7 @@ def compare(
     moves: Annotated[int, Field(low=1, high=100_000)] = 20,
     seed: Annotated[int, Field(high=2**31 - 1)] = 0,
     seconds: Annotated[float, Field("simulated time, s", low=1e-6, high=1e6)] = 2.0,
-    engine: tuple[EngineName, ...] | None = None,
+    engine: tuple[EngineName, ...] | EngineName | None = None,
     randomization: Randomization | None = None,
     workers: int | None = None,
     progress: Callable[[Any], Any] | None = None,
@@ -245,8 +245,10 @@ def compare(
     InvalidArgumentError
         A set of gains is unknown.
     """
-    if engine is None:
-        engine = (tuning_engine(runner_options.get("build")),)
+    if isinstance(engine, str):
+        engine = (engine,)
+    # The flag without a word is an empty tuple.
+    engine = engine or (tuning_engine(runner_options.get("build")),)
     titles = {name: load_engine(name).title for name in engine}
     named = gains or default_sets(robot)
     sets = [gain_set(robot, entry) if isinstance(entry, str) else entry for entry in named]

@@ -119,8 +119,8 @@ def following_error(robot: Robot, rollout: Rollout) -> Float64:
     nearest = error - TURN * np.rint(error / TURN)
     size = np.abs(np.where(robot.continuous, nearest, error))
     largest = np.where(rollout.ok[..., None], size, np.inf).max(0)
-    efforts: Float64 = robot.coupling.of_leaders(largest)
-    return efforts
+    errors: Float64 = robot.coupling.of_leaders(largest)
+    return errors
 
 
 def arm_joints(robot: Robot) -> NDArray[np.bool_]:

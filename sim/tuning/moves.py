@@ -127,19 +127,20 @@ def random_moves(
     # Around a pose in contact, only deeper contact can be avoided.
     if dynamics.in_contact(center[None], CLEARANCE)[0]:
         clearance = 0.0
-    moves = Moves(np.empty((0, robot.dof)), np.empty((0, robot.dof)), ())
+    moves = list[Moves]()
     share = 1.0
     in_vain = 0
     for _ in range(200 * count + 200):
-        if len(moves.names) == count:
-            return moves
+        if len(moves) == count:
+            ends = np.reshape([move[:2] for move in moves], (count, 2, robot.dof))
+            return Moves(ends[:, 0], ends[:, 1], tuple(move.names[0] for move in moves))
         if in_vain == PATIENCE:
             share /= 2
             in_vain = 0
         # Start, then a step of the next kind.
         pose = robot.sample(1, seed=int(rng.integers(2**31)))[0]
         start = np.clip(center + share * (pose - center), low, high)
-        kind = KINDS[len(moves.names) % len(KINDS)]
+        kind = KINDS[len(moves) % len(KINDS)]
         step = rng.uniform(-1, 1, robot.dof)
         joint = robot.coupling.leader[rng.integers(robot.dof)]
         if kind == "small":
@@ -158,11 +159,11 @@ def random_moves(
         if touches or shortest_durations(robot, move)[0] > LONGEST:
             in_vain += 1
         else:
-            moves += move
+            moves.append(move)
             in_vain = 0
     problem = (
         f"{robot.name!r} touches itself or the ground, or is too weak, in nearly every draw of a"
-        f" move: {len(moves.names)} of {count} moves were found"
+        f" move: {len(moves)} of {count} moves were found"
     )
     remedy = "pass moves or gains, or correct the contacts and limits that batchpid inspect lists"
     raise InvalidArgumentError("robot", problem, remedy=remedy)
@@ -295,7 +296,7 @@ def smooth_variation(robot: Robot, moves: Moves, durations: Float64 | float) -> 
     for start, target, duration in zip(moves.start, moves.target, times, strict=True):
         efforts = smooth_effort(robot, start, target, float(duration))
         variation.append(np.abs(np.diff(efforts, axis=0)).sum(0))
-    tolerance: Float64 = robot.coupling.of_leaders(
+    variations: Float64 = robot.coupling.of_leaders(
         np.maximum(variation, 1e-3 * robot.design_effort_limit)
     )
-    return tolerance
+    return variations

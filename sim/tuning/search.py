@@ -312,4 +312,4 @@ def _plain(value: Any) -> Any:
     """Return an option of the runner as a plain value, or as text."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    return getattr(value, "__qualname__", None) or repr(value)
+    return repr(value)

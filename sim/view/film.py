@@ -160,7 +160,8 @@ def write_film(
         raise MissingDependencyError("imageio-ffmpeg", "a film", "view") from None
     recorded = Playback(rollout, robot)
     painter = Painter(recorded.robot, rollout.num_envs, recorded.ground, size)
-    rows = film_rows(rollout, rate).tolist()
+    times = np.arange(0.0, recorded.duration + 0.5 / rate, 1 / rate)
+    rows = rows_at(rollout, times).tolist()
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         for row in rows if progress is None else progress(rows):
@@ -204,8 +205,3 @@ def encode(
             messages.seek(0)
             text = messages.read().decode(errors="replace").strip()
             raise BatchPIDError(f"{path}: ffmpeg: {text}")
-
-
-def film_rows(rollout: Rollout, fps: float) -> NDArray[np.int64]:
-    """Return the rows of ``rollout`` that a film shows at ``fps`` frames per second, (frames,)."""
-    return rows_at(rollout, np.arange(0.0, rollout.time[-1] - rollout.time[0] + 0.5 / fps, 1 / fps))

@@ -127,11 +127,8 @@ class Panel:
             self.frames_left = math.inf
         elif button == "Pause":
             self.frames_left = 0
-        # Steps add up, and the first one pauses a run.
-        elif math.isinf(self.frames_left):
-            self.frames_left = 1
         else:
-            self.frames_left += 1
+            self.frames_left = 1
 
     def _add_setpoints(self, live: LiveSimulation) -> None:
         """Add a slider for each joint, and buttons for poses."""

@@ -93,15 +93,12 @@ class LiveSimulation:
         gains[:, joint] = value
         self.params = self.params.replace(**{gain: gains})
 
-    def set_setpoint(
-        self, position: ArrayLike, *, joint: int | None = None, env: int | None = None
-    ) -> None:
-        """Set setpoints [rad or m]: of one joint or all, (dof,) or (envs, dof); of one env or
-        all.
+    def set_setpoint(self, position: ArrayLike, *, joint: int | None = None) -> None:
+        """Set setpoints [rad or m] of every robot: of one joint, or of all, (dof,) or (envs,
+        dof).
         """
-        envs = slice(None) if env is None else env
         joints = slice(None) if joint is None else joint
-        self.setpoint[envs, joints] = position
+        self.setpoint[:, joints] = position
         self.setpoint = self.robot.coupled(self.setpoint)
 
     def randomize_setpoints(self) -> None:

@@ -13,7 +13,7 @@ from tiny_urdf import LIMIT, gripper, joint, link, robot, write  # noqa: E402
 
 from batchpid.errors import CallOrderError, InvalidArgumentError  # noqa: E402
 from batchpid.sim import FaultWarning, Randomization, Robot, Uniform  # noqa: E402
-from batchpid.sim.gym import ReachVectorEnv  # noqa: E402
+from batchpid.sim.gym import ReachEnv, ReachVectorEnv  # noqa: E402
 
 ID = "batchpid.sim.gym:batchpid/Reach-v0"
 
@@ -268,6 +268,7 @@ REFUSED = [
     (ReachVectorEnv, {"terminate_on_success": "no"}, "terminate_on_success"),
     (ReachVectorEnv, {"control": Hold()}, "control"),
     (ReachVectorEnv, {"control": "osc"}, "control"),
+    (lambda num, **options: ReachEnv(**options), {"num_envs": 3}, "num_envs"),
     (lambda num, **options: gymnasium.make_vec(ID, num, **options), {"robto": "panda"}, "robto"),
 ]
 
@@ -281,20 +282,28 @@ def test_refused_arguments_are_named(make, options, argument):
 
 def test_refused_calls_name_their_argument_and_the_env_goes_on():
     env = ReachVectorEnv(2, workers=0, autoreset_mode="Disabled", max_episode_steps=1)
-    mask = np.zeros(2, bool)
     for arguments, argument in (
         *(({"seed": seed}, "seed") for seed in ([1], -1, [0, -1], [0, 1.5], "ab")),
         ({"options": {"reset_masks": [True, False]}}, "reset_masks"),
-        ({"options": {"reset_mask": mask}}, "reset_mask"),
+        ({"options": {"reset_mask": [True]}}, "reset_mask"),
     ):
         with pytest.raises(InvalidArgumentError, match=argument):
             env.reset(**arguments)
     env.reset(seed=[1, 3])
-    with pytest.raises(InvalidArgumentError, match="actions"):
+    with pytest.raises(InvalidArgumentError, match="actions, entry 'panda_joint1'"):
         env.step(np.full((2, 9), np.nan))
     env.step(np.zeros((2, 9)))
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros((2, 9)))
+    env.close()
+
+
+@pytest.mark.parametrize("hook", ["observe", "first_setpoint"])
+def test_a_hook_of_a_wrong_shape_is_named(hook):
+    env = ReachVectorEnv(2, workers=0)
+    setattr(env, hook, lambda *_: np.zeros(3))
+    with pytest.raises(InvalidArgumentError, match=f"{hook}: returned an array of shape"):
+        env.reset()
     env.close()
 
 

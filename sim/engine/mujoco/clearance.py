@@ -204,7 +204,7 @@ class GroupClearance:
         }
         self.arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         # Native code has their addresses.
-        self._kept = models, data
+        self._kept = [*models], data
         fields = zip(("flags", "counts", "types_at", "affinities_at"), places() or (), strict=True)
         self._fields = Clearance(
             kinematics=kinematics,

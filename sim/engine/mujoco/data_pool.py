@@ -9,6 +9,7 @@ A pack that is not at work keeps the rows of its states; back at work it compute
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -54,9 +55,9 @@ class DataPool:
         """Return the rows of ``size`` robots at rest."""
         return np.tile(self._initial, (size, 1))
 
-    def take(self, models: list[Any], rows: Float64) -> list[Any]:
+    def take(self, models: list[Any], rows: Float64, placed: Sequence[int] = ()) -> list[Any]:
         """Return the data of the robots with these ``models``, in the states ``rows``; the states
-        of the rows before are kept in those.
+        of the rows before are kept in those. The robots ``placed`` get another state at once.
         """
         if self._rows is not rows:
             if self._rows is not None:
@@ -66,7 +67,8 @@ class DataPool:
             self._taken = self._new(len(rows))
             # MuJoCo warns of states that are not finite, and the loop finds them by itself.
             qpos = rows[:, POSITIONS : POSITIONS + self.model.nq]
-            is_near = np.all(np.abs(qpos) <= FARTHEST, axis=1).tolist()
+            is_near = np.all(np.abs(qpos) <= FARTHEST, axis=1)
+            is_near[list(placed)] = False
             for model, data, row, near in zip(models, self._taken, rows, is_near, strict=True):
                 mujoco.mj_setState(model, data, row, STATE)
                 if near:

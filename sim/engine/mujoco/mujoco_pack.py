@@ -274,7 +274,7 @@ class MujocoPack(ModelPack):
         """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root
         at ``base``.
         """
-        everyone = self.data
+        everyone = self._pool.take(self.models, self.rows, rows)
         floats = self._robot.base is not None
         bases = np.tile(ORIGIN, (len(rows), 1)) if base is None else base.copy()
         at, moves = self._robot.base or (0, 0)

@@ -128,7 +128,7 @@ class MujocoStep(NativeStep):
             clearance = GroupClearance(shapes, kinematics, models, data, dof)
             robots.clearance = clearance.address
         self._pool = pool
-        self._states = models, rows
+        self._states = [*models], rows
         self._kept = data, arrays, robots, clearance
         super().__init__(
             len(data),

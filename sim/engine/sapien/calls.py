@@ -2,8 +2,7 @@
 
 Native calls are one call of the extension for all robots. The extension calls functions that
 SAPIEN's shared library exports, so that it compiles without SAPIEN. It depends on the layout of two
-of SAPIEN's types, which SAPIEN does not guarantee: see
-:data:`TESTED`.
+of SAPIEN's types, which SAPIEN does not guarantee: see :data:`TESTED`.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ import numpy as np
 import sapien
 from sapien.physx import (
     PhysxArticulationLinkComponent,
+    PhysxCollisionShapeConvexMesh,
     PhysxCpuSystem,
     PhysxRigidDynamicComponent,
 )
@@ -78,8 +79,7 @@ class SceneContent:
         # What exists now is the robot and the ground; the rest is the user's.
         before = {entity.per_scene_id for entity in scene.entities}
         self.watched = _call(build, scene, env, links)
-        if not spec.collisions:
-            _refuse_shapes(scene, env)
+        _check_shapes(scene, env, spec.collisions)
         self._bodies = []
         self._articulations = []
         for entity in scene.entities:
@@ -140,19 +140,25 @@ class SceneContent:
         return np.array(rows, np.float32).reshape(len(rows), 7)
 
 
-def _refuse_shapes(scene: SapienScene, env: int) -> None:
+def _check_shapes(scene: SapienScene, env: int, collisions: bool) -> None:
     """Raise InvalidArgumentError if an entity of ``scene``, which belongs to env ``env``, has a
-    collision shape.
+    collision shape without ``collisions``, or a convex mesh of negative scale.
     """
     for entity in scene.entities:
         for component in entity.components:
-            if getattr(component, "collision_shapes", ()):
-                raise InvalidArgumentError(
-                    "build",
-                    f"added collision shapes (to {entity.name!r}), and collisions are False",
-                    env=env,
-                    remedy="leave them out, or use collisions=True",
-                )
+            for shape in getattr(component, "collision_shapes", ()):
+                if not collisions:
+                    raise InvalidArgumentError(
+                        "build",
+                        f"added collision shapes (to {entity.name!r}), and collisions are False",
+                        env=env,
+                        remedy="leave them out, or use collisions=True",
+                    )
+                # Two of them end the process once they touch.
+                if isinstance(shape, PhysxCollisionShapeConvexMesh) and min(shape.scale) < 0:
+                    problem = f"gave {entity.name!r} a convex mesh of negative scale"
+                    remedy = "mirror the vertices in the file"
+                    raise InvalidArgumentError("build", problem, env=env, remedy=remedy)
 
 
 def _call(

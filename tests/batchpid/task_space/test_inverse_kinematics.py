@@ -47,7 +47,7 @@ def test_reachable_poses_are_reached(name):
     np.testing.assert_array_equal(found.qpos[:, others], np.tile(start[others], (rows, 1)))
 
 
-def test_joints_with_a_full_turn_pass_their_limits_and_are_turned_back():
+def test_an_arm_with_limits_of_half_a_turn_reaches_its_poses():
     tree = dataclasses.replace(serial(), lower=-np.pi, upper=np.pi)
     rng = np.random.default_rng(0)
     pose = ts.link_poses(tree, rng.uniform(tree.lower, tree.upper, (500, 6)), ["tip"])[:, 0]

@@ -12,6 +12,7 @@ from trees import NAMES, planar, robot_of, states, tool_of, tree_of
 
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError, RobotError
+from batchpid.motors.coupling import Coupling
 from batchpid.sim import Robot, to_urdf
 
 POINT = np.array([0.1, -0.2, 0.3])
@@ -142,20 +143,24 @@ def test_the_dynamics_are_those_of_the_engine():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    "changes",
     [
-        ("parent", [-1, 0, 2, 2]),
-        ("mass", [0, 1, -1, 0]),
-        ("wxyz", np.ones((4, 4))),
-        ("axis", np.zeros((4, 3))),
-        ("joint_names", ("a",)),
-        ("joint_types", ("revolute",) * 4),
-        ("center", np.full((4, 3), np.nan)),
+        {"parent": [-1, 0, 2, 2]},
+        {"mass": [0, 1, -1, 0]},
+        {"wxyz": np.ones((4, 4))},
+        {"axis": np.zeros((4, 3))},
+        {"joint_names": ("a",)},
+        {"joint_types": ("revolute",) * 4},
+        {"joint_types": (), "links": ()},
+        {"center": np.full((4, 3), np.nan)},
+        {"gravity": -9.81},
+        {"armature": -1.0},
+        {"coupling": Coupling.of(3)},
     ],
 )
-def test_a_tree_that_is_none_is_refused(name, value):
-    with pytest.raises(InvalidArgumentError, match=name):
-        dataclasses.replace(planar(), **{name: value})
+def test_a_tree_that_is_none_is_refused(changes):
+    with pytest.raises(InvalidArgumentError, match=next(iter(changes))):
+        dataclasses.replace(planar(), **changes)
 
 
 def test_the_mass_of_collision_shapes_is_sapiens_and_a_floating_base_is_refused(tmp_path):

@@ -15,8 +15,10 @@ import pytest
 import tyro
 from commands_that_write import WORDS, output, output_flags
 
+from batchpid.sim import Robot
 from batchpid.sim.cli import COMMANDS
 from batchpid.sim.cli.commands import bar
+from batchpid.sim.tuning import compare
 
 HAVE = {
     "--gains": {"demo", "rollout", "compare", "identify", "export", "inspect", "view"},
@@ -208,6 +210,15 @@ class Terminal(io.StringIO):
 
     def isatty(self):
         return self.is_terminal
+
+
+def test_an_engine_is_a_word_several_or_the_default(files, batchpid, monkeypatch):
+    monkeypatch.chdir(files)
+    short = ("--moves", 1, "--seconds", 0.05, "--workers", 0)
+    status, said, _ = batchpid("compare", "arm.urdf", *short, "--engine")
+    assert (status, said.count(" of 1")) == (0, 2)
+    options = {"moves": 1, "seconds": 0.05, "workers": 0, "engine": "mujoco"}
+    assert compare(Robot.load("arm.urdf"), **options).engines == ("mujoco",)
 
 
 @pytest.mark.parametrize("is_terminal", [False, True])

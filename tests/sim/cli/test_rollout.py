@@ -267,6 +267,29 @@ def test_rates_take_the_short_way_round_and_followers_need_no_column(saved, tmp_
     assert 0 < run.qvel[-1, 0, turn] < 5
 
 
+@pytest.mark.parametrize(
+    ("time", "message"),
+    [("0", "line 2: the only row is at 0 s; give a row for"), ("1e300", "has rows every 1e+300")],
+)
+def test_a_wrong_single_row_is_refused(batchpid, tmp_path, time, message):
+    (tmp_path / "motion.csv").write_text(f"time,setpoint:left\n{time},0.1\n")
+    arm = write(tmp_path, gripper())
+    assert message in batchpid("rollout", arm, "--trajectory", tmp_path / "motion.csv", *ONE)[2]
+
+
+LOOP = """<mujoco><worldbody>
+  <body name="a"><joint name="a" axis="0 1 0"/><geom size=".1"/></body>
+  <body name="b" pos="1 0 0"><joint name="b" axis="0 1 0"/><geom size=".1"/></body>
+</worldbody><equality><connect body1="a" body2="b" anchor="0 0 .5"/></equality></mujoco>"""
+
+
+@pytest.mark.parametrize("words", [("rollout", "--seconds", 0.01), ("view", "--time-limit", 0.1)])
+def test_a_closed_loop_has_the_gains_of_a_runner(batchpid, words):
+    Path("loop.xml").write_text(LOOP)
+    status, _, error = batchpid(words[0], "loop.xml", *words[1:], "--engine", "mujoco", *ONE)
+    assert (status, error) == (0, "")
+
+
 def cut(change):
     """Return a function that changes the lines of a file, each a list of cells."""
 

@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 
 import pytest
-from robots import load_bundled
 from tiny_urdf import one_joint, write
 
 import batchpid as bp
@@ -57,23 +56,6 @@ def test_tune_writes_the_better_gains_with_settings(batchpid, tmp_path, monkeypa
     same = (bp.load_params("gains.yaml")[0].kp == robot.designed().kp).all()
     assert same or about["gains"] == "tuned"
     assert (tmp_path / "gains-tune.png").stat().st_size > 5_000
-
-
-@pytest.mark.slow
-def test_compare_lists_each_set_and_draws_the_first_two(batchpid, tmp_path):
-    robot = load_bundled("panda")
-    bp.save_params(tmp_path / "mine.yaml", robot.params(kp=1.0, ki=0.0, kd=0.1), robot.joint_names)
-    picture = tmp_path / "two.png"
-    flags = ("--moves", 1, "--seconds", 1.2, "--workers", 0, "--picture", picture)
-    status, said, _ = batchpid(
-        "compare", "--gains", "tuned", tmp_path / "mine.yaml", "drive:30,6", *flags
-    )
-    assert status == 0
-    rows = {line.split("  ")[0]: line for line in said.splitlines() if " of 2" in line}
-    assert rows.keys() == {"tuned", "mine.yaml", "drive (30, 6)"}
-    assert "2 / 2 of 2" in rows["tuned"]
-    assert "never / never" in rows["mine.yaml"]
-    assert picture.stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("drawn", [False, pytest.param(True, marks=pytest.mark.slow)])

@@ -6,6 +6,7 @@ import threading
 
 import numpy as np
 import pytest
+import trimesh
 from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
@@ -127,3 +128,17 @@ def test_errors_of_build_name_it_and_the_env():
         run(None, workers=0)
     with pytest.raises(InvalidArgumentError, match="more entities for one env"):
         run(lambda scene, env: box_beside_the_robot(scene, env) if env else None, workers=0)
+
+
+def test_a_convex_mesh_of_negative_scale_is_refused(tmp_path):
+    """Two of them would end the process once they touch."""
+    file = str(tmp_path / "box.stl")
+    trimesh.creation.box((1, 1, 1)).export(file)
+
+    def mirrored(scene, env):
+        builder = scene.create_articulation_builder()
+        builder.create_link_builder().add_convex_collision_from_file(file, scale=(-1, 1, 1))
+        builder.build()
+
+    with pytest.raises(InvalidArgumentError, match=r"build, env 0: gave .* of negative scale"):
+        run(mirrored, num_envs=1, ticks=1, workers=0)

@@ -61,8 +61,7 @@ def test_motors_are_found_from_setpoints(found):
     assert_right(found)
     assert found.explains
     assert found.converged
-    late = found.interval("setpoint_delay")
-    assert late is None or late[0] < 3e-4
+    assert found.interval("setpoint_delay") is None
 
 
 def test_motors_are_found_from_efforts(robot, effort_log):
@@ -248,7 +247,7 @@ def test_the_saved_file_is_what_was_found_and_holds_the_region(robot, log, found
 
 def test_the_report_has_all_values_and_errors(found):
     report = found.report()
-    for words in ("shoulder", "with ideal motors", "by joint"):
+    for words in ("shoulder", "elbow", "as described", "by joint"):
         assert words in report
     document = found.document()
     assert document["intervals"]["elbow"]["strength"][0] == found.interval("strength", 1)[0]
@@ -299,7 +298,7 @@ def test_intervals_name_unknowns_that_there_are(found):
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth(robot):
-    """Of 90 to 99 % of the unknowns, as 95 % intervals do."""
+    """Of at least 90 % of 96 unknowns, as 95 % intervals do."""
     inside = []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -313,4 +312,4 @@ def test_intervals_hold_the_truth(robot):
             for joint, true in enumerate(truth[field]):
                 _, low, high = found.interval(kind, joint)
                 inside.append(low <= true <= high)
-    assert 0.88 <= np.mean(inside) <= 1.0
+    assert np.mean(inside) >= 0.9

@@ -167,7 +167,8 @@ def test_a_recording_says_what_it_knows(robot, tmp_path):
 REFUSED = {
     "guard changed": {"guard": 0.1},
     "randomization": {"randomization": Randomization(payload=Uniform(0.1, 0.2))},
-    "setpoint rates": {"rates": True},
+    "setpoint rates": {"given": "setpoint_rates"},
+    "a feedforward": {"given": "feedforwards"},
     "under control 'drive'": {"control": "drive"},
 }
 
@@ -177,10 +178,10 @@ def test_runs_that_a_fit_cannot_simulate_are_refused(robot, problem):
     options = dict(REFUSED[problem])
     if "guard" in options:
         options["guard"] = robot.guard(rate=np.full(2, options["guard"]))
-    if options.pop("rates", False):
+    if given := options.pop("given", ""):
         with Runner(robot, 1, params=gains(), workers=0, engine="mujoco") as runner:
             runner.reset(np.zeros(2))
-            rollout = runner.rollout(motion(0.5), setpoint_rates=0 * motion(0.5))
+            rollout = runner.rollout(motion(0.5), **{given: 0 * motion(0.5)})
     else:
         actuators = dict.fromkeys(("strength", "command_delay")) if "control" in options else {}
         rollout = run(robot, motion(0.5), actuators=actuators, **options)

@@ -1,6 +1,7 @@
 """Randomization: draws depend on seed, env, episode and field alone, and results are in range."""
 
 import hashlib
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ FIELDS = {
     "params": {"kp": LogUniform(0.5, 2.0, operation="scale")},
     "actuators": {"command_delay": Uniform(0, 0.005, shared=True)},
 }
+READ_ONLY = {"params": MappingProxyType(FIELDS["params"])}
 counts = st.integers(0, 2**63 - 1)
 episodes = st.lists(st.tuples(counts, counts), min_size=1, max_size=5)
 
@@ -128,6 +130,7 @@ def test_draws_are_applied_by_their_operation():
     varied = randomization.randomized("params", params, draws, PANDA)
     np.testing.assert_array_equal(varied.kp, params.kp * draws.values["params.kp"])
     assert varied.ki is params.ki
+    assert Randomization().randomized("params", params, draws, PANDA) is params
     ideal = prepared_actuators(randomization, None, PANDA)
     assert ideal.max_delay == 0.005
     actuators = randomization.randomized("actuators", ideal, draws, PANDA)
@@ -183,6 +186,7 @@ def test_static_friction_below_coulombs_is_coulombs():
 def test_it_is_what_its_dict_describes():
     randomization = Randomization(seed=3, per="env", payload_link="panda_hand", **FIELDS)
     assert Randomization.from_dict(randomization.to_dict()) == randomization
+    assert Randomization(**FIELDS) == Randomization(**MappingProxyType(FIELDS | READ_ONLY))
 
 
 @pytest.mark.parametrize(
@@ -212,6 +216,7 @@ def test_it_is_what_its_dict_describes():
         ({"actuators": {"command_delay": Uniform(0, 2)}}, "command_delay, joint .*: out of range"),
         ({"actuators": {"effort_limit": Uniform(0, 2)}}, "actuators.effort_limit: is off"),
         ({"payload": 0.5}, "payload: must be of type Distribution"),
+        ({"friction": {}}, "friction: must be of type Distribution"),
         ({"params": Uniform(0, 1)}, "params: is not a mapping"),
         ({"seed": -1}, "seed: out of range"),
         ({"per": "tick"}, "per: unknown option"),

@@ -491,6 +491,11 @@ def test_missing_meshes(load, tmp_path):
             assert "gone.stl" in finding.text
             with pytest.raises(RobotError, match=r"gone\.stl"):
                 load(text, missing_meshes="error")
+    # A <pair> of the shape goes with it.
+    geoms = f'{INERTIAL}<geom name="box" size=".1"/><geom name="m" type="mesh" mesh="m"/>'
+    pair = '<contact><pair geom1="m" geom2="box"/></contact>'
+    (finding,) = load(two_links(rest=asset + pair).replace(BOX, geoms, 1)).repairs
+    assert finding.code == "missing-mesh"
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "gone.stl").write_bytes(b"solid wedge")
     with pytest.raises(RobotError, match=r"MuJoCo cannot compile the file: .*(gone|'m')"):
@@ -557,9 +562,14 @@ def test_a_default_namespace_changes_nothing(load, tmp_path):
 
 def test_keyframes_other_than_the_start_are_named(load):
     keys = '<keyframe><key name="home" qpos=".1"/><key name="stand"/><key/></keyframe>'
-    (finding,) = load(two_links(rest=keys)).repairs
-    assert "2 keyframes" in finding.text
+    robot = load(two_links(rest=keys))
+    assert ["2 keyframes" in finding.text for finding in robot.repairs] == [True]
     assert load(two_links(rest='<keyframe><key name="home" qpos=".1"/></keyframe>')).repairs == ()
+    # They are a part of the file's identity, but the last bits are not.
+    same, other = (
+        load(two_links(rest=keys.replace(".1", at))) for at in (f"{1e-15 + 0.1!r}", ".2")
+    )
+    assert same.mjcf.content == robot.mjcf.content != other.mjcf.content
 
 
 def test_a_geom_that_is_referred_to_stays(load):

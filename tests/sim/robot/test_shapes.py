@@ -119,14 +119,6 @@ def test_shapes_of_one_colour_are_joined_at_their_origins(tmp_path):
     np.testing.assert_allclose(first.vertices.max(0), [0.2, 0.1, 0.55], atol=1e-12)
 
 
-def test_collision_shapes_stand_in_for_missing_visuals(tmp_path):
-    collision = visual(BOX, kind="collision")
-    drawn = surfaces(
-        load(tmp_path, a=visual('<mesh filename="lost.stl"/>') + collision, b=collision)
-    )
-    assert [surface.link for surface in drawn] == ["a", "b"]
-
-
 def test_a_robot_without_shapes_is_drawn_by_rods_between_its_joints(tmp_path):
     tip = INERTIAL.replace("<mass", '<origin xyz="0.5 0 0"/><mass')
     parts = (
@@ -180,17 +172,16 @@ def test_meshes_that_cannot_be_read_are_reported_with_link_file_and_remedy(tmp_p
         ("empty.stl", r"\(no triangles\)", "repair the file"),
         ("box.dae", r"cannot be read \(", "repair the file"),
     ):
-        for shape, shown in (
-            ("", "it is not drawn"),
-            (visual(BOX, kind="collision"), "collision shapes are drawn"),
-        ):
+        for shape in ("", visual(BOX, kind="collision")):
             findings = []
             surfaces(
                 load(tmp_path, b=visual(f'<mesh filename="{name}"/>') + shape), findings=findings
             )
             (finding,) = findings
             assert (finding.code, finding.link, finding.detail) == ("visual-mesh", "b", repr(name))
-            assert re.search(f"{reason}.*: {shown}.*; .*{remedy}", str(finding)), str(finding)
+            assert re.search(
+                f"{reason}.*: collision shapes are drawn.*; .*{remedy}", str(finding)
+            ), str(finding)
 
 
 def test_visuals_are_looked_up_in_package_dirs(tmp_path):

@@ -41,7 +41,7 @@ BAD = {
     ),
     "misspelt link": (
         robot(BASE, ARM, TIP, joint("hinge", "base", "amr"), joint("k", "arm", "tip")),
-        r"one root link.*joints name \['amr'\], not in the file: correct",
+        r"one root link.*joints name, not in the file: \['amr'\]",
     ),
     "xacro": (
         robot(BASE, ARM, joint("${side}_hinge", "base", "arm")),
@@ -256,8 +256,6 @@ def test_a_robot_without_a_name_is_called_after_its_file(tmp_path):
     loaded = Robot.load(write(tmp_path, one_joint().replace(' name="test"', ""), "arm.urdf"))
     assert loaded.name == "arm"
     assert '<robot name="arm">' in to_urdf(loaded).text
-    with Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0)) as runner:
-        assert runner.step([0.0]).ok.all()
 
 
 def test_a_joint_gets_a_name_that_no_other_has(tmp_path):

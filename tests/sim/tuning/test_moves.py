@@ -84,9 +84,3 @@ def test_smooth_variation_of_a_joint_at_rest_is_a_thousandth_of_its_limit(panda)
     rest = np.array([panda.start])
     variation = smooth_variation(panda, Moves(rest, rest, ("rest",)), 1.0)
     np.testing.assert_array_equal(variation, 1e-3 * panda.effort_limit[None])
-
-
-def test_poses_in_contact_are_recognised(panda):
-    folded = panda.start.copy()
-    folded[[1, 3]] = 1.7, -2.9
-    assert panda.dynamics().in_contact(np.array([folded, panda.start])).tolist() == [True, False]

@@ -66,11 +66,6 @@ def test_a_film_has_its_pictures_in_order(name, rollout, tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == [name]
 
 
-def test_frames_of_a_film_follow_the_recorded_time(rollout):
-    assert film.film_rows(rollout, 50.0).tolist() == list(range(0, 20, 2))
-    assert film.film_rows(rollout, 200.0)[:5].tolist() == [0, 1, 1, 2, 2]
-
-
 def test_a_film_that_is_interrupted_leaves_the_older_one(rollout, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     path = tmp_path / "film.mp4"
