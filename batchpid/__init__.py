@@ -6,8 +6,8 @@ Params say how to control, a state is carried from step to step, and every array
     import numpy as np
 
     params = bp.make_params(joints=9, kp=40, ki=5, kd=2, effort_limit=87, anti_windup="conditional")
-    pid = bp.BatchPID(params, num_envs=64, dt=1 / 2000)  # keeps the state; backend="jax" for the
-    same law, jitted effort = pid(np.ones((64, 9)), np.zeros((64, 9)))  # setpoint, measurement
+    pid = bp.BatchPID(params, num_envs=64, dt=1 / 2000)  # keeps the state; or backend="jax"
+    effort = pid(np.ones((64, 9)), np.zeros((64, 9)))  # setpoint, measurement
 
 - Control: :class:`BatchPID`, or the pure functions :func:`init`, :func:`step`, :func:`reset` and
   :func:`track`, which take and return a :class:`PIDState`; :func:`discretise` and :func:`advance`
