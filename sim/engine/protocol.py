@@ -200,9 +200,6 @@ class EnginePack(Protocol):
         Next the loop calls :meth:`write_joints` and :meth:`write_state` for them.
         """
 
-    def state_sizes(self) -> list[int]:
-        """Return the number of values in the state of each env."""
-
     def read_state(self) -> Float64:
         """Return the state of every env (M, values) for a snapshot; only the engine can interpret
         it.

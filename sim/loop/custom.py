@@ -7,7 +7,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -142,14 +141,16 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
     """Return the initial state of the caller's own controller for ``envs`` envs."""
     assert not isinstance(options.control, str)
     init: Callable[..., Any] = options.control.init
-    start = partial(init, options.robot, envs)
+    arguments: tuple[Any, ...] = (options.robot, envs, options.timestep)
     # A controller without a time step of its own may leave the last argument out.
-    if "timestep" in inspect.signature(start).parameters:
-        start = partial(start, timestep=options.timestep)
+    try:
+        inspect.signature(init).bind(*arguments)
+    except TypeError:
+        arguments = arguments[:2]
     if options.backend != "jax":
-        return start()
+        return init(*arguments)
     with own_settings("float64"):  # its arrays have this dtype, not JAX's default in this process
-        return unflatten(state := start(), flatten(state))
+        return unflatten(state := init(*arguments), flatten(state))
 
 
 def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
@@ -163,12 +164,11 @@ def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
         is_fit = old is not None and new is not None and new.shape == old.shape
         if is_fit and np.can_cast(new.dtype, old.dtype, "same_kind"):
             continue
-        kinds = [
-            "no array" if leaf is None else f"{leaf.dtype} {leaf.shape}" for leaf in (new, old)
-        ]
+        # Not the shape before, whose number of envs is that of a group.
+        returned = "no array" if new is None else f"{new.dtype} {new.shape}"
         raise InvalidArgumentError(
             "control",
-            "returned {!r} of {}, not {}".format(name, *kinds),
+            f"returned {name!r} of {returned}",
             remedy="return (state, effort): a state as init does, an effort of shape (envs, dof)",
         )
     return {name: leaf.astype(before[name].dtype, copy=False) for name, leaf in leaves.items()}

@@ -182,6 +182,8 @@ class EnvGroup:
         An env whose ``qpos`` or ``qvel`` (M, dof) is not finite returns to its last start, and has
         failed.
         """
+        if not mask.any():  # a reset of other envs
+            return
         faults = self._faults
         faults.clear(mask)
         self._vary(mask)
@@ -204,9 +206,9 @@ class EnvGroup:
         """Put the draws of the envs of ``mask`` (M,) into effect, before these envs are placed."""
         randomization = self._options.randomization
         acting = self.acting
-        rows = np.flatnonzero(mask).tolist()
-        if randomization is None or acting.draws is None or not rows:
+        if randomization is None or acting.draws is None:
             return
+        rows = np.flatnonzero(mask).tolist()
         # The robots first: friction and inertia of the motors add to theirs.
         if randomization.changes_robot:
             self.pack.vary(rows, variation(self._options, len(rows), acting.draws.for_envs(rows)))

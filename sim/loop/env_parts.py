@@ -1,5 +1,5 @@
-"""Parts of a group of envs: robots, params and actuators with the draws of the randomization, sensors
-of links, and pushes of bases.
+"""Parts of a group of envs: its pack, and params and actuators with the draws of the randomization;
+sensors of links; pushes of bases.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Failure(Exception):
 
     @classmethod
     def of(cls, error: Exception) -> Failure:
-        """Return an exception of a loop, if it is another one as a failure at step 0."""
+        """Return ``error`` if it is a Failure, else a Failure at step 0 with it."""
         if isinstance(error, Failure):
             return error
         return cls(0, 0, 0, error)

@@ -6,8 +6,7 @@ neither read nor written. So every continuation from a snapshot, in this process
 starts in a new world in that state, and the results are bit-identical. The barrier itself changes
 the last bits.
 
-A file is checked where a runner restores it: its arrays are compared with those of a fresh state of
-that runner.
+``Runner.restore`` checks names, shapes and dtypes of the arrays against the runner's own.
 """
 
 from __future__ import annotations
@@ -54,27 +53,31 @@ class Snapshot:
 
     def check_options(self, about: Mapping[str, Any]) -> None:
         """Raise InvalidArgumentError if a runner with options ``about`` cannot restore it."""
-        different = [key for key, value in about.items() if self.about.get(key) != value]
-        if different:
-            problem = f"is of a runner with another {', and another '.join(different)}"
-            remedy = "restore it in a runner made with the same options"
-            raise InvalidArgumentError("snapshot", problem, remedy=remedy)
+        for key, ours in about.items():
+            theirs = self.about.get(key)
+            if theirs != ours:
+                problem = f"is of a runner with {key} {theirs}, not {ours}"
+                remedy = "use one with the same options"
+                raise InvalidArgumentError("snapshot", problem, remedy=remedy)
 
-    def check_rows(self, fresh: Mapping[str, Rows]) -> None:
-        """Compare the arrays with the ``fresh`` ones of the runner that restores them.
+    def check_rows(self, own: Mapping[str, Rows]) -> None:
+        """Check names, shapes and dtypes of the arrays against the runner's ``own``.
 
         Raises
         ------
         InvalidArgumentError
-            An array is missing, unknown, or of another shape or dtype.
+            An array is missing, unknown, or of another shape or dtype, or an env has other content.
         """
         theirs, ours = (
             {name: f"{table.dtype.str} {table.shape}" for name, table in rows.items()}
-            for rows in (self.rows, fresh)
+            for rows in (self.rows, own)
         )
         for name in ours | theirs:
             kind, other = theirs.get(name), ours.get(name)
             _expect(kind == other, f"has {kind} for {name}, not {other}")
+        # The engine's values of an env end where NaN begin.
+        lengths = np.isnan(self.rows["engine"]) == np.isnan(own["engine"])
+        _expect(lengths.all(), "holds other content than this runner's build makes")
 
     def episodes(self, num_envs: int) -> NDArray[np.int64]:
         """Return the checked stream and episode of each of ``num_envs`` envs."""
@@ -193,4 +196,4 @@ def _widened(table: Rows, width: int) -> Rows:
 def _expect(holds: Any, problem: str) -> None:
     """Raise InvalidArgumentError with a ``problem`` of a snapshot unless something ``holds``."""
     if not holds:
-        raise InvalidArgumentError("snapshot", problem, remedy="take a new one")
+        raise InvalidArgumentError("snapshot", problem, remedy="take one with the same build=")

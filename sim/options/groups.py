@@ -496,17 +496,19 @@ class Ray:
     """Largest number of machines. Default: all that have enough CPUs."""
     cpus_per_node: Annotated[int | None, Field(low=1, high=100_000)] = None
     """Workers on each machine, each on one CPU of Ray's count. Machines with fewer CPUs are not
-    used. Default: the CPUs of the smallest one.
+    used, except after a loss. Default: the CPUs of the smallest machine that is used; small ones
+    are left out where that gives more workers.
     """
     runtime_env: Document | None = None
     """Ray's ``runtime_env`` of the processes on the machines, such as ``{"working_dir": "."}``."""
 
     def __post_init__(self) -> None:
         check_plain(self)
-        if "://" in (self.address or ""):
-            problem = "must be HOST:PORT, 'auto' or 'local'"
-            remedy = "leave out the protocol"
-            raise InvalidArgumentError("address", problem, value=self.address, remedy=remedy)
+        instance("runtime_env", self.runtime_env or {}, dict, "pass a dict")
+        remedy = "pass HOST:PORT, 'auto' or 'local'"
+        address = instance("address", self.address or "", str, remedy)
+        if "://" in address:
+            raise InvalidArgumentError("address", "has a protocol", value=address, remedy=remedy)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

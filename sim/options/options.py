@@ -144,8 +144,11 @@ class RunnerOptions(RunnerKeywords):
         if "coriolis" not in self.compensate and "partial_force" not in engine.capabilities:
             lacks_force = True
         obstacle = engine.native_obstacle() or xla.obstacle()
+        if obstacle:
+            problem = f"'jax' needs native code: {obstacle}"
+            remedy = "build the extensions, or use backend='numpy'"
+            raise InvalidArgumentError("backend", problem, remedy=remedy)
         for argument, problem, is_lacking in (
-            ("backend", f"is 'jax'; {obstacle}", obstacle),
             ("control", "has no law to compile", self.control == "drive"),
             ("compensate", "needs NumPy's force", lacks_force and "gravity" in self.compensate),
             ("randomization", "is given", self.randomization is not None),

@@ -174,9 +174,13 @@ def base_rows(
     if inputs["base_pose"] is None:
         # An MJCF file may have a ground at another height.
         ground = options.ground and options.mjcf is None
-        different, which = np.unique(qpos[mask], axis=0, return_inverse=True)
-        starts = [base_start(robot, row, ground) for row in different]
-        pose[mask] = np.array(starts).reshape(-1, 7)[which.ravel()]
+        # Most envs start at the same positions, and a start takes the lowest point of all shapes.
+        starts: dict[bytes, Float64] = {}
+        for env in np.flatnonzero(mask):
+            key = qpos[env].tobytes()
+            if key not in starts:
+                starts[key] = base_start(robot, qpos[env], ground)
+            pose[env] = starts[key]
         return rows
     length = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     remedy = "give (w, x, y, z), (1, 0, 0, 0) upright"

@@ -278,10 +278,9 @@ def snapshot_of(options: RunnerOptions, state: RunnerState, rows: dict[str, Rows
 def restored(options: RunnerOptions, snapshot: Snapshot, present: Snapshot) -> Restore:
     """Return the operation that restores a snapshot, checked and copied.
 
-    ``present`` is a snapshot of the runner, whose rows have the same names and shapes but for those
-    that depend on params and actuators.
+    ``present`` is any snapshot of this runner; only the shapes of its ``control/`` arrays may
+    differ, since params and actuators decide them.
     """
-    snapshot.check_options(present.about)
     num_envs = options.num_envs
     randomization = options.randomization
     params = options.check_params(snapshot.params)

@@ -248,8 +248,9 @@ class Runner(SingleOwner):
         """Begin a tick and return, while the workers run it; :meth:`recv` returns its observation.
 
         The two are bit-identical to one :meth:`step`, and take its arguments. In between,
-        attributes such as :attr:`time` are those of the tick before, and other methods but
-        :meth:`close` raise CallOrderError. With ``workers=0`` the tick runs in this call.
+        :attr:`time`, :attr:`faults` and the like are those of the tick before; :attr:`info`,
+        assignments, and all methods but :meth:`recv` and :meth:`close` raise CallOrderError. With
+        ``workers=0`` the tick runs in this call.
 
         Raises
         ------
@@ -447,6 +448,7 @@ class Runner(SingleOwner):
         """
         self._ready()
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
+        snapshot.check_options(self.options.described)
         restore = restored(self.options, snapshot, self._present)
         self._execute(restore)
         self._pool.start_replay_from(restore)

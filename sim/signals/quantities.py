@@ -54,10 +54,11 @@ class CommandSpec:
     def __post_init__(self) -> None:
         names = tuple(different_names("names", self.names))
         units = tuple(self.units) or ("",) * len(names)
-        if len(units) != len(names):
-            problem = f"has {len(units)} units for {len(names)} names"
-            remedy = "give one unit for each name"
-            raise InvalidArgumentError("units", problem, value=units, remedy=remedy)
+        are_texts = all(isinstance(unit, str) for unit in units)
+        if isinstance(self.units, str) or not are_texts or len(units) != len(names):
+            problem = "must be a sequence of texts"
+            remedy = "give one for each name"
+            raise InvalidArgumentError("units", problem, value=self.units, remedy=remedy)
         neutral = array("neutral", self.neutral, (1, len(names)), names, kind="entry")[0]
         # The class is frozen; its __dict__ is not.
         vars(self).update(names=names, units=units, neutral=tuple(neutral.tolist()))
@@ -269,7 +270,7 @@ def untouched(num_envs: int, observed: Mapping[str, Quantity]) -> dict[str, Rows
 def failed_envs(ok: Bool) -> str:
     """Return in words how many envs failed in ``ok`` (..., envs)."""
     # Rows are ticks: an env that failed in one of them counts once.
-    failed = int((~ok.reshape(-1, ok.shape[-1])).any(0).sum())
+    failed = (~np.atleast_2d(ok)).any(0).sum()
     if failed:
         return f"{failed} failed"
     return "all ok"

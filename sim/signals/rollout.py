@@ -374,8 +374,6 @@ class Rollout:
 
         if robot is None:
             robot = self.info.description
-        else:
-            robot = robot
         if robot is None:
             problem = "of this run is not known"
             remedy = "pass it: rollout.findings(Robot.load(...))"

@@ -110,13 +110,17 @@ class Cluster:
         self.options = options
         least = options.cpus_per_node or 1
         counts = [node["Resources"].get("CPU", 0) for node in self.ray.nodes() if node["Alive"]]
-        # The largest machines, each with as many workers as the smallest of them has CPUs.
+        # The largest machines, each with as many workers as the smallest of them has CPUs: as many
+        # machines as give the most workers in all.
         large = sorted([int(count) for count in counts if count >= least], reverse=True)
-        used = large[: min(options.nodes or num_envs, num_envs)]
+        most = min(len(large), options.nodes or num_envs, num_envs)
+        parts = (large[:count] for count in range(most, 0, -1))
+        fixed = options.cpus_per_node
+        used = max(parts, key=lambda part: len(part) * (fixed or part[-1]), default=[])
         if not used:
             remedy = "lower cpus_per_node, or add larger machines"
             raise InvalidArgumentError("cluster", f"has no machine of {least} CPUs", remedy=remedy)
-        self.workers: int = options.cpus_per_node or used[-1]
+        self.workers: int = fixed or used[-1]
         """Workers on each machine."""
         self.slices = split(num_envs, len(used))
         """Envs of each node."""
@@ -150,18 +154,19 @@ class NodeWorker(Worker):
         ticks = len(self._arrays.observation.ok)
         self._message = pickled((pool_type, start, ticks))
         self._actor: Any = None
+        self._cpus = cluster.workers
         self.info: NodeInfo | None = None
         """Known when the node has started."""
 
     def open(self) -> None:
-        # A node that replaces a lost one reserves no CPUs, which the lost one has until it has ended.
-        cpus = self._cluster.workers if self.info is None else 0
         actor_type = self._cluster.ray.remote(Node).options(
-            num_cpus=cpus,
+            num_cpus=self._cpus,
             scheduling_strategy="SPREAD",
             runtime_env=self._cluster.options.runtime_env,
         )
         self._actor = actor_type.remote()
+        # A node that replaces a lost one reserves no CPUs, which the lost one has until it has ended.
+        self._cpus, self.info = 0, None
 
     def send(self, request: Request) -> None:
         limit = self._step_limit * (request.ticks or 1) * request.substeps

@@ -102,7 +102,7 @@ class WorkerPool(SingleOwner):
         if options.cluster is not None:
             cluster = Cluster(options.cluster, num_envs)
             slices = cluster.slices
-            loops = len(slices) * cluster.workers
+            loops = min(num_envs, len(slices) * cluster.workers)
             most_steps = NODE_STEPS
         else:
             slices = split(num_envs, max(1, min(count or 0, num_envs)))

@@ -238,9 +238,9 @@ def pickled(message: Any) -> bytes:
         reply: bytes = cloudpickle.dumps(message)
         return reply
     except Exception as error:
-        problem = f"cannot be sent to a worker process: {error}"
-        remedy = "let it hold nothing that cannot be pickled, or pass workers=0"
-        raise InvalidArgumentError("control or build", problem, remedy=remedy) from error
+        problem = f"cannot be sent to a worker: {error}"
+        remedy = "let control and build hold nothing that cannot be pickled"
+        raise InvalidArgumentError("options", problem, remedy=remedy) from error
 
 
 def pinned_cores(workers: int) -> list[int]:

@@ -107,9 +107,6 @@ class DoubleIntegrators:
     def vary(self, rows, variation):
         raise AssertionError
 
-    def state_sizes(self):
-        return [2 * self.dof] * self.size
-
     def read_state(self):
         return np.hstack(self._state)
 

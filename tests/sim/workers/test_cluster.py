@@ -59,9 +59,11 @@ def stop_node(runner, cluster):
 
 
 def kill_machine(runner, cluster):
-    parent = psutil.Process(runner.nodes[1].pid).ppid()
+    pid = runner.nodes[1].pid
+    parent = psutil.Process(pid).ppid()
     raylets = {node.all_processes["raylet"][0].process.pid: node for node in cluster.nodes}
     cluster.remove_node(raylets[parent], allow_graceful=False)
+    assert have_ended([pid])  # which answers until then
 
 
 def program(runner, disturb=lambda: None):
