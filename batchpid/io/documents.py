@@ -13,7 +13,6 @@ A file of params has this form; the keys are the options of :func:`batchpid.make
 from __future__ import annotations
 
 import json
-import math
 import os
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -279,7 +278,9 @@ def parse(source: str, text: str | bytes, format: str) -> Any:
 def render(document: Document, format: str) -> str:
     """Return a document as text in ``format``, "yaml" or "json"."""
     if choice("format", format, ("yaml", "json")) == "json":
-        return json.dumps(_without_infinities(document), indent=2, allow_nan=False) + "\n"
+        # JSON has no number for infinities, which are written as "inf" and "-inf".
+        standard = json.loads(json.dumps(document), parse_constant=lambda name: str(float(name)))
+        return json.dumps(standard, indent=2) + "\n"
     import yaml
 
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
@@ -307,17 +308,6 @@ def plain(column: Rows) -> Any:
     if len(values) == 1:
         return values[0]
     return values
-
-
-def _without_infinities(value: Any) -> Any:
-    """Return the document with infinities as "inf" and "-inf": JSON has no number for them."""
-    if isinstance(value, dict):
-        return {key: _without_infinities(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_without_infinities(entry) for entry in value]
-    if value in (math.inf, -math.inf):
-        return str(value)
-    return value
 
 
 def _parse_json(text: str) -> Any:

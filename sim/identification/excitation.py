@@ -102,9 +102,11 @@ def excite(
         while obstacle and share[movable].min() >= _LEAST:
             motion = _chirp(robot, center, share, time, lowest, highest, phase)
             obstacle, joints = _obstacle(robot, motion)
-            if joints and not share[joints].any():
+            # Followers move with their leaders.
+            leaders = robot.coupling.leader[joints]
+            if joints and not share[leaders].any():
                 break
-            share[joints] *= _SHRINK
+            share[leaders] *= _SHRINK
         if obstacle:
             obstacles[obstacle] += 1
         elif best is None or share.mean() > best[0]:
@@ -115,8 +117,8 @@ def excite(
         return best[1]
     ((text, _),) = obstacles.most_common(1)
     problem = f"{robot.name!r} has no free motion about any pose that was tried: {text}"
-    remedy = "disable pairs of links that only seem to touch in an .srdf, or correct the effort"
-    raise InvalidArgumentError("robot", problem, remedy=f"{remedy} limit or the masses")
+    remedy = "disable pairs that only seem to touch in an .srdf, or correct masses and limits"
+    raise InvalidArgumentError("robot", problem, remedy=remedy)
 
 
 def _obstacle(robot: Robot, motion: Trajectory) -> tuple[str, list[int]]:
@@ -127,7 +129,7 @@ def _obstacle(robot: Robot, motion: Trajectory) -> tuple[str, list[int]]:
     outside |= np.abs(motion.velocity) > robot.velocity_limit
     joints = np.flatnonzero(outside.any(0)).tolist()
     if joints:
-        return f"joint {robot.joint_names[joints[0]]!r} exceeds its limits", _leaders(robot, joints)
+        return f"joint {robot.joint_names[joints[0]]!r} exceeds its limits", joints
     rows = np.unique(np.linspace(0, motion.ticks - 1, _CHECKS).astype(int))
     position = motion.position[rows]
     velocity = motion.velocity[rows]
@@ -138,7 +140,7 @@ def _obstacle(robot: Robot, motion: Trajectory) -> tuple[str, list[int]]:
     joints = np.flatnonzero(excess > 0).tolist()
     if joints:
         name = robot.joint_names[int(excess.argmax())]
-        return f"joint {name!r} is too weak to move", _leaders(robot, joints)
+        return f"joint {name!r} is too weak to move", joints
     # Links keep the distances of the center, or half of them where they are near there.
     contacts = robot.dynamics().contacts
     clearance = CLEARANCE
@@ -151,11 +153,6 @@ def _obstacle(robot: Robot, motion: Trajectory) -> tuple[str, list[int]]:
                 names = " and ".join(repr(name) for name in (first, second or "ground"))
                 return f"{names} touch", list(range(robot.dof))
     return "", []
-
-
-def _leaders(robot: Robot, joints: list[int]) -> list[int]:
-    """Return the joints that move ``joints``: followers have no motion of their own."""
-    return [int(joint) for joint in np.unique(robot.coupling.leader[joints])]
 
 
 def _centers(robot: Robot, easy: Float64, rng: np.random.Generator) -> Iterator[Float64]:

@@ -424,8 +424,9 @@ def _window(number: int, data: LogData, steps: tuple[int, int], split: int, ever
     step = np.maximum(np.ceil(place - 1e-6).astype(int), first + 1)
     past = round(PAST / dt)
     command = motion.command[np.maximum(np.arange(first - past, last), 0)]
-    qpos, qvel = (motion.qpos[first], motion.qvel[first]) if first else log.start
     before = np.maximum(step - place, 0.0) * dt
-    stretch = Stretch(qpos, qvel, command, past, step - first - 1, before)
+    stretch = Stretch(
+        motion.qpos[first], motion.qvel[first], command, past, step - first - 1, before
+    )
     fitted = place <= split + 1e-6
     return Window(number, stretch, log.qpos[rows], log.time[rows], fitted)

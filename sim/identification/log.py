@@ -31,8 +31,6 @@ CLEAR = np.pi / 2
 """Largest change from row to row, apart from whole turns, at which the number of turns is certain
 [rad].
 """
-BEGIN = 0.03
-"""Time at the start of a log over which its first velocity is measured [s]."""
 
 
 class LogWarning(UserWarning):
@@ -91,18 +89,6 @@ class Log:
     def seconds(self) -> float:
         """Length [s]."""
         return float(self.time[-1] - self.time[0])
-
-    @property
-    def start(self) -> tuple[Float64, Float64]:
-        """Position and velocity (joints,) at the start: a line through the first rows; small speeds
-        are rest.
-        """
-        count = max(4, int((self.time <= self.time[0] + BEGIN).sum()))
-        time = self.time[:count] - self.time[0]
-        slope, place = np.polyfit(time, self.qpos[:count], 1)
-        speed = np.diff(self.qpos, axis=0) / np.diff(self.time)[:, None]
-        moves = np.abs(slope) > 0.2 * np.sqrt((speed**2).mean(0))
-        return np.where(moves, place, self.qpos[:count].mean(0)), np.where(moves, slope, 0.0)
 
     def part(
         self,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from identical import assert_identical
 from robots import load_bundled
-from tiny_urdf import random_tree, robot, write
+from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
 from batchpid.sim import Robot, Runner
 
@@ -106,20 +106,14 @@ def test_a_motion_is_the_same_without_proofs(name, fixed_base, ground, tmp_path,
 @pytest.mark.skipif(os.environ.get("BATCHPID_NATIVE") == "0", reason="there are no native calls")
 def test_a_link_that_is_welded_far_out_stops_at_an_obstacle(tmp_path, monkeypatch):
     """A link with a wrench is a body of its own, with a pose in the body that carries it."""
-    inertial = (
-        '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    ball = (
+        '<collision><origin xyz="0 0 {}"/><geometry><sphere radius="0.1"/></geometry></collision>'
     )
-    ball = '<collision><geometry><sphere radius="0.1"/></geometry></collision>'
-    post = f'<collision><origin xyz="0 1.5 0"/>{ball.removeprefix("<collision>")}'
-    hinge = '<axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="9" velocity="9"/>'
-    (tmp_path / "arm.urdf").write_text(
-        f'<robot name="arm"><link name="a">{post}</link><link name="b">{inertial}</inertial></link>'
-        f'<link name="c">{inertial}</inertial>{ball}</link><joint name="j" type="revolute">'
-        f'<parent link="a"/><child link="b"/>{hinge}</joint><joint name="k" type="fixed">'
-        '<parent link="b"/><child link="c"/><origin xyz="1.5 0 0"/></joint></robot>'
-    )
-    arm = Robot.load(tmp_path / "arm.urdf", self_collision="urdf")
-    options = {"ticks": 300, "wrenches": ["c"]}
+    parts = link("a", ball.format(1.5)), link("b"), link("c", INERTIAL + ball.format(0))
+    hinge = joint("j", "a", "b", "continuous", origin="0 0 0")
+    weld = joint("k", "b", "c", "fixed", "", "1.5 0 0")
+    arm = Robot.load(write(tmp_path, robot(*parts, hinge, weld)), self_collision="urdf")
+    options = {"ticks": 300, "wrenches": ["c"], "ground": False}
     ours, theirs = (motion(arm, monkeypatch, proofs, **options) for proofs in (True, False))
     for one, other in zip(ours, theirs, strict=True):
         assert_identical(one, other)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from batchpid.sim.identification import excite, read_logs
+from batchpid.sim.identification import excite
 
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
@@ -27,19 +27,6 @@ def test_the_seed_decides(panda):
     first, again, other = (excite(panda, 2.0, rate=50, seed=seed) for seed in (1, 1, 2))
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
     assert not np.array_equal(first.position, other.position)
-
-
-def test_a_log_may_keep_the_rates_of_the_setpoints(panda, tmp_path):
-    motion = excite(panda, 1.0, rate=100)
-    quantities = ("setpoint", "setpoint_rate", "qpos")
-    header = ",".join(
-        ["time", *(f"{quantity}:{name}" for quantity in quantities for name in panda.joint_names)]
-    )
-    table = np.column_stack([motion.time, motion.position, motion.velocity, motion.position])
-    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=header, comments="")
-    (log,) = read_logs(panda, [tmp_path / "log.csv"])
-    assert log.kind == "setpoint"
-    np.testing.assert_allclose(log.command, motion.position[:, list(log.joints)], atol=1e-8)
 
 
 @pytest.mark.parametrize(
