@@ -164,8 +164,8 @@ def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
         is_fit = old is not None and new is not None and new.shape == old.shape
         if is_fit and np.can_cast(new.dtype, old.dtype, "same_kind"):
             continue
-        # Not the shape before, whose number of envs is that of a group.
-        returned = "no array" if new is None else f"{new.dtype} {new.shape}"
+        # Without the number of envs, which is that of a group.
+        returned = "no array" if new is None else f"{new.dtype} {new.shape[1:]} an env"
         raise InvalidArgumentError(
             "control",
             f"returned {name!r} of {returned}",

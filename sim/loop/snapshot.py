@@ -53,12 +53,10 @@ class Snapshot:
 
     def check_options(self, about: Mapping[str, Any]) -> None:
         """Raise InvalidArgumentError if a runner with options ``about`` cannot restore it."""
-        for key, ours in about.items():
-            theirs = self.about.get(key)
-            if theirs != ours:
-                problem = f"is of a runner with {key} {theirs}, not {ours}"
-                remedy = "use one with the same options"
-                raise InvalidArgumentError("snapshot", problem, remedy=remedy)
+        others = [key for key, ours in about.items() if self.about.get(key) != ours]
+        if others:
+            problem = f"is of a runner with another {' and '.join(others)}"
+            raise InvalidArgumentError("snapshot", problem, remedy="use one with the same options")
 
     def check_rows(self, own: Mapping[str, Rows]) -> None:
         """Check names, shapes and dtypes of the arrays against the runner's ``own``.

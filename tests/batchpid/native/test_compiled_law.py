@@ -242,7 +242,7 @@ def test_a_wrong_out_is_refused_and_changes_nothing(out):
         pid(2.0, y)
         before = pid.state
         for _ in range(2):  # before and after a fast call
-            with pytest.raises(InvalidArgumentError, match="out: is not a contiguous"):
+            with pytest.raises(InvalidArgumentError, match="out: must be a contiguous"):
                 pid(2.0, y, out=out)
             np.testing.assert_array_equal(pid.state.integral, before.integral)
             pid(2.0, y)
@@ -252,7 +252,7 @@ def test_a_wrong_out_is_refused_and_changes_nothing(out):
 def test_out_is_for_numpy():
     pytest.importorskip("jax")
     pid = bp.BatchPID(bp.make_params(3, 1.0, dtype=np.float32), 5, DT, "jax")
-    with pytest.raises(InvalidArgumentError, match=r"out: .*not for this backend"):
+    with pytest.raises(InvalidArgumentError, match="for backend 'numpy' alone"):
         pid(1.0, np.zeros((5, 3)), out=np.zeros((5, 3), np.float32))
     with pytest.raises(InvalidArgumentError, match="threads"):
         bp.BatchPID(bp.make_params(3, 1.0), 5, DT, threads=0)

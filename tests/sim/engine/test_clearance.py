@@ -113,7 +113,7 @@ def test_a_link_that_is_welded_far_out_stops_at_an_obstacle(tmp_path, monkeypatc
     hinge = joint("j", "a", "b", "continuous", origin="0 0 0")
     weld = joint("k", "b", "c", "fixed", "", "1.5 0 0")
     arm = Robot.load(write(tmp_path, robot(*parts, hinge, weld)), self_collision="urdf")
-    options = {"ticks": 300, "wrenches": ["c"], "ground": False}
+    options = {"ticks": 300, "wrenches": ["c"]}
     ours, theirs = (motion(arm, monkeypatch, proofs, **options) for proofs in (True, False))
     for one, other in zip(ours, theirs, strict=True):
         assert_identical(one, other)

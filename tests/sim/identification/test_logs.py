@@ -45,7 +45,7 @@ def read(robot, folder, columns, kind=None, **reading):
 
 
 def test_columns_are_found_by_name_in_the_order_of_the_robot(robot, tmp_path):
-    others = {"mode": ["idle"] * 200, "note": [""] * 200, "setpoint_rate:elbow": TIME}
+    others = {"mode": ["idle"] * 200, "setpoint_rate:elbow": TIME}
     (log,) = read(robot, tmp_path, table(**others))
     assert (log.joints, log.kind, log.held) == ((0, 1), "setpoint", False)
     np.testing.assert_allclose(

@@ -49,7 +49,7 @@ def test_copies_go_on_as_the_original(engine: str, workers: int, options: dict[s
 def test_a_runner_of_another_number_of_envs_or_control_refuses_it() -> None:
     with Runner(ARM, 2, workers=0) as runner:
         snapshot = runner.snapshot()
-        with pytest.raises(InvalidArgumentError, match="with num_envs"):
+        with pytest.raises(InvalidArgumentError, match="another num_envs"):
             runner.restore(snapshot.for_envs([0, 1, 1]))
     with (
         Runner(ARM, 3, workers=0, control="drive") as other,
