@@ -256,7 +256,7 @@ def test_what_a_scene_does_not_have_is_refused(load):
     robot = load(ARM.replace('density="200"', 'density="100"'))
     with (
         Runner(robot, 1, workers=0, engine="mujoco") as runner,
-        pytest.raises(InvalidArgumentError, match="with mjcf"),
+        pytest.raises(InvalidArgumentError, match="another mjcf"),
     ):
         runner.restore(kept)
     robot = load(ARM.replace('density="200"', 'density="150"'))
