@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -21,9 +21,6 @@ from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
 from batchpid.sim.robot.tables import Shape
 from batchpid.sim.robot.xml import LARGEST, LFS_POINTER, parse_bytes
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
 
 FORMATS = (".stl", ".obj", ".dae", ".glb")
 SIZE_LIMIT = 2**27  # bytes of a mesh file
@@ -89,7 +86,7 @@ def _ros_packages(package: str) -> Iterator[Path]:
             yield from sorted(root.glob(pattern))
 
 
-def read_mesh(path: str | Path) -> Trimesh:
+def read_mesh(path: str | Path) -> Any:
     """Return the result of ``trimesh`` for a mesh file, in metres. Raises errors of many types."""
     from trimesh import load
 
