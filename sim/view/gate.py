@@ -17,7 +17,6 @@ from typing import Any
 
 import websockets.asyncio.server as websocket_server
 
-from batchpid.arrays.array_types import T
 from batchpid.errors import BatchPIDError
 
 HOST = "127.0.0.1"
@@ -49,7 +48,7 @@ class Gate:
             return "the token is missing; open the address that was printed"
         return None
 
-    def start(self, make: Callable[[], T]) -> T:
+    def start(self, make: Callable[[], Any]) -> Any:
         """Return the server of viser that ``make()`` starts, behind this gate."""
         serve = websocket_server.serve
         handlers = []
