@@ -118,7 +118,7 @@ def names(argument: str, value: Any, count: int | None = None) -> list[str]:
         )
     if count is not None and len(value) != count:
         problem = f"must hold {count} names"
-        raise InvalidArgumentError(argument, problem, value=value, remedy="give one for each")
+        raise InvalidArgumentError(argument, problem, value=value, remedy="pass that many")
     if len(set(value)) != len(value):
         remedy = "name each once"
         raise InvalidArgumentError(argument, "repeats a name", value=value, remedy=remedy)
@@ -305,7 +305,7 @@ def within(
         near,
         f"is beyond +-{far:g}",
         joint_names,
-        remedy="give what a robot can have",
+        remedy="check the unit",
     )
     return rows
 

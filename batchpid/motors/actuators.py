@@ -145,7 +145,9 @@ class Actuators(Record, _ActuatorsFields):
             present.pop("dtype", None)
         if not self.num_joints and "joints" not in options:
             remedy = "build them with make_actuators(), or give joints="
-            raise InvalidArgumentError("joints", "is not known: every effect is off", remedy=remedy)
+            raise InvalidArgumentError(
+                "joints", "is missing, and every effect is off", remedy=remedy
+            )
         return make_actuators(**{"joints": self.num_joints, **present, **options})
 
     def __repr__(self) -> str:

@@ -41,7 +41,7 @@ def samples_of(longest: Array, dt: float) -> int:
     """
     if is_traced(longest) or is_traced(dt):
         raise InvalidArgumentError(
-            "max_delay", "is traced, so that it is not known", remedy="pass samples= to init"
+            "max_delay", "is traced: its value is unknown", remedy="pass samples= to init"
         )
     count = math.floor(float(longest[0, 0]) / dt + _NEAR) + 2
     if count > MOST_SAMPLES:

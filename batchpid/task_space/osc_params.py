@@ -251,6 +251,6 @@ def _checked(params: OSCParams) -> OSCParams:
     """
     for name, leaf in params.leaves().items():
         if leaf.shape[0] not in (1, params.num_envs):
-            problem = f"has rows for {leaf.shape[0]} envs, but others for {params.num_envs}"
+            problem = f"has rows for {leaf.shape[0]} envs, but other options for {params.num_envs}"
             raise InvalidArgumentError(name, problem, remedy="give one row, or one for each env")
     return frozen(params)

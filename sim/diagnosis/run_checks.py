@@ -138,7 +138,7 @@ class MovingSetpointCheck:
         warn(
             "setpoint moves in every tick without its rate: under these gains joint"
             f" {self._robot.joint_names[joint]!r} follows {1e3 * self._lag[joint]:.0f} ms behind"
-            " (kp (1 - b) / ki); pass setpoint_rate, such as the change over a tick by the tick, or"
+            " (kp (1 - b) / ki); pass setpoint_rate, such as (setpoint - last setpoint) / tick, or"
             " use gains with setpoint_weight=1",
             MovingSetpointWarning,
         )

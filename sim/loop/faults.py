@@ -65,7 +65,7 @@ class Fault(NamedTuple):
             "speed": "it is faster than speed_limit",
             "effort": "the effort that its controller returned is not finite",
         }
-        cause = texts.get(self.cause, f"the {self.cause} given for it is not finite")
+        cause = texts.get(self.cause, f"its {self.cause} is not finite")
         if self.action == "hold":
             action = "held until it is reset"
         else:

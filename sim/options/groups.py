@@ -244,7 +244,7 @@ class Scene(OptionGroup):
             problem = "has no effect without collisions"
             raise InvalidArgumentError("ground_friction", problem, remedy="leave it out")
         if draws.gravity is not None and self.build is not None:
-            problem = "cannot change in scenes of build, which SAPIEN does not build anew"
+            problem = "cannot vary in scenes with build, which SAPIEN builds once"
             raise InvalidArgumentError("gravity", problem, remedy="leave out one of them")
 
     def _check_without_collisions(self, robot: Robot) -> None:
@@ -289,7 +289,7 @@ class Scene(OptionGroup):
             choice(argument, link, [link.name for link in robot.links])
             if bodies[link].link == root and (argument == "wrenches" or robot.fixed_base):
                 problem = f"names {link!r}, which no joint moves"
-                remedy = "name one further along"
+                remedy = "name a link beyond a joint"
                 raise InvalidArgumentError(argument, problem, remedy=remedy)
         return links
 

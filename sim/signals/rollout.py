@@ -375,7 +375,7 @@ class Rollout:
         if robot is None:
             robot = self.info.description
         if robot is None:
-            problem = "of this run is not known"
+            problem = "is unknown for this run"
             remedy = "pass it: rollout.findings(Robot.load(...))"
             raise InvalidArgumentError("robot", problem, remedy=remedy)
         return unsettled_findings(self, robot)

@@ -188,7 +188,7 @@ def _call(
                 "returned something other than entities and names of the robot's links",
                 env=env,
                 value=item if isinstance(item, str) else type(item).__name__,
-                remedy="return the entities and links whose poses are wanted, or None",
+                remedy="return the entities and links for runner.poses(), or None",
             )
     return watched
 

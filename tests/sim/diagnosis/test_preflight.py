@@ -32,7 +32,7 @@ def codes(findings: list[Finding]) -> dict[str, Finding]:
             "warning",
             "link 'arm' .1 kg.: no <inertial>.*collision shapes, at 1000",
         ),
-        (one_joint(arm=""), "no-inertia", "warning", "link 'arm': .*1e-6 kg, without load"),
+        (one_joint(arm=""), "no-inertia", "warning", "link 'arm': .*1e-6 kg that carries"),
         (
             robot(link("b"), link("m", ""), link("a"), joint("h", "b", "m"), joint("k", "m", "a")),
             "no-inertia",
