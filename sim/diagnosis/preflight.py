@@ -291,6 +291,8 @@ class _Preflight:
                 remedy = "pass continuous= to make_params, or use robot.params()"
                 self._warn("continuous", text, remedy, joint.name)
             if wraps[index] and not joint.continuous:
-                text = "continuous in params, not in the URDF: the short way may pass the limits"
+                text = (
+                    "continuous in params, not in the URDF: the short way round may exceed limits"
+                )
                 remedy = "leave it out of continuous="
                 self._warn("continuous", text, remedy, joint.name)
