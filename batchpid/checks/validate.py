@@ -22,7 +22,7 @@ from batchpid.errors import InvalidArgumentError
 S = TypeVar("S", bound=str)
 T = TypeVar("T")
 LONGEST_STEP = 1.0
-"""Longest time step of a loop [s]; a larger number is taken for a rate."""
+"""Longest time step of a loop [s]; a larger number is refused as a rate in Hz."""
 AxisKind = Literal["joint", "entry"]
 
 
@@ -62,7 +62,9 @@ def positive(argument: str, value: object, unit: str) -> float:
 
 
 def time_step(argument: str, value: object) -> float:
-    """Return ``value`` as a time step [s]; above :data:`LONGEST_STEP` it is taken for a rate."""
+    """Return ``value`` as a time step [s]; a value above :data:`LONGEST_STEP` is refused as a rate
+    in Hz.
+    """
     value = positive(argument, value, "s")
     if value > LONGEST_STEP:
         problem = f"is longer than {LONGEST_STEP:g} s, and looks like a rate in Hz"

@@ -53,8 +53,8 @@ def samples_of(longest: Array, dt: float) -> int:
 
 
 def discretise(delay: Array, dt: Array, history: Array, begin: int = 0) -> Delay:
-    """Return ``delay`` (1 | envs, joints) [s] at ``dt`` [s] for ``history`` (envs, samples,
-    numbers), its longest.
+    """Return ``delay`` (1 | envs, joints) [s] in samples of ``dt`` [s], at most the length of
+    ``history`` (envs, samples, numbers).
 
     The joints' values are those from number ``begin`` of a sample on.
     """

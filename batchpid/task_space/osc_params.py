@@ -98,7 +98,9 @@ WITHOUT_EFFECT = {
     "integral_limit": ("integral_gain", False, "integral_gain is not given"),
     "limit_stiffness": ("limit_margin", False, "limit_margin is not given"),
 }
-"""Options without effect where another one is given (True), or is not (False), and the reason."""
+"""Options that have no effect if another option is given (True) or missing (False): that option,
+the flag, the reason.
+"""
 
 
 class OSCParams(Record, _OSCParamsFields):

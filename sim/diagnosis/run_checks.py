@@ -103,8 +103,8 @@ class MovingSetpointCheck:
         self.is_watching = not self._has_warned and bool((self._lag > LAG).any())
 
     def see(self, setpoints: Float64, rated: bool, seconds: float) -> None:
-        """Look at the setpoints of ticks (ticks, envs, dof) of ``seconds`` each, which are
-        ``rated`` or not, and warn of those that move.
+        """Check the setpoints of ticks (ticks, envs, dof) of ``seconds`` each; warn of moving
+        setpoints without rates (``rated`` False).
         """
         if not self.is_watching:
             return

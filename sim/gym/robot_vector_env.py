@@ -286,8 +286,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         return self.step_wait()
 
     def step_async(self, actions: ArrayLike) -> None:
-        """Begin a step, which the workers make while the caller computes something else, and
-        return.
+        """Begin a step and return; the workers run it while the caller computes something else.
 
         Raises
         ------

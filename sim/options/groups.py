@@ -42,7 +42,8 @@ Backend = Literal["numpy", "jax"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
 Place = Literal["snapshot", "recording", "scene", "restored", "processes", "next commands"]
-"""Where an option is kept, or why a snapshot can be restored in a runner with another value.
+"""Places that hold the value of an option, and reasons why a snapshot can be restored in a runner
+with another value.
 
 - "snapshot": it must be the same in the runner that restores the snapshot;
 - "recording": a field of :class:`batchpid.sim.RunInfo`;
@@ -56,7 +57,7 @@ Place = Literal["snapshot", "recording", "scene", "restored", "processes", "next
 
 
 class Option(NamedTuple):
-    """Where an argument of a Runner is kept and shown, by :func:`option`."""
+    """Places that hold an argument of a Runner, and its flag; made by :func:`option`."""
 
     places: Mapping[str, str]
     """Attribute of :class:`batchpid.sim.RunnerOptions` that each :data:`Place` keeps; "" for the
@@ -67,8 +68,8 @@ class Option(NamedTuple):
 
 
 def option(*places: Place, flag: str = "", **attributes: str) -> Option:
-    """Return the option that ``places`` keep; ``attributes`` are further places, with the attribute
-    that each keeps.
+    """Return the option that ``places`` hold; ``attributes`` are further places, with the attribute
+    that each holds.
     """
     return Option(dict.fromkeys(places, "") | attributes, flag)
 

@@ -259,7 +259,7 @@ def _substeps(source: str, time: Float64, lines: list[int], timestep: float) -> 
     late = np.abs(time - expected) > SHARE * timestep
     if late.any():
         row = int(late.argmax())
-        problem = f"line {lines[row]}: time is {time[row]:.9g} s, not {expected[row]:.9g} s"
+        problem = f"line {lines[row]}: time is {time[row]:.9g} s, and not {expected[row]:.9g} s"
         remedy = f"begin at 0 or {dt:g} s, with rows whole sim steps of {timestep:g} s apart"
         raise error(source, problem, remedy)
     if first + len(time) == 1:

@@ -63,7 +63,7 @@ class TickRecorder(Protocol):
     path: Path
 
     def prepare(self) -> None:
-        """Return, or raise, before the next tick begins: whether it can be recorded."""
+        """Prepare for the next tick; raise if it cannot be recorded."""
 
     def append(self, time_: float, command: Command, observation: Observation) -> None:
         """Record the state at ``time_`` [s] after a tick under ``command`` (envs, ...), which may

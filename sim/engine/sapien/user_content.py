@@ -23,8 +23,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import Build, SceneSpec
 
 Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
-"""Links of a robot by name: the entity that each is part of, and its pose in that, None for the
-same.
+"""Entity of each link of a robot, by name, and the pose of the link in it; None for the same frame.
 """
 
 
