@@ -198,7 +198,7 @@ class OperationalSpace:
         return self._advance(state, setpoint, qpos, qvel, passive)[:2]
 
     @property
-    def reporting(self) -> Callable[..., tuple[Any, Any, Any]] | None:
+    def reporting(self) -> Callable[..., tuple[Array, Array, Array]] | None:
         """Call that also returns the joints (envs, dof) whose effort the limits have changed.
 
         None in a subclass that defines ``__call__``.

@@ -5,7 +5,7 @@ read-only views.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, wraps
 from types import NoneType
 from typing import Any, TypeVar
@@ -33,7 +33,7 @@ def namespace(*leaves: Array) -> ArrayModule:
     return np
 
 
-def in_dtype_of(params: Any, *arrays: Array) -> list[Array]:
+def in_dtype_of(params: Iterable[Array], *arrays: Array) -> list[Array]:
     """Return ``arrays`` in the dtype of the floats in ``params``, a named tuple; None stays
     None.
     """

@@ -108,7 +108,7 @@ def instance(argument: str, value: object, kind: type[T], remedy: str) -> T:
     return value
 
 
-def names(argument: str, value: Any, count: int | None = None) -> list[str]:
+def names(argument: str, value: Sequence[str], count: int | None = None) -> list[str]:
     """Return ``value`` as a list of different names, ``count`` of them if given."""
     # A string is a sequence of names, too, and never meant.
     sequence = isinstance(value, Sequence) and not isinstance(value, str)
@@ -242,7 +242,7 @@ def array(
 def entries(
     argument: str,
     values: NDArray[Any],
-    good: Any,
+    good: ArrayLike,
     problem: str,
     names: Sequence[str] | None = None,
     *,

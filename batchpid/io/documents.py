@@ -286,7 +286,7 @@ def render(document: Document, format: str) -> str:
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
 
 
-def is_number(entry: Any) -> bool:
+def is_number(entry: object) -> bool:
     """Return whether an entry is a number, an infinity included."""
     whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
     return whole or isinstance(entry, float) or entry in ("inf", "-inf")

@@ -168,7 +168,7 @@ def checked_dt(dt: Array) -> Array:
     return time_step("dt", dt)
 
 
-def _as_array(name: str, value: Any, kinds: str = "iuf") -> Array:
+def _as_array(name: str, value: Array, kinds: str = "iuf") -> Array:
     """Return ``value`` as an array of NumPy; arrays of JAX are returned unchanged."""
     is_own = type(value) is np.ndarray
     if (is_own and value.dtype.kind in kinds) or (

@@ -42,7 +42,7 @@ is left for inertias that change between two refreshes.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
@@ -178,7 +178,7 @@ def refresh(
 
 def advance(
     friction: Friction, state: FrictionState, effort: Array, velocity: Array
-) -> tuple[FrictionState, Any]:
+) -> tuple[FrictionState, Array]:
     """Advance the model by one step; return the state and the effort to apply (envs, joints) [N m
     or N].
 

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from batchpid.arrays.array_types import Document
+from batchpid.arrays.array_types import Document, Progress, T
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
@@ -290,7 +290,7 @@ def check_output(
     raise InvalidArgumentError(argument, problem, value=str(path), remedy=remedy)
 
 
-def write_figures(path: Path, figures: Any) -> None:
+def write_figures(path: Path, figures: object) -> None:
     """Write figures as JSON: arrays as lists, named tuples and mappings as objects, null for NaN
     and infinity.
     """
@@ -312,7 +312,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
+def bar(label: str, **options: Any) -> Progress[T]:
     """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; ``options``
     go to tqdm.
 

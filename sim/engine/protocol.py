@@ -253,7 +253,7 @@ class EnginePack(Protocol):
         gravity: bool,
         coriolis: bool,
         velocities: bool,
-        speed_limit: Any,
+        speed_limit: Float64 | None,
         drives: bool = False,
     ) -> CompiledStep:
         """Return the sim step of the present robots.

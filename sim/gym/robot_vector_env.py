@@ -165,7 +165,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         Actions are clipped to their space, and observations to theirs.
         """
 
-    def runner_options(self) -> Mapping[str, Any]:
+    def runner_options(self) -> Document:
         """Return the options of the Runner that belong to the task; the caller cannot give these.
         Default: none.
         """
@@ -378,7 +378,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             pictures.append(painter.picture(row.qpos, row.base_pose))
         return tuple(pictures)
 
-    def close_extras(self, **_: Any) -> None:
+    def close_extras(self, **_: object) -> None:
         """Close the runner."""
         self.runner.close()
 

@@ -5,7 +5,6 @@ sensors of links; pushes of bases.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +78,7 @@ def make_pack(
     size: int,
     first_env: int,
     draws: Draws | None,
-    workspace: dict[Any, Any],
+    workspace: object,
 ) -> EnginePack:
     """Return the pack of ``size`` envs; without ``draws`` all robots equal the model."""
     randomization = options.randomization

@@ -112,7 +112,7 @@ class EventLog:
     """
 
     def __init__(
-        self, num_envs: int, field: str, none: int, read: Callable[[int, Arrays], Any]
+        self, num_envs: int, field: str, none: int, read: Callable[[int, Arrays], object]
     ) -> None:
         self.events: tuple[Any, ...] = ()
         """Latest last."""

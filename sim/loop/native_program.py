@@ -76,7 +76,7 @@ class TickProgram:
     """
 
     def __init__(
-        self, setup: Setup, buffers: Buffers, table: Table, noise: Any, reads_force: bool
+        self, setup: Setup, buffers: Buffers, table: Table, noise: Pytree, reads_force: bool
     ) -> None:
         _, pack, layout, constants, _ = setup
         self._setup, self._buffers = setup, buffers

@@ -51,7 +51,7 @@ class Snapshot:
     """
     actuators: bp.Actuators | None = None
 
-    def check_options(self, about: Mapping[str, Any]) -> None:
+    def check_options(self, about: Document) -> None:
         """Raise InvalidArgumentError if a runner with options ``about`` cannot restore it."""
         others = [key for key, ours in about.items() if self.about.get(key) != ours]
         if others:

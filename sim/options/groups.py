@@ -95,7 +95,7 @@ class OptionGroup:
         """
         return self
 
-    def changed(self, **values: Any) -> Self:
+    def changed(self, **values: object) -> Self:
         """Return the options with other ``values``."""
         # Without the checks of __post_init__: these values have passed them.
         made = object.__new__(type(self))

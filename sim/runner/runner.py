@@ -9,7 +9,7 @@ editors and readers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from inspect import Signature, signature
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Progress
 from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
@@ -299,7 +300,7 @@ class Runner(SingleOwner):
         setpoint_rates: ArrayLike | None = None,
         setpoint_accelerations: ArrayLike | None = None,
         feedforwards: ArrayLike | None = None,
-        progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
+        progress: Progress[int] | None = None,
     ) -> Rollout:
         """Run one tick for each row of ``setpoints`` and record every observation.
 

@@ -146,7 +146,7 @@ class NodeWorker(Worker):
     """Caller's end of a node."""
 
     def __init__(
-        self, start: Start, shared: SharedArrays, cluster: Cluster, pool_type: Any
+        self, start: Start, shared: SharedArrays, cluster: Cluster, pool_type: type
     ) -> None:
         super().__init__(start, shared)
         self._cluster = cluster

@@ -225,7 +225,7 @@ class ProcessWorker(Worker):
         return WorkerLost(f"worker {self.label} {cause}")
 
 
-def pickled(message: Any) -> bytes:
+def pickled(message: object) -> bytes:
     """Return the start message of a worker as bytes, with functions and classes that the worker
     cannot import.
 

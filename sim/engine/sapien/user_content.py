@@ -18,7 +18,7 @@ from sapien.physx import (
 from sapien.wrapper.actor_builder import ActorBuilder
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
-from batchpid.arrays.array_types import Float32, SapienScene
+from batchpid.arrays.array_types import Float32
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import Build, SceneSpec
 
@@ -74,7 +74,7 @@ class SceneContent:
     """
 
     def __init__(
-        self, spec: SceneSpec, build: Build, scene: SapienScene, env: int, links: Frames
+        self, spec: SceneSpec, build: Build, scene: HeadlessScene, env: int, links: Frames
     ) -> None:
         # What exists now is the robot and the ground; the rest is the user's.
         before = {entity.per_scene_id for entity in scene.entities}
@@ -140,7 +140,7 @@ class SceneContent:
         return np.array(rows, np.float32).reshape(len(rows), 7)
 
 
-def _check_shapes(scene: SapienScene, env: int, collisions: bool) -> None:
+def _check_shapes(scene: HeadlessScene, env: int, collisions: bool) -> None:
     """Raise InvalidArgumentError if an entity of ``scene``, which belongs to env ``env``, has a
     collision shape without ``collisions``, or a convex mesh of negative scale.
     """
@@ -162,7 +162,7 @@ def _check_shapes(scene: SapienScene, env: int, collisions: bool) -> None:
 
 
 def _call(
-    build: Build, scene: SapienScene, env: int, links: Frames
+    build: Build, scene: HeadlessScene, env: int, links: Frames
 ) -> list[tuple[sapien.Entity, sapien.Pose | None]]:
     """Return the entities and frames that ``build`` returns; its errors become an
     InvalidArgumentError.
