@@ -391,7 +391,7 @@ def windows_of(data: Sequence[LogData]) -> list[Window]:
     every = 1 + sum(len(part.log.time) for part in data) // MOST_ROWS
     for number, part in enumerate(data):
         total = len(part.motion.qpos) - 1
-        share = {None: 1 - HELD_OUT, False: 1.0, True: 0.0}[part.log.settings.held_out]
+        share = {None: 1 - HELD_OUT, False: 1.0, True: 0.0}[part.log.held_out]
         split = round(share * total)
         if part.drive.params is not None:
             windows.append(_window(number, part, (0, total), split, every))

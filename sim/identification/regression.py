@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +32,7 @@ from batchpid.sim.identification.simulator import (
     PlantCandidates,
     SimulatedControl,
 )
+from batchpid.sim.robot.robot import Robot
 
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
@@ -52,6 +54,8 @@ MOVES = 0.4
 """Speed, over its root mean square, below which a joint may stick."""
 WEIGHT = 0.02
 """Weight of the prior at strength 1, over the effort's size."""
+BEYOND = 3.0
+"""Effort over the robot's limit from which it looks like another unit."""
 EVIDENCE = 0.7
 """Least decrease of the cost for another reading of a log to be reported."""
 WORST = -1.0
@@ -101,8 +105,9 @@ class Guess(NamedTuple):
     costs: Float64
     """log(mean square of the residual / mean square of the motor's effort) of each joint."""
 
+    @property
     def cost(self) -> float:
-        """Return the mean of the costs."""
+        """Mean of the costs."""
         return float(self.costs.mean())
 
     @property
@@ -190,11 +195,11 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
             values["delay"] = np.array([delay])
             values["setpoint_delay"] = np.array([setpoint_delay])
             options.append(Guess(values, costs))
-        guesses.append(min(options, key=Guess.cost))
+        guesses.append(min(options, key=attrgetter("cost")))
     # Logs show the sum of both delays; armature and damping can hide how it is divided.
     # Setpoints that were logged late are the last explanation.
-    least = min(map(Guess.cost, guesses)) + ALIKE
-    alike = sorted([guess for guess in guesses if guess.cost() < least], key=Guess.cost)
+    least = min(guess.cost for guess in guesses) + ALIKE
+    alike = sorted([guess for guess in guesses if guess.cost < least], key=attrgetter("cost"))
     usual = [guess for guess in alike if guess.values["setpoint_delay"][0] > -1e-9]
     return usual or alike
 
@@ -257,44 +262,62 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     return [*values, bias, float(np.log((residual**2).mean() / motor + 1e-12))]
 
 
-def better_reading(data: LogData, names: Sequence[str]) -> str:
+def better_reading(robot: Robot, data: LogData, guess: Guess) -> str:
     """Return the reading of a log that explains its efforts far better than the present one, in
     words; "" for none.
 
-    Signs, exchanged joints and units are tried. ``names`` are the joints' names.
+    Signs, exchanged joints and units are tried if the ``guess`` is odd or efforts are far above the
+    robot's limits.
     """
     log = data.log
-    first = log.part(log.time < log.time[0] + TRIED, log.command_time < log.time[0] + TRIED)
+    limits = robot.effort_limit[list(log.joints)]
+    beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > BEYOND * limits
+    if guess.odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
+        part = log.part(log.time < log.time[0] + TRIED, log.command_time < log.time[0] + TRIED)
 
-    def guess(log: Log) -> Guess:
-        return regress([data._replace(log=log, motion=smooth(log, data.drive.timestep))])[0]
+        def changed(on_qpos: Float64, on_command: Float64) -> Guess:
+            other = replace(part, qpos=part.qpos @ on_qpos, command=part.command @ on_command)
+            motion = smooth(other, data.drive.timestep)
+            return regress([data._replace(log=other, motion=motion)])[0]
 
-    present = guess(first)
-    odd = np.flatnonzero(present.odd).tolist()
-    costs = {words: guess(log).cost() for words, log in _readings(first, names, odd)}
-    best = min(costs.values())
-    if best > min(present.cost() - EVIDENCE, WORST):
-        return ""
-    return next(words for words, cost in costs.items() if cost < best + ALIKE)
+        same = np.eye(len(log.joints))
+        present = changed(same, same)
+        names = [robot.joint_names[joint] for joint in log.joints]
+        costs = dict[str, float]()
+        for words, *matrices in _readings(log.kind, names, np.flatnonzero(present.odd).tolist()):
+            costs[words] = changed(*matrices).cost
+        best = min(costs.values())
+        if best < min(present.cost - EVIDENCE, WORST):
+            return next(words for words, cost in costs.items() if cost < best + ALIKE)
+    delay = float(guess.values["setpoint_delay"][0])
+    if delay < -1e-9:
+        return f"setpoints that were logged about {-1e3 * delay:.0f} ms late"
+    return ""
 
 
-def _readings(log: Log, names: Sequence[str], odd: list[int]) -> Iterator[tuple[str, Log]]:
-    """Yield other readings of the ``odd`` joints of a log, in words."""
-    eye = np.eye(len(names))
+def _readings(
+    kind: str, names: Sequence[str], odd: list[int]
+) -> Iterator[tuple[str, Float64, Float64]]:
+    """Yield other readings of the ``odd`` joints: words, and the matrices (joints, joints) that
+    correct rows of positions and of commands.
+    """
+    same = np.eye(len(names))
     changes = dict[str, Float64]()
     for joint in odd:
-        changes[f"of {names[joint]} with the other sign"] = eye - 2 * np.diag(eye[joint])
-    for first, second in combinations(odd, 2):
+        changes[f"of {names[joint]} with the other sign"] = same - 2 * np.diag(same[joint])
+    for pair in map(list, combinations(range(len(names)), 2)):
+        # One of two exchanged joints may look as usual.
+        if not {*pair} & {*odd}:
+            continue
         order = np.arange(len(names))
-        order[[first, second]] = second, first
-        changes[f"of {names[first]} and {names[second]} exchanged"] = eye[order]
+        order[pair] = pair[::-1]
+        changes[f"of {names[pair[0]]} and {names[pair[1]]} exchanged"] = same[order]
     for words, matrix in changes.items():
-        command = replace(log, command=log.command @ matrix)
-        yield f"{log.kind} {words}", command
-        yield f"qpos {words}", replace(log, qpos=log.qpos @ matrix)
-        yield f"qpos and {log.kind} {words}", replace(command, qpos=log.qpos @ matrix)
-    yield f"{log.kind} of all joints with the other sign", replace(log, command=-log.command)
-    if log.kind == "effort":
-        yield "effort in thousandths of SI units", replace(log, command=1e-3 * log.command)
+        yield f"{kind} {words}", same, matrix
+        yield f"qpos {words}", matrix, same
+        yield f"qpos and {kind} {words}", matrix, matrix
+    yield f"{kind} of all joints with the other sign", same, -same
+    if kind == "effort":
+        yield "effort in thousandths of SI units", same, 1e-3 * same
     else:
-        yield "setpoints in degrees", replace(log, command=np.radians(log.command))
+        yield "setpoints in degrees", same, np.radians(same)

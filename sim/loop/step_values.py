@@ -169,7 +169,7 @@ class Values(NamedTuple):
     """Noise of the sensors in this step, if it is drawn in advance."""
     limited: Array = None
     """Joints whose effort the caller's own controller has limited (M, dof); None if it does not
-    say.
+    report them.
     """
     outputs: Outputs = Outputs()
 

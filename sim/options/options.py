@@ -149,7 +149,7 @@ class RunnerOptions(RunnerKeywords):
             remedy = "build the extensions, or use backend='numpy'"
             raise InvalidArgumentError("backend", problem, remedy=remedy)
         for argument, problem, is_lacking in (
-            ("control", "has no law to compile", self.control == "drive"),
+            ("control", "is 'drive'", self.control == "drive"),
             ("compensate", "needs NumPy's force", lacks_force and "gravity" in self.compensate),
             ("randomization", "is given", self.randomization is not None),
             ("guard", "is given", self.guard is not None),
@@ -400,5 +400,5 @@ def _plain(value: Any) -> object:
 
 def _not_in_program(argument: str, problem: str) -> InvalidArgumentError:
     """Return the error for an option that the program of backend "jax" does not have."""
-    problem = f"{problem}, which the program of backend 'jax' does not have"
+    problem = f"{problem}, which backend 'jax' does not support"
     return InvalidArgumentError(argument, problem, remedy="use backend='numpy'")

@@ -239,7 +239,7 @@ def pickled(message: object) -> bytes:
         return reply
     except Exception as error:
         problem = f"cannot be sent to a worker: {error}"
-        remedy = "let control and build hold nothing that cannot be pickled"
+        remedy = "keep objects that cannot be pickled out of control and build"
         raise InvalidArgumentError("options", problem, remedy=remedy) from error
 
 

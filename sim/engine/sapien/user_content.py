@@ -24,8 +24,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import Build, SceneSpec
 
 Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
-"""Links of a robot by name: the entity that each is part of, and its pose in that, None for the
-same.
+"""Entity of each link of a robot, by name, and the pose of the link in it; None for the same frame.
 """
 
 
@@ -189,7 +188,7 @@ def _call(
                 "returned something other than entities and names of the robot's links",
                 env=env,
                 value=item if isinstance(item, str) else type(item).__name__,
-                remedy="return the entities and links whose poses are wanted, or None",
+                remedy="return the entities and links for runner.poses(), or None",
             )
     return watched
 
