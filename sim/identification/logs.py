@@ -235,7 +235,7 @@ def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
     left_out = ", ".join(sorted(set(others.values())))
     for column in others:
         del samples[column]
-    needed = {reading.topic: "qpos:", reading.command_topic: ("setpoint:", "effort:")}
+    needed = {reading.topic: ("qpos:",), reading.command_topic: ("setpoint:", "effort:")}
     for topic, quantities in needed.items():
         if topic and not any(column.startswith(quantities) for column in samples):
             problem = f"has no values in the topic {topic!r} of the robot's joints"
