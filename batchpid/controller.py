@@ -146,7 +146,7 @@ class BatchPID:
     @params.setter
     def params(self, params: PIDParams) -> None:
         if _checked(params).num_joints != self.num_joints:
-            problem = f"hold {params.num_joints} joints, not {self.num_joints}"
+            problem = f"are for {params.num_joints} joints, not {self.num_joints}"
             raise InvalidArgumentError("params", problem, remedy="give one gain per joint")
         params.check(self.num_envs, self._names)
         check_alone(params._replace(measurement_rate=None), None)
@@ -177,7 +177,7 @@ class BatchPID:
         """Terms of the last call, read-only; None before the first."""
         if not self._engine.terms:
             raise InvalidArgumentError(
-                "terms", "are not kept", remedy="build the BatchPID with terms=True"
+                "terms", "are off", remedy="build the BatchPID with terms=True"
             )
         if self._terms is None:
             return None

@@ -47,7 +47,9 @@ class MeasuredRate(NamedChoice):
 
 
 class PerMassMatrix(NamedChoice):
-    """Gains are of an acceleration, which the whole mass matrix turns into an effort."""
+    """Gains per unit of inertia: the law returns an acceleration, which the mass matrix turns into
+    an effort.
+    """
 
 
 class ImplicitLaw(NamedChoice):

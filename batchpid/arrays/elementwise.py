@@ -131,8 +131,8 @@ def replace_envs(state: T, fresh: T, mask: Array) -> T:
 
 
 def wrap(angle: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:
-    """Return an angle or a difference of angles, less its whole turns; ``turns_per_rad`` is 0 to
-    keep them.
+    """Return an angle, or a difference of angles, wrapped to half a turn on either side of 0; where
+    ``turns_per_rad`` is 0 it is unchanged.
     """
     if turns_per_rad is None:
         return angle

@@ -27,7 +27,7 @@ class Coefficients(NamedTuple):
     decay: Array
     """tau / (tau + dt), the weight of the derivative's old value in its filter."""
     intake: Array
-    """dt / (tau + dt), the weight of the new one."""
+    """dt / (tau + dt), the weight of its new value."""
     effort_min: Array
     effort_max: Array
     effort_step: Array

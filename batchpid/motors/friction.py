@@ -51,7 +51,7 @@ from batchpid.checks.validate import check_time_step
 SHARE = 0.7
 """Share of the deadbeat gain K that is used."""
 LOOKAHEAD = 0.1
-"""Time by which the setpoint is looked ahead to tell the direction of the wanted motion [s]."""
+"""Time ahead at which the setpoint is taken to determine the direction of motion [s]."""
 
 
 class Friction(NamedTuple):

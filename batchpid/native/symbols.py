@@ -105,7 +105,7 @@ class Symbol:
         return self._namespace.apply(name, *arrays)
 
     def __bool__(self) -> NoReturn:
-        raise TypeError("a function that is traced cannot depend on the entries of an array")
+        raise TypeError("a traced function cannot branch on the entries of an array")
 
     def __abs__(self) -> Symbol:
         return self.record("absolute", self)

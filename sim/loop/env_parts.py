@@ -20,7 +20,9 @@ from batchpid.sim.signals.quantities import untouched
 
 Int64 = NDArray[np.int64]
 COUNTS = ("steps", "due", "number")
-"""Sim steps since the reset, those at which the next push is due, and pushes so far."""
+"""Counters of an env: sim steps since the reset, the sim step of the next push, and the number of
+pushes so far.
+"""
 
 
 class ActingDraws:

@@ -40,7 +40,7 @@ class Table(NamedTuple):
     arrays: Arrays
     """(ticks, envs, ...), the same in every run."""
     effort: NDArray[np.float32]
-    """Of the last tick (envs, dof), as the next two."""
+    """Effort of the last tick (envs, dof), as are the next two."""
     saturated: NDArray[np.bool_]
     guarded: NDArray[np.bool_]
     fault: FaultArrays

@@ -176,8 +176,8 @@ def _turns(pack: EnginePack) -> Array:
 def empty_state(
     options: RunnerOptions, law: Pytree, actuators: bp.Actuators | None, stiction: bool, envs: int
 ) -> StepState:
-    """Return a state of the control of ``envs`` envs with this part of the law, in the structure
-    that it has with ``actuators`` (None: without an effect), and with Coulomb friction or without.
+    """Return the state of the control of ``envs`` envs with the state ``law`` of the law, and zeros
+    for the rest: actuators, unless None, and Coulomb friction if ``stiction``.
     """
     rows = np.zeros((envs, options.robot.dof))
     state = StepState(law)

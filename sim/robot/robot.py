@@ -273,10 +273,7 @@ class Robot(RobotDescription):
         if self.actuators is not None and self.actuators.armature is not None:
             own_options["armature"] = np.asarray(self.actuators.armature, float)[0]
         if not self.fixed_base:
-            problem = (
-                "operational space and inverse kinematics need a kinematic tree, which has a fixed"
-                " base"
-            )
+            problem = "operational space and inverse kinematics need a robot with a fixed base"
             raise RobotError(
                 f"{self.path}: {problem}; load the robot with fixed_base=True, or control its"
                 " joints"

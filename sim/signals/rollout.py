@@ -93,7 +93,7 @@ class RunInfo:
     "none".
     """
     engine: str | None = None
-    """Physics engine: "sapien"."""
+    """Physics engine: "sapien" or "mujoco"."""
     physics: str | None = None
     """Solver settings: "accurate", "fast", or the text of a :class:`batchpid.sim.Physics`."""
     collisions: bool | None = None
@@ -111,7 +111,7 @@ class RunInfo:
     params: PIDParams | None = None
     """PID parameters at the start."""
     params_changed: bool = False
-    """True if they were changed in the run, or a snapshot was restored; known of a complete
+    """True if the params changed during the run, or a snapshot was restored; None in an incomplete
     recording.
     """
     actuators: Actuators | None = None
@@ -256,7 +256,7 @@ class Rollout:
     back.
     """
     setpoint: Float64
-    """(ticks, envs, dof) [rad or m]; under control "effort" the effort asked for [N m or N]. For a
+    """(ticks, envs, dof) [rad or m]; under control "effort" the commanded effort [N m or N]. For a
     control that defines its command (ticks, envs, size), in the order of ``info.command.names``.
     """
     observation: Observation
@@ -380,7 +380,7 @@ class Rollout:
         if robot is None:
             robot = self.info.description
         if robot is None:
-            problem = "of this run is not known"
+            problem = "is unknown for this run"
             remedy = "pass it: rollout.findings(Robot.load(...))"
             raise InvalidArgumentError("robot", problem, remedy=remedy)
         return unsettled_findings(self, robot)

@@ -57,8 +57,9 @@ class DataPool:
     def take(
         self, models: list[MjModel], rows: Float64, placed: Sequence[int] = ()
     ) -> list[MjData]:
-        """Return the data of the robots with these ``models``, in the states ``rows``; the states
-        of the rows before are kept in those. The robots ``placed`` get another state at once.
+        """Return the data of the robots with these ``models``, in the states ``rows``. The states
+        of the previous pack are first saved to its rows. The robots ``placed`` get another state
+        next, and are not updated here.
         """
         if self._rows is not rows:
             if self._rows is not None:
