@@ -252,16 +252,14 @@ class EnginePack(Protocol):
         self,
         gravity: bool,
         coriolis: bool,
-        velocities: bool,
         speed_limit: Float64 | None,
         drives: bool = False,
     ) -> CompiledStep:
         """Return the sim step of the present robots.
 
         ``gravity`` and ``coriolis`` select the parts of the passive force that it reads; without
-        both it is zero. Without ``velocities`` it reads zero velocities. The status reports speeds
-        above ``speed_limit`` (dof,), if given. With ``drives`` the targets of the drives may move
-        within a tick.
+        both it is zero. The status reports speeds above ``speed_limit`` (dof,), if given. With
+        ``drives`` the targets of the drives may move within a tick.
         """
 
     @property

@@ -152,7 +152,7 @@ class MujocoPack(ModelPack):
         """Do one sim step of every robot, with constraint efforts on coupled joints."""
         if self.steps_natively:
             if self._own_step is None:
-                self._own_step = self.compiled_step(False, False, True, None)
+                self._own_step = self.compiled_step(False, False, None)
             self._own_step.may_have_failed(self._own_step(self.qf, *np.empty((3, *self.qf.shape))))
             return
         effort = self.qf
@@ -186,7 +186,6 @@ class MujocoPack(ModelPack):
         self,
         gravity: bool,
         coriolis: bool,
-        velocities: bool,
         speed_limit: Float64 | None,
         drives: bool = False,
     ) -> MujocoStep:
