@@ -31,8 +31,8 @@ KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
 LEAST_SHARE = 0.1
 """Least share of the remaining squared error that an effect has to explain to be named."""
-ALIKE = 0.8
-"""Share of the best explanation from which another one is as good."""
+ALIKE = 0.5
+"""Share of the best explanation from which another link is as likely."""
 EXPLAINS = 0.5
 """Share of the position error of the robot as described that a file may leave."""
 
@@ -325,19 +325,20 @@ def advice(fit: Fit) -> str:
         slopes = triangle[:, 1:][:, columns]
         change, *_ = np.linalg.lstsq(slopes, target, rcond=1e-10)
         share = 1 - float(((target - slopes @ change) ** 2).sum() / (target @ target))
-        # A heavier link looks like a lighter other one with weaker motors: take factors near 1.
         factors = (values[columns] + change)[is_factor[columns]]
         effects.append((share, float(np.abs(factors - 1).sum()), name, change[-1]))
-    best = max((share for share, *_ in effects), default=0.0)
-    if best < LEAST_SHARE:
+    share, _, name, _ = max(effects, default=(0.0, 0.0, "", 0.0))
+    if share < LEAST_SHARE:
         return "no further effect that was tried would explain a tenth of the remaining error"
-    alike = [effect for effect in effects if effect[0] > ALIKE * best]
-    share, _, name, size = min(alike, key=lambda effect: effect[1])
-    words = f"would explain {100 * share:.0f} % of the squared error (extras:"
+    words = "would explain {:.0f} % of the squared error (extras: {})"
     if name in KINDS:
-        return f"{name} {words} {name})"
+        return f"{name} {words.format(100 * share, name)}"
+    # A heavier link looks like a lighter other one with weaker motors: take factors near 1.
+    alike = [effect for effect in effects if effect[0] > ALIKE * share and effect[2] not in KINDS]
+    share, _, name, size = min(alike, key=lambda effect: effect[1])
     more = "heavier" if size > 0 else "lighter"
-    return f"link {name} {more} than described {words} mass), or the strengths: weigh it"
+    words = words.format(100 * share, "mass")
+    return f"link {name} {more} than described {words}, or the strengths: weigh it"
 
 
 def draw_motors(
