@@ -17,7 +17,7 @@ from batchpid.native.availability import obstacle
 from batchpid.native.compiled import CompiledLaw
 
 
-def declined(*_: Any) -> Any:
+def declined(*_: object) -> Array:
     """Return NotImplemented, as a fast call does that leaves its work to Python."""
     return NotImplemented
 
@@ -61,14 +61,13 @@ class NumPyBackend:
         """Return ``value`` as an array of this backend."""
         return np.asarray(value, dtype=self.params.dtype)
 
-    def call(self, function: Any, *inputs: Array, **named: Any) -> PIDState:
+    def call(self, function: Callable[..., PIDState], *inputs: Array, **named: Array) -> PIDState:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
-        state: PIDState = function(self.params, *inputs, **named)
-        return state
+        return function(self.params, *inputs, **named)
 
     def step(
         self, state: PIDState, out: Array, *inputs: Array
-    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Any]]:
+    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Array]]:
         """Return the new state, the effort, the terms if they are kept, and a fast call of the next
         steps.
 
@@ -150,7 +149,7 @@ class JAXBackend:
         with own_settings():
             return np.asarray(value, dtype=self.dtype)
 
-    def call(self, function: Any, *inputs: Array, **named: Any) -> PIDState:
+    def call(self, function: Callable[..., PIDState], *inputs: Array, **named: Array) -> PIDState:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
         if function not in self._compiled:
             self._compiled[function] = self._compile(function)
@@ -159,8 +158,8 @@ class JAXBackend:
             return state
 
     def step(
-        self, state: PIDState, out: None, r: Array, y: Array, *rates: Array
-    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Any]]:
+        self, state: PIDState, out: Array, r: Array, y: Array, *rates: Array
+    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Array]]:
         """Return the new state, the effort, the terms if they are kept, and no fast call; ``out``
         is None.
         """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -147,7 +146,7 @@ class BatchPID:
     @params.setter
     def params(self, params: PIDParams) -> None:
         if _checked(params).num_joints != self.num_joints:
-            problem = f"hold {params.num_joints} joints, not {self.num_joints}"
+            problem = f"are for {params.num_joints} joints, not {self.num_joints}"
             raise InvalidArgumentError("params", problem, remedy="give one gain per joint")
         params.check(self.num_envs, self._names)
         check_alone(params._replace(measurement_rate=None), None)
@@ -178,7 +177,7 @@ class BatchPID:
         """Terms of the last call, read-only; None before the first."""
         if not self._engine.terms:
             raise InvalidArgumentError(
-                "terms", "are not kept", remedy="build the BatchPID with terms=True"
+                "terms", "are off", remedy="build the BatchPID with terms=True"
             )
         if self._terms is None:
             return None
@@ -192,7 +191,7 @@ class BatchPID:
         setpoint_rate: Array = None,
         feedforward: Array = None,
         *,
-        out: Any = None,
+        out: Array = None,
     ) -> Array:
         """Return the effort (envs, joints) [N m or N]; arguments as in :func:`batchpid.step`.
 
@@ -279,7 +278,7 @@ class BatchPID:
             for name, value in values.items()
         }
 
-    def _check_out(self, out: Any) -> None:
+    def _check_out(self, out: Array) -> None:
         if self._backend != "numpy":
             problem = "is for backend 'numpy' alone"
             raise InvalidArgumentError("out", problem, remedy="leave it out")
@@ -289,7 +288,7 @@ class BatchPID:
             problem = f"must be a contiguous, writeable array of {dtype} {self._shape}"
             raise InvalidArgumentError("out", problem, remedy="give one, or leave it out")
 
-    def _array(self, name: str, value: Any, exact: bool = False) -> Array:
+    def _array(self, name: str, value: Array, exact: bool = False) -> Array:
         """Return ``value`` as an array of the backend that broadcasts to (envs, joints), or is
         ``exact``-ly that.
         """
@@ -313,5 +312,5 @@ class BatchPID:
         )
 
 
-def _checked(params: Any) -> PIDParams:
+def _checked(params: object) -> PIDParams:
     return instance("params", params, PIDParams, "build them with make_params")

@@ -101,7 +101,7 @@ def minimum_jerk(
     x0, move = _move(start, target)
     if (duration is None) == (max_velocity is None and max_acceleration is None):
         remedy = "give duration=, or max_velocity= and max_acceleration="
-        raise InvalidArgumentError("duration", "or limits are needed, and not both", remedy=remedy)
+        raise InvalidArgumentError("duration", "is needed, or limits, not both", remedy=remedy)
     if duration is not None:
         total = _limits("duration", duration, move)
     else:
@@ -113,7 +113,7 @@ def minimum_jerk(
             )
         )
         if np.isinf(np.minimum(v, a)).any():
-            problem = "and max_acceleration are both infinite for a joint"
+            problem = "is infinite, and so is max_acceleration, for a joint"
             raise InvalidArgumentError("max_velocity", problem, remedy="limit one of them")
         distance = np.abs(move)
         needed = np.maximum(

@@ -113,7 +113,7 @@ class OperationalSpace:
         for name, leaf in params._asdict().items():
             if isinstance(leaf, np.ndarray) and len(leaf) > 1:
                 problem = f"has rows for {len(leaf)} envs"
-                remedy = "give one row: a controller is called for groups of envs"
+                remedy = "give one row for all envs"
                 raise InvalidArgumentError(name, problem, remedy=remedy)
         self._params = frozen(params)
         self._timestep = 1 / 2000
@@ -198,7 +198,7 @@ class OperationalSpace:
         return self._advance(state, setpoint, qpos, qvel, passive)[:2]
 
     @property
-    def reporting(self) -> Callable[..., tuple[Any, Any, Any]] | None:
+    def reporting(self) -> Callable[..., tuple[Array, Array, Array]] | None:
         """Call that also returns the joints (envs, dof) whose effort the limits have changed.
 
         None in a subclass that defines ``__call__``.

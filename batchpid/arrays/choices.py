@@ -6,7 +6,7 @@ registered.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from batchpid.arrays.array_types import Document
 
@@ -47,7 +47,9 @@ class MeasuredRate(NamedChoice):
 
 
 class PerMassMatrix(NamedChoice):
-    """Gains are of an acceleration, which the whole mass matrix turns into an effort."""
+    """Gains per unit of inertia: the law returns an acceleration, which the mass matrix turns into
+    an effort.
+    """
 
 
 class ImplicitLaw(NamedChoice):
@@ -61,7 +63,7 @@ CHOICES: dict[str, Document] = {
     "discretization": {"explicit": None, "implicit": ImplicitLaw()},
 }
 """Options chosen by name, and what each name puts into the params; the first is the default."""
-CHOICE_TYPES: tuple[type[Any], ...] = (
+CHOICE_TYPES: tuple[type, ...] = (
     Everywhere,
     *(type(one) for named in CHOICES.values() for one in named.values() if one is not None),
 )

@@ -5,7 +5,7 @@ read-only views.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, wraps
 from types import NoneType
 from typing import Any, TypeVar
@@ -33,7 +33,7 @@ def namespace(*leaves: Array) -> ArrayModule:
     return np
 
 
-def in_dtype_of(params: Any, *arrays: Array) -> list[Array]:
+def in_dtype_of(params: Iterable[Array], *arrays: Array) -> list[Array]:
     """Return ``arrays`` in the dtype of the floats in ``params``, a named tuple; None stays
     None.
     """
@@ -131,8 +131,8 @@ def replace_envs(state: T, fresh: T, mask: Array) -> T:
 
 
 def wrap(angle: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:
-    """Return an angle or a difference of angles, less its whole turns; ``turns_per_rad`` is 0 to
-    keep them.
+    """Return an angle, or a difference of angles, wrapped to half a turn on either side of 0; where
+    ``turns_per_rad`` is 0 it is unchanged.
     """
     if turns_per_rad is None:
         return angle

@@ -64,7 +64,7 @@ class Field(NamedTuple):
         *,
         infinite: bool = False,
         kind: AxisKind = "joint",
-    ) -> Any:
+    ) -> Array:
         """Return ``values`` (..., envs, joints) after a check of the bounds; values that JAX traces
         are not checked.
 

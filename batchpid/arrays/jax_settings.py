@@ -17,7 +17,7 @@ from typing import Any
 from batchpid.arrays.array_types import DType
 from batchpid.errors import MissingDependencyError
 
-NEEDED: dict[str, tuple[Any, ...]] = {
+NEEDED: dict[str, tuple[object, ...]] = {
     "jax_debug_nans": (False,),
     "jax_debug_infs": (False,),
     "jax_check_tracer_leaks": (False,),

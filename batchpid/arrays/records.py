@@ -243,7 +243,7 @@ class LeafBuilder:
             if envs == 1 or self.num_envs in (1, envs):
                 self.num_envs = max(self.num_envs, envs)
                 return namespace(array).broadcast_to(rows, (envs, self.joints)).copy()
-            expected = f"({self.num_envs}, {self.joints}), as another option has it"
+            expected = f"({self.num_envs}, {self.joints}), like another option"
         problem = f"has shape {array.shape}, not {expected}"
         remedy = "give one value, one per joint, or one per env and joint"
         raise InvalidArgumentError(name, problem, remedy=remedy)

@@ -10,7 +10,6 @@ without leaves.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ def is_leaf(tree: Pytree) -> bool:
     )
 
 
-def leaves(tree: Pytree) -> list[Any]:
+def leaves(tree: Pytree) -> list[Pytree]:
     """Return the leaves of a tree of tuples, in order."""
     if is_leaf(tree):
         return [tree]
@@ -33,7 +32,7 @@ def leaves(tree: Pytree) -> list[Any]:
     return []
 
 
-def mapped(function: Callable[[Any], Any], tree: Pytree) -> Any:
+def mapped(function: Callable[[Pytree], Pytree], tree: Pytree) -> Pytree:
     """Return a tree of tuples with ``function`` applied to its leaves."""
     if is_leaf(tree):
         return function(tree)
@@ -42,12 +41,12 @@ def mapped(function: Callable[[Any], Any], tree: Pytree) -> Any:
     return tree
 
 
-def structure(tree: Pytree) -> Any:
+def structure(tree: Pytree) -> Pytree:
     """Return a tree of tuples with ``...`` in place of each leaf; the result is hashable."""
     return mapped(lambda _: ..., tree)
 
 
-def filled(tree: Pytree, given: Iterator[Any]) -> Any:
+def filled(tree: Pytree, given: Iterator[Pytree]) -> Pytree:
     """Return a :func:`structure` with its placeholders replaced by values of ``given``, in
     order.
     """
@@ -55,7 +54,7 @@ def filled(tree: Pytree, given: Iterator[Any]) -> Any:
 
 
 def flatten(
-    tree: Pytree, separator: str = "/", read: Callable[[Any], Array] = np.asarray, name: str = ""
+    tree: Pytree, separator: str = "/", read: Callable[[Pytree], Array] = np.asarray, name: str = ""
 ) -> Document:
     """Return all values in a tree by name, converted to arrays by ``read``.
 
@@ -75,7 +74,7 @@ def flatten(
 
 def unflatten(
     like: Pytree, named: Mapping[str, Array], separator: str = "/", name: str = ""
-) -> Any:
+) -> Pytree:
     """Return a tree with the structure of ``like`` from the arrays that :func:`flatten`
     returned.
     """
@@ -97,7 +96,7 @@ def parts(tree: Pytree) -> Document:
     return dict(zip(getattr(tree, "_fields", map(str, range(len(tree)))), tree, strict=True))
 
 
-def _rebuilt(like: Pytree, parts: list[Any]) -> Any:
+def _rebuilt(like: Pytree, parts: list[Pytree]) -> Pytree:
     """Return a mapping, tuple or list of the type of ``like`` with other parts."""
     if isinstance(like, Mapping):
         return dict(zip(like, parts, strict=True))

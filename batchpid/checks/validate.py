@@ -22,7 +22,7 @@ from batchpid.errors import InvalidArgumentError
 S = TypeVar("S", bound=str)
 T = TypeVar("T")
 LONGEST_STEP = 1.0
-"""Longest time step of a loop [s]; a larger number is taken for a rate."""
+"""Longest time step of a loop [s]; a larger number is refused as a rate in Hz."""
 AxisKind = Literal["joint", "entry"]
 
 
@@ -62,7 +62,9 @@ def positive(argument: str, value: object, unit: str) -> float:
 
 
 def time_step(argument: str, value: object) -> float:
-    """Return ``value`` as a time step [s]; above :data:`LONGEST_STEP` it is taken for a rate."""
+    """Return ``value`` as a time step [s]; a value above :data:`LONGEST_STEP` is refused as a rate
+    in Hz.
+    """
     value = positive(argument, value, "s")
     if value > LONGEST_STEP:
         problem = f"is longer than {LONGEST_STEP:g} s, and looks like a rate in Hz"
@@ -108,7 +110,7 @@ def instance(argument: str, value: object, kind: type[T], remedy: str) -> T:
     return value
 
 
-def names(argument: str, value: Any, count: int | None = None) -> list[str]:
+def names(argument: str, value: Sequence[str], count: int | None = None) -> list[str]:
     """Return ``value`` as a list of different names, ``count`` of them if given."""
     # A string is a sequence of names, too, and never meant.
     sequence = isinstance(value, Sequence) and not isinstance(value, str)
@@ -118,7 +120,7 @@ def names(argument: str, value: Any, count: int | None = None) -> list[str]:
         )
     if count is not None and len(value) != count:
         problem = f"must hold {count} names"
-        raise InvalidArgumentError(argument, problem, value=value, remedy="give one for each")
+        raise InvalidArgumentError(argument, problem, value=value, remedy="pass that many")
     if len(set(value)) != len(value):
         remedy = "name each once"
         raise InvalidArgumentError(argument, "repeats a name", value=value, remedy=remedy)
@@ -242,7 +244,7 @@ def array(
 def entries(
     argument: str,
     values: NDArray[Any],
-    good: Any,
+    good: ArrayLike,
     problem: str,
     names: Sequence[str] | None = None,
     *,
@@ -305,7 +307,7 @@ def within(
         near,
         f"is beyond +-{far:g}",
         joint_names,
-        remedy="give what a robot can have",
+        remedy="check the unit",
     )
     return rows
 

@@ -63,10 +63,9 @@ class Differences(list[str]):
         # No target has the implicit law, but all can have its gains at one time step.
         explicit = as_explicit(params, self.dt)
         if explicit is not params:
-            text = f"gains of the explicit law at dt = {self.dt:g} s, for no other step"
+            text = f"gains of the explicit law at dt = {self.dt:g} s only"
             if params.ki is not None and np.any(params.ki > 0):
-                text += "; the integral takes the setpoint for the beginning of a step, a lead of"
-                text += " dt times its rate"
+                text += "; the integral leads by dt times the rate of the setpoint"
             self.append(f"discretization: {text}")
         return explicit
 
@@ -80,8 +79,8 @@ class Differences(list[str]):
             problem = "is missing for gains per mass_matrix"
             remedy = "pass inertia=, the diagonal of the mass matrix, or gains in effort units"
             raise InvalidArgumentError("inertia", problem, remedy=remedy)
-        text = f"gains per mass_matrix are efforts at one inertia: {self.listed(inertia)} kg m^2"
-        self.append(f"gain_units: {text} or kg, and joints disturb each other")
+        text = f"gains in efforts, for one inertia: {self.listed(inertia)} kg m^2"
+        self.append(f"gain_units: {text} or kg; joints disturb each other")
         scaled: Document = {"gain_units": None}
         for name, leaf in params.leaves().items():
             if name in ("kp", "ki", "kd", "integral_min", "integral_max"):
@@ -176,7 +175,7 @@ EFFECTS = {
 """Effects of actuators that a target may lack."""
 _PROBLEMS = {
     "saturation_effort": "no torque-speed line",
-    "static": "friction at rest is that of motion",
+    "static": "friction at rest as in motion",
     "load_friction": "friction does not grow with the effort",
 }
 
@@ -198,8 +197,8 @@ class Drive(Differences):
             "actuators", motors, Actuators, "build them with make_actuators()"
         )
         if motors.num_envs > 1 or motors.num_joints not in (0, len(self.joints)):
-            problem = f"are of {motors.num_envs} envs and {motors.num_joints} joints"
-            remedy = f"give those of one env and {len(self.joints)} joints"
+            problem = f"are for {motors.num_envs} envs and {motors.num_joints} joints"
+            remedy = f"give them for one env and {len(self.joints)} joints"
             raise InvalidArgumentError("actuators", problem, remedy=remedy)
         self._compare()
 
@@ -236,9 +235,9 @@ class Drive(Differences):
         winds = self.limited | np.isfinite(motors).any(0)
         winds &= np.array(strategies(self.params)) != "none"
         rows = (
-            ("anti_windup", "the integral goes on at the effort's limit, up to its own", winds),
+            ("anti_windup", "the integral grows during saturation, up to its limit", winds),
             ("integral_limit", "the same in both directions", (-low != high) & clamps),
-            ("integral_limit", "passed by up to one step, ki dt |e|", passes),
+            ("integral_limit", "exceeded by up to one step, ki dt |e|", passes),
         )
         for option, text, where in rows:
             self.add(option, text, integrates & where, limits, "N m or N")
@@ -248,7 +247,7 @@ class Drive(Differences):
         params = self.params
         low, high = self.ends("integral")
         excluded = ((low > 0) | (high < 0)) & (params.ki is not None)
-        self.add("integral_limit", "an integral whose limits exclude 0 begins at 0", excluded)
+        self.add("integral_limit", "the integral begins at 0, outside its limits", excluded)
         self.lack_weights()
         self.lack("deadband", "none: P acts on the whole error", 0.0, "rad or m")
         turns = params.continuous is not None

@@ -141,8 +141,10 @@ def _compare(law: Differences) -> None:
     law.lack_weights()
     # The weight of a given rate: differences of setpoints do not enter.
     weight = law.value("setpoint_weight_derivative", 1.0)
-    text = "a feedforward of the desired velocity, after u_clamp, which differences of setpoints"
-    law.add("setpoint_weight_derivative", f"{text} do not enter", acts & (weight != 1), weight)
+    text = "a feedforward of the desired velocity, after u_clamp; setpoints"
+    law.add(
+        "setpoint_weight_derivative", f"{text} are not differentiated", acts & (weight != 1), weight
+    )
     time = law.value("derivative_filter_time")
     law.add("derivative_filter_time", "no filter", acts & (time > 0), time, "s")
     text = "the derivative is the measured velocity, not a difference"
@@ -157,20 +159,20 @@ def _compare(law: Differences) -> None:
 def _compare_anti_windup(law: Differences) -> None:
     """Add the differences of the integral's limits and of anti-windup."""
     low, high = law.ends("integral")
-    law.add("integral_min", "0 at most in the target", low > 0, low)
-    law.add("integral_max", "0 at least in the target", high < 0, high)
+    law.add("integral_min", "at most 0 in the target", low > 0, low)
+    law.add("integral_max", "at least 0 in the target", high < 0, high)
     if law.params.ki is None:
         return
     strategy = np.array(strategies(law.params))
     integrates = law.value("ki") > 0
     back = strategy == "back_calculation"
     low, high = law.ends("effort")
-    text = "conditional integration takes the sign of the whole effort, wrong where the limits"
+    text = "conditional integration uses the sign of the effort, wrong where the limits"
     excludes = (low > 0) | (high < 0)
     law.add("anti_windup", f"{text} exclude 0", (strategy == "conditional") & excludes)
     law.add("anti_windup", "without ki the integral does not track", back & ~integrates)
     text = "back-calculation is left out in a step with an error of exactly 0"
     law.add("anti_windup", text, law.limited & back & integrates)
     times = law.value("tracking_time", math.inf)
-    text = "shorter than dt, the integral over-corrects"
+    text = "below dt the integral over-corrects"
     law.add("tracking_time", text, back & (times < law.dt), times, "s")

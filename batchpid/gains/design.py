@@ -40,8 +40,8 @@ FILTER_SHARE = 0.3
 DAMPING_RATIO, INTEGRAL_TIME = math.sqrt(3) / 2, 3 * math.sqrt(3)
 """zeta, and Ti in units of 1 / w, of three equal poles."""
 OWN_SHARE = 0.2
-"""Least share of kd that stays, however much damping a joint has: in poses where it is heavy, that
-does less.
+"""Least share of kd that remains after the joint's damping ``load`` is subtracted from it: in poses
+with a larger inertia, that damping does less.
 """
 BACK_OFF = 0.8
 """Factor by which the bandwidth is reduced, until the filter is fast enough."""

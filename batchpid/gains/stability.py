@@ -306,7 +306,7 @@ def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[F
     time_step("dt", dt)
     m = read_array("mass_matrix", mass_matrix).astype(np.float64)
     if m.ndim < 2 or m.shape[-1] != m.shape[-2]:
-        remedy = "pass (joints, joints), or a stack of such"
+        remedy = "pass shape (..., joints, joints)"
         raise InvalidArgumentError("mass_matrix", "is not square", value=m.shape, remedy=remedy)
     if not np.isfinite(m).all() or np.linalg.eigvalsh(m).min(initial=np.inf) <= 0:
         remedy = "check the masses and inertias of the robot's links"

@@ -170,7 +170,7 @@ class RecordFile(Generic[R]):
         missing = sorted(set(order) - set(joints))
         unknown = sorted(set(joints) - set(order))
         if unknown or (missing and not self.partial):
-            problem = f"does not hold these joints: missing {missing}, unknown {unknown}"
+            problem = f"has other joints: missing {missing}, unknown {unknown}"
             remedy = f"the file's joints are {', '.join(joints)}"
             raise InvalidArgumentError(source, problem, remedy=remedy)
         chosen = {joint: joints.get(joint, {}) for joint in order}
@@ -286,7 +286,7 @@ def render(document: Document, format: str) -> str:
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
 
 
-def is_number(entry: Any) -> bool:
+def is_number(entry: object) -> bool:
     """Return whether an entry is a number, an infinity included."""
     whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
     return whole or isinstance(entry, float) or entry in ("inf", "-inf")
@@ -348,7 +348,7 @@ class _ParamsFile(RecordFile[PIDParams]):
         for joint, entry in joints.items() if "tracking_time" in options else ():
             tracks = "back_calculation" in str(entry.get("anti_windup"))
             if tracks and "tracking_time" not in entry:
-                problem = "is missing, while other joints have it"
+                problem = "is missing, but other joints have it"
                 raise error(source, "tracking_time", problem, "give it too", joint)
         return options
 

@@ -18,7 +18,7 @@ PACKAGES = ("batchpid", "numpy", "sapien", "jax", "h5py", "cmaes", "mujoco", "gy
 
 @contextmanager
 def standard_streams_occupied() -> Iterator[None]:
-    """Give files that are opened inside a number above 2.
+    """Keep the file descriptors 0 to 2 occupied, so that files opened in the block get larger ones.
 
     The numbers 0 to 2 belong to the standard streams. In a program that has closed these, the next
     file would get such a number, and printed text would go into it.

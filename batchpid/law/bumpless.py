@@ -55,7 +55,7 @@ def track(
     if params.ki is None:
         raise InvalidArgumentError(
             "params.ki",
-            "is off, so no integral can carry the effort over",
+            "is off: no integral can take over the effort",
             remedy="give ki; 0 is allowed",
         )
     if dt is None and params.discretization is not None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
+from batchpid.arrays.choices import NamedChoice
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
 from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import instance
@@ -26,7 +27,7 @@ class Coefficients(NamedTuple):
     decay: Array
     """tau / (tau + dt), the weight of the derivative's old value in its filter."""
     intake: Array
-    """dt / (tau + dt), the weight of the new one."""
+    """dt / (tau + dt), the weight of its new value."""
     effort_min: Array
     effort_max: Array
     effort_step: Array
@@ -46,14 +47,15 @@ class Coefficients(NamedTuple):
     """dt / Tt, at most 1. Above 1, a step would correct more than the whole excess, and
     oscillate.
     """
-    conditional: Any
+    conditional: Array
+    """Everywhere(), or 1.0 on the joints that have it."""
     turns: Array
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
     tiny: Array
     """Argument of :func:`batchpid.arrays.elementwise.flush`."""
-    non_finite: Any
+    non_finite: NamedChoice | None
     measurement_rate: Array
-    gain_units: Any
+    gain_units: NamedChoice | None
     """Unit of gains that :mod:`batchpid.law.computed_torque` turns into efforts; the law alone
     refuses them.
     """
@@ -113,6 +115,6 @@ def spread(k: Coefficients, num_envs: int) -> Coefficients:
     dtype = k.kp.dtype
     zeros = xp.zeros((num_envs, k.kp.shape[-1]), dtype)
     off = (type(None), tuple)
-    return Coefficients(
-        *(leaf if isinstance(leaf, off) else zeros + xp.asarray(leaf, dtype=dtype) for leaf in k)
+    return Coefficients._make(
+        leaf if isinstance(leaf, off) else zeros + xp.asarray(leaf, dtype=dtype) for leaf in k
     )

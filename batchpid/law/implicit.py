@@ -87,8 +87,8 @@ def implicit_gains(params: PIDParams, dt: Array) -> tuple[Array, ...]:
 
 
 def as_explicit(params: PIDParams, dt: Array) -> PIDParams:
-    """Return ``params``; implicit ones as params of the explicit law with the same gains at ``dt``
-    [s].
+    """Return explicit ``params`` unchanged, and implicit ones as params of the explicit law with
+    the same gains at ``dt`` [s].
 
     Their ``setpoint_weight_derivative`` is for a setpoint rate that is given.
     """

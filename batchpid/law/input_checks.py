@@ -92,7 +92,7 @@ def check_drive(params: PIDParams) -> None:
             f"params.{next(iter(lacking))}",
             "is not available in a drive, whose effort is kp (target - y) - kd dy/dt within the"
             " effort limits",
-            remedy=f"use params.replace({others}), or the law itself, as control 'pid' does",
+            remedy=f"use params.replace({others}), or the PID law, as in control 'pid'",
         )
 
 
@@ -110,8 +110,8 @@ def _check_shapes(
             fits = False
         if not fits:
             problem = (
-                f"has shape {shapes[0]}, which does not fit {shape} of the params and the inputs"
-                " before it"
+                f"has shape {shapes[0]}, which does not fit {shape} of the params and the other"
+                " inputs"
             )
             raise InvalidArgumentError(name, problem, remedy=f"give (envs, {joints})")
 
@@ -137,7 +137,7 @@ def checked_state(state: PIDState, needed: PIDState) -> PIDState:
     for name, leaf, need in zip(PIDState._fields, state, needed, strict=True):
         if need and leaf is None:
             remedy = (
-                "begin with init(params, measurement), or take state.matched_to(init(params,"
+                "begin with init(params, measurement), or use state.matched_to(init(params,"
                 " measurement))"
             )
             raise InvalidArgumentError(
@@ -168,7 +168,7 @@ def checked_dt(dt: Array) -> Array:
     return time_step("dt", dt)
 
 
-def _as_array(name: str, value: Any, kinds: str = "iuf") -> Array:
+def _as_array(name: str, value: Array, kinds: str = "iuf") -> Array:
     """Return ``value`` as an array of NumPy; arrays of JAX are returned unchanged."""
     is_own = type(value) is np.ndarray
     if (is_own and value.dtype.kind in kinds) or (

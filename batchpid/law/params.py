@@ -33,7 +33,7 @@ PLAIN = (
     "setpoint_weight_derivative",
     "deadband",
 )
-"""Options that become a leaf without regard to others."""
+"""Options whose leaf depends on no other option."""
 
 
 class _ParamsFields(NamedTuple):
@@ -60,11 +60,13 @@ class _ParamsFields(NamedTuple):
     non_finite: NamedChoice | None = None
     """ZeroEffort() or HoldEffort(); off: non-finite values propagate."""
     measurement_rate: NamedChoice | None = None
-    """MeasuredRate(): whoever runs the law on a robot gives it the measured rate; off: differences
-    of measurements.
+    """MeasuredRate(): the caller passes the measured rate; off: the law takes differences of
+    measurements.
     """
     gain_units: NamedChoice | None = None
-    """PerMassMatrix(): whoever runs the law on a robot converts to efforts; off: efforts."""
+    """PerMassMatrix(): the law returns accelerations, which the caller converts to efforts; off:
+    efforts.
+    """
     discretization: NamedChoice | None = None
     """ImplicitLaw(): the law acts on the predicted end of the step; off: on its beginning."""
 

@@ -1,4 +1,4 @@
-r"""From the effort asked for to the effort delivered, and from the joint's state to its
+r"""From the commanded effort to the delivered effort, and from the joint's state to its
 measurement.
 
 Pure functions on (envs, joints), for NumPy and JAX. At each step, with the joint's position q and
@@ -85,8 +85,8 @@ def init(
     episode: Array = 0,
     samples: int | None = None,
 ) -> ActuatorState:
-    """Return the state of actuators that have been at rest: with ``qpos`` measured and ``effort``
-    asked so far.
+    """Return the state of actuators that have been at rest, at the measured positions ``qpos`` and
+    the commanded efforts ``effort``.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ def _delivered(
 
 
 def command_limits(k: MotorCoefficients, qpos: Array, qvel: Array) -> tuple[Array, Array]:
-    """Return the least and the largest effort to ask for that the motor does not clip at ``qpos``
+    """Return the smallest and the largest commanded effort that the motor does not clip at ``qpos``
     and ``qvel``.
 
     They are those for the saturation and anti-windup of a law. Delay and lag do not enter: they are

@@ -68,7 +68,7 @@ class _ActuatorsFields(NamedTuple):
 FIELDS = declared(_ActuatorsFields, Field)
 """Declared fields of all effects that are one number for each joint."""
 MOTOR_SIDE = in_group(FIELDS, "motor")
-"""Effects between the effort asked for and the effort delivered."""
+"""Effects between the commanded and the delivered effort."""
 JOINT_SIDE = in_group(FIELDS, "joint")
 """Effects on the joint instead of the signals: :class:`batchpid.sim.Runner` simulates them in the
 robot's joints.
@@ -103,7 +103,7 @@ class Actuators(Record, _ActuatorsFields):
 
     @property
     def delivers(self) -> bool:
-        """True if the efforts delivered differ from those asked for."""
+        """True if the delivered efforts differ from the commanded ones."""
         return not MOTOR_SIDE.keys().isdisjoint(self.leaves())
 
     @property
@@ -145,7 +145,9 @@ class Actuators(Record, _ActuatorsFields):
             present.pop("dtype", None)
         if not self.num_joints and "joints" not in options:
             remedy = "build them with make_actuators(), or give joints="
-            raise InvalidArgumentError("joints", "is not known: every effect is off", remedy=remedy)
+            raise InvalidArgumentError(
+                "joints", "is missing, and every effect is off", remedy=remedy
+            )
         return make_actuators(**{"joints": self.num_joints, **present, **options})
 
     def __repr__(self) -> str:
@@ -286,13 +288,11 @@ def _longest_delay(leaves: Document, max_delay: float | None) -> float | None:
 
 class _ActuatorStateFields(NamedTuple):
     command: Array = None
-    """Efforts asked for, latest first (envs, samples, joints) [N m or N]."""
+    """Commanded efforts, latest first (envs, samples, joints) [N m or N]."""
     effort: Array = None
     """Effort behind the lag (envs, joints) [N m or N]."""
     sensor: Array = None
-    """Positions that the sensor was at, and its velocities, latest first (envs, samples, 2
-    joints).
-    """
+    """Positions and velocities at the sensor, latest first (envs, samples, 2 joints)."""
     encoder: Array = None
     """Position of the sensor's side of the play (envs, joints) [rad or m]."""
     key: Array = None

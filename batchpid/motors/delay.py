@@ -41,7 +41,7 @@ def samples_of(longest: Array, dt: float) -> int:
     """
     if is_traced(longest) or is_traced(dt):
         raise InvalidArgumentError(
-            "max_delay", "is traced, so that it is not known", remedy="pass samples= to init"
+            "max_delay", "is traced: its value is unknown", remedy="pass samples= to init"
         )
     count = math.floor(float(longest[0, 0]) / dt + _NEAR) + 2
     if count > MOST_SAMPLES:
@@ -53,8 +53,8 @@ def samples_of(longest: Array, dt: float) -> int:
 
 
 def discretise(delay: Array, dt: Array, history: Array, begin: int = 0) -> Delay:
-    """Return ``delay`` (1 | envs, joints) [s] at ``dt`` [s] for ``history`` (envs, samples,
-    numbers), its longest.
+    """Return ``delay`` (1 | envs, joints) [s] in samples of ``dt`` [s], at most the length of
+    ``history`` (envs, samples, numbers).
 
     The joints' values are those from number ``begin`` of a sample on.
     """

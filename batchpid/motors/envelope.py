@@ -50,8 +50,8 @@ def envelope(actuators: Actuators) -> Envelope:
 
 
 def command_envelope(actuators: Actuators) -> Envelope:
-    """Return the envelope of the commands u of motors that deliver s u + b: each end e of the
-    other's is (e - b) / s.
+    """Return the envelope of the commands u of motors that deliver s u + b: each bound e of the
+    efforts becomes (e - b) / s.
 
     Where s = 0 it is wide: no command matters.
     """

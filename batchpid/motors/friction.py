@@ -42,7 +42,7 @@ is left for inertias that change between two refreshes.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
@@ -51,7 +51,7 @@ from batchpid.checks.validate import check_time_step
 SHARE = 0.7
 """Share of the deadbeat gain K that is used."""
 LOOKAHEAD = 0.1
-"""Time by which the setpoint is looked ahead to tell the direction of the wanted motion [s]."""
+"""Time ahead at which the setpoint is taken to determine the direction of motion [s]."""
 
 
 class Friction(NamedTuple):
@@ -178,7 +178,7 @@ def refresh(
 
 def advance(
     friction: Friction, state: FrictionState, effort: Array, velocity: Array
-) -> tuple[FrictionState, Any]:
+) -> tuple[FrictionState, Array]:
     """Advance the model by one step; return the state and the effort to apply (envs, joints) [N m
     or N].
 

@@ -13,9 +13,10 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from functools import cache, partial
-from typing import Any
+from types import ModuleType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import DType, Rows
 from batchpid.native.extensions import PROGRAM, StaleExtensionError, load
@@ -26,7 +27,7 @@ NUMBERS_PER_THREAD = 2**17
 
 
 @cache
-def interpreter() -> Any:
+def interpreter() -> ModuleType:
     """Return the extension, initialised with NumPy's array type; errors as in
     :func:`extensions.load`.
     """
@@ -67,7 +68,7 @@ class ArrayProgram:
     def __init__(
         self,
         trace: Trace,
-        constants: Sequence[Any],
+        constants: Sequence[ArrayLike],
         inputs: int,
         shape: tuple[int, int],
         dtype: DType = np.float64,
@@ -114,7 +115,7 @@ class ArrayProgram:
 
     def bind(
         self, inputs: Sequence[Rows], outputs: Sequence[Rows], given: int, full: int
-    ) -> Callable[..., Any]:
+    ) -> Callable[..., Rows]:
         """Return a fast function with the first inputs, and all outputs but the last, fixed to
         these arrays.
 

@@ -68,7 +68,7 @@ class CompiledLaw:
 
     def step(
         self, state: PIDState, inputs: tuple[Rows | None, ...], out: Rows | None
-    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Any] | None]:
+    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Rows] | None]:
         """Advance the law; return the new state, the effort, the terms, and a fast function for the
         next steps.
 

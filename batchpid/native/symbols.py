@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from batchpid.arrays.array_types import DType
+from batchpid.arrays.array_types import Array, DType
 from batchpid.native.extensions import MASKS, OPERATIONS
 
 _NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
@@ -27,7 +27,7 @@ class Namespace:
         self.literals: dict[str, tuple[float, Symbol]] = {}
         """Numbers and their symbols, by ``repr``, which distinguishes -0.0 from 0.0."""
 
-    def symbol(self, value: Any) -> Symbol:
+    def symbol(self, value: Array) -> Symbol:
         """Return the symbol of a number; a symbol is returned unchanged.
 
         A number is rounded to the arrays' dtype. A scalar of a wider dtype is a TypeError, because
@@ -40,10 +40,11 @@ class Namespace:
             raise TypeError(f"a program of {self.dtype} cannot hold a scalar of {value.dtype}")
         return self.literals.setdefault(repr(float(value)), (float(value), Symbol(self)))[1]
 
-    def apply(self, name: str, *values: Any) -> Symbol:
+    def apply(self, name: str, *values: Array) -> Symbol:
         """Record an operation; return its result."""
-        result = Symbol(self, name in MASKS or (name == "gather" and values[0].is_mask))
-        self.noted.append((name, tuple(map(self.symbol, values)), result))
+        operands = tuple(map(self.symbol, values))
+        result = Symbol(self, name in MASKS or (name == "gather" and operands[0].is_mask))
+        self.noted.append((name, operands, result))
         return result
 
     def __getattr__(self, name: str) -> Callable[..., Symbol]:
@@ -52,11 +53,11 @@ class Namespace:
             raise AttributeError(f"programs have no operation {name!r}")
         return lambda *values: self.apply(name, *values)
 
-    def zeros_like(self, _: Any) -> Symbol:
+    def zeros_like(self, _: object) -> Symbol:
         """Return the number 0."""
         return self.symbol(0.0)
 
-    def ones_like(self, _: Any) -> Symbol:
+    def ones_like(self, _: object) -> Symbol:
         """Return the number 1."""
         return self.symbol(1.0)
 
@@ -97,14 +98,14 @@ class Symbol:
         """Return the same symbol: the results of a program are new arrays."""
         return self
 
-    def record(self, name: str, *arrays: Any) -> Symbol:
+    def record(self, name: str, *arrays: Array) -> Symbol:
         """Record a function of :mod:`batchpid.arrays.elementwise` as the operation ``name``; return
         its result.
         """
         return self._namespace.apply(name, *arrays)
 
     def __bool__(self) -> NoReturn:
-        raise TypeError("a function that is traced cannot depend on the entries of an array")
+        raise TypeError("a traced function cannot branch on the entries of an array")
 
     def __abs__(self) -> Symbol:
         return self.record("absolute", self)

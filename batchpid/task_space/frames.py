@@ -61,8 +61,8 @@ def multiply(a: Array, b: Array) -> Array:
 
 
 def turned(frame: Array, inner: Array) -> Array:
-    """Return the frames ``inner`` (..., 3, 4), given in ``frame`` (..., 3, 4), where the latter is
-    given.
+    """Return the frames ``inner`` (..., 3, 4), which are given in ``frame`` (..., 3, 4), in the
+    axes in which ``frame`` is given.
     """
     xp = namespace(frame, inner)
     product = multiply(frame[..., :3], inner)
@@ -178,8 +178,8 @@ def inverse(q: Rows) -> Rows:
 
 
 def placed(base: Rows, poses: Rows) -> Rows:
-    """Return poses (..., 7) that are given in the frame of ``base`` (..., 7), in the frame of that
-    one.
+    """Return poses (..., 7), which are given in the frame of ``base`` (..., 7), in the frame in
+    which ``base`` is given.
     """
     position = base[..., :3] + rotate(matrix_of(base[..., 3:]), poses[..., :3])
     return np.concatenate([position, compose(base[..., 3:], poses[..., 3:])], axis=-1)
@@ -225,8 +225,8 @@ class SpatialInertia(NamedTuple):
     tensor: Float64
 
     def moved(self, position: Float64, wxyz: Float64) -> SpatialInertia:
-        """Return the inertia as seen from a frame in which its own has this position and rotation:
-        c' = p + R c.
+        """Return the inertia in another frame, in which its present frame has this position and
+        rotation: c' = p + R c.
 
         The tensor about the center of mass turns with the axes: I' = R I R^T.
         """
@@ -254,8 +254,8 @@ def spatial_matrix(inertia: SpatialInertia) -> Float64:
 
 
 def moved_matrix(matrix: Float64, place: Float64) -> Float64:
-    """Return spatial matrices (..., 6, 6) in the frame in which their own has the homogeneous pose
-    ``place`` (4, 4).
+    """Return spatial matrices (..., 6, 6) in another frame, in which their present frame has the
+    homogeneous pose ``place`` (4, 4).
     """
     turn = np.zeros(
         (6, 6)

@@ -291,7 +291,7 @@ def _goals_and_starts(
     rows = array("start", start, (envs, tree.dof), tree.joint_names)
     length = np.linalg.norm(goal[:, 3:], axis=1, keepdims=True)
     unit = np.abs(length - 1) < 1e-3
-    problem = "has a quaternion that is not of unit length"
+    problem = "has a quaternion whose length is not 1"
     remedy = "normalise w, x, y, z"
     entries("pose", length, unit, problem, ["qw"], kind="entry", remedy=remedy)
     goal[:, 3:] /= length
@@ -305,7 +305,7 @@ def _report(result: IKResult, on_failure: str) -> None:
     problem = (
         f"was not reached in {len(failed)} of {len(result.success)} envs:"
         f" {result.position_error[env] * 1e3:.3g} mm and"
-        f" {result.rotation_error[env] * 1e3:.3g} mrad are left"
+        f" {result.rotation_error[env] * 1e3:.3g} mrad remain"
     )
     remedy = "check that it is in reach, or give more starts or larger tolerances"
     error = InvalidArgumentError("pose", problem, env=env, remedy=remedy)

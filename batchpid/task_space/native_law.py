@@ -160,7 +160,7 @@ class BoundOSC:
             rubbing = [arrays.pop("damping", None), *friction]
         self._kept, self.address = native.bind(rows, dof, *fixed, *map(arrays.get, LAW), *rubbing)
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
+    def set_state(self, state: Document) -> None:
         """Copy a state."""
         for name, array in self.state.items():
             array[...] = state[name]

@@ -174,7 +174,7 @@ def tool(tree: RigidTree, index: int, point: Array) -> Float64:
     return frames
 
 
-def native_tree(native: Any, tree: RigidTree) -> Any:
+def native_tree(native: ModuleType, tree: RigidTree) -> object:
     """Return the capsule of the extension with the constants of a tree."""
     if tree not in _trees:
         bodies, (kinds, rows) = tree.bodies, tree.tables
@@ -195,7 +195,7 @@ def for_rows(like: Array, *arrays: Array) -> ModuleType | None:
     return None
 
 
-def call(function: Callable[..., None], *arguments: Any) -> None:
+def call(function: Callable[..., None], *arguments: object) -> None:
     """Call a function of the extension, which takes contiguous arrays of float64 only; others are
     converted.
     """

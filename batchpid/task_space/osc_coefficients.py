@@ -20,9 +20,10 @@ The posture has the same law, without V and integral.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
+from batchpid.arrays.choices import NamedChoice
 from batchpid.arrays.elementwise import namespace
 from batchpid.checks.validate import check_time_step, instance
 from batchpid.task_space.osc_params import MAKE_PARAMS, OSCParams
@@ -50,12 +51,12 @@ class OSCCoefficients(NamedTuple):
     position_error_limit: Array
     rotation_error_limit: Array
     smallest_eigenvalue: Array
-    axes: Any
-    force_axes: Any
+    axes: Array
+    force_axes: Array
     effort_min: Array
     effort_max: Array
     turns: Array
-    frame: Any
+    frame: NamedChoice | None
 
 
 def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:

@@ -98,7 +98,9 @@ WITHOUT_EFFECT = {
     "integral_limit": ("integral_gain", False, "integral_gain is not given"),
     "limit_stiffness": ("limit_margin", False, "limit_margin is not given"),
 }
-"""Options without effect where another one is given (True), or is not (False), and the reason."""
+"""Options that have no effect if another option is given (True) or missing (False): that option,
+the flag, the reason.
+"""
 
 
 class OSCParams(Record, _OSCParamsFields):
@@ -251,6 +253,6 @@ def _checked(params: OSCParams) -> OSCParams:
     """
     for name, leaf in params.leaves().items():
         if leaf.shape[0] not in (1, params.num_envs):
-            problem = f"has rows for {leaf.shape[0]} envs, but others for {params.num_envs}"
+            problem = f"has rows for {leaf.shape[0]} envs, but other options for {params.num_envs}"
             raise InvalidArgumentError(name, problem, remedy="give one row, or one for each env")
     return frozen(params)

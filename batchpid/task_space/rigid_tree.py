@@ -142,7 +142,7 @@ class RigidTree:
         count = len(links)
         types = tuple(choice("joint_types", one, JOINT_TYPES) for one in self.joint_types)
         if len(types) != count or types[:1] != ("fixed",):
-            remedy = f"give {count}, the type of the joint above each link: 'fixed' for the base"
+            remedy = f"give {count}: the type of the joint above each link, 'fixed' for the base"
             raise InvalidArgumentError("joint_types", "does not fit the links", remedy=remedy)
         moving = tuple(
             names("joint_names", list(self.joint_names), sum(one != "fixed" for one in types))
@@ -150,7 +150,7 @@ class RigidTree:
         # Parents first, so that one pass from the base outwards serves every recursion.
         parent = np.array(_array("parent", self.parent, links), np.intp)
         first = (parent < np.arange(count)) & (parent >= np.minimum(np.arange(count), 1) - 1)
-        entries("parent", parent, first, "does not come before its child", links, kind="entry")
+        entries("parent", parent, first, "must come before its child", links, kind="entry")
         # One copy of each table, in float64: later writes by the caller change nothing.
         columns = {
             "position": (3,),

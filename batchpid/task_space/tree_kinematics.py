@@ -20,7 +20,7 @@ the others, to the last bit.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class Velocities(NamedTuple):
     angular_rate: Array
 
 
-def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Any], Bodies, Any]:
+def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Array], Bodies, ArrayModule]:
     """Return checked arrays (..., dof) in one dtype, the tree's bodies in it, and their
     namespace.
     """
@@ -105,7 +105,7 @@ def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModu
             + (1 - xp.cos(q)) * bodies.cosine
             + q * bodies.slide
         )
-        frames: list[Any] = []
+        frames: list[Array] = []
         for joint, above in enumerate(tree.body_parents):
             part = local[..., joint, :, :]
             frames.append(part if above < 0 else turned(frames[above], part))
@@ -143,7 +143,7 @@ def velocities_of(
 
 def from_base(tree: RigidTree, steps: Array, xp: ArrayModule) -> Array:
     """Return the sums of ``steps`` (..., dof, k) over the joints between the base and each body."""
-    sums: list[Any] = []
+    sums: list[Array] = []
     for joint, above in enumerate(tree.body_parents):
         sums.append(steps[..., joint, :] if above < 0 else sums[above] + steps[..., joint, :])
     return xp.stack(sums, axis=-2)

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from batchpid.arrays.array_types import Document
+from batchpid.arrays.array_types import Document, Progress, T
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
@@ -39,7 +39,7 @@ DOCUMENTS = (".yaml", ".yml", ".json")
 DEFAULT_ROBOT = "panda"
 FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
-SWITCH: dict[Any, bool] = {"on": True, "off": False, "fixed": True, "free": False}
+SWITCH: dict[str | None, bool] = {"on": True, "off": False, "fixed": True, "free": False}
 """Values of flags with two words."""
 COUNTS = {"num_envs": "robots", "moves": "random moves", "population": "candidates at once"}
 """Flags that are counts, with nouns for the first line."""
@@ -74,7 +74,7 @@ class CommandFunction(NamedTuple):
     loading: tuple[str, ...] = ("base",)
     """Options of :meth:`Robot.load` that are flags."""
 
-    def record(self) -> type[Any]:
+    def record(self) -> type:
         """Return the record of the flags."""
         outputs = {name: output.help for name, output in self.outputs.items()}
         return flags.record_of(self.function, self.options, self.loading, outputs)
@@ -290,7 +290,7 @@ def check_output(
     raise InvalidArgumentError(argument, problem, value=str(path), remedy=remedy)
 
 
-def write_figures(path: Path, figures: Any) -> None:
+def write_figures(path: Path, figures: object) -> None:
     """Write figures as JSON: arrays as lists, named tuples and mappings as objects, null for NaN
     and infinity.
     """
@@ -312,7 +312,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
+def bar(label: str, **options: object) -> Progress[T]:
     """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; ``options``
     go to tqdm.
 

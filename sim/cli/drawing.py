@@ -5,7 +5,6 @@ live or recorded.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from batchpid.arrays.array_types import Document, Progress
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, read_recording
@@ -50,7 +50,7 @@ class Recording:
             return plots.efforts(self.rollout)
         return plots.following_errors(self.rollout)
 
-    def film(self, path: Path, progress: Callable[[Any], Any]) -> None:
+    def film(self, path: Path, progress: Progress[int]) -> None:
         """Film the first :data:`SHOWN_ENVS` envs in real time."""
         from batchpid.sim.view.film import write_film
 
@@ -123,7 +123,9 @@ def view(
     from batchpid.sim.view import View
 
     if play is None:
-        source: Any = _live(robot or Robot.load("panda"), num_envs, gains, options)
+        source: LiveSimulation | Playback = _live(
+            robot or Robot.load("panda"), num_envs, gains, options
+        )
     else:
         source = _recorded(play, robot)
     with closing(source), View(source, port=port) as page:
@@ -135,9 +137,7 @@ def view(
             page.run(time_limit)
 
 
-def _live(
-    robot: Robot, num_envs: int, gains: str | None, options: dict[str, Any]
-) -> LiveSimulation:
+def _live(robot: Robot, num_envs: int, gains: str | None, options: Document) -> LiveSimulation:
     """Return the running robots."""
     from batchpid.sim.view import LiveSimulation
 

@@ -6,14 +6,13 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Document, Float64, Rows
+from batchpid.arrays.array_types import Document, Float64, Progress, Rows
 from batchpid.arrays.field_tables import Field
 from batchpid.checks.validate import array
 from batchpid.errors import InvalidArgumentError
@@ -33,7 +32,7 @@ def demo(
     num_envs: NumEnvs = 64,
     gains: str | None = None,
     seconds: Annotated[float, SECONDS] = 2.0,
-    progress: Callable[[Any], Any] | None = None,
+    progress: Progress[int] | None = None,
     **options: Any,
 ) -> RunReport:
     """Move 64 arms to a setpoint; print a table of the joints and draw a picture.
@@ -70,7 +69,7 @@ def rollout(
     seed: Annotated[int, Field(high=2**31 - 1)] = 0,
     spread: Annotated[float, Field("rad or m", high=10.0)] = 0.3,
     randomization: Randomization | None = None,
-    progress: Callable[[Any], Any] | None = None,
+    progress: Progress[int] | None = None,
     **options: Any,
 ) -> RunReport:
     """Move N of any robot to a setpoint or along a trajectory; print a table.

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cached_property
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -239,7 +239,7 @@ class Rule(NamedTuple):
     code: str
     text: str
     remedy: str
-    test: Callable[[_Run], Any]  # the joints that have it (envs, dof), or the envs (envs, 1)
+    test: Callable[[_Run], Bool]  # the joints that have it (envs, dof), or the envs (envs, 1)
     names_joint: bool = True  # False for a cause of whole envs
 
 
@@ -289,7 +289,7 @@ RULES: tuple[Rule, ...] = (
     Rule("guard", "the guard holds the setpoint back", "move it inside the guard's limits, or give it more time",
          lambda run: run.rollout.guarded[-1]),
     Rule("touching", "links are pressed together, or against the ground",
-         "choose another start, setpoint or way, disable the pair in an .srdf, or use ground=False",
+         "choose another start, setpoint or path, disable the pair in an .srdf, or use ground=False",
          lambda run: np.array(run.pressed)[:, None] != "", names_joint=False),
     Rule("effort-limit", "the effort is at its limit: gravity and friction need more, or the move more time",
          "raise the effort limit, lighten the load, or run longer", _is_too_weak),
@@ -297,9 +297,9 @@ RULES: tuple[Rule, ...] = (
          "use robot.designed(), or raise kd and lower kp and ki; robot.check(params=) tells which", _oscillates),
     Rule("blocked", "something outside the robot's model acts on it: an object, a payload, another force",
          "look at the scene; for a constant load use gains with integral action", _is_blocked),
-    Rule("gains", "rests beside the setpoint: its gains leave the error that balances gravity or friction",
+    Rule("gains", "rests away from the setpoint: the remaining error balances gravity or friction",
          "raise kp, ki or integral_limit, or compensate gravity and friction", lambda run: run.is_at_rest),
-    Rule("slow", "still moves when the run ends: to its setpoint, or behind one that moves",
+    Rule("slow", "still moves at the end of the run: to its setpoint, or behind a moving one",
          "run longer, hold the last setpoint, pass setpoint_rate, or raise the gains", lambda run: run.unsettled),
 )  # fmt: skip
 """Every cause, in the order in which they are tested and listed."""

@@ -121,7 +121,7 @@ def stability_report(
     if np.isinf(ratio):
         remedy = "use a kd that is larger than kp times the delay and lag"
     if loop["delay"].any() or loop["lag"].any():
-        effect = "with motors as late as these the joint oscillates or diverges"
+        effect = "with these delays and lags the joint oscillates or diverges"
     elif params.gain_units is None:
         # A drive integrates these gains implicitly, as MuJoCo does with a servo's kv.
         remedy += ", control='drive'"
@@ -192,7 +192,7 @@ class StabilityCheck:
         if is_beyond and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
             env = ""
-            if params.num_envs > 1 or report.env:
+            if params.num_envs > 1 or (motors is not None and motors.num_envs > 1):
                 env = f", env {report.env}"
             warn(
                 f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the"

@@ -139,7 +139,9 @@ class _Preflight:
         """Report a link without ``<inertial>``."""
         mass = self.robot.link_masses[link]
         report = self._warn if is_body else self._note
-        effect = "it becomes a link of 1e-6 kg, without load: no gains per effort control it"
+        effect = (
+            "it becomes a link of 1e-6 kg that carries nothing: gains in efforts cannot control it"
+        )
         detail = ""
         if mass.source == "shapes":
             effect = f"mass and inertia are those of the collision shapes, at {DENSITY:g} kg/m^3"
@@ -186,7 +188,7 @@ class _Preflight:
         """Report oddities of a joint; ``suggested`` is the effort limit of designed gains."""
         name = joint.name
         if friction >= joint.effort_limit > 0:
-            text = "friction is not below the effort limit: no motion"
+            text = "friction reaches the effort limit: no motion"
             detail = f"{friction:g} {joint.effort_unit}, limit {joint.effort_limit:g}"
             self._warn("friction", text, "correct one of them", name, detail=detail)
         if joint.mimic is not None:
@@ -194,10 +196,10 @@ class _Preflight:
             detail = f"{joint.mimic.multiplier:g} x {joint.mimic.joint!r}"
             self._note("mimic", text, "command the leader", name, detail=detail)
         elif math.isinf(joint.effort_limit):
-            text = "no effort limit: designed and tuned gains stay within these, from gravity and"
+            text = "no effort limit: designed and tuned gains use limits from gravity and inertia"
             remedy = "give <limit effort=>, or pass effort_limit= to robot.params()"
             detail = f"{suggested:.3g} {joint.effort_unit}"
-            self._note("no-effort-limit", f"{text} inertia", remedy, name, detail=detail)
+            self._note("no-effort-limit", text, remedy, name, detail=detail)
         if joint.continuous:
             text = "position wraps: qpos jumps by whole turns"
             remedy = "build params with robot.params(), which takes errors the short way round"
@@ -205,7 +207,13 @@ class _Preflight:
         elif joint.lower == joint.upper:
             remedy = "give <limit lower= upper=>, or make it fixed"
             limits = f"[{joint.lower:g}, {joint.upper:g}]"
-            self._warn("no-range", "limits without range: no motion", remedy, name, detail=limits)
+            self._warn(
+                "no-range",
+                "lower and upper limit are equal: no motion",
+                remedy,
+                name,
+                detail=limits,
+            )
         elif math.isinf(joint.upper - joint.lower) and not ranged:
             remedy = f"{GIVE_RANGE}, so that setpoints can be checked"
             self._note("no-limits", "no position limits", remedy, name)
@@ -237,13 +245,18 @@ class _Preflight:
         if ratio < 1:
             self._check_ringing(params, start, timestep, report.env)
         if ratio >= NEAR_BOUND and params.discretization is not None:
-            text = f"the implicit law diverges where the model has {1 / ratio:.3g} times the"
-            remedy = "lower its kp and kd if the model may be as far off"
-            self._note("near-unstable", f"{text} inertia of the robot, or more", remedy)
+            text = (
+                f"the implicit law diverges if the model's inertia is {1 / ratio:.3g} times the"
+                " robot's, or more"
+            )
+            remedy = "lower kp and kd if the model may be that wrong"
+            self._note("near-unstable", text, remedy)
         elif ratio >= NEAR_BOUND:
             joint = robot.joint_names[int(np.argmax(report.participation))]
-            text = f"the sampled PID loop is at {ratio:.3g} times its stability bound, mostly of"
-            text = f"{text} joint {joint!r}, at the start pose"
+            text = (
+                f"the sampled PID loop is at {ratio:.3g} times its stability bound, mostly of joint"
+                f" {joint!r}, at the start pose"
+            )
             if ratio >= 1:
                 self._warn("unstable", f"{text}: {report.effect}", report.remedy)
             else:
@@ -258,12 +271,14 @@ class _Preflight:
         if zeta >= RINGING:
             return
         rest = math.exp(-2 * math.pi * zeta / math.sqrt(1 - zeta**2))
-        text = f"the PID loop rings at {slow.frequency:.2g} Hz with a damping ratio of {zeta:.2g}"
-        text = f"{text} at the start pose: after each period {100 * rest:.0f} % of the amplitude"
+        text = (
+            f"the PID loop rings at {slow.frequency:.2g} Hz with a damping ratio of {zeta:.2g} at"
+            f" the start pose: after each period {100 * rest:.0f} % of the amplitude remains"
+        )
         joint = self.robot.joint_names[int(np.argmax(slow.participation))]
         report = self._note if zeta > 0 else self._warn
         remedy = "raise its kd, lower its ki, or use robot.designed()"
-        report("ringing", f"{text} is left", remedy, joint)
+        report("ringing", text, remedy, joint)
 
     def check_params(self, params: bp.PIDParams, control: str) -> None:
         """Report params that disagree with the joints, or have no effect under ``control``."""
@@ -276,6 +291,8 @@ class _Preflight:
                 remedy = "pass continuous= to make_params, or use robot.params()"
                 self._warn("continuous", text, remedy, joint.name)
             if wraps[index] and not joint.continuous:
-                text = "continuous in params, not in the URDF: the short way round may lie beyond"
+                text = (
+                    "continuous in params, not in the URDF: the short way round may exceed limits"
+                )
                 remedy = "leave it out of continuous="
-                self._warn("continuous", f"{text} the limits", remedy, joint.name)
+                self._warn("continuous", text, remedy, joint.name)

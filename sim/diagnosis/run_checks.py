@@ -103,8 +103,8 @@ class MovingSetpointCheck:
         self.is_watching = not self._has_warned and bool((self._lag > LAG).any())
 
     def see(self, setpoints: Float64, rated: bool, seconds: float) -> None:
-        """Look at the setpoints of ticks (ticks, envs, dof) of ``seconds`` each, which are
-        ``rated`` or not, and warn of those that move.
+        """Check the setpoints of ticks (ticks, envs, dof) of ``seconds`` each; warn of moving
+        setpoints without rates (``rated`` False).
         """
         if not self.is_watching:
             return
@@ -138,7 +138,7 @@ class MovingSetpointCheck:
         warn(
             "setpoint moves in every tick without its rate: under these gains joint"
             f" {self._robot.joint_names[joint]!r} follows {1e3 * self._lag[joint]:.0f} ms behind"
-            " (kp (1 - b) / ki); pass setpoint_rate, such as the change over a tick by the tick, or"
+            " (kp (1 - b) / ki); pass setpoint_rate, such as (setpoint - last setpoint) / tick, or"
             " use gains with setpoint_weight=1",
             MovingSetpointWarning,
         )

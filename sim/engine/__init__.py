@@ -1,1 +1,1 @@
-"""Physics engines: the interface that the loop uses, and its implementations, one room each."""
+"""Physics engines: the interface that the loop uses, and its implementations, one folder each."""

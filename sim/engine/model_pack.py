@@ -84,7 +84,7 @@ class ModelPack(EnginePack, SingleOwner):
 
     def joint_mass_matrix(self, qpos: Rows) -> Float64:
         """Return the mass matrices of the joints at ``qpos`` (M, dof, dof) [kg m^2 or kg]; a
-        floating base yields.
+        floating base moves with them.
         """
         if self.steps_natively:
             return self.joint_model.mass_matrix(qpos)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
@@ -164,7 +164,7 @@ class NativeRefresh:
         size: int,
         armature: Float64,
         friction: Friction,
-        drive: tuple[Any, Any],
+        drive: tuple[Array, Array],
         coupling: Coupling,
         timestep: float,
         steps: int,
@@ -172,7 +172,7 @@ class NativeRefresh:
         self._native = native.extension("_gateway")
         shape = (size, armature.shape[1])
         if friction.viscous is None:
-            viscous: Any = 0.0
+            viscous: Array = 0.0
         else:
             viscous = friction.viscous
         named = {"armature": armature, "coulomb": friction.most, "viscous": viscous}
@@ -216,7 +216,7 @@ class NativeStep:
         dof: int,
         arrays: Mapping[str, Rows],
         speed_limit: Float64 | None,
-        **fields: Any,
+        **fields: object,
     ) -> None:
         self._arrays = dict(arrays)
         if speed_limit is not None:

@@ -208,16 +208,16 @@ class EnginePack(Protocol):
         """
 
     def write_state_rows(self, states: Float64) -> None:
-        """Put all envs into the states that :meth:`read_state` returned; of a new pack, unless they
-        are complete.
+        """Put all envs into the states that :meth:`read_state` returned. Incomplete states need a
+        new pack.
 
         Rows may be longer, with more NaN at the end. The loop writes efforts and suspension
         afterwards.
         """
 
     def read_poses(self, names: Sequence[str] | None = None) -> list[Rows]:
-        """Return the poses that ``build`` asked for in each env (poses, 7): x, y, z [m], quaternion
-        w, x, y, z.
+        """Return the poses of the entities that ``build`` returned in each env (poses, 7): x, y, z
+        [m], quaternion w, x, y, z.
 
         With ``names``, those of these bodies of the file of ``spec``, in float64.
         """
@@ -253,7 +253,7 @@ class EnginePack(Protocol):
         gravity: bool,
         coriolis: bool,
         velocities: bool,
-        speed_limit: Any,
+        speed_limit: Float64 | None,
         drives: bool = False,
     ) -> CompiledStep:
         """Return the sim step of the present robots.

@@ -92,8 +92,8 @@ class ReachVectorEnv(RobotVectorEnv):
         self._action_names = self.joint_names
         if self.runner.options.own_command is not None:
             self.close()
-            problem = "has setpoints that are not of joints"
-            raise InvalidArgumentError("control", problem, remedy="write a task for it")
+            problem = "takes no joint setpoints"
+            raise InvalidArgumentError("control", problem, remedy="subclass RobotVectorEnv")
         # Only a law that takes errors the short way round follows a setpoint past pi.
         self._setpoint_turns = np.zeros(len(self.joint_names))
         if self.runner.control == "pid" and self.runner.params.continuous is not None:

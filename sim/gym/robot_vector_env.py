@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from inspect import signature
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from batchpid.arrays.array_types import Bool, Document, Float32, Float64, Rows
 from batchpid.checks.validate import array, check_keywords, choice, env_mask, flag, integer, number
 from batchpid.errors import CallOrderError, InvalidArgumentError, SingleOwner
-from batchpid.sim.options.options import RunnerOptions, checked_option
+from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import LARGEST
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
@@ -132,6 +133,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self.step_seconds = substeps * timestep
         chosen = {"substeps": substeps, **self.runner_options()}
         check_free(self, options, chosen)
+        arguments = [*signature(type(self)).parameters, *signature(RobotVectorEnv).parameters]
+        check_keywords(type(self).__name__, options, [*arguments, *OPTIONS])
         # Spaces come first: an invalid one is an error before any process starts.
         self.single_observation_space, self.single_action_space = self.spaces()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -165,7 +168,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         Actions are clipped to their space, and observations to theirs.
         """
 
-    def runner_options(self) -> Mapping[str, Any]:
+    def runner_options(self) -> Document:
         """Return the options of the Runner that belong to the task; the caller cannot give these.
         Default: none.
         """
@@ -283,8 +286,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         return self.step_wait()
 
     def step_async(self, actions: ArrayLike) -> None:
-        """Begin a step, which the workers make while the caller computes something else, and
-        return.
+        """Begin a step and return; the workers run it while the caller computes something else.
 
         Raises
         ------
@@ -297,7 +299,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         action = np.clip(action, space.low, space.high)
         begins = self._done.copy()
         if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
-            raise error.ResetNeeded(f"reset env {int(np.argmax(begins))} before the next step")
+            raise error.ResetNeeded(
+                f"env {int(np.argmax(begins))} has ended; reset it before the next step"
+            )
         # In next-step mode an ended env holds its setpoint: step_wait begins its next episode.
         last = self._setpoint
         setpoint = self._returned("command", self.command(action, last), last.shape)
@@ -378,7 +382,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             pictures.append(painter.picture(row.qpos, row.base_pose))
         return tuple(pictures)
 
-    def close_extras(self, **_: Any) -> None:
+    def close_extras(self, **_: object) -> None:
         """Close the runner."""
         self.runner.close()
 

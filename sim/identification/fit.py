@@ -365,7 +365,7 @@ def windows_of(data: Sequence[LogData]) -> list[Window]:
     for number, part in enumerate(data):
         dt = part.drive.timestep
         total = len(part.motion.qpos) - 1
-        share = {None: 1 - HELD_OUT, False: 1.0, True: 0.0}[part.log.settings.held_out]
+        share = {None: 1 - HELD_OUT, False: 1.0, True: 0.0}[part.log.held_out]
         split = round(share * total)
         length = total
         starts = [0]

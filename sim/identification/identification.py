@@ -24,6 +24,7 @@ from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.regression import (
     Guess,
     LogData,
+    Motion,
     better_reading,
     regress,
     smooth,
@@ -43,8 +44,6 @@ FOLLOWS = 0.01
 """A joint is stuck if the standard deviation of its positions is at most this share of its
 setpoints'.
 """
-BEYOND = 3.0
-"""Effort over the robot's limit from which it looks like another unit."""
 DETOUR = 0.1
 """Decrease of the regression's cost from which the compensation counts as exact, not through the
 motors.
@@ -139,15 +138,14 @@ def _read(
     read = list[Log]()
     for source in [logs] if isinstance(logs, str | os.PathLike | Log) else logs:
         if isinstance(source, Log):
-            read += checked(source.settings.robot or robot, source)
+            read += checked(source.robot or robot, source)
         else:
             read += read_logs(robot, [source], kind, reading=reading)
-    if all(log.settings.held_out for log in read):
+    if all(log.held_out for log in read):
         raise InvalidArgumentError("logs", "are missing or held out", remedy="name some to fit")
+    first = read[0]
     for log in read:
-        first = read[0]
-        alike = (first.joints, first.kind, first.measured)
-        if (log.joints, log.kind, log.measured) != alike:
+        if (log.joints, log.kind, log.measured) != (first.joints, first.kind, first.measured):
             problem = f"holds other joints or commands than {first.source}"
             raise log.error(problem, "fit them one by one")
     return read
@@ -184,19 +182,22 @@ def _prepared(
     """Return the robot with its still joints at their mean positions, and the moving joints of each
     log with plant and control.
     """
-    forces = _option("compensate", compensate, logs, "gravity+coriolis+friction")
+    recorded = [log.compensate for log in logs]
+    forces = _option("compensate", compensate, recorded, "gravity+coriolis+friction")
     choice(
         "compensate", forces, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none")
     )
     forces, is_friction, _ = forces.partition("+friction")
-    dt = number("timestep", _option("timestep", timestep, logs, 1 / 2000), 1e-5, 0.01, "seconds")
+    dt = _option("timestep", timestep, [log.timestep for log in logs], 1 / 2000)
+    dt = number("timestep", dt, 1e-5, 0.01, "seconds")
     # Joints that did not move are held at their mean position, with the unlogged ones.
+    qpos = np.concatenate([log.qpos for log in logs])
     joints = np.array(logs[0].joints)
     start = robot.start
-    start[joints[~moves]] = np.concatenate([log.qpos for log in logs]).mean(0)[~moves]
-    # Joints whose positions leave the limits have none in the simulation.
-    qpos = np.concatenate([log.qpos for log in logs])[:, moves]
+    start[joints[~moves]] = qpos.mean(0)[~moves]
     joints = joints[moves]
+    # Joints whose positions leave the limits have none in the simulation.
+    qpos = qpos[:, moves]
     free = (qpos.min(0) < robot.lower[joints]) | (qpos.max(0) > robot.upper[joints])
     # A Runner compensates the friction of the description and of the robot's motors, too.
     modelled = None
@@ -208,13 +209,11 @@ def _prepared(
     data = list[LogData]()
     for log in logs:
         law = _law(robot, log, params)
-        if law is not None:
-            law = law.for_joints(moves)
-        key = log.settings.robot or robot
+        drive = LogControl(dt, law and law.for_joints(moves), forces, modelled=modelled)
+        key = log.robot or robot
         if key not in plants:
             plants[key] = Plant(_resting(key, start), tuple(joints.tolist()), free)
         part = log.part(joints=moves)
-        drive = LogControl(dt, law, forces, modelled=modelled)
         data.append(LogData(part, smooth(part, dt), plants[key], drive))
     return _resting(robot, start), data
 
@@ -224,31 +223,25 @@ def _resting(robot: Robot, start: Float64) -> Robot:
     return replace(robot, settings=None, defaults=FileDefaults(start))
 
 
-def _option(name: str, value: Any, logs: list[Log], default: Any) -> Any:
-    """Return ``value``, else that of the recordings, which must not differ, else the default."""
-    for log in logs:
-        recorded = getattr(log, name)
-        if value is None:
-            value = recorded
-        if recorded is not None and recorded != value:
-            problem = f"contradicts {log.source}, which was made with {recorded!r}"
-            raise InvalidArgumentError(name, problem, value=value, remedy="leave the option out")
-    return default if value is None else value
+def _option(name: str, value: Any, recorded: list[Any], default: Any) -> Any:
+    """Return ``value``, else that of the recordings, else the default."""
+    values = {option for option in (value, *recorded) if option is not None} or {default}
+    if len(values) > 1:
+        problem = f"contradicts recordings, which were made with {recorded}"
+        raise InvalidArgumentError(name, problem, value=value, remedy="fit them one by one")
+    return values.pop()
 
 
 def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
     """Return the params that drove a log, of its joints, one row; None for efforts."""
-    law = _of_joints(log.settings.params or params, robot, log)
-    recorded = _of_joints(log.params, robot, log)
-    if law is not None and recorded is not None:
-        for name in ("kp", "ki", "kd"):
-            gains = [getattr(table, name) for table in (recorded, law)]
-            before, now = (0.0 if gain is None else gain for gain in gains)
-            if not np.allclose(before, now, rtol=1e-6):
-                problem = f"contradict {log.source}, which was recorded with another {name}"
-                remedy = "leave them out: a recording has its own"
-                raise InvalidArgumentError("params", problem, remedy=remedy)
-    law = law or recorded
+    laws = [_of_joints(law, robot, log) for law in (params, log.params) if law is not None]
+    law = laws[-1] if laws else None
+    for name in ("kp", "ki", "kd"):
+        gains = [0.0 if getattr(table, name) is None else getattr(table, name) for table in laws]
+        if not np.allclose(gains[:1], gains[-1:], rtol=1e-6):
+            problem = f"contradict {log.source}, which was recorded with another {name}"
+            remedy = "leave them out: a recording has its own"
+            raise InvalidArgumentError("params", problem, remedy=remedy)
     if (law is None) != (log.kind == "effort"):
         remedy = "give the params that drove the robot" if law is None else "give no params"
         raise log.error(f"holds {log.kind}s", remedy)
@@ -258,9 +251,9 @@ def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | 
     return law
 
 
-def _of_joints(params: bp.PIDParams | None, robot: Robot, log: Log) -> bp.PIDParams | None:
+def _of_joints(params: bp.PIDParams, robot: Robot, log: Log) -> bp.PIDParams:
     """Return the params of the joints of a log."""
-    if params is None or params.num_joints == len(log.joints):
+    if params.num_joints == len(log.joints):
         return params
     if params.num_joints != robot.dof or params.num_envs != 1:
         problem = f"hold {params.num_joints} joints of {params.num_envs} envs"
@@ -282,19 +275,10 @@ def _regress(
         # A robot that adds the compensation by itself may do so exactly, whatever its motors.
         exact = [part._replace(drive=part.drive._replace(through=False)) for part in data]
         others = regress(_fitted(exact), has_slew)
-        if others[0].cost() < guesses[0].cost() - DETOUR:
+        if others[0].cost < guesses[0].cost - DETOUR:
             data = exact
             guesses = others
-    first = _fitted(data)[0]
-    log = first.log
-    limits = robot.effort_limit[list(log.joints)]
-    beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > BEYOND * limits
-    words = ""
-    if guesses[0].odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
-        words = better_reading(first, [robot.joint_names[joint] for joint in log.joints])
-    delay = float(guesses[0].values["setpoint_delay"][0])
-    if delay < -1e-9 and not words:
-        words = f"setpoints that were logged about {-1e3 * delay:.0f} ms late"
+    words = better_reading(robot, _fitted(data)[0], guesses[0])
     if words:
         remedy = "correct the log or its options"
         raise InvalidArgumentError("logs", f"make sense with {words}", remedy=remedy)
@@ -303,7 +287,7 @@ def _regress(
 
 def _fitted(data: list[LogData]) -> list[LogData]:
     """Return the logs that are not held out as a whole."""
-    return [part for part in data if not part.log.settings.held_out]
+    return [part for part in data if not part.log.held_out]
 
 
 def _unknowns(robot: Robot, data: list[LogData], guess: Guess, extras: Sequence[str]) -> Unknowns:
@@ -328,24 +312,24 @@ def _unknowns(robot: Robot, data: list[LogData], guess: Guess, extras: Sequence[
     if "gain" in extras:
         kinds.remove("strength")
         starts["gain"] = starts["strength"]
-    motions = [part.motion for part in data]
-    qpos, qvel, qacc, command = (np.concatenate(tables) for tables in zip(*motions, strict=True))
-    poses = np.ascontiguousarray(qpos[:: 1 + len(qpos) // 200])
+    motion = Motion(*map(np.concatenate, zip(*(part.motion for part in data), strict=True)))
+    # The mean inertia of the links, on 200 poses of the motion.
+    poses = np.ascontiguousarray(motion.qpos[:: 1 + len(motion.qpos) // 200])
     dynamics = Dynamics(plant, [()] * len(poses), poses, np.zeros_like(poses))
     dynamics.update()
     links = np.diagonal(dynamics.matrix, axis1=1, axis2=2).mean(0)
-    speed = np.maximum(np.sqrt((qvel**2).mean(0)), 1e-3)
+    speed = np.maximum(np.sqrt((motion.qvel**2).mean(0)), 1e-3)
+    acceleration = np.maximum(np.sqrt((motion.qacc**2).mean(0)), 0.1)
     friction = starts["friction"]
-    inertia = links + starts["armature"]
-    effort = inertia * np.maximum(np.sqrt((qacc**2).mean(0)), 0.1) + friction
+    effort = (links + starts["armature"]) * acceleration + friction
     sizes = {
         "inertia": links,
         "damping": effort / speed,
         "effort": effort,
         "friction": 0.3 * np.maximum(friction, 0.05 * effort),
         "speed": 0.1 * speed,
-        "top_speed": np.mean([motion.top_speed for motion in motions], axis=0),
-        "error": 0.7 * np.quantile(np.abs(command - qpos), 0.95, axis=0),
+        "top_speed": np.mean([part.motion.top_speed for part in data], axis=0),
+        "error": 0.7 * np.quantile(np.abs(motion.command - motion.qpos), 0.95, axis=0),
     }
     return Unknowns.of(robot, log.joints, kinds, starts, sizes, plant.heavy_links)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal, NamedTuple, SupportsIndex
+from typing import Literal, SupportsIndex
 
 import numpy as np
 
@@ -19,8 +19,10 @@ from batchpid.errors import InvalidArgumentError, warn
 from batchpid.sim.robot.robot import Robot
 
 CommandKind = Literal["setpoint", "effort"]
-BEYOND = {"rad": 0.3, "m": 0.05}
-"""Distance beyond a joint limit at which a position counts as given in another unit."""
+BEYOND = 0.3, 0.05
+"""Distances [rad], [m] beyond a joint limit at which a position counts as given in another
+unit.
+"""
 MIN_ROWS, MIN_SECONDS = 50, 0.2
 """Least number of rows and length [s] of a stretch."""
 LONGEST = 0.05
@@ -34,22 +36,7 @@ CLEAR = np.pi / 2
 
 
 class LogWarning(UserWarning):
-    """A log was changed when it was read, or a joint did not move."""
-
-
-class LogSettings(NamedTuple):
-    """Settings of one log; None: as given to ``identify``."""
-
-    robot: Robot | None = None
-    """The robot, with the same joints as all."""
-    params: bp.PIDParams | None = None
-    """Params of the PID law, of the joints of the log."""
-    held_out: bool | None = None
-    """True to hold out the whole log, False to fit it all; None: its last quarter is held out."""
-
-
-NO_SETTINGS = LogSettings()
-"""Settings of a log that has none of its own."""
+    """Rows of a log were left out, or a joint did not move."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +65,13 @@ class Log:
     measured: bool = False
     """True if the efforts of ``command`` were measured and not commanded: they have no delay."""
     params: bp.PIDParams | None = None
-    """Params that drove the robot, where the log says it."""
-    settings: LogSettings = NO_SETTINGS
+    """Params that drove the robot, of all its joints or of those of the log; None: as given to
+    ``identify``.
+    """
+    robot: Robot | None = None
+    """The robot, with the same joints as that of ``identify``; None: that one."""
+    held_out: bool | None = None
+    """True to hold out the whole log, False to fit it all; None: its last quarter is held out."""
     lines: Rows | None = None
     """Number of each row's line in a file (rows,)."""
     is_checked: bool = False
@@ -164,7 +156,7 @@ def checked(robot: Robot, log: Log) -> list[Log]:
         else:
             parts.append(_unwrapped(robot, part))
     if not parts:
-        problem = f"has {len(log.time)} rows of {log.seconds:.3g} s in {1 + len(cuts)} stretches"
+        problem = f"has {len(log.time)} rows of {log.seconds:.3g} s in {len(short)} stretches"
         remedy = f"record {MIN_ROWS} rows and {MIN_SECONDS} s without a gap; {units}"
         raise log.error(problem, remedy)
     if short:
@@ -174,16 +166,20 @@ def checked(robot: Robot, log: Log) -> list[Log]:
 
 def _check_finite(robot: Robot, log: Log) -> None:
     if len(log.command_time) != len(log.command) or not len(log.time):
-        remedy = "give a time for each command"
-        raise log.error(f"has {len(log.time)} rows and {len(log.command)} commands", remedy)
-    columns = {"time": log.time, "command_time": log.command_time}
-    for number, joint in enumerate(log.joints):
-        columns[f"qpos:{robot.joint_names[joint]}"] = log.qpos[:, number]
-        columns[f"{log.kind}:{robot.joint_names[joint]}"] = log.command[:, number]
-    for name, column in columns.items():
-        if not np.isfinite(column).all():
-            place = log.place(min(int(np.argmin(np.isfinite(column))), len(log.time) - 1))
-            raise log.error(f"{place}, column {name!r} is empty or not finite", "remove the row")
+        problem = f"has {len(log.time)} rows and {len(log.command)} commands"
+        raise log.error(problem, "give a time for each command")
+    tables = {
+        "time": log.time[:, None],
+        "command_time": log.command_time[:, None],
+        "qpos": log.qpos,
+        log.kind: log.command,
+    }
+    for quantity, table in tables.items():
+        for row, column in np.argwhere(~np.isfinite(table)):
+            if quantity in ("qpos", log.kind):
+                quantity += f":{robot.joint_names[log.joints[column]]}"
+            problem = f"{log.place(row)}, column {quantity!r} is empty or not finite"
+            raise log.error(problem, "remove the row")
 
 
 def _in_order(log: Log) -> Log:
@@ -196,9 +192,7 @@ def _in_order(log: Log) -> Log:
         return log
     first = log.place(np.argmax(repeats))
     log.warn(f"{repeats.sum()} rows repeat a time, the first at {first}: left out")
-    # Commands of a recording have times of their own.
-    commands = ~repeats if len(log.command_time) == len(repeats) else slice(None)
-    return log.part(~repeats, commands)
+    return log.part(~repeats, np.diff(log.command_time, prepend=-np.inf) > 0)
 
 
 def _between(log: Log, begin: int, end: int) -> Log:
@@ -213,47 +207,35 @@ def _unwrapped(robot: Robot, log: Log) -> Log:
     """Return ``log``, without gaps, with continuous positions, and setpoints on the turns closest
     to them.
     """
-    qpos = log.qpos.copy()
-    command = log.command.copy()
-    limited = list[str]()
-    for number, joint in enumerate(log.joints):
-        name = robot.joint_names[joint]
-        column = qpos[:, number]
-        steps = np.diff(column)
-        turns = np.rint(steps / TURN) * (robot.units[joint] == "rad")
-        wraps = turns.any()
-        unclear = (np.abs(steps - TURN * turns) > CLEAR) | (np.abs(turns) > 2)
-        if wraps and unclear.any():
-            row = np.argmax(unclear)
-            problem = f"{log.place(row + 1)}: joint {name!r} jumps by {steps[row]:.3g} rad"
-            remedy = "give positions in rad, log more rows per second, or remove wrong rows"
-            raise log.error(problem, remedy)
-        if not robot.continuous[joint]:
-            if wraps:
-                limited.append(name)
-            else:
-                _check_unit(robot, log, joint, column)
-        column[1:] -= TURN * np.cumsum(turns)
-        if log.kind == "setpoint" and (wraps or robot.continuous[joint]):
-            measured = np.interp(log.command_time, log.time, column)
-            command[:, number] -= TURN * np.rint((command[:, number] - measured) / TURN)
-    if limited:
-        names = ", ".join(limited)
-        problem = f"the positions of {names} jump by whole turns, and were unwrapped"
-        log.warn(f"{problem}; in the robot's file the type is not continuous: correct it")
-    return replace(log, qpos=qpos, command=command, is_checked=True)
-
-
-def _check_unit(robot: Robot, log: Log, joint: int, column: Float64) -> None:
-    """Raise InvalidArgumentError for positions far beyond the joint's limits."""
-    unit = robot.units[joint]
-    low = robot.lower[joint]
-    high = robot.upper[joint]
-    beyond = (column < low - BEYOND[unit]) | (column > high + BEYOND[unit])
-    if beyond.any():
-        row = np.argmax(beyond)
-        place = f"{log.place(row)}, column 'qpos:{robot.joint_names[joint]}'"
-        problem = f"{place} is far beyond the joint's limits, {low:g} to {high:g}"
-        remedy = f"positions are in {unit}; degrees need the option degrees (--degrees)"
+    joints = list(log.joints)
+    names = [robot.joint_names[joint] for joint in joints]
+    revolute = np.array([robot.units[joint] == "rad" for joint in joints])
+    steps = np.diff(log.qpos, axis=0)
+    turns = np.rint(steps / TURN) * revolute
+    wraps = turns.any(0)
+    unclear = (np.abs(steps - TURN * turns) > CLEAR) | (np.abs(turns) > 2)
+    for row, column in np.argwhere(unclear & wraps):
+        problem = f"{log.place(row + 1)}: joint {names[column]!r} jumps by"
+        remedy = "give positions in rad, log more rows per second, or remove wrong rows"
+        raise log.error(f"{problem} {steps[row, column]:.3g} rad", remedy)
+    # Positions far beyond the limits are in another unit; those that wrap are within a turn.
+    margin = np.where(revolute, *BEYOND)
+    low = robot.lower[joints]
+    high = robot.upper[joints]
+    beyond = (log.qpos < low - margin) | (log.qpos > high + margin)
+    free = robot.continuous[joints] | wraps
+    for row, column in np.argwhere(beyond & ~free):
+        problem = (
+            f"{log.place(row)}, column 'qpos:{names[column]}' is far beyond the joint's limits"
+        )
+        remedy = "positions are in rad or m; degrees need the option degrees (--degrees)"
         remedy += "; a joint that turns freely is of type continuous"
-        raise log.error(problem, remedy, column[row])
+        between = f"{low[column]:g} to {high[column]:g}"
+        raise log.error(f"{problem}, {between}", remedy, log.qpos[row, column])
+    qpos = log.qpos.copy()
+    qpos[1:] -= TURN * np.cumsum(turns, axis=0)
+    command = log.command
+    if log.kind == "setpoint":
+        measured = interpolated(log.command_time, log.time, qpos)
+        command = command - TURN * free * np.rint((command - measured) / TURN)
+    return replace(log, qpos=qpos, command=command, is_checked=True)

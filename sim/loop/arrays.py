@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import repeat
 from operator import is_not, itemgetter
 from typing import Any, NamedTuple
@@ -34,7 +34,7 @@ class Command(NamedTuple):
     feedforward: Array = None
     """Joint effort added before saturation (envs, dof) [N m or N]."""
 
-    def map(self, function: Any) -> Command:
+    def map(self, function: Callable[[Array], Array]) -> Command:
         """Return a command with ``function`` applied to each array that is given."""
         return Command(*[None if rows is None else function(rows) for rows in self])
 
@@ -104,7 +104,7 @@ class Arrays(NamedTuple):
             group(FaultArrays, "fault"),
         )
 
-    def at(self, index: Any) -> Arrays:
+    def at(self, index: object) -> Arrays:
         """Return views at an index of the leading axes, such as a tick or a slice of envs."""
         part = itemgetter(index)
         return Arrays(

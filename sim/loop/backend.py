@@ -15,9 +15,9 @@ def native_obstacle(options: RunnerOptions) -> str:
     control = options.control
     if isinstance(control, OperationalSpace):
         if type(control) is not OperationalSpace:
-            return "the law of a subclass of OperationalSpace is one of Python"
+            return "a subclass of OperationalSpace runs in Python"
     elif not isinstance(control, str):
-        return "the controller is one of Python"
+        return "the controller runs in Python"
     if options.robot.dof > MOST_SUMMED:
         return f"more than {MOST_SUMMED} joints"
     return ""
@@ -37,7 +37,7 @@ def describe(options: RunnerOptions) -> str:
     if options.control == "drive":
         law = f"in {engine.title} (control 'drive')"
     if reason:
-        steps = f", a call each sim step ({reason})"
+        steps = f", one call per sim step ({reason})"
     else:
         steps = ""
     return f"law {law}{steps}, {native.describe_calls(engine.title, lack)}"

@@ -5,7 +5,7 @@ envs.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Array, Document, Float64, Rows
+from batchpid.arrays.array_types import Array, Document, Float64, Pytree, Rows
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.trees import flatten, unflatten
@@ -61,7 +61,7 @@ class OwnController:
                 )
         return leaves
 
-    def reset(self, state: Mapping[str, Any], mask: NDArray[np.bool_]) -> dict[str, Rows]:
+    def reset(self, state: Document, mask: NDArray[np.bool_]) -> dict[str, Rows]:
         """Return ``state`` with the envs of ``mask`` (M,) at their start."""
         rows = {name: np.array(leaf) for name, leaf in state.items()}
         with controller_errors(self):
@@ -70,7 +70,7 @@ class OwnController:
             leaf[mask] = fresh[name][mask]
         return rows
 
-    def __call__(self, state: Mapping[str, Any], *inputs: Float64) -> tuple[Array, ...]:
+    def __call__(self, state: Document, *inputs: Float64) -> tuple[Array, ...]:
         """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel, passive
         force, and the time to the end of the tick, which only operational-space control takes.
 
@@ -95,7 +95,7 @@ class OwnController:
         state, effort = self._controller(*arguments[:-1])
         return state, effort
 
-    def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[Array, ...]:
+    def traced(self, leaves: Document, *inputs: Array) -> tuple[Array, ...]:
         """Call the controller within a JAX program; arguments and results as in :meth:`__call__`.
 
         Raises InvalidArgumentError if JAX cannot trace the controller, or it returns an effort or a
@@ -117,7 +117,7 @@ class OwnController:
         return new, _like({"effort": qpos}, efforts)["effort"], *limited
 
 
-def initial_state(options: RunnerOptions, params: bp.PIDParams) -> Any:
+def initial_state(options: RunnerOptions, params: bp.PIDParams) -> Pytree:
     """Return the initial state of the law of all envs."""
     if isinstance(options.control, str):
         return bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32))
@@ -153,7 +153,7 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
         return unflatten(state := init(*arguments), flatten(state))
 
 
-def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
+def _like(before: Document, leaves: Document) -> Document:
     """Return the arrays that a controller returned in the dtypes of ``before``.
 
     Raises InvalidArgumentError if names or shapes differ, or a dtype cannot be cast.

@@ -5,7 +5,6 @@ sensors of links; pushes of bases.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,9 @@ from batchpid.sim.signals.quantities import untouched
 
 Int64 = NDArray[np.int64]
 COUNTS = ("steps", "due", "number")
-"""Sim steps since the reset, those at which the next push is due, and pushes so far."""
+"""Counters of an env: sim steps since the reset, the sim step of the next push, and the number of
+pushes so far.
+"""
 
 
 class ActingDraws:
@@ -79,7 +80,7 @@ def make_pack(
     size: int,
     first_env: int,
     draws: Draws | None,
-    workspace: dict[Any, Any],
+    workspace: object,
 ) -> EnginePack:
     """Return the pack of ``size`` envs; without ``draws`` all robots equal the model."""
     randomization = options.randomization

@@ -65,7 +65,7 @@ class Fault(NamedTuple):
             "speed": "it is faster than speed_limit",
             "effort": "the effort that its controller returned is not finite",
         }
-        cause = texts.get(self.cause, f"the {self.cause} given for it is not finite")
+        cause = texts.get(self.cause, f"its {self.cause} is not finite")
         if self.action == "hold":
             action = "held until it is reset"
         else:
@@ -112,7 +112,7 @@ class EventLog:
     """
 
     def __init__(
-        self, num_envs: int, field: str, none: int, read: Callable[[int, Arrays], Any]
+        self, num_envs: int, field: str, none: int, read: Callable[[int, Arrays], object]
     ) -> None:
         self.events: tuple[Any, ...] = ()
         """Latest last."""
@@ -122,19 +122,17 @@ class EventLog:
         self._steps: Rows = np.full(num_envs, none)
 
     def without(self, mask: Bool) -> EventLog:
-        """Return a log that knows no last event of the envs of ``mask`` (envs,), which were
-        reset.
-        """
+        """Return a log without the last event of the envs of ``mask`` (envs,), which were reset."""
         return self.restored(np.where(mask, self._none, self._steps))
 
     def restored(self, steps: Rows) -> EventLog:
-        """Return a log that knows the steps of the envs' last events (envs,)."""
+        """Return a log with the sim steps of the envs' last events (envs,)."""
         log = copy.copy(self)
         log._steps = steps.copy()
         return log
 
     def with_events(self, arrays: Arrays) -> EventLog:
-        """Return a log with the events of ``arrays`` that this one does not know."""
+        """Return a log with the events of ``arrays`` that this log does not have yet."""
         steps = getattr(arrays.fault, self._field)
         # An event is new if it has another step than the env's last one.
         new = np.flatnonzero((steps != self._none) & (steps != self._steps)).tolist()
@@ -188,7 +186,7 @@ class FaultContainment:
         self.step[mask], self.missed_contact[mask] = -1, 0
 
     def fail(self, bad: Bool, cause: str, step: int, qpos: NDArray[np.float64]) -> None:
-        """Note a fault of the envs with a True entry in ``bad`` (M, dof); suspended envs stay at
+        """Record a fault of the envs with a True entry in ``bad`` (M, dof); suspended envs stay at
         ``qpos`` (M, dof).
         """
         failed = bad.any(1)
@@ -213,7 +211,7 @@ class FaultContainment:
         returned: Float64 | None,
         speed_limit: Array,
     ) -> None:
-        """Note the faults of envs whose state is not finite, too far or too fast after sim step
+        """Record the faults of envs whose state is not finite, too far or too fast after sim step
         ``step``; ``before`` are the positions before it (M, dof).
 
         ``returned`` is the effort of the caller's own controller, within the limits; or None.

@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,7 +129,7 @@ class Loop:
         )
         self._steps = 0
         self._given: tuple[bool, ...] = ()
-        self._workspace: dict[Any, Any] = {}
+        self._workspace: dict[object, object] = {}
         if isinstance(options.control, str):
             controller = None
         else:

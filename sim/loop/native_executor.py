@@ -132,7 +132,7 @@ class NativeExecutor:
         self.failed = self._engine.compiled().may_have_failed(tick.status)
         return tick.tick, tick.step
 
-    def prepare(self) -> Any:
+    def prepare(self) -> object:
         """Return the program for the extension, with robots and noise prepared."""
         assert self._program is not None
         tick = self._program.tick

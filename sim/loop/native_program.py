@@ -40,7 +40,7 @@ class Table(NamedTuple):
     arrays: Arrays
     """(ticks, envs, ...), the same in every run."""
     effort: NDArray[np.float32]
-    """Of the last tick (envs, dof), as the next two."""
+    """Effort of the last tick (envs, dof), as are the next two."""
     saturated: NDArray[np.bool_]
     guarded: NDArray[np.bool_]
     fault: FaultArrays
@@ -76,7 +76,7 @@ class TickProgram:
     """
 
     def __init__(
-        self, setup: Setup, buffers: Buffers, table: Table, noise: Any, reads_force: bool
+        self, setup: Setup, buffers: Buffers, table: Table, noise: Pytree, reads_force: bool
     ) -> None:
         _, pack, layout, constants, _ = setup
         self._setup, self._buffers = setup, buffers

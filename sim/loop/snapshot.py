@@ -51,12 +51,12 @@ class Snapshot:
     """
     actuators: bp.Actuators | None = None
 
-    def check_options(self, about: Mapping[str, Any]) -> None:
+    def check_options(self, about: Document) -> None:
         """Raise InvalidArgumentError if a runner with options ``about`` cannot restore it."""
         others = [key for key, ours in about.items() if self.about.get(key) != ours]
         if others:
-            problem = f"is of a runner with another {' and '.join(others)}"
-            raise InvalidArgumentError("snapshot", problem, remedy="use one with the same options")
+            problem = f"comes from a runner with another {' and '.join(others)}"
+            raise InvalidArgumentError("snapshot", problem, remedy="take one with the same options")
 
     def check_rows(self, own: Mapping[str, Rows]) -> None:
         """Check names, shapes and dtypes of the arrays against the runner's ``own``.
@@ -81,7 +81,7 @@ class Snapshot:
         """Return the checked stream and episode of each of ``num_envs`` envs."""
         episodes = self.rows.get("episodes", np.zeros(0))
         is_table = episodes.shape == (num_envs, 2) and episodes.dtype == np.int64
-        _expect(is_table and (episodes >= 0).all(), "has no valid episodes of its envs")
+        _expect(is_table and (episodes >= 0).all(), "has no valid episode numbers")
         return episodes
 
     def for_envs(self, envs: slice | Sequence[int] | Rows) -> Snapshot:

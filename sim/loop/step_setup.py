@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid import motors as actuator_model
-from batchpid.arrays.array_types import Array, Bool, Float64
+from batchpid.arrays.array_types import Array, Bool, Float64, Pytree
 from batchpid.arrays.elementwise import TURN, replace_envs
 from batchpid.arrays.trees import mapped
 from batchpid.law.coefficients import spread
@@ -174,10 +174,10 @@ def _turns(pack: EnginePack) -> Array:
 
 
 def empty_state(
-    options: RunnerOptions, law: Any, actuators: bp.Actuators | None, stiction: bool, envs: int
+    options: RunnerOptions, law: Pytree, actuators: bp.Actuators | None, stiction: bool, envs: int
 ) -> StepState:
-    """Return a state of the control of ``envs`` envs with this part of the law, in the structure
-    that it has with ``actuators`` (None: without an effect), and with Coulomb friction or without.
+    """Return the state of the control of ``envs`` envs with the state ``law`` of the law, and zeros
+    for the rest: actuators, unless None, and Coulomb friction if ``stiction``.
     """
     rows = np.zeros((envs, options.robot.dof))
     state = StepState(law)

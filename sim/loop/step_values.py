@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Array
+from batchpid.arrays.array_types import Array, Pytree, T
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.computed_torque import advance_with_mass_matrix
@@ -61,7 +61,7 @@ class PIDLaw(NamedTuple):
         viscous: Array = None,
         low: Array = None,
         high: Array = None,
-    ) -> tuple[bp.PIDState, Any, Any]:
+    ) -> tuple[bp.PIDState, Array, Array]:
         """Return the new state, the effort, and the mask of saturated joints.
 
         Parameters
@@ -98,10 +98,10 @@ class StepState(NamedTuple):
     axis.
     """
 
-    law: Any
+    law: Pytree
     """:class:`batchpid.PIDState`, or the arrays of the caller's own controller by name."""
     friction: FrictionState = FrictionState()
-    age: Any = None
+    age: Array = None
     """Sim steps since the last update of the friction model's inertia (M,); None without Coulomb
     friction.
     """
@@ -140,13 +140,13 @@ class Outputs(NamedTuple):
 
     qf: Array = None
     """Effort to apply to the joints in the next step of the engine [N m or N]."""
-    motor: Any = None
+    motor: Array = None
     """Effort of the motors."""
     saturated: Array = None
     """Joints whose effort was limited; None under control "drive"."""
     guarded: Array = None
     """Setpoints that the guard changed; None without guard."""
-    returned: Any = None
+    returned: Array = None
     """Effort that the caller's own controller returned; None for other controls."""
     target: Array = None
     """Position target of the engine's drives [rad or m]; None without drives."""
@@ -165,11 +165,11 @@ class Values(NamedTuple):
     """Reading as the sensors measure it, with the whole feedforward as its passive force from that
     stage on.
     """
-    noise: Any = None
+    noise: Pytree = None
     """Noise of the sensors in this step, if it is drawn in advance."""
     limited: Array = None
     """Joints whose effort the caller's own controller has limited (M, dof); None if it does not
-    say.
+    report them.
     """
     outputs: Outputs = Outputs()
 
@@ -216,7 +216,7 @@ class Constants(NamedTuple):
     """1 / (2 pi) on continuous joints with drives, 0 elsewhere; None without such joints."""
 
 
-def when(due: Any, function: Callable[[], Any], otherwise: Array) -> Any:
+def when(due: Array, function: Callable[[], T], otherwise: T) -> T:
     """Return ``function()`` if ``due``, a bool or an array, has a True entry; else
     ``otherwise``.
     """
@@ -272,7 +272,7 @@ class Layout(NamedTuple):
     implicit: bool = False
     """Whether the law, or operational-space control, is implicit."""
 
-    def left(self, index: Any, end: Array, timestep: Array) -> Array:
+    def left(self, index: Array, end: Array, timestep: Array) -> Array:
         """Return the time from the law's setpoint in sim step ``index`` to the end of a tick of
         ``end`` steps [s].
 
@@ -287,7 +287,7 @@ class Layout(NamedTuple):
         return int(self.control == "drive" or self.implicit)
 
 
-def half_way(qpos: Array, qvel: Array, steps: Any, timestep: float) -> Array:
+def half_way(qpos: Array, qvel: Array, steps: Array, timestep: float) -> Array:
     """Return the pose for the mass matrix of the next ``steps`` sim steps from ``qpos``: half way
     through them.
 

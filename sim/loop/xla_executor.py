@@ -38,7 +38,7 @@ ROWS = 16
 """Number of which the rows in a program are a multiple."""
 
 
-def padded(rows: Any) -> Rows:
+def padded(rows: Array) -> Rows:
     """Return ``rows`` (envs, ...) followed by copies of the first row, up to a multiple of ROWS."""
     rows = np.asarray(rows)
     # Copies of a robot stay finite, which rows of zeros need not.
@@ -46,7 +46,7 @@ def padded(rows: Any) -> Rows:
     return np.concatenate([rows, np.repeat(rows[:1], missing, 0)])
 
 
-def put(tree: Pytree) -> Any:
+def put(tree: Pytree) -> Pytree:
     """Return a structure of arrays as JAX arrays on the CPU."""
     import jax
 
@@ -56,12 +56,12 @@ def put(tree: Pytree) -> Any:
 class Carry(NamedTuple):
     """State of the loop over sim steps."""
 
-    progress: Any
+    progress: Array
     """Sim steps of the tick that are done, and the last status (2,)."""
     state: StepState
     measured: Measured
     outputs: Outputs
-    before: Any
+    before: Array
     """qpos before the last step."""
 
 
@@ -172,10 +172,10 @@ class XLAExecutor:
 
 def tick(
     layout: Layout,
-    controller: Any,
-    span: Any,
+    controller: object,
+    span: Array,
     constants: Constants,
-    bodies: tuple[Any, Any] | None,
+    bodies: tuple[Array, Array] | None,
     state: StepState,
     measured: Measured,
     command: Command,
@@ -232,7 +232,7 @@ def tick(
 
 
 @lru_cache(maxsize=8)
-def compiled(layout: Layout, controller: Any) -> Any:
+def compiled(layout: Layout, controller: object) -> Any:
     """Return :func:`tick` of this layout, compiled at its first call."""
     import jax
 

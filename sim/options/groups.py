@@ -42,7 +42,8 @@ Backend = Literal["numpy", "jax"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
 Place = Literal["snapshot", "recording", "scene", "restored", "processes", "next commands"]
-"""Where an option is kept, or why a snapshot can be restored in a runner with another value.
+"""Places that hold the value of an option, and reasons why a snapshot can be restored in a runner
+with another value.
 
 - "snapshot": it must be the same in the runner that restores the snapshot;
 - "recording": a field of :class:`batchpid.sim.RunInfo`;
@@ -56,7 +57,7 @@ Place = Literal["snapshot", "recording", "scene", "restored", "processes", "next
 
 
 class Option(NamedTuple):
-    """Where an argument of a Runner is kept and shown, by :func:`option`."""
+    """Places that hold an argument of a Runner, and its flag; made by :func:`option`."""
 
     places: Mapping[str, str]
     """Attribute of :class:`batchpid.sim.RunnerOptions` that each :data:`Place` keeps; "" for the
@@ -67,8 +68,8 @@ class Option(NamedTuple):
 
 
 def option(*places: Place, flag: str = "", **attributes: str) -> Option:
-    """Return the option that ``places`` keep; ``attributes`` are further places, with the attribute
-    that each keeps.
+    """Return the option that ``places`` hold; ``attributes`` are further places, with the attribute
+    that each holds.
     """
     return Option(dict.fromkeys(places, "") | attributes, flag)
 
@@ -95,7 +96,7 @@ class OptionGroup:
         """
         return self
 
-    def changed(self, **values: Any) -> Self:
+    def changed(self, **values: object) -> Self:
         """Return the options with other ``values``."""
         # Without the checks of __post_init__: these values have passed them.
         made = object.__new__(type(self))
@@ -244,7 +245,7 @@ class Scene(OptionGroup):
             problem = "has no effect without collisions"
             raise InvalidArgumentError("ground_friction", problem, remedy="leave it out")
         if draws.gravity is not None and self.build is not None:
-            problem = "cannot change in scenes of build, which SAPIEN does not build anew"
+            problem = "cannot vary in scenes with build, which SAPIEN builds once"
             raise InvalidArgumentError("gravity", problem, remedy="leave out one of them")
 
     def _check_without_collisions(self, robot: Robot) -> None:
@@ -289,7 +290,7 @@ class Scene(OptionGroup):
             choice(argument, link, [link.name for link in robot.links])
             if bodies[link].link == root and (argument == "wrenches" or robot.fixed_base):
                 problem = f"names {link!r}, which no joint moves"
-                remedy = "name one further along"
+                remedy = "name a link beyond a joint"
                 raise InvalidArgumentError(argument, problem, remedy=remedy)
         return links
 

@@ -149,7 +149,7 @@ class RunnerOptions(RunnerKeywords):
             remedy = "build the extensions, or use backend='numpy'"
             raise InvalidArgumentError("backend", problem, remedy=remedy)
         for argument, problem, is_lacking in (
-            ("control", "has no law to compile", self.control == "drive"),
+            ("control", "is 'drive'", self.control == "drive"),
             ("compensate", "needs NumPy's force", lacks_force and "gravity" in self.compensate),
             ("randomization", "is given", self.randomization is not None),
             ("guard", "is given", self.guard is not None),
@@ -363,7 +363,7 @@ def default_params(
     return robot.designed("effort" if loops else None)
 
 
-def checked_option(name: str, value: Any) -> Any:
+def checked_option(name: str, value: object) -> Any:
     """Return the value of an argument in the canonical form of its declared type.
 
     Raises InvalidArgumentError if a number is out of bounds, or the value is of another type.
@@ -373,7 +373,7 @@ def checked_option(name: str, value: Any) -> Any:
 
 def arguments_of(
     record: Callable[P, object],
-) -> Callable[[Callable[..., None]], Callable[Concatenate[Any, P], None]]:
+) -> Callable[[Callable[..., None]], Callable[Concatenate[object, P], None]]:
     """Decorate an ``__init__`` that forwards its arguments to ``record``, so that editors show that
     signature.
     """
@@ -400,5 +400,5 @@ def _plain(value: Any) -> object:
 
 def _not_in_program(argument: str, problem: str) -> InvalidArgumentError:
     """Return the error for an option that the program of backend "jax" does not have."""
-    problem = f"{problem}, which the program of backend 'jax' does not have"
+    problem = f"{problem}, which backend 'jax' does not support"
     return InvalidArgumentError(argument, problem, remedy="use backend='numpy'")

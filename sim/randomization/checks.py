@@ -54,7 +54,7 @@ def _check_events(randomization: Randomization, robot: Robot) -> None:
     if len(missing) == len(EVENTS):
         return
     for name in missing:
-        remedy = "give push and push_interval, or none"
+        remedy = "give push and push_interval, or neither"
         raise InvalidArgumentError(name, "is missing", remedy=remedy)
     if robot.fixed_base:
         problem = f"needs a floating base, which {robot.name!r} does not have"
@@ -82,7 +82,7 @@ def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robo
     leaves = params.leaves()
     for name, field in randomization.params.items():
         if name not in leaves:
-            problem = "is off in the params, or none of their numbers"
+            problem = "is off in the params, or not a number"
             remedy = f"draw one of {', '.join(leaves)}"
             raise InvalidArgumentError(f"params.{name}", problem, remedy=remedy)
         for rows in _extremes(f"params.{name}", field, robot.joint_names, leaves[name]):

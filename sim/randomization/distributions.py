@@ -138,7 +138,7 @@ class Normal(Distribution):
         below, above = (math.erf((end - mean) / (math.sqrt(2.0) * std)) for end in (low, high))
         share = 0.5 * (above - below)
         if not share >= LEAST_SHARE:
-            problem = f"and high leave {share:.2g} of the draws"
+            problem = f"the range to high holds {share:.2g} of the draws"
             remedy = "use a uniform distribution for a tail"
             raise InvalidArgumentError("low", problem, value=low, remedy=remedy)
         vars(self).update(mean=mean, std=std, low=low, high=high)
@@ -212,7 +212,7 @@ def read_distribution(name: str, value: object) -> Distribution:
         except TypeError as error:
             problem = f"is not a distribution: {error}"
         break
-    remedy = f"write e.g. {{uniform: [0, 1], operation: add}}; there are {', '.join(KINDS)}"
+    remedy = f"write e.g. {{uniform: [0, 1], operation: add}}; kinds: {', '.join(KINDS)}"
     raise InvalidArgumentError(name, problem, value=value, remedy=remedy)
 
 

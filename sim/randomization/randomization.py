@@ -124,7 +124,7 @@ class Randomization:
             if value and isinstance(value, Mapping) and name not in SINGLE:
                 distributions = list(value.values())
             for part in distributions:
-                remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to such"
+                remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to distributions"
                 instance(name, part, Distribution, remedy)  # type: ignore[type-abstract]
 
     @property

@@ -192,7 +192,7 @@ def _urdf_of(info: RunInfo) -> str | None:
     return None
 
 
-def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Mapping[str, Any]) -> None:
+def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Document) -> None:
     """Write ``arrays``, ticks first, from row ``first`` on; it can be repeated if it was
     interrupted.
     """
@@ -246,7 +246,7 @@ def attributes(info: RunInfo) -> Document:
     return values
 
 
-def read_info(values: Mapping[str, Any]) -> RunInfo:
+def read_info(values: Document) -> RunInfo:
     """Return the :class:`RunInfo` in the attributes of a recording."""
     joints = tuple(values["joint_names"])
     read: Document = {}

@@ -76,7 +76,7 @@ def read_csv(
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as bad:
-        problem = f"is not a text: {bad.reason} at byte {bad.start}"
+        problem = f"is not text: {bad.reason} at byte {bad.start}"
         raise error(source, problem, "save it as UTF-8") from None
     delimiter = ","
     header = list[str]()
@@ -106,7 +106,7 @@ def read_csv(
         raise error(source, "has no rows", "give a header and one row per sample")
     columns = dict(zip(header, np.array(rows).T, strict=False))
     if len(columns) < len(header):
-        raise error(source, "has two columns of one name", "give each column another name")
+        raise error(source, "has two columns with the same name", "rename one of them")
     return columns, numbers
 
 
@@ -237,7 +237,7 @@ def _tables(
             if joint in by_joint:
                 tables[quantity][:, column] = by_joint[joint]
             elif robot.independent[column]:
-                remedy = "give every joint that does not follow another one"
+                remedy = "give every joint but followers"
                 raise error(f"{source}: column {quantity}:{joint}", "is missing", remedy)
     return tables
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64, MjModel
+from batchpid.arrays.array_types import Float64, MjModel, MjSpec, Rows
 from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.errors import RobotError
@@ -118,7 +118,7 @@ def convex_hull(points: Float64) -> tuple[Float64, NDArray[np.int64]]:
     )
 
 
-def vertices_in_file(model: MjModel, indices: Any) -> Float64:
+def vertices_in_file(model: MjModel, indices: Rows) -> Float64:
     """Return vertices of the only mesh of a model in the frame of its file; MuJoCo's are in
     principal axes.
     """
@@ -150,7 +150,7 @@ def inertia_of(shapes: Sequence[Shape]) -> SpatialInertia:
     return SpatialInertia(float(model.body_mass[1]), read_only(center), read_only(tensor))
 
 
-def add_geom(spec: Any, body: Any, shape: Shape, **options: Any) -> None:
+def add_geom(spec: MjSpec, body: Any, shape: Shape, **options: Any) -> None:
     """Add a shape to a body of a ``mujoco.MjSpec``; equal hulls share a mesh."""
     import mujoco
 

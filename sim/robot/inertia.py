@@ -62,10 +62,10 @@ def possible_inertia(mass: float, tensor: Float64) -> tuple[Float64, tuple[str, 
         changed = nearest_physical(tensor)
     else:
         changed = np.zeros((3, 3))
-    done = "the nearest that a body has is used"
+    done = "the nearest possible one is used"
     if changed.max() < SMALLEST:
         changed = ball(mass)
-        done = f"that of a ball of its mass at {DENSITY:g} kg/m^3 is used"
+        done = f"the tensor of a ball of its mass at {DENSITY:g} kg/m^3 is used"
     before = " ".join(f"{moment:.3g}" for moment in moments)
     after = " ".join(f"{moment:.3g}" for moment in np.linalg.eigvalsh(changed))
     text = f"no body has such an inertia tensor: {done}"

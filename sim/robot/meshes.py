@@ -127,7 +127,7 @@ def _problem(path: Path, changed: int, size: int) -> str | None:
         if data.startswith(LFS_POINTER):
             return LFS_PROBLEM
         if path.suffix.lower() == ".dae" and not _has_its_numbers(data):
-            return "arrays of other lengths than it says"
+            return "array lengths that do not match count="
         if path.suffix.lower() == ".stl" and len(data) == 84 + _TRIANGLE.itemsize * int.from_bytes(
             data[80:84], "little"
         ):
@@ -142,7 +142,7 @@ def _problem(path: Path, changed: int, size: int) -> str | None:
         return "damaged, or without faces"
     if (np.abs(corners) <= LARGEST).all():
         return None
-    return f"vertices that are not within {LARGEST:g} m"
+    return f"vertices beyond {LARGEST:g} m"
 
 
 def _has_its_numbers(data: bytes) -> bool:

@@ -70,7 +70,7 @@ def read_couplings(model: MjModel, robot: RobotInFile, findings: list[Finding]) 
         offset += rest - multiplier * rest_of_leader
         couplings[name] = robot.joints[leader], multiplier, offset
     if others:
-        text = f"{ALONE} equality constraints other than of the robot's joints: {', '.join(others)}"
+        text = f"{ALONE} equality constraints other than between the robot's joints: {', '.join(others)}"
         remedy = "in SAPIEN expect closed loops to be open"
         findings.append(Finding("warning", "equality", text, remedy))
     return couplings
@@ -102,7 +102,7 @@ def read_motors(
             motors.kv[name] += arm**2 * kv
     for joint, name in robot.joints.items():
         if model.nu and name not in motors.effort_limit and name not in couplings:
-            text = "no actuator of the file moves the joint: it is controlled as all others"
+            text = "no actuator of the file moves the joint: it is controlled like all others"
             remedy = "give it gains of 0 to let it move freely"
             findings.append(Finding("warning", "actuator", text, remedy, name))
         # A limit of 0 counts as none.
@@ -222,10 +222,7 @@ def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
     # Limits here are symmetric; the smaller is safe in both directions.
     smaller, larger = sorted(abs(float(end)) for end in ends)
     if smaller != larger:
-        text = (
-            "the limits of the effort differ by direction: the smaller one that is not zero holds"
-            " in both"
-        )
+        text = "effort limits differ by direction: the smaller one above zero is used in both"
         detail = f"{min(ends):g} to {max(ends):g}"
         remedy = "pass effort_min= and effort_max= to robot.params()"
         findings.append(Finding("warning", "limits", text, remedy, name, detail=detail))

@@ -214,7 +214,7 @@ class RobotInFile:
             if self.is_of_robot(model.jnt_bodyid[joint])
         }
 
-    def is_of_robot(self, body: Any) -> bool:
+    def is_of_robot(self, body: int) -> bool:
         """Return whether a body, or the world, is of the robot."""
         return int(self._roots[body]) not in self._left_out
 

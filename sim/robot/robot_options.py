@@ -92,8 +92,7 @@ def fit_actuators(
     ):
         raise InvalidArgumentError(
             "actuators",
-            "act on efforts and measurements, or need the effort, and PhysX's drives bypass all"
-            " three",
+            "change efforts or measurements, or use the effort, which PhysX's drives bypass",
             remedy=f"use control 'pid', or leave only {', '.join(DRIVEN)}",
         )
     # Ideal ones have no leaf that a joint could change.

@@ -90,7 +90,7 @@ def read_srdf(path: Path, links: Iterable[str]) -> Srdf:
         if len(names.intersection(pair)) != 2:
             text = (
                 f"{path.name}: <{element.tag} link1={pair[0]!r} link2={pair[1]!r}> does not name"
-                " two of its links"
+                " two links of the robot"
             )
             findings.append(Finding("warning", "srdf-link", text, "left out; correct the names"))
         elif element.tag == "enable_collisions":

@@ -27,8 +27,8 @@ from batchpid.task_space.frames import matrix_of, rotate
 
 Rgba = tuple[float, ...]
 _REMEDY = (
-    "repair the file, put it next to the URDF, or pass package_dirs=[...] to Robot.load"
-    ", or ROS_PACKAGE_PATH"
+    "repair the file, put it next to the URDF, pass package_dirs=[...] to Robot.load"
+    ", or set ROS_PACKAGE_PATH"
 )
 
 DEVIATION = 2e-3  # default distance allowed between a chord and its arc [m]

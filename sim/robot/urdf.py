@@ -152,7 +152,7 @@ class _Reader:
         self._links = self._name_links(root)
         self._joints = self._name_joints(root)
         if not self._joints:
-            remedy = f"a xacro has to be expanded first: {_EXPAND}"
+            remedy = f"if it is a xacro, {_EXPAND}"
             raise RobotError(f"{path}: a robot without joints cannot be controlled; {remedy}")
         self._match_links()
 
@@ -216,8 +216,8 @@ class _Reader:
         for element in root.findall("link"):
             name = _text(element, "name")
             if not name or name in links:
-                text = "has no name, or one that is used twice: left out"
-                remedy = "give every link a name to itself"
+                text = "has no name, or a repeated one: left out"
+                remedy = "give every link a unique name"
                 self._warn("repeated-name", text, remedy, link=name or None)
                 continue
             links[name] = element
@@ -236,7 +236,7 @@ class _Reader:
             new = name
             if not name or name in joints:
                 new = unique(name or "{}_to_{}".format(*ends), names)
-                text = f"no name, or one that is used twice: called {new!r}"
+                text = f"no name, or a repeated one: renamed {new!r}"
                 self._warn("repeated-name", text, "name it in the URDF", name or None)
             joints[new] = element
         return joints
@@ -258,7 +258,7 @@ class _Reader:
                 text = "named by joints, but not in the file: added, without mass and shape"
                 self._warn("missing-link", text, "correct the name, or add the link", link=name)
         for name in [name for name in self._links if name not in joined]:
-            text = "held by no joint: left out"
+            text = "no joint holds it: left out"
             self._warn("loose-link", text, "join it, or remove it", link=name)
             del self._links[name]
 
@@ -368,7 +368,7 @@ class _Reader:
                 values = (math.inf,)
             limits[f"{key}_limit"] = values[0]
         if placeholders:
-            text = f"<limit {' '.join(placeholders)}> is a placeholder or no number within"
+            text = f"<limit {' '.join(placeholders)}> is a placeholder or not within"
             text += f" +-{LARGEST:g}: no limit"
             self._warn("placeholder", text, "give <limit effort= velocity=> of the motor", name)
         is_unknown = all(map(math.isinf, limits.values()))
@@ -461,7 +461,7 @@ class _Reader:
         value = numbers(mass, "value", "0")
         if value is None or value[0] < 0 or 0 < value[0] < SMALLEST:
             text = f"<mass value={_text(mass, 'value')!r}> is a mass that PhysX cannot hold"
-            text += ": it counts as not given"
+            text += ": it counts as missing"
             self._warn("inertia", text, "give a mass > 0 [kg]", link=body.name)
             return body
         if value[0] == 0:
@@ -472,7 +472,7 @@ class _Reader:
         if None not in entries:
             tensor = from_entries([entry[0] for entry in entries if entry])
         for problem in filter(None, (fault(inertia, key, "0") for key in MOMENTS)):
-            text = f"{problem}: the inertia tensor counts as not given"
+            text = f"{problem}: the inertia tensor counts as missing"
             self._warn("inertia", text, "correct <inertia>", link=body.name)
         tensor, repair = possible_inertia(value[0], tensor)
         if repair is not None:

@@ -50,7 +50,7 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
                 f"{path}: not well-formed XML: {error.msg}; correct the file at that line"
             ) from error
         if repairs is not None:
-            text = f"not well-formed XML: {error.msg}; read as if that were correct"
+            text = f"not well-formed XML: {error.msg}; read as far as possible"
             repairs.append(Finding("warning", "xml", text, "correct the file at that line"))
     except OSError as error:
         raise RobotError(

@@ -120,7 +120,7 @@ def _check_acceleration(params: bp.PIDParams, inputs: Mapping[str, ArrayLike | N
     """Raise InvalidArgumentError for an acceleration that the law does not take."""
     _, rate, acceleration, _ = inputs
     if params.gain_units is None:
-        problem = "is for gains in accelerations, and these are efforts"
+        problem = "needs gains in accelerations, but these are in efforts"
         remedy = "give M(q) times it as feedforward, or use robot.designed()"
         raise InvalidArgumentError(acceleration, problem, remedy=remedy)
     if inputs[rate] is None:

@@ -57,11 +57,11 @@ class RunWarnings:
         if faults.events:
             self._warn_once(f"{faults.events[0]}; see runner.faults for more", FaultWarning)
         if contacts is not None and contacts.events:
-            problem = "without collisions robots went through what they would have touched"
+            problem = "robots passed through links or the ground, since collisions are off"
             remedy = "Use collisions=True, or other moves; see runner.missed_contacts for more"
             self._warn_once(f"{problem}: {contacts.events[0]}. {remedy}", MissedContactWarning)
 
     def _warn_once(self, text: str, kind: type[Warning]) -> None:
         if kind not in self._issued:
             self._issued.add(kind)
-            warn(f"{text}, of which there is no further warning", kind)
+            warn(f"{text}; this warning is not repeated", kind)

@@ -9,7 +9,7 @@ editors and readers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from inspect import Signature, signature
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Progress
 from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
@@ -63,7 +64,7 @@ class TickRecorder(Protocol):
     path: Path
 
     def prepare(self) -> None:
-        """Return, or raise, before the next tick begins: whether it can be recorded."""
+        """Prepare for the next tick; raise if it cannot be recorded."""
 
     def append(self, time_: float, command: Command, observation: Observation) -> None:
         """Record the state at ``time_`` [s] after a tick under ``command`` (envs, ...), which may
@@ -299,7 +300,7 @@ class Runner(SingleOwner):
         setpoint_rates: ArrayLike | None = None,
         setpoint_accelerations: ArrayLike | None = None,
         feedforwards: ArrayLike | None = None,
-        progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
+        progress: Progress[int] | None = None,
     ) -> Rollout:
         """Run one tick for each row of ``setpoints`` and record every observation.
 
@@ -383,7 +384,7 @@ class Runner(SingleOwner):
         """
         self._ready()
         if self.options.mjcf is None:
-            problem = "are those of an MJCF file in the engine 'mujoco'"
+            problem = "need a robot from an MJCF file and the engine 'mujoco'"
             remedy = "use robot.kinematic_tree() for links"
             raise InvalidArgumentError("names", problem, remedy=remedy)
         chosen = tuple([choice("names", name, self.options.mjcf.bodies) for name in names])
@@ -593,7 +594,7 @@ class Runner(SingleOwner):
         """
         self._check_open()
         if self._sent is not None:
-            problem = "the observation of the last tick that was sent has not been received"
+            problem = "the observation of the last tick has not been received"
             raise CallOrderError(f"{problem}; call recv() first")
 
     def _check_open(self) -> None:

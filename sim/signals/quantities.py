@@ -122,7 +122,7 @@ class Quantity(NamedTuple):
     option that lists links, each with a row.
     """
     links: tuple[str, ...] | None = None
-    """These links."""
+    """Names of the links of that option."""
 
     def shape(self, joints: tuple[int, ...]) -> tuple[int, ...]:
         """Return the shape of this quantity where that of a quantity per joint is ``joints`` (...,

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
+from batchpid.sim.robot.findings import Findings
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.quantities import (
     QUANTITIES,
     CommandSpec,
@@ -23,6 +25,9 @@ from batchpid.sim.signals.quantities import (
     joint_command,
     observed,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 RECORDED = {
     "setpoint": Quantity(np.float64, "setpoint", "rad|m"),
@@ -88,7 +93,7 @@ class RunInfo:
     "none".
     """
     engine: str | None = None
-    """Physics engine: "sapien"."""
+    """Physics engine: "sapien" or "mujoco"."""
     physics: str | None = None
     """Solver settings: "accurate", "fast", or the text of a :class:`batchpid.sim.Physics`."""
     collisions: bool | None = None
@@ -106,7 +111,7 @@ class RunInfo:
     params: PIDParams | None = None
     """PID parameters at the start."""
     params_changed: bool = False
-    """True if they were changed in the run, or a snapshot was restored; known of a complete
+    """True if the params changed during the run, or a snapshot was restored; None in an incomplete
     recording.
     """
     actuators: Actuators | None = None
@@ -121,7 +126,7 @@ class RunInfo:
     """False for a recording that was cut short, or is still being written."""
     faults: tuple[Any, ...] = ()
     """Faults (:class:`batchpid.sim.Fault`) of the runner up to the end of the run."""
-    randomization: Mapping[str, Any] | None = None
+    randomization: Document | None = None
     """Distributions, as :meth:`batchpid.sim.Randomization.to_dict` returns them."""
     draws: Mapping[str, Float64] | None = None
     """Draws at the start, by field: (envs, joints or links)."""
@@ -129,7 +134,7 @@ class RunInfo:
     """Stream and episode of each env at the start (envs, 2)."""
     redraws: tuple[Redraw, ...] = ()
     """Episodes that began after that."""
-    description: Any = field(default=None, repr=False)
+    description: Robot | None = field(default=None, repr=False)
     """Robot (:class:`batchpid.sim.Robot`) of the run, for :meth:`Rollout.findings`; a recording
     keeps its :attr:`urdf` instead.
     """
@@ -137,7 +142,7 @@ class RunInfo:
     """Robot of a recording, as :func:`batchpid.sim.to_urdf` writes it, to be drawn."""
 
     @classmethod
-    def of(cls, robot: Any, **options: Any) -> RunInfo:
+    def of(cls, robot: Robot, **options: Any) -> RunInfo:
         """Return the info of a run of a :class:`batchpid.sim.Robot`; ``options`` are further
         fields.
         """
@@ -251,7 +256,7 @@ class Rollout:
     back.
     """
     setpoint: Float64
-    """(ticks, envs, dof) [rad or m]; under control "effort" the effort asked for [N m or N]. For a
+    """(ticks, envs, dof) [rad or m]; under control "effort" the commanded effort [N m or N]. For a
     control that defines its command (ticks, envs, size), in the order of ``info.command.names``.
     """
     observation: Observation
@@ -352,7 +357,7 @@ class Rollout:
             end = "empty"
         return f"Rollout({ticks} ticks {end}, {envs} envs, {dof} joints, {failed_envs(self.ok)})"
 
-    def findings(self, robot: Any = None) -> Any:
+    def findings(self, robot: Robot | None = None) -> Findings:
         """Return the causes for which joints do not settle; an empty list if all settle.
 
         Each is a :class:`batchpid.sim.Finding` with ``code``, ``text``, ``remedy``, ``envs``,
@@ -375,12 +380,12 @@ class Rollout:
         if robot is None:
             robot = self.info.description
         if robot is None:
-            problem = "of this run is not known"
+            problem = "is unknown for this run"
             remedy = "pass it: rollout.findings(Robot.load(...))"
             raise InvalidArgumentError("robot", problem, remedy=remedy)
         return unsettled_findings(self, robot)
 
-    def plot(self, **options: Any) -> Any:
+    def plot(self, **options: Any) -> Figure:
         """Return a Matplotlib figure of the run, which a notebook shows: positions above efforts
         for each joint.
 

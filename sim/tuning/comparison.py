@@ -5,7 +5,7 @@ picture.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 from tabulate import tabulate
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.array_types import Document, Progress, Rows
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN
@@ -133,8 +133,8 @@ class Comparison:
             ABOUT,
         ]
         for evaluation in self.evaluations:
-            causes = evaluation.rollout.findings(robot)
-            causes = [cause for cause in causes if cause.joint in names]
+            findings = evaluation.rollout.findings(robot)
+            causes = [cause for cause in findings if cause.joint in names]
             if causes:
                 lines += [f"\nNot settled under {evaluation.name} (each env makes one move):"]
                 lines += cause_lines(causes)
@@ -207,7 +207,7 @@ def compare(
     engine: tuple[EngineName, ...] | EngineName | None = None,
     randomization: Randomization | None = None,
     workers: int | None = None,
-    progress: Callable[[Any], Any] | None = None,
+    progress: Progress[tuple[GainSet, EngineName]] | None = None,
     **runner_options: Any,
 ) -> Comparison:
     """Compare sets of gains on the same seeded moves: settling, overshoot, final error and chatter

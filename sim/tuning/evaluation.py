@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -72,7 +71,7 @@ class Evaluation(NamedTuple):
     """
 
 
-def tuning_engine(build: Callable[..., Any] | None) -> EngineName:
+def tuning_engine(build: object) -> EngineName:
     """Return the default engine of searches and comparisons: MuJoCo, which is several times as
     fast, unless scenes have content of the user's for SAPIEN.
     """

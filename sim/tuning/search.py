@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Float64
+from batchpid.arrays.array_types import Document, Float64, Progress
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import package_versions
@@ -122,7 +122,7 @@ def tune(
     motors: bp.Actuators | None = None,
     engine: EngineName | None = None,
     workers: int | None = None,
-    progress: Callable[[Any], Any] | None = None,
+    progress: Progress[int] | None = None,
     **runner_options: Any,
 ) -> Tuning:
     """Tune the gains of any robot: design them from its inertia, then search by CMA-ES on simulated
@@ -276,7 +276,7 @@ def _evolve(
     generations: int,
     population: int,
     seed: int,
-    progress: Callable[[Any], Any] | None,
+    progress: Progress[int] | None,
 ) -> tuple[Float64, tuple[tuple[float, ...], ...]]:
     """Return all points (n, factors) and their costs by generation.
 

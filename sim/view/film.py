@@ -7,10 +7,10 @@ from __future__ import annotations
 import math
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, cast
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,7 +18,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Float64, Progress, Rows
 from batchpid.checks.validate import file_path, integer, number
 from batchpid.errors import BatchPIDError, MissingDependencyError
 from batchpid.io.files import replacing
@@ -127,7 +127,7 @@ def write_film(
     fps: float = 30.0,
     width: int = 960,
     height: int = 540,
-    progress: Callable[[Any], Any] | None = None,
+    progress: Progress[int] | None = None,
 ) -> Path:
     """Write a film of ``rollout`` in real time, all envs next to each other, and return its path.
 

@@ -76,7 +76,7 @@ class Worker(SingleOwner, ABC):
         """Start the part of a request for the envs of this worker, whose rows are in the arrays."""
 
     @abstractmethod
-    def receive(self) -> Any:
+    def receive(self) -> object:
         """Wait for the result of the last request and return it; a Failure if the loop raised.
 
         Raises
@@ -116,7 +116,7 @@ class LocalWorker(Worker):
         except Exception as error:
             self._result = Failure.of(error)
 
-    def receive(self) -> Any:
+    def receive(self) -> object:
         return self._result
 
     def close(self) -> None:
@@ -190,7 +190,7 @@ class ProcessWorker(Worker):
             self._raise_early(error)
             self._process.kill()  # receive() reports it
 
-    def receive(self) -> Any:
+    def receive(self) -> object:
         try:
             result = pickle.load(self._answers)
         except (EOFError, OSError, pickle.UnpicklingError) as error:
@@ -225,7 +225,7 @@ class ProcessWorker(Worker):
         return WorkerLost(f"worker {self.label} {cause}")
 
 
-def pickled(message: Any) -> bytes:
+def pickled(message: object) -> bytes:
     """Return the start message of a worker as bytes, with functions and classes that the worker
     cannot import.
 
@@ -239,7 +239,7 @@ def pickled(message: Any) -> bytes:
         return reply
     except Exception as error:
         problem = f"cannot be sent to a worker: {error}"
-        remedy = "let control and build hold nothing that cannot be pickled"
+        remedy = "keep objects that cannot be pickled out of control and build"
         raise InvalidArgumentError("options", problem, remedy=remedy) from error
 
 

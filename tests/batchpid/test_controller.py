@@ -89,7 +89,7 @@ def test_params_of_another_size_or_type_are_refused_and_change_nothing(kind):
     ):
         with pytest.raises(bp.InvalidArgumentError, match=f"^{argument}: "):
             pid.params = params
-    with pytest.raises(bp.InvalidArgumentError, match="terms: are not kept"):
+    with pytest.raises(bp.InvalidArgumentError, match="terms: are off"):
         _ = pid.terms
     assert pid.params is PARAMS
     assert all(

@@ -201,7 +201,7 @@ def test_a_fault_names_the_entry_and_is_contained(arm):
         runner.step(good)
         sound.step(good)
         with pytest.warns(
-            FaultWarning, match="env 1, entry 'number 5': the setpoint given for it is not finite"
+            FaultWarning, match="env 1, entry 'number 5': its setpoint is not finite"
         ):
             failed = runner.step(bad)
         expected = sound.step(good)

@@ -1,1 +1,1 @@
-"""MuJoCo as the second physics engine ; only this room imports it for simulation."""
+"""MuJoCo as the second physics engine; only this folder imports it for simulation."""

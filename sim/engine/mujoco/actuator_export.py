@@ -181,23 +181,20 @@ class MjcfActuators:
         for joints, text in (
             (
                 law & late,
-                (
-                    "command_delay: of the inputs, which are 0 at first, not of the effort: the law"
-                    " is not late"
-                ),
+                ("command_delay: delays the inputs, 0 at first, and not the effort"),
             ),
             (dcmotor & biased & ~law, "bias: none in a dcmotor"),
             (np.isfinite(self._stall) & ~line, "saturation_effort: none without strength"),
             (
                 lags & limited,
                 (
-                    "lag: before effort_limit, not after it, so that the effort stays at its limit"
+                    "lag: acts before effort_limit, not after it: the effort stays at its limit"
                     " for longer"
                 ),
             ),
             (
                 lags & line,
-                "lag: an effort that lags behind the speed may pass the torque-speed line",
+                "lag: the lagging effort may exceed the torque-speed line",
             ),
             (
                 line & is_weak,
@@ -211,7 +208,7 @@ class MjcfActuators:
             (turns, "guard: setpoints do not go the short way round"),
             (
                 guarded & (drive.value("kd") > 0),
-                "guard: of the position input; the velocity input is as given",
+                "guard: limits the position input, not the velocity input",
             ),
         ):
             if (joints := joints & self._independent).any():

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64, MjModel
+from batchpid.arrays.array_types import Float64, MjData, MjModel
 from batchpid.sim.engine.missed_contacts import speed_bounds
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import Clearance
@@ -177,7 +177,12 @@ class GroupClearance:
     """
 
     def __init__(
-        self, tables: Arrays, kinematics: int, models: Sequence[Any], data: Sequence[Any], dof: int
+        self,
+        tables: Arrays,
+        kinematics: int,
+        models: Sequence[MjModel],
+        data: Sequence[MjData],
+        dof: int,
     ) -> None:
         robots = len(data)
         pairs = len(tables["pairs"])

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Float64, MjModel
+from batchpid.arrays.array_types import Float64, MjData, MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import FARTHEST
 
@@ -25,7 +24,7 @@ POSITIONS = 1
 """Place of the positions in the state, after the time."""
 
 
-def rest(model: MjModel, data: Any) -> None:
+def rest(model: MjModel, data: MjData) -> None:
     """Reset the data of a robot: to the start of its file, or with its joints at 0."""
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -43,8 +42,8 @@ class DataPool:
     def __init__(self, robot: RobotMj) -> None:
         self.robot = robot
         self.model = copy.copy(robot.model)
-        self._data = list[Any]()
-        self._taken = list[Any]()
+        self._data = list[MjData]()
+        self._taken = list[MjData]()
         self._rows: Float64 | None = None
         self._initial = np.empty(mujoco.mj_stateSize(robot.model, STATE))
         (data,) = self._new(1)
@@ -55,9 +54,12 @@ class DataPool:
         """Return the rows of ``size`` robots at rest."""
         return np.tile(self._initial, (size, 1))
 
-    def take(self, models: list[Any], rows: Float64, placed: Sequence[int] = ()) -> list[Any]:
-        """Return the data of the robots with these ``models``, in the states ``rows``; the states
-        of the rows before are kept in those. The robots ``placed`` get another state at once.
+    def take(
+        self, models: list[MjModel], rows: Float64, placed: Sequence[int] = ()
+    ) -> list[MjData]:
+        """Return the data of the robots with these ``models``, in the states ``rows``. The states
+        of the previous pack are first saved to its rows. The robots ``placed`` get another state
+        next, and are not updated here.
         """
         if self._rows is not rows:
             if self._rows is not None:
@@ -80,6 +82,6 @@ class DataPool:
         if self._rows is rows:
             self._rows = None
 
-    def _new(self, size: int) -> list[Any]:
+    def _new(self, size: int) -> list[MjData]:
         self._data += [mujoco.MjData(self.robot.model) for _ in range(size - len(self._data))]
         return self._data[:size]

@@ -79,7 +79,9 @@ def to_mjcf(
         guard.check(1, robot.joint_names)
         if params is None:
             raise InvalidArgumentError(
-                "guard", "limits setpoints of a law", remedy="pass params, or leave it out"
+                "guard",
+                "needs a law, whose setpoints it limits",
+                remedy="pass params, or leave it out",
             )
     drive = Drive(law, robot.joint_names, dt, inertia, actuators)
     spec = SceneSpec(
@@ -139,7 +141,7 @@ def _set_inertia(body: Any, inertia: SpatialInertia, link: str, drive: Drive) ->
     low, middle, high = np.linalg.eigvalsh(inertia.tensor)
     if low <= 0 or low + middle < high:
         inertia = inertia._replace(tensor=nearest_physical(inertia.tensor * (1 + 1e-9)))
-        drive.append(f"inertia: of the body that is nearest to link {link!r}, which no body has")
+        drive.append(f"inertia: the nearest possible tensor instead of that of link {link!r}")
     body.inertia, body.iquat = principal_inertia(inertia)
 
 
@@ -169,7 +171,7 @@ def _set_joints(
         tie.data = np.pad(figures, (0, len(tie.data) - 2))
     if rubs.any():
         drive.append(
-            "friction: a soft constraint in MuJoCo, in which a joint creeps below its friction"
+            "friction: a soft constraint in MuJoCo, in which a joint creeps under smaller efforts"
         )
     if names := [robot.joint_names[joint] for joint in coupling.followers]:
         drive.append(f"followers: soft constraints in MuJoCo: {', '.join(names)}")

@@ -26,7 +26,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
+from batchpid.arrays.array_types import Array, Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.mujoco_sensors import add_link_sensors
@@ -71,7 +71,7 @@ class RobotMj:
     """Index of each joint in MuJoCo's qvel (dof,)."""
     bodies: dict[str, int]
     """Number of the body of each simulated link."""
-    terms: Any = (0.0, 0.0)
+    terms: Array = (0.0, 0.0)
     """Armature and damping (2, dof) of the joints in addition to the description and the motors."""
     frames: Mapping[str, BodyFrame] = field(default_factory=dict)
     """Frames of simulated links in their bodies, in an MJCF file; of other links the frames are
@@ -158,7 +158,7 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     return RobotMj(model, spec.joints, qpos, qvel, bodies, parts.terms, parts.frames, base)
 
 
-def robot_spec(spec: SceneSpec) -> tuple[Any, dict[str, str]]:
+def robot_spec(spec: SceneSpec) -> tuple[MjSpec, dict[str, str]]:
     """Return the ``mujoco.MjSpec`` of ``spec``, and the name of the body of each simulated link.
 
     The inertia tensors of the bodies are placeholders.

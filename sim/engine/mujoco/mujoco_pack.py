@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Bool, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, MjData, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ORIGIN, ModelPack
@@ -59,7 +59,7 @@ class MujocoPack(ModelPack):
         size: int,
         first_env: int = 0,
         variation: Variation | None = None,
-        workspace: dict[Any, Any] | None = None,
+        workspace: dict[object, DataPool] | None = None,
     ) -> None:
         super().__init__(spec, size, first_env, variation, not obstacle())
         self._workspace = {} if workspace is None else workspace
@@ -99,7 +99,7 @@ class MujocoPack(ModelPack):
         self._update(range(self.size))
 
     @property
-    def data(self) -> list[Any]:
+    def data(self) -> list[MjData]:
         """``mujoco.MjData`` of each robot, in its state."""
         data: list[Any] = self._pool.take(self.models, self.rows)
         return data

@@ -11,12 +11,11 @@ from __future__ import annotations
 import ctypes
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Bool, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, MjModel, Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
 from batchpid.sim.engine.mujoco.data_pool import DataPool
@@ -101,7 +100,7 @@ class MujocoStep(NativeStep):
     def __init__(
         self,
         pool: DataPool,
-        models: list[Any],
+        models: list[MjModel],
         rows: Float64,
         reads_force: bool,
         speed_limit: Float64 | None,

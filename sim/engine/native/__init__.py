@@ -6,7 +6,7 @@ same work.
 
 from __future__ import annotations
 
-from typing import Any
+from types import ModuleType
 
 from batchpid.native import availability
 from batchpid.native.availability import SWITCH
@@ -30,7 +30,7 @@ def describe_calls(engine: str, obstacle: str) -> str:
     return f"native calls into {engine}"
 
 
-def extension(name: str) -> Any:
+def extension(name: str) -> ModuleType:
     """Return the extension ``name`` of :data:`interface.EXTENSIONS`; errors as
     :func:`batchpid.native.extensions.load`.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import threading
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -38,7 +37,7 @@ def _registered() -> str:
     return ""
 
 
-def sim_step(address: Any, step: Any, effort: Array) -> tuple[Any, Any, Any, Any]:
+def sim_step(address: Array, step: Array, effort: Array) -> tuple[Array, ...]:
     """Do a sim step of a :class:`batchpid.sim.engine.native_model.NativeStep` in a program of JAX.
 
     Order is kept by the data and by the number of the step, which is another in each call.
@@ -68,7 +67,7 @@ def sim_step(address: Any, step: Any, effort: Array) -> tuple[Any, Any, Any, Any
     return qpos, qvel, passive, status
 
 
-def mass_matrix(tree: Any, bodies: Any, qpos: Array) -> Array:
+def mass_matrix(tree: Array, bodies: Array, qpos: Array) -> Array:
     """Return the mass matrices (rows, dof, dof) [kg m^2 or kg] at ``qpos`` (rows, dof) in a program
     of JAX, of float64.
 

@@ -1,4 +1,4 @@
-"""SAPIEN: packs of scenes, dynamics, contacts. No other room imports SAPIEN, except to draw
+"""SAPIEN: packs of scenes, dynamics, contacts. No other folder imports SAPIEN, except to draw
 pictures.
 """
 

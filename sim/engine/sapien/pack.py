@@ -77,7 +77,7 @@ class Pack(ModelPack):
         size: int,
         first_env: int = 0,
         variation: Variation | None = None,
-        workspace: dict[Any, Any] | None = None,
+        workspace: object = None,
     ) -> None:
         super().__init__(spec, size, first_env, variation, not obstacle())
         self._shapes: dict[int, list[Any]] = {}

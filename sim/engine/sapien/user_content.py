@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import sapien
 from sapien.physx import (
+    PhysxArticulation,
     PhysxArticulationLinkComponent,
     PhysxCollisionShapeConvexMesh,
     PhysxCpuSystem,
@@ -18,13 +19,12 @@ from sapien.physx import (
 from sapien.wrapper.actor_builder import ActorBuilder
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
-from batchpid.arrays.array_types import Float32, SapienScene
+from batchpid.arrays.array_types import Float32
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import Build, SceneSpec
 
 Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
-"""Links of a robot by name: the entity that each is part of, and its pose in that, None for the
-same.
+"""Entity of each link of a robot, by name, and the pose of the link in it; None for the same frame.
 """
 
 
@@ -46,11 +46,11 @@ class HeadlessScene(sapien.Scene):
         # ends the process.
         super().__init__([PhysxCpuSystem() if system is None else system])
 
-    def create_articulation_builder(self) -> Any:
+    def create_articulation_builder(self) -> ArticulationBuilder:
         """Return a builder of articulations for this scene."""
         return ArticulationBuilder().set_scene(self)
 
-    def create_actor_builder(self) -> Any:
+    def create_actor_builder(self) -> ActorBuilder:
         """Return a builder of actors for this scene."""
         return _HeadlessBuilder().set_scene(self)
 
@@ -74,7 +74,7 @@ class SceneContent:
     """
 
     def __init__(
-        self, spec: SceneSpec, build: Build, scene: SapienScene, env: int, links: Frames
+        self, spec: SceneSpec, build: Build, scene: HeadlessScene, env: int, links: Frames
     ) -> None:
         # What exists now is the robot and the ground; the rest is the user's.
         before = {entity.per_scene_id for entity in scene.entities}
@@ -140,7 +140,7 @@ class SceneContent:
         return np.array(rows, np.float32).reshape(len(rows), 7)
 
 
-def _check_shapes(scene: SapienScene, env: int, collisions: bool) -> None:
+def _check_shapes(scene: HeadlessScene, env: int, collisions: bool) -> None:
     """Raise InvalidArgumentError if an entity of ``scene``, which belongs to env ``env``, has a
     collision shape without ``collisions``, or a convex mesh of negative scale.
     """
@@ -162,7 +162,7 @@ def _check_shapes(scene: SapienScene, env: int, collisions: bool) -> None:
 
 
 def _call(
-    build: Build, scene: SapienScene, env: int, links: Frames
+    build: Build, scene: HeadlessScene, env: int, links: Frames
 ) -> list[tuple[sapien.Entity, sapien.Pose | None]]:
     """Return the entities and frames that ``build`` returns; its errors become an
     InvalidArgumentError.
@@ -188,7 +188,7 @@ def _call(
                 "returned something other than entities and names of the robot's links",
                 env=env,
                 value=item if isinstance(item, str) else type(item).__name__,
-                remedy="return the entities and links whose poses are wanted, or None",
+                remedy="return the entities and links for runner.poses(), or None",
             )
     return watched
 
@@ -196,14 +196,14 @@ def _call(
 ROOT_SIZE = 13
 
 
-def read_root(articulation: Any) -> Float32:
+def read_root(articulation: PhysxArticulation) -> Float32:
     """Return the state of the root link of a SAPIEN articulation (13,)."""
     pose = articulation.get_root_pose()
     velocity = articulation.get_root_linear_velocity(), articulation.get_root_angular_velocity()
     return np.concatenate([pose.p, pose.q, *velocity], dtype=np.float32)
 
 
-def write_root(articulation: Any, state: Float32) -> None:
+def write_root(articulation: PhysxArticulation, state: Float32) -> None:
     """Set the state of the root link of a SAPIEN articulation (13,)."""
     articulation.set_root_pose(sapien.Pose(state[:3], state[3:7]))
     articulation.set_root_linear_velocity(state[7:10])

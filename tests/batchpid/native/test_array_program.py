@@ -228,7 +228,7 @@ def test_an_operation_that_programs_do_not_have_is_an_error():
 
 
 def test_a_branch_on_entries_cannot_be_traced():
-    with pytest.raises(TypeError, match="depend on the entries"):
+    with pytest.raises(TypeError, match="branch on the entries"):
         trace(lambda x: [x if x > 0 else -x], 0, 1)
 
 

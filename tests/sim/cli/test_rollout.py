@@ -338,7 +338,7 @@ def in_column(column, function):
         ),
         (
             cut(lambda lines: lines[0].__setitem__(3, " setpoint: panda_joint1")),
-            "two columns of one name",
+            "with the same name",
         ),
         (
             cut(lambda lines: [line.pop(3) for line in lines]),
@@ -366,8 +366,8 @@ def test_a_wrong_trajectory_is_refused(batchpid, tmp_path, panda, motion, change
         (("--seconds", 1), "seconds: is given by the trajectory"),
         (("--setpoint", 0, 0), "setpoint: is given by the trajectory"),
         (("--control", "osc"), "excludes --control osc"),
-        (("--gains", "sapien-tutorial"), "setpoint_accelerations: is for gains in accelerations"),
-        (("--control", "drive"), "setpoint_accelerations: is for gains in accelerations"),
+        (("--gains", "sapien-tutorial"), "setpoint_accelerations: needs gains in accelerations"),
+        (("--control", "drive"), "setpoint_accelerations: needs gains in accelerations"),
     ],
 )
 def test_flags_that_contradict_a_trajectory_are_refused(

@@ -260,7 +260,7 @@ def test_a_recording_needs_its_robot(tmp_path):
     rollout, path = run(case, "mujoco"), tmp_path / "run.h5"
     write_recording(rollout, path)
     read = read_recording(path)
-    with pytest.raises(InvalidArgumentError, match="robot: of this run is not known"):
+    with pytest.raises(InvalidArgumentError, match="robot: is unknown for this run"):
         read.findings()
     assert str(read.findings(arm())) == str(rollout.findings())
     with pytest.raises(InvalidArgumentError, match="other joints"):

@@ -71,7 +71,7 @@ def log_of(robot: Robot, rollout, noise: float = 0.0, **settings) -> Log:
     """Return the log of a rollout, with noise of its positions and other settings."""
     (log,) = logs_of_rollout(robot, rollout)
     shaken = log.qpos + noise * np.random.default_rng(1).standard_normal(log.qpos.shape)
-    return replace(log, qpos=shaken, settings=log.settings._replace(**settings))
+    return replace(log, qpos=shaken, **settings)
 
 
 def effort_run(robot: Robot, driven: tuple[float, float] = (1.0, 1.0)):

@@ -292,6 +292,6 @@ def test_an_error_says_that_a_controller_cannot_be_sent(panda):
     controller.lock = threading.Lock()
     with pytest.raises(
         InvalidArgumentError,
-        match=r"^options: cannot be sent to a worker: .*; let control and build",
+        match=r"^options: cannot be sent to a worker: .*; keep objects",
     ):
         rollout(panda, controller, workers=1)

@@ -202,7 +202,7 @@ def test_a_start_pose_that_is_not_finite_is_replaced_by_the_last_start():
     qpos = np.tile(PANDA.start, (N, 1))
     qpos[3, 2] = np.nan
     with make() as runner:
-        with pytest.warns(FaultWarning, match=r"env 3, joint 'panda_joint3': the qpos"):
+        with pytest.warns(FaultWarning, match=r"env 3, joint 'panda_joint3': its qpos"):
             obs = runner.reset(qpos=qpos)
         assert obs.ok.tolist() == [env != 3 for env in range(N)]
         assert np.isfinite(obs.qpos).all()

@@ -116,7 +116,7 @@ def test_operations(operation, expected):
         (lambda: Uniform(0, 1, operation="times"), "operation: unknown option"),
         (lambda: LogUniform(0, 1), "low: out of range"),
         (lambda: Normal(0, 0), "std: out of range"),
-        (lambda: Normal(0, 1, low=5), "low: and high leave"),
+        (lambda: Normal(0, 1, low=5), "low: the range to"),
         (lambda: Choice([]), "values: must be a list of numbers"),
         (lambda: Choice([math.nan]), "values: must be a list of numbers"),
         (

@@ -66,21 +66,21 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
     "link twice": (
         robot(BASE, ARM, ARM, HINGE),
         "repeated-name",
-        "link 'arm': .*used twice: left out",
+        "link 'arm': .*repeated one: left",
     ),
     "joint twice": (robot(BASE, ARM, HINGE, HINGE), "repeated-name", "'hinge': given twice"),
     "joint name twice": (
         robot(BASE, ARM, TIP, HINGE, joint("hinge", "arm", "tip")),
         "repeated-name",
-        "used twice: called 'hinge_2'",
+        "one: renamed 'hinge_2'",
     ),
     "joint without name": (
         one_joint().replace('name="hinge"', ""),
         "repeated-name",
-        "called 'base_to_arm'",
+        "renamed 'base_to_arm'",
     ),
     "unknown link": (robot(BASE, HINGE), "missing-link", "link 'arm': .*added"),
-    "loose link": (robot(BASE, ARM, TIP, HINGE), "loose-link", "link 'tip': held by no joint"),
+    "loose link": (robot(BASE, ARM, TIP, HINGE), "loose-link", "link 'tip': no joint holds"),
     "unknown type": (
         robot(BASE, ARM, TIP, HINGE, joint("k", "arm", "tip", "ball")),
         "joint-type",

@@ -60,7 +60,7 @@ BAD = {
         "has 256 links that move; PhysX holds at most 255.*split",
     ),
     "no parent": (one_joint().replace('<parent link="base"/>', ""), "joint 'hinge'.*needs <parent"),
-    "no joint": (robot(BASE), "without joints.*xacro has to be expanded"),
+    "no joint": (robot(BASE), "without joints.*xacro, expand it first"),
     "library of xacro": (
         robot(
             '<xacro:macro xmlns:xacro="http://wiki.ros.org/xacro" name="arm">',
@@ -69,7 +69,7 @@ BAD = {
             HINGE,
             "</xacro:macro>",
         ),
-        "xacro has to be expanded",
+        "xacro, expand it first",
     ),
     "fixed joints only": (one_joint("", "fixed"), "without moving joints"),
     "no link": (robot(), "exactly one root|without"),
