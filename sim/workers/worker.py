@@ -76,7 +76,7 @@ class Worker(SingleOwner, ABC):
         """Start the part of a request for the envs of this worker, whose rows are in the arrays."""
 
     @abstractmethod
-    def receive(self) -> Any:
+    def receive(self) -> object:
         """Wait for the result of the last request and return it; a Failure if the loop raised.
 
         Raises
@@ -116,7 +116,7 @@ class LocalWorker(Worker):
         except Exception as error:
             self._result = Failure.of(error)
 
-    def receive(self) -> Any:
+    def receive(self) -> object:
         return self._result
 
     def close(self) -> None:
@@ -190,7 +190,7 @@ class ProcessWorker(Worker):
             self._raise_early(error)
             self._process.kill()  # receive() reports it
 
-    def receive(self) -> Any:
+    def receive(self) -> object:
         try:
             result = pickle.load(self._answers)
         except (EOFError, OSError, pickle.UnpicklingError) as error:
