@@ -188,7 +188,7 @@ class Pack(ModelPack):
             self.calls, self._stepped, *reads, speed_limit, self._constraint_address, joints, sense
         )
 
-    def update_constraint(self, rows: Any = slice(None)) -> None:
+    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         if self._constraint is not None:
             passive = self._calls.passive_force(True, True)
             self._constraint.update(self.joint_mass_matrix, self._calls.qpos(), passive, rows)
