@@ -131,7 +131,7 @@ class EnginePack(Protocol):
     def write_qf(self, effort: Rows) -> None:
         """Apply joint efforts [N m or N]. They persist until written again."""
 
-    def update_constraint(self, rows: Any = slice(None)) -> None:
+    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are
         coupled.
         """

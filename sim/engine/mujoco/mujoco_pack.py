@@ -204,7 +204,7 @@ class MujocoPack(ModelPack):
             self._constraint_address,
         )
 
-    def update_constraint(self, rows: Any = slice(None)) -> None:
+    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         if self._constraint is None:
             return
         if self.spec.fixed_base:

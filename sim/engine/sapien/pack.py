@@ -193,7 +193,7 @@ class Pack(ModelPack):
             sense,
         )
 
-    def update_constraint(self, rows: Any = slice(None)) -> None:
+    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         if self._constraint is not None:
             passive = self._calls.passive_force(True, True)
             self._constraint.update(self.joint_mass_matrix, self._calls.qpos(), passive, rows)
