@@ -265,10 +265,10 @@ def _solve(table: Sequence[Float64]) -> list[float]:
 
 
 def better_reading(robot: Robot, data: LogData, guess: Guess) -> str:
-    """Return the reading of a log that explains its efforts far better than the ``guess``, in
+    """Return the reading of a log that explains its efforts far better than the present one, in
     words; "" for none.
 
-    Signs, exchanged joints and units are tried if the guess is odd or efforts are far above the
+    Signs, exchanged joints and units are tried if the ``guess`` is odd or efforts are far above the
     robot's limits.
     """
     log = data.log
@@ -277,13 +277,19 @@ def better_reading(robot: Robot, data: LogData, guess: Guess) -> str:
     if guess.odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
         begin = log.part(log.time < log.time[0] + TRIED, log.command_time < log.time[0] + TRIED)
         names = [robot.joint_names[joint] for joint in log.joints]
-        costs = dict[str, float]()
-        for words, on_qpos, on_command in _readings(log.kind, names, guess.odd):
+
+        def changed(on_qpos: Float64, on_command: Float64) -> Guess:
             other = replace(begin, qpos=begin.qpos @ on_qpos, command=begin.command @ on_command)
             motion = smooth(other, data.drive.timestep)
-            costs[words] = regress([data._replace(log=other, motion=motion)])[0].cost
+            return regress([data._replace(log=other, motion=motion)])[0]
+
+        same = np.eye(len(names))
+        present = changed(same, same)
+        costs = dict[str, float]()
+        for words, *matrices in _readings(log.kind, names, present.odd):
+            costs[words] = changed(*matrices).cost
         best = min(costs.values())
-        if best < min(guess.cost - EVIDENCE, WORST):
+        if best < min(present.cost - EVIDENCE, WORST):
             return next(words for words, cost in costs.items() if cost < best + ALIKE)
     delay = float(guess.values["setpoint_delay"][0])
     if delay < -1e-9:
