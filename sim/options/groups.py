@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Protocol, Self, get_args
 from numpy.typing import ArrayLike
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.array_types import Array, Document, Rows
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.field_tables import Field, plain
 from batchpid.checks.validate import choice, instance, joint_speeds, names
@@ -345,7 +345,7 @@ class Controller(Protocol):
         qpos: Rows,
         qvel: Rows,
         passive: Rows,
-    ) -> tuple[Any, Any]:
+    ) -> tuple[Any, Array]:
         """Return the new state, and the joint efforts [N m or N], which the runner clips to the
         params' limits.
 

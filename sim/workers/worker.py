@@ -127,7 +127,7 @@ class LocalWorker(Worker):
 class ProcessWorker(Worker):
     """Caller's end of a worker process, which runs on the core ``core`` alone if there is one."""
 
-    def __init__(self, start: Start, shared: SharedArrays, core: int | None = None) -> None:
+    def __init__(self, start: Start, shared: SharedArrays, core: int | None) -> None:
         super().__init__(start, shared)
         self._core = core
         # Once: a controller may change in the caller, and a replacement begins as the first worker

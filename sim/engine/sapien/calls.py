@@ -239,7 +239,6 @@ class SapienStep(NativeStep):
         stepped: Bool,
         gravity: bool,
         coriolis: bool,
-        velocities: bool,
         speed_limit: Float64 | None,
         constraint: int | None = None,
         joints: Sequence[object] | None = None,
@@ -261,7 +260,6 @@ class SapienStep(NativeStep):
             gateway=extension("_gateway").address(calls.gateway),
             gravity=gravity,
             coriolis=coriolis,
-            velocities=velocities,
             constraint=constraint,
             senses=sense is not None,
         )
