@@ -29,7 +29,7 @@ class NumPyBackend:
     Its coefficients are computed once; for NumPy they are spread over all envs.
     """
 
-    def __init__(self, dt: float, terms: bool, threads: int | None = None) -> None:
+    def __init__(self, dt: float, terms: bool, threads: int | None) -> None:
         self.dt = dt
         self.terms = terms
         self.threads = threads
@@ -94,7 +94,7 @@ class JAXBackend:
 
     native = False
 
-    def __init__(self, dt: float, terms: bool, threads: int | None = None) -> None:
+    def __init__(self, dt: float, terms: bool, threads: int | None) -> None:
         require_jax()
         import jax
 

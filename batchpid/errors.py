@@ -39,7 +39,7 @@ class InvalidArgumentError(BatchPIDError, ValueError):
         joint: str | int | None = None,
         entry: str | int | None = None,
         env: int | None = None,
-        value: Any = None,
+        value: object = None,
     ) -> None:
         self.argument = argument
         self.problem = problem

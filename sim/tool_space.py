@@ -331,7 +331,7 @@ class OperationalSpace:
                 warn(
                     f"{name}, {columns[worst]!r}: {kp[0, worst]:g} with damping {kd[0, worst]:g} is"
                     f" {ratio[worst]:.3g} times the stability bound of the sampled loop at a time"
-                    f" step of {dt:g} s; use less, a smaller timestep, or"
+                    f" step of {dt:g} s; lower it, use a smaller timestep, or"
                     " discretization='implicit'",
                     StabilityWarning,
                 )

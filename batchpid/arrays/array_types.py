@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import jax
     from mujoco import MjData as MjData
     from mujoco import MjModel as MjModel
+    from mujoco import MjsBody as MjsBody
     from mujoco import MjSpec as MjSpec
 
     Array: TypeAlias = NDArray[Any] | jax.Array
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 else:
     # MuJoCo is imported where it is used.
     Array = np.ndarray
-    MjData = MjModel = MjSpec = object
+    MjData = MjModel = MjsBody = MjSpec = object
 
 Rows = NDArray[Any]
 """An array of NumPy whose dtype is the caller's."""

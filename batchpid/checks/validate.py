@@ -74,14 +74,14 @@ def time_step(argument: str, value: object) -> float:
     return value
 
 
-def check_time_step(argument: str, value: object) -> None:
+def check_time_step(dt: object) -> None:
     """Check a time step that is not an array; the values of arrays are not read."""
     if (
-        isinstance(value, float) and 0.0 < value <= LONGEST_STEP
+        isinstance(dt, float) and 0.0 < dt <= LONGEST_STEP
     ):  # at every sim step: without the checks' cost
         return
-    if isinstance(value, np.generic) or not hasattr(value, "__array_namespace__"):
-        time_step(argument, value)
+    if isinstance(dt, np.generic) or not hasattr(dt, "__array_namespace__"):
+        time_step("dt", dt)
 
 
 def choice(argument: str, value: object, known: Collection[S]) -> S:

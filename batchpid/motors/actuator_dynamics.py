@@ -108,7 +108,7 @@ def init(
         dt is not positive, or above 1 s; ``max_delay`` is traced and ``samples`` is missing, or it
         needs too many.
     """
-    check_time_step("dt", dt)
+    check_time_step(dt)
     qpos, qvel, effort = in_dtype_of(actuators, qpos, qvel, effort)
     xp = namespace(*actuators, qpos)
     zeros = xp.zeros_like(qpos)
@@ -150,7 +150,7 @@ def discretise(
     With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches
     faster. Raises InvalidArgumentError if dt is a number that is not positive, or above 1 s.
     """
-    check_time_step("dt", dt)
+    check_time_step(dt)
     a = actuators
     xp = namespace(*actuators)
     position = velocity = None
@@ -246,9 +246,9 @@ def _delivered(
     return motor
 
 
-def command_limits(k: MotorCoefficients, qpos: Array, qvel: Array) -> tuple[Array, Array]:
-    """Return the smallest and the largest commanded effort that the motor does not clip at ``qpos``
-    and ``qvel``.
+def command_limits(k: MotorCoefficients, qvel: Array) -> tuple[Array, Array]:
+    """Return the smallest and the largest commanded effort that the motor does not clip at
+    ``qvel``.
 
     They are those for the saturation and anti-windup of a law. Delay and lag do not enter: they are
     dynamics, and as a difference from the effort asked for they would leak into the integral. None:

@@ -116,7 +116,7 @@ def init(
     mass_matrix, dt, damping, stiffness
         As in :func:`refresh`.
     """
-    check_time_step("dt", dt)
+    check_time_step(dt)
     if friction.coulomb is None:
         return FrictionState()
     return with_sliding(
@@ -156,7 +156,7 @@ def refresh(
     ``damping`` and ``stiffness`` (envs, joints) or (1, joints) belong to a drive that the simulator
     integrates implicitly [N m s/rad, N m/rad].
     """
-    check_time_step("dt", dt)
+    check_time_step(dt)
     if friction.coulomb is None:
         return state
     xp = namespace(mass_matrix, *friction)

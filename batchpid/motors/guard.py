@@ -126,7 +126,7 @@ def advance(
     has the same shape. Raises InvalidArgumentError if dt is a number that is not positive, or above
     1 s.
     """
-    check_time_step("dt", dt)
+    check_time_step(dt)
     (setpoint,) = in_dtype_of(guard, setpoint)
     xp = namespace(*guard, setpoint, *state)
     target = clip(setpoint, guard.lower, guard.upper, xp)

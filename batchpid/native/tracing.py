@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import DType
+from batchpid.arrays.array_types import Array, DType, Pytree
 from batchpid.arrays.trees import filled, leaves
 from batchpid.native.extensions import OPERATIONS
 from batchpid.native.symbols import Namespace, Symbol
@@ -34,7 +34,7 @@ class Trace(NamedTuple):
 
 
 def trace(
-    function: Callable[..., Any], constants: int, inputs: int, dtype: DType = np.float64
+    function: Callable[..., Iterable[Array]], constants: int, inputs: int, dtype: DType = np.float64
 ) -> Trace:
     """Return the trace of a function with this number of ``constants`` and ``inputs``, which
     returns a list of arrays.
@@ -76,7 +76,9 @@ def trace(
     )
 
 
-def trace_trees(function: Callable[..., Any], *structures: Any, dtype: DType = np.float64) -> Trace:
+def trace_trees(
+    function: Callable[..., Iterable[Array]], *structures: Pytree, dtype: DType = np.float64
+) -> Trace:
     """Return the trace of a function of nested tuples, as :func:`trace` does.
 
     ``structures`` (:func:`batchpid.arrays.trees.structure`) describe its arguments; the first one

@@ -68,7 +68,7 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
         The params are of another type, or dt is not positive, or above 1 s.
     """
     instance("params", params, OSCParams, MAKE_PARAMS)
-    check_time_step("dt", dt)
+    check_time_step(dt)
     # Explicit gains first; the implicit law then replaces those that it changes.
     xp = namespace(*params, dt)
     kp = params.stiffness

@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(INPUT_ERROR, f"{error.filename}: {problem}" if error.filename else problem)
 
 
-def parse(arguments: Sequence[str]) -> tuple[str, Any]:
+def parse(arguments: Sequence[str]) -> tuple[str, object]:
     """Return the name of the command and the record of its flags; for --help or unknown flags print
     help and raise SystemExit.
     """

@@ -39,7 +39,7 @@ DOCUMENTS = (".yaml", ".yml", ".json")
 DEFAULT_ROBOT = "panda"
 FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
-SWITCH: dict[Any, bool] = {"on": True, "off": False, "fixed": True, "free": False}
+SWITCH: dict[str | None, bool] = {"on": True, "off": False, "fixed": True, "free": False}
 """Values of flags with two words."""
 COUNTS = {"num_envs": "robots", "moves": "random moves", "population": "candidates at once"}
 """Flags that are counts, with nouns for the first line."""
@@ -74,7 +74,7 @@ class CommandFunction(NamedTuple):
     loading: tuple[str, ...] = ("base",)
     """Options of :meth:`Robot.load` that are flags."""
 
-    def record(self) -> type[Any]:
+    def record(self) -> type:
         """Return the record of the flags."""
         outputs = {name: output.help for name, output in self.outputs.items()}
         return flags.record_of(self.function, self.options, self.loading, outputs)
@@ -312,7 +312,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def bar(label: str, **options: Any) -> Progress[T]:
+def bar(label: str, **options: object) -> Progress[T]:
     """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; ``options``
     go to tqdm.
 

@@ -59,11 +59,11 @@ METAVARS = {
 
 
 def record_of(
-    function: Callable[..., Any],
+    function: Callable[..., object],
     options: Sequence[str] = (),
     loading: Sequence[str] = (),
     outputs: Document | None = None,
-) -> type[Any]:
+) -> type:
     """Return a frozen dataclass whose fields are the flags of ``function``, for tyro.
 
     ``options`` are options of a Runner, and ``loading`` arguments of :meth:`Robot.load`, that have
@@ -101,7 +101,7 @@ def record_of(
     return record
 
 
-def sections(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
+def sections(function: Callable[..., object]) -> tuple[str, dict[str, str]]:
     """Return the description in a function's docstring, and the text of each parameter."""
     about, _, rest = inspect.getdoc(function).partition("\n\nParameters\n")  # type: ignore[union-attr]
     parameters = re.split("\n\n(?:Raises|Returns)\n", rest)[0]

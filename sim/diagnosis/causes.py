@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cached_property
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -239,7 +239,7 @@ class Rule(NamedTuple):
     code: str
     text: str
     remedy: str
-    test: Callable[[_Run], Any]  # the joints that have it (envs, dof), or the envs (envs, 1)
+    test: Callable[[_Run], Bool]  # the joints that have it (envs, dof), or the envs (envs, 1)
     names_joint: bool = True  # False for a cause of whole envs
 
 

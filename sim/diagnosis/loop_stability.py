@@ -128,7 +128,7 @@ def stability_report(
     else:
         remedy += ", discretization='implicit'"
     shares = robot.coupling.of_all(bound.participation[worst])
-    return StabilityReport(ratio, shares, worst, effect, f"{remedy} or robot.designed()")
+    return StabilityReport(ratio, shares, worst, effect, f"{remedy}, or robot.designed()")
 
 
 def slow_oscillation(

@@ -127,7 +127,7 @@ class ConstraintEfforts:
         mass_matrix: Callable[[Float64], Float64],
         qpos: Float64,
         passive: Float64,
-        rows: Sequence[int],
+        rows: Sequence[int] | slice,
     ) -> None:
         """Set mass matrix and passive force of robots ``rows``, at positions and passive forces of
         all robots.

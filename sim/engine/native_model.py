@@ -216,7 +216,7 @@ class NativeStep:
         dof: int,
         arrays: Mapping[str, Rows],
         speed_limit: Float64 | None,
-        **fields: Any,
+        **fields: object,
     ) -> None:
         self._arrays = dict(arrays)
         if speed_limit is not None:

@@ -131,7 +131,7 @@ class EnginePack(Protocol):
     def write_qf(self, effort: Rows) -> None:
         """Apply joint efforts [N m or N]. They persist until written again."""
 
-    def update_constraint(self, rows: Any = slice(None)) -> None:
+    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are
         coupled.
         """
@@ -252,16 +252,14 @@ class EnginePack(Protocol):
         self,
         gravity: bool,
         coriolis: bool,
-        velocities: bool,
         speed_limit: Float64 | None,
         drives: bool = False,
     ) -> CompiledStep:
         """Return the sim step of the present robots.
 
         ``gravity`` and ``coriolis`` select the parts of the passive force that it reads; without
-        both it is zero. Without ``velocities`` it reads zero velocities. The status reports speeds
-        above ``speed_limit`` (dof,), if given. With ``drives`` the targets of the drives may move
-        within a tick.
+        both it is zero. The status reports speeds above ``speed_limit`` (dof,), if given. With
+        ``drives`` the targets of the drives may move within a tick.
         """
 
     @property

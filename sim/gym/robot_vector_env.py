@@ -31,7 +31,7 @@ from batchpid.sim.signals.quantities import Observation
 def check_free(owner: object, options: Document, chosen: Document) -> None:
     """Raise InvalidArgumentError for an option among those that ``owner`` has chosen."""
     for option in options.keys() & chosen.keys():
-        problem = f"is chosen by {type(owner).__name__}"
+        problem = f"is set by {type(owner).__name__}"
         raise InvalidArgumentError(option, problem, remedy="leave it out, or make a subclass")
 
 
@@ -133,8 +133,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self.step_seconds = substeps * timestep
         chosen = {"substeps": substeps, **self.runner_options()}
         check_free(self, options, chosen)
-        arguments = [*signature(type(self)).parameters, *signature(RobotVectorEnv).parameters]
-        check_keywords(type(self).__name__, options, [*arguments, *OPTIONS])
+        arguments = {**signature(type(self)).parameters, **signature(RobotVectorEnv).parameters}
+        check_keywords(type(self).__name__, options, {**arguments, **OPTIONS})
         # Spaces come first: an invalid one is an error before any process starts.
         self.single_observation_space, self.single_action_space = self.spaces()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)

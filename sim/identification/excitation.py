@@ -21,9 +21,6 @@ room.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator
-
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
@@ -47,7 +44,6 @@ _SHRINK = 0.7
 _LEAST = 0.04
 """Factor of an amplitude from one motion to the next, and its least share."""
 _ENOUGH = 0.5  # mean share of the amplitudes with which no other center is tried
-_COARSE = 40  # poses that are tested first
 _CHECKS = 400  # poses of a motion that are tested for contact
 _WINDOW = 0.1
 _SHARPNESS = 4
@@ -93,84 +89,70 @@ def excite(
     phase = rng.uniform(0, 2 * np.pi, robot.dof)
     easy, movable = easy_pose(robot, robot.dynamics(), robot.sample(200, seed=0))
     movable = movable if movable.any() else ~movable
-    best: tuple[float, Trajectory] | None = None
-    obstacles = Counter[str]()
-    for trial, center in enumerate(_centers(robot, easy, rng)):
+    best = None
+    most = 0.0
+    obstacle = ""
+    for center in _centers(robot, easy, rng):
         # The motion shrinks about a center until nothing is in its way.
         share = movable.astype(np.float64)
-        obstacle = "the motion is too small"
-        while obstacle and share[movable].min() >= _LEAST:
+        while most < _ENOUGH and share[movable].min() >= _LEAST:
             motion = _chirp(robot, center, share, time, lowest, highest, phase)
-            obstacle, joints = _obstacle(robot, motion)
+            problem, joints = _obstacle(robot, motion)
+            obstacle = obstacle or problem
             # Followers move with their leaders.
             leaders = robot.coupling.leader[joints]
-            if joints and not share[leaders].any():
+            if not share[leaders].any():
+                if not problem and share.mean() > most:
+                    most = float(share.mean())
+                    best = motion
                 break
             share[leaders] *= _SHRINK
-        if obstacle:
-            obstacles[obstacle] += 1
-        elif best is None or share.mean() > best[0]:
-            best = float(share.mean()), motion
-        if best is not None and (best[0] >= _ENOUGH or trial >= 3):
-            return best[1]
     if best is not None:
-        return best[1]
-    ((text, _),) = obstacles.most_common(1)
-    problem = f"{robot.name!r} has no free motion about any pose that was tried: {text}"
+        return best
+    problem = f"{robot.name!r} has no free motion about any pose that was tried: {obstacle}"
     remedy = "disable pairs that only seem to touch in an .srdf, or correct masses and limits"
     raise InvalidArgumentError("robot", problem, remedy=remedy)
+
+
+def _centers(robot: Robot, easy: Float64, rng: np.random.Generator) -> Float64:
+    """Return candidates for the center (n, dof), away from joint limits: the start pose, the
+    ``easy`` one, and random ones.
+    """
+    poses = np.vstack([robot.start, easy, robot.sample(_DRAWS, seed=int(rng.integers(2**31)))])
+    low = np.maximum(robot.lower, robot.start - np.pi)
+    high = np.minimum(robot.upper, robot.start + np.pi)
+    edge = np.minimum(0.4 * (high - low), [REACH[unit] for unit in robot.units])
+    return robot.coupled(np.clip(poses, low + edge, high - edge))
 
 
 def _obstacle(robot: Robot, motion: Trajectory) -> tuple[str, list[int]]:
     """Return what is in the way of a motion, "" for nothing, and the joints that have to move
     less.
     """
-    outside = (motion.position < robot.lower - 1e-9) | (motion.position > robot.upper + 1e-9)
-    outside |= np.abs(motion.velocity) > robot.velocity_limit
-    joints = np.flatnonzero(outside.any(0)).tolist()
-    if joints:
-        return f"joint {robot.joint_names[joints[0]]!r} exceeds its limits", joints
     rows = np.unique(np.linspace(0, motion.ticks - 1, _CHECKS).astype(int))
     position = motion.position[rows]
     velocity = motion.velocity[rows]
     effort = motion_effort(robot, position, velocity, motion.acceleration[rows])
     effort += robot.damping * velocity + robot.friction * np.sign(velocity)
-    moves = np.ptp(motion.position, axis=0) > 0
-    excess = np.where(moves, np.abs(effort) - robot.design_effort_limit, 0.0).max(0)
-    joints = np.flatnonzero(excess > 0).tolist()
-    if joints:
-        name = robot.joint_names[int(excess.argmax())]
-        return f"joint {name!r} is too weak to move", joints
+    outside = (position < robot.lower - 1e-9) | (position > robot.upper + 1e-9)
+    outside |= np.abs(velocity) > robot.velocity_limit
+    # A joint that stays still may be too weak to hold itself.
+    weak = (np.abs(effort) > robot.design_effort_limit) & (np.ptp(position, axis=0) > 0)
+    for exceeds, words in ((outside, "exceeds its limits"), (weak, "is too weak to move")):
+        joints = np.flatnonzero(exceeds.any(0)).tolist()
+        if joints:
+            return f"joint {robot.joint_names[joints[0]]!r} {words}", joints
     # Links keep the distances of the center, or half of them where they are near there.
     contacts = robot.dynamics().contacts
     clearance = CLEARANCE
-    coarse = np.linspace(0, len(position) - 1, _COARSE).astype(int)
-    for row in (0, *coarse, *range(len(position))):
-        for first, second, distance in contacts.near(position[row], clearance):
+    for row, pose in enumerate(position):
+        for first, second, distance in contacts.near(pose, clearance):
             if row == 0 and distance > 0:
                 clearance = min(clearance, 0.5 * distance)
             elif distance < clearance:
                 names = " and ".join(repr(name) for name in (first, second or "ground"))
                 return f"{names} touch", list(range(robot.dof))
     return "", []
-
-
-def _centers(robot: Robot, easy: Float64, rng: np.random.Generator) -> Iterator[Float64]:
-    """Yield candidates for the center, away from joint limits: the start pose, the ``easy`` one,
-    and random ones.
-    """
-    low = np.maximum(robot.lower, robot.start - np.pi)
-    high = np.minimum(robot.upper, robot.start + np.pi)
-    edge = np.minimum(0.4 * (high - low), [REACH[unit] for unit in robot.units])
-
-    def inside(pose: Float64, share: float = 1.0) -> Float64:
-        return robot.coupled(np.clip(pose, low + share * edge, high - share * edge))
-
-    yield inside(robot.start)
-    yield inside(robot.start, 0.2)
-    yield inside(easy, 0.2)
-    yield inside(easy)
-    yield from map(inside, robot.sample(_DRAWS, seed=int(rng.integers(2**31))))
 
 
 def _chirp(

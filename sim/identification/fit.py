@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,8 +34,8 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.trees import structure
 from batchpid.sim.identification.regression import LogData
-from batchpid.sim.identification.simulator import PlantCandidates, Stretch, simulate
-from batchpid.sim.identification.unknowns import KINDS, Unknowns
+from batchpid.sim.identification.simulator import Stretch, simulate
+from batchpid.sim.identification.unknowns import Unknown, Unknowns
 
 WINDOW = 0.3
 """Length of a window of a log of efforts [s]."""
@@ -91,35 +92,21 @@ class Window(NamedTuple):
     """Fitted rows; the others are held out (rows,) bool."""
 
 
-class Solution(NamedTuple):
-    """Result of a least-squares fit."""
+class Fit(NamedTuple):
+    """A fit of the unknowns that the logs show."""
 
+    problem: Problem
+    hidden: list[Unknown]
+    """Unknowns that the logs do not identify; they have the values of the description."""
     point: Float64
     """Coordinates of the unknowns."""
     size: Float64
     """Size of the residuals that the fit was weighted with (joints,)."""
     converged: bool
-
-
-class Intervals(NamedTuple):
-    """Uncertainty of values, in their units."""
-
     deviation: Float64
-    """Standard deviations (unknowns,)."""
+    """Standard deviations (unknowns,) of the values, in their units."""
     root: Float64
-    """Root L of the covariance L L^T (unknowns, unknowns)."""
-    shown: Bool
-    """Unknowns that the logs say something about (unknowns,)."""
-
-
-class Fit(NamedTuple):
-    """A fit of the unknowns that the logs show."""
-
-    hidden: Unknowns
-    """Unknowns that the logs do not identify; they have the values of the description."""
-    problem: Problem
-    solution: Solution
-    intervals: Intervals
+    """Root L of their covariance L L^T (unknowns, unknowns)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +120,11 @@ class Problem:
     """Map over groups of windows: ``map``, or that of worker processes."""
 
     def evaluate(
-        self, point: Float64, changes: Float64, free_states: bool = True, held_out: bool = False
+        self,
+        point: Float64,
+        changes: Float64 | None = None,
+        free_states: bool = True,
+        held_out: bool = False,
     ) -> list[Float64]:
         """Return the residuals of each window at a point (unknowns,), and their changes by
         ``changes`` (n, unknowns) of the point: (rows, joints, 1 + n).
@@ -145,14 +136,22 @@ class Problem:
         free = free_states and self.data[0].drive.params is None
         shifts = np.diag(np.repeat(STATE_STEPS, joints * free))
         # Rows: the point, each change of it, a change of each initial state.
-        count = 1 + len(changes)
-        points = np.tile(point, (count + len(shifts), 1))
-        points[1:count] += changes
+        moved = point[None] if changes is None else np.vstack([point, point + changes])
+        count = len(moved)
+        points = np.vstack([moved, np.tile(point, (len(shifts), 1))])
         states = np.zeros((len(points), 2, joints))
         states[count:] = shifts.reshape(-1, 2, joints)
-        candidates = self.unknowns.candidates(self.unknowns.values(points))
-        groups = self._groups(len(points), held_out)
-        tasks = [self._task(group, candidates, states) for group in groups]
+        # Windows of the same robot and law are simulated at once.
+        alike = defaultdict[Any, list[int]](list)
+        for number, window in enumerate(self.windows):
+            part = self.data[window.log]
+            if held_out or window.fitted.any():
+                alike[id(part.plant), structure(part.drive.params)].append(number)
+        many = max(1, ENVS // len(points))
+        groups = []
+        for numbers in alike.values():
+            groups += [numbers[first : first + many] for first in range(0, len(numbers), many)]
+        tasks = [self._task(group, points, states) for group in groups]
         tables = [np.zeros((0, joints, count))] * len(self.windows)
         for group, positions in zip(groups, self.run(_simulated, tasks), strict=True):
             for number, table in zip(group, positions, strict=True):
@@ -161,41 +160,36 @@ class Problem:
                 tables[number] = _projected(np.moveaxis(errors, 0, 2), count)
         return tables
 
-    def _task(self, group: list[int], candidates: PlantCandidates, states: Float64) -> Any:
-        """Return the arguments of :func:`simulate` for a group of windows."""
+    def _task(self, group: list[int], points: Float64, states: Float64) -> Any:
+        """Return the arguments of :func:`simulate` for a group of windows, each at all points."""
         parts = [self.data[self.windows[number].log] for number in group]
+        stretches = [self.windows[number].stretch for number in group]
         drive = parts[0].drive
         if drive.params is not None:
-            params: Any = zip(*[part.drive.params for part in parts], strict=True)
-            drive = drive._replace(params=bp.PIDParams(*map(_stacked, params)))
-        stretches = [self.windows[number].stretch for number in group]
-        return parts[0].plant, drive, candidates, states, stretches
+            # A column of rows: other options are equal in all logs of a group.
+            rows: Any = zip(*[part.drive.params for part in parts * len(points)], strict=True)
+            leaves: Any = [
+                np.concatenate(row) if isinstance(row[0], np.ndarray) else row[0] for row in rows
+            ]
+            drive = drive._replace(params=bp.PIDParams(*leaves))
+        points, states = (np.repeat(table, len(group), axis=0) for table in (points, states))
+        robots = self.unknowns.candidates(self.unknowns.values(points))
+        return parts[0].plant, drive, robots, states, stretches
 
-    def _groups(self, candidates: int, held_out: bool) -> list[list[int]]:
-        """Return the numbers of windows that are simulated at once."""
-        alike = defaultdict[Any, list[int]](list)
-        for number, window in enumerate(self.windows):
-            part = self.data[window.log]
-            if held_out or window.fitted.any():
-                alike[id(part.plant), structure(part.drive.params)].append(number)
-        many = max(1, ENVS // candidates)
-        groups = []
-        for numbers in alike.values():
-            groups += [numbers[first : first + many] for first in range(0, len(numbers), many)]
-        return groups
+    def weighted(self, evaluation: Sequence[Float64], size: Float64) -> Float64:
+        """Return residuals and their changes (n, 1 + changes) of the fitted rows over their
+        ``size``.
+        """
+        pairs = zip(self.windows, evaluation, strict=True)
+        tables = [table[window.fitted] / size[:, None] for window, table in pairs if len(table)]
+        table = np.concatenate(tables)
+        return table.reshape(-1, table.shape[2])
 
-    def system(
-        self, evaluation: Sequence[Float64], point: Float64, size: Float64
-    ) -> tuple[Float64, Float64]:
+    def system(self, point: Float64, evaluation: Any, size: Float64) -> tuple[Float64, Float64]:
         """Return residuals and derivatives (n, unknowns), by changes of STEP, of the fitted rows
         over their ``size``, then of the prior.
         """
-        tables = []
-        for window, table in zip(self.windows, evaluation, strict=True):
-            if len(table):
-                weighted = table[window.fitted] / size[:, None]
-                tables.append(weighted.reshape(-1, 1 + len(point)))
-        table = np.concatenate(tables)
+        table = self.weighted(evaluation, size)
         mean, spread = self.unknowns.prior
         residual = np.append(table[:, 0], (point - mean) / spread)
         return residual, np.vstack([table[:, 1:] / STEP, np.diag(1 / spread)])
@@ -204,20 +198,23 @@ class Problem:
         """Return the size of fitted residuals (joints,): the root mean square, the largest tenth of
         each joint cut.
         """
-        errors = np.abs(_residuals(self.windows, evaluation, fitted=True))
-        errors = np.minimum(errors, np.quantile(errors, 0.9, axis=0))
-        return _root_mean_square(errors) + RESOLUTION
+        joints = self.windows[0].measured.shape[1]
+        errors = self.weighted(evaluation, np.ones(joints))[:, 0].reshape(-1, joints)
+        errors = np.minimum(np.abs(errors), np.quantile(np.abs(errors), 0.9, axis=0))
+        size: Float64 = np.sqrt((errors**2).mean(0)) + RESOLUTION
+        return size
 
-    def error(self, point: Float64, free_states: bool = True) -> Float64:
-        """Return the root mean square (joints,) of the position error at the held-out rows; at all
-        rows if none is held out.
+    def error(self, point: Float64) -> Float64:
+        """Return the root mean square (joints,) of the position error at the held-out rows,
+        simulated from the logged state; at all rows if none is held out.
         """
-        still = np.zeros((0, len(point)))
-        evaluation = self.evaluate(point, still, free_states, held_out=True)
-        errors = _residuals(self.windows, evaluation, fitted=False)
-        if not len(errors):
-            errors = _residuals(self.windows, evaluation, fitted=True)
-        return _root_mean_square(errors)
+        evaluation = self.evaluate(point, free_states=False, held_out=True)
+        errors = np.concatenate(evaluation)[..., 0]
+        held_out = ~np.concatenate([window.fitted for window in self.windows])
+        if held_out.any():
+            errors = errors[held_out]
+        size: Float64 = np.sqrt((errors**2).mean(0))
+        return size
 
 
 def fit(
@@ -228,60 +225,54 @@ def fit(
     """
 
     def start_error(problem: Problem) -> float:
-        start = problem.unknowns.start
-        size = problem.size(problem.evaluate(start, np.zeros((0, len(start)))))
-        return float(np.linalg.norm(size))
+        return float(np.linalg.norm(problem.size(problem.evaluate(problem.unknowns.start))))
 
-    problem = problems[0] if len(problems) == 1 else min(problems, key=start_error)
+    problem = min(problems, key=start_error)
     unknowns = problem.unknowns
-    solution = solve(problem, unknowns.start, evaluations, None, progress)
-    uncertainty = intervals(problem, solution)
-    shown = uncertainty.shown
+    solution = solve(problem, unknowns.start, None, evaluations, progress)
+    *uncertainty, shown = intervals(problem, *solution[:2])
     if not shown.all():
-        values = unknowns.values(solution.point[None])[:, shown]
+        point, size, _ = solution
+        values = unknowns.values(point)[shown]
         problem = replace(problem, unknowns=unknowns.only(shown))
-        start = problem.unknowns.points(values)[0]
-        solution = solve(problem, start, evaluations, solution.size, progress)
-        uncertainty = intervals(problem, solution)
+        start = problem.unknowns.points(values)
+        solution = solve(problem, start, size, evaluations, progress)
+        *uncertainty, _ = intervals(problem, *solution[:2])
     # Worker processes end with the fit.
-    return Fit(unknowns.only(~shown), replace(problem, run=map), solution, uncertainty)
+    hidden = list(unknowns.only(~shown).entries)
+    return Fit(replace(problem, run=map), hidden, *solution, *uncertainty)
 
 
 def solve(
     problem: Problem,
-    start: Float64,
+    point: Float64,
+    size: Float64 | None,
     evaluations: int,
-    size: Float64 | None = None,
     progress: Callable[[], object] | None = None,
-) -> Solution:
-    """Return the fit from a point ``start``, with residuals of a ``size`` (joints,), or that at the
-    start.
+) -> tuple[Float64, Float64, bool]:
+    """Return the fit from a ``point``, the size of residuals that it was weighted with, and whether
+    it has converged; it begins with a ``size`` (joints,), or that at the point.
 
     The size of residuals that are left may be far smaller, which would give the prior too much
     weight: further fits follow until it stays.
     """
     from scipy.optimize import least_squares
 
-    steps = STEP * np.eye(len(start))
-    cache = dict[bytes, list[Float64]]()
+    # Residuals and derivatives at a point come from one evaluation.
+    @lru_cache(maxsize=1)
+    def evaluated(*point: float) -> list[Float64]:
+        if progress is not None:
+            progress()
+        return problem.evaluate(np.array(point), STEP * np.eye(len(point)))
 
-    def evaluated(point: Float64) -> list[Float64]:
-        if point.tobytes() not in cache:
-            cache.clear()
-            cache[point.tobytes()] = problem.evaluate(point, steps)
-            if progress is not None:
-                progress()
-        return cache[point.tobytes()]
+    def residual(point: Float64, size: Float64) -> Float64:
+        return problem.system(point, evaluated(*point), size)[0]
 
-    def residual(point: Float64, weight: Float64) -> Float64:
-        return problem.system(evaluated(point), point, weight)[0]
+    def derivative(point: Float64, size: Float64) -> Float64:
+        return problem.system(point, evaluated(*point), size)[1]
 
-    def derivative(point: Float64, weight: Float64) -> Float64:
-        return problem.system(evaluated(point), point, weight)[1]
-
-    point = start
     if size is None:
-        size = problem.size(evaluated(start))
+        size = problem.size(evaluated(*point))
     for _ in range(ROUNDS):
         weight = size
         optimum = least_squares(
@@ -299,75 +290,57 @@ def solve(
         )
         point = optimum.x
         evaluations -= optimum.nfev
-        size = problem.size(evaluated(point))
+        size = problem.size(evaluated(*point))
         if evaluations < 1 or np.median(size / weight) > SETTLED:
             break
-    return Solution(point, weight, optimum.status > 0)
+    return point, weight, optimum.status > 0
 
 
-def intervals(problem: Problem, solution: Solution) -> Intervals:
-    """Return the intervals at a solution, from derivatives by the values, not the coordinates: near
-    0 a coordinate hardly changes its value.
+def intervals(problem: Problem, point: Float64, size: Float64) -> tuple[Float64, Float64, Bool]:
+    """Return deviations, root of the covariance, and the mask of unknowns that the logs show
+    (unknowns,).
+
+    Derivatives are by the values over their sizes, not by coordinates: near 0 a coordinate hardly
+    changes its value.
     """
     unknowns = problem.unknowns
-    entries = unknowns.entries
-    values = unknowns.values(solution.point[None])[0]
-    sizes = np.array([entry.size for entry in entries])
-    change = 0.01 * np.maximum(np.abs(values), sizes)
-    point = unknowns.points(values[None])[0]
-    further = unknowns.points(values + np.diag(change))
-    prior = np.array([KINDS[entry.kind].spread for entry in entries])
-    prior *= np.maximum(np.abs(values) / sizes, 1.0)
-    evaluation = problem.evaluate(point, further - point)
-    residual, matrix = problem.system(evaluation, solution.point, solution.size)
-    # Rows are weighted as by the loss; the last ones are of the prior.
-    rows = len(residual) - len(point)
-    residual = residual[:rows]
-    weight = (1 + (residual / OUTLIER) ** 2) ** -0.25
-    residual = weight * residual
-    matrix = weight[:, None] * matrix[:rows] * (STEP * sizes / change)
-    square = float(residual @ residual) / max(rows - len(point), 1)
+    values = unknowns.values(point)
+    scale = np.maximum(np.abs(values) / unknowns.sizes, 1.0)
+    prior = unknowns.spread * scale
+    further = unknowns.points(values + np.diag(0.01 * scale * unknowns.sizes))
+    table = downweighted(problem.weighted(problem.evaluate(point, further - point), size))
+    residual = table[:, 0]
+    matrix = table[:, 1:] / (0.01 * scale)
+    square = float(residual @ residual) / max(len(residual) - len(point), 1)
     hessian = matrix.T @ matrix + np.diag(square / prior**2)
-    inverse = np.linalg.inv(hessian)
+    root = np.linalg.inv(np.linalg.cholesky(hessian)).T
+    inverse = root @ root.T
+    # Changes of the estimate without each part.
     shifts = []
-    for part in np.array_split(np.arange(len(residual)), PARTS):
-        block = matrix[part]
-        shifts.append(np.linalg.solve(hessian - block.T @ block, block.T @ residual[part]))
+    for part in np.array_split(table, PARTS):
+        block = part[:, 1:] / (0.01 * scale)
+        shifts.append(np.linalg.solve(hessian - block.T @ block, block.T @ part[:, 0]))
     jackknife = (PARTS - 1) * np.var(shifts, axis=0)
     curvature = square * np.diagonal(inverse)
     variance = np.maximum(jackknife, curvature) + (inverse @ matrix.T @ residual) ** 2
-    deviation = np.sqrt(np.minimum(variance, prior**2)) * sizes
+    deviation = np.sqrt(np.minimum(variance, prior**2)) * unknowns.sizes
     deviation = np.maximum(deviation, LEAST * np.abs(values))
     # Correlations are those of the curvature.
-    scale = deviation / np.sqrt(np.diagonal(inverse))
-    root = scale[:, None] * np.linalg.cholesky(inverse)
+    ratio = deviation / np.sqrt(np.diagonal(inverse))
+    root = ratio[:, None] * root
     # A short delay of setpoints is left out: that of efforts explains the rest.
-    late = np.array([entry.kind == "setpoint_delay" for entry in entries])
+    late = np.array([entry.kind == "setpoint_delay" for entry in unknowns.entries])
     shown = (np.sqrt(curvature) < SHOWN * prior) & ~(late & (values < SHORT))
-    return Intervals(deviation, root, shown)
+    return deviation, root, shown
 
 
-def _residuals(windows: Sequence[Window], evaluation: Sequence[Float64], fitted: bool) -> Float64:
-    """Return the residuals (rows, joints) of the fitted rows, or of the others."""
-    tables = []
-    for window, table in zip(windows, evaluation, strict=True):
-        if len(table):
-            tables.append(table[window.fitted == fitted, :, 0])
-    return np.concatenate(tables)
-
-
-def _root_mean_square(errors: Float64) -> Float64:
-    size: Float64 = np.sqrt((errors**2).mean(0))
-    return size
+def downweighted(table: Float64) -> Float64:
+    """Return rows of residuals and their changes with the weights of the loss."""
+    return table * (1 + (table[:, :1] / OUTLIER) ** 2) ** -0.25
 
 
 def _simulated(task: Any) -> list[Float64]:
     return simulate(*task)
-
-
-def _stacked(rows: Any) -> Any:
-    """Return the rows of several logs as one array; other options are equal in all logs."""
-    return np.concatenate(rows) if isinstance(rows[0], np.ndarray) else rows[0]
 
 
 def _projected(table: Float64, count: int) -> Float64:
@@ -390,29 +363,28 @@ def windows_of(data: Sequence[LogData]) -> list[Window]:
     windows = list[Window]()
     every = 1 + sum(len(part.log.time) for part in data) // MOST_ROWS
     for number, part in enumerate(data):
+        dt = part.drive.timestep
         total = len(part.motion.qpos) - 1
         share = {None: 1 - HELD_OUT, False: 1.0, True: 0.0}[part.log.held_out]
         split = round(share * total)
-        if part.drive.params is not None:
-            windows.append(_window(number, part, (0, total), split, every))
-            continue
-        # Windows of the fitted part, then of the held-out part; the filter begins at the edge.
-        edge = round(0.05 / part.drive.timestep)
-        first = max(split + 1, edge)
-        length = min(round(WINDOW / part.drive.timestep), max(total - first, split - edge))
-        starts = [*range(edge, split - length + 1, length)]
-        starts += range(first, total - length + 1, length)
-        windows += [
-            _window(number, part, (start, start + length), split, every) for start in starts
-        ]
+        length = total
+        starts = [0]
+        if part.drive.params is None:
+            # Windows of the fitted part, then of the held-out part; the filter begins at the edge.
+            edge = round(0.05 / dt)
+            first = max(split + 1, edge)
+            length = min(round(WINDOW / dt), max(total - first, split - edge))
+            starts = [*range(edge, split - length + 1, length)]
+            starts += range(first, total - length + 1, length)
+        for start in starts:
+            windows.append(_window(number, part, start, start + length, split, every))
     return windows[:: 1 + len(windows) // MOST_WINDOWS]
 
 
-def _window(number: int, data: LogData, steps: tuple[int, int], split: int, every: int) -> Window:
-    """Return the window between two sim ``steps`` of a log's grid, of one row of ``every``; rows are
+def _window(number: int, data: LogData, first: int, last: int, split: int, every: int) -> Window:
+    """Return the window between two sim steps of a log's grid, of one row of ``every``; rows are
     held out from the step ``split`` on.
     """
-    first, last = steps
     log, motion, _, drive = data
     dt = drive.timestep
     settle = 0.0
@@ -421,12 +393,11 @@ def _window(number: int, data: LogData, steps: tuple[int, int], split: int, ever
     place = (log.time - log.time[0]) / dt
     rows = np.flatnonzero((place > first + settle + 1e-6) & (place <= last + 1e-6))[::every]
     place = place[rows]
+    # Rows lie before the ends of their sim steps.
     step = np.maximum(np.ceil(place - 1e-6).astype(int), first + 1)
+    before = np.maximum(step - place, 0.0) * dt
     past = round(PAST / dt)
     command = motion.command[np.maximum(np.arange(first - past, last), 0)]
-    before = np.maximum(step - place, 0.0) * dt
-    stretch = Stretch(
-        motion.qpos[first], motion.qvel[first], command, past, step - first - 1, before
-    )
-    fitted = place <= split + 1e-6
-    return Window(number, stretch, log.qpos[rows], log.time[rows], fitted)
+    begin = motion.qpos[first], motion.qvel[first]
+    stretch = Stretch(*begin, command, past, step - first - 1, before)
+    return Window(number, stretch, log.qpos[rows], log.time[rows], place <= split + 1e-6)

@@ -36,7 +36,7 @@ CLEAR = np.pi / 2
 
 
 class LogWarning(UserWarning):
-    """A log was changed when it was read, or a joint did not move."""
+    """Rows of a log were left out, or a joint did not move."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +156,7 @@ def checked(robot: Robot, log: Log) -> list[Log]:
         else:
             parts.append(_unwrapped(robot, part))
     if not parts:
-        problem = f"has {len(log.time)} rows of {log.seconds:.3g} s in {len(short)} stretches"
+        problem = f"has {len(log.time)} rows in {len(short)} stretches, all too short"
         remedy = f"record {MIN_ROWS} rows and {MIN_SECONDS} s without a gap; {units}"
         raise log.error(problem, remedy)
     if short:
@@ -165,9 +165,6 @@ def checked(robot: Robot, log: Log) -> list[Log]:
 
 
 def _check_finite(robot: Robot, log: Log) -> None:
-    if len(log.command_time) != len(log.command) or not len(log.time):
-        problem = f"has {len(log.time)} rows and {len(log.command)} commands"
-        raise log.error(problem, "give a time for each command")
     tables = {
         "time": log.time[:, None],
         "command_time": log.command_time[:, None],
@@ -192,9 +189,7 @@ def _in_order(log: Log) -> Log:
         return log
     first = log.place(np.argmax(repeats))
     log.warn(f"{repeats.sum()} rows repeat a time, the first at {first}: left out")
-    # Commands of a recording have times of their own.
-    commands = ~repeats if len(log.command_time) == len(repeats) else slice(None)
-    return log.part(~repeats, commands)
+    return log.part(~repeats, np.diff(log.command_time, prepend=-np.inf) > 0)
 
 
 def _between(log: Log, begin: int, end: int) -> Log:
@@ -234,11 +229,6 @@ def _unwrapped(robot: Robot, log: Log) -> Log:
         remedy += "; a joint that turns freely is of type continuous"
         between = f"{low[column]:g} to {high[column]:g}"
         raise log.error(f"{problem}, {between}", remedy, log.qpos[row, column])
-    limited = np.flatnonzero(wraps & ~robot.continuous[joints])
-    if len(limited):
-        problem = f"the positions of {', '.join(names[column] for column in limited)} jump by"
-        remedy = "in the robot's file the type is not continuous: correct it"
-        log.warn(f"{problem} whole turns, and were unwrapped; {remedy}")
     qpos = log.qpos.copy()
     qpos[1:] -= TURN * np.cumsum(turns, axis=0)
     command = log.command

@@ -12,7 +12,6 @@ efforts are commanded efforts.
 from __future__ import annotations
 
 import os
-import re
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import replace
@@ -25,7 +24,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import file_path
 from batchpid.errors import MissingDependencyError, warn
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
-from batchpid.sim.recording.recording_files import RecordingError, read_recording
+from batchpid.sim.recording.recording_files import read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.rollout import Rollout
@@ -33,9 +32,8 @@ from batchpid.sim.signals.rollout import Rollout
 QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
 HDF5 = (".h5", ".hdf5")
-SECONDS = {None: 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SECONDS = {"time": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9}
 JOINT_STATE = "sensor_msgs/msg/JointState"
-_TIME = re.compile(r"time[\s_]*[\[(]?(s|ms|us|ns)?[\])]?")
 
 
 class Reading(NamedTuple):
@@ -88,16 +86,11 @@ def read_logs(
 
 
 def _read(robot: Robot, path: Path, kind: CommandKind | None, reading: Reading) -> list[Log]:
-    if not path.exists():
-        raise FileNotFoundError(2, "there is no such file", str(path))
-    if path.suffix.lower() in HDF5:
-        try:
-            return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
-        except RecordingError as bad:
-            remedy = "logs of other programs are CSV files with the columns time, qpos:JOINT, ..."
-            raise RecordingError(f"{bad}; {remedy}") from bad
+    suffix = path.suffix.lower()
+    if suffix in HDF5:
+        return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
     lines = None
-    if path.suffix.lower() in BAGS or path.is_dir():
+    if path.exists() and (suffix in BAGS or path.is_dir()):
         columns = _read_bag(robot, path, reading)
     else:
         file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
@@ -136,7 +129,7 @@ def logs_of_rollout(
         if holds:
             remedy = "record another run under control pid or effort"
             raise error(source, f"{problem}, which a fit cannot use", remedy)
-    joints = np.flatnonzero(robot.independent).tolist()
+    joints = np.flatnonzero(robot.independent)
     logs = []
     for env in range(rollout.num_envs):
         params = None
@@ -144,7 +137,7 @@ def logs_of_rollout(
             params = info.params.for_envs(slice(env, env + 1))
         log = Log(
             source if rollout.num_envs == 1 else f"{source}, env {env}",
-            tuple(joints),
+            tuple(joints.tolist()),
             recorded,
             rollout.time,
             rollout.qpos[:, env, joints].astype(float),
@@ -167,13 +160,12 @@ def _build(
     reading: Reading,
 ) -> Log:
     """Return the log that the columns of a file hold."""
-    times = {name: match[1] for name in columns if (match := _TIME.fullmatch(name))}
-    if not times:
+    unit = next((name for name in SECONDS if name in columns), None)
+    if unit is None:
         problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
         remedy = "begin the header with time, in seconds, or time_ms, time_us, time_ns"
         raise error(source, problem, remedy)
-    name, unit = next(iter(times.items()))
-    time = SECONDS[unit] * columns[name]
+    time = SECONDS[unit] * columns[unit]
     by = columns_by_joint(robot, source, columns, QUANTITIES, reading.prefix)
     if by["feedforward"]:
         remedy = "log the complete efforts, without the columns of the feedforward"
@@ -182,89 +174,83 @@ def _build(
     measured = not by["effort"]
     by["effort"] = by["effort"] or by["measured_effort"]
     kind = kind or ("effort" if by["effort"] else "setpoint")
-    names = [name for name in robot.joint_names if name in by["qpos"] or name in by[kind]]
-    names = [name for name in names if robot.independent[robot.joint_names.index(name)]]
+    joints = list[int]()
+    for joint, name in enumerate(robot.joint_names):
+        if robot.independent[joint] and name in by["qpos"] | by[kind]:
+            joints.append(joint)
+    names = [robot.joint_names[joint] for joint in joints]
+    revolute = np.array([robot.units[joint] == "rad" for joint in joints])
     tables = dict[str, Float64]()
     for quantity in ("qpos", kind):
-        if not by[quantity]:
-            remedy = f"positions and commands are needed, e.g. {quantity}:{robot.joint_names[0]}"
-            raise error(source, f"has no column {quantity}:JOINT", remedy)
-        for name in names:
+        for name in names or ["JOINT"]:
             if name not in by[quantity]:
-                remedy = "give all columns of a joint or none: without columns it rests"
+                remedy = "positions and commands are needed; a joint without both rests"
                 raise error(f"{source}: column {quantity}:{name}", "is missing", remedy)
         tables[quantity] = np.stack([by[quantity][name] for name in names], axis=1)
-    joints = [robot.joint_names.index(name) for name in names]
-    if reading.degrees:
-        revolute = [robot.units[joint] == "rad" for joint in joints]
-        for quantity in tables.keys() - {"effort"}:
-            tables[quantity][:, revolute] = np.radians(tables[quantity][:, revolute])
+        if reading.degrees and quantity != "effort":
+            tables[quantity] *= np.where(revolute, np.radians(1.0), 1.0)
+    measured = measured and kind == "effort"
+    table = tables[kind]
+    hold = reading.hold
     return Log(
-        source,
-        tuple(joints),
-        kind,
-        time,
-        tables["qpos"],
-        time,
-        tables[kind],
-        held=reading.hold,
-        measured=measured and kind == "effort",
+        source, tuple(joints), kind, time, tables["qpos"], time, table, hold, measured=measured
     )
 
 
 def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
-    """Return the columns of a bag by name, of the joints of ``robot``, in seconds since the first
-    row.
+    """Return the columns of a bag by name, in seconds since the first row.
 
     Messages are merged by the names of joints: each joint has the samples of all messages that name
-    it. Rows are at the stamps of the joint with most of them, as long as all joints are measured.
+    it. Rows are at the stamps of the joint with most positions, as long as all columns have values.
     """
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingDependencyError("rosbags", "a log in a ROS bag", "tune") from None
-    names = {f"{reading.prefix}{joint}" for joint in robot.joint_names}
-    topics = {reading.topic: {"position": "qpos", "effort": "measured_effort"}}
+    topics = {reading.topic: ("qpos:", "measured_effort:")}
     if reading.command_topic:
-        topics[reading.command_topic] = {"position": "setpoint", "effort": "effort"}
-    samples = defaultdict[tuple[str, str], dict[int, float]](dict)
-    others = set[str]()
+        topics[reading.command_topic] = ("setpoint:", "effort:")
+    samples = defaultdict[str, dict[int, float]](dict)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
             states = [line for line in reader.connections if line.msgtype == JOINT_STATE]
-            chosen = [line for line in states if line.topic in topics]
             # Without a connection the reader would return all messages.
-            for line, received, raw in reader.messages(connections=chosen) if chosen else ():
+            for line, received, raw in reader.messages(connections=states) if states else ():
                 message: Any = reader.deserialize(raw, line.msgtype)
                 stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec or received
-                for field, quantity in topics[line.topic].items():
-                    # A driver without such a value leaves the list empty.
-                    for name, value in zip(message.name, getattr(message, field), strict=False):
-                        if name in names:
-                            samples[line.topic, f"{quantity}:{name}"][stamp] = float(value)
-                        else:
-                            others.add(name.removeprefix(reading.prefix))
+                lists = message.position, message.effort
+                # A driver without such a value leaves the list empty.
+                for quantity, values in zip(topics.get(line.topic, ()), lists, strict=False):
+                    for name, value in zip(message.name, values, strict=False):
+                        samples[f"{quantity}{name}"][stamp] = float(value)
     except Exception as bad:  # a damaged file can make the library raise anything
         raise error(str(path), f"cannot be read: {bad}", "correct or record it again") from None
-    present = ", ".join(sorted(line.topic for line in states)) or "there are none"
-    left_out = ", ".join(sorted(others))
-    for topic in topics:
-        if all(place[0] != topic for place in samples):
+    # Other devices publish joints of their own.
+    others = dict[str, str]()
+    for column in samples:
+        joint = column.partition(":")[2].removeprefix(reading.prefix)
+        if joint not in robot.joint_names:
+            others[column] = joint
+    left_out = ", ".join(sorted(set(others.values())))
+    for column in others:
+        del samples[column]
+    needed = {reading.topic: ("qpos:",), reading.command_topic: ("setpoint:", "effort:")}
+    for topic, quantities in needed.items():
+        if topic and not any(column.startswith(quantities) for column in samples):
             problem = f"has no values in the topic {topic!r} of the robot's joints"
+            present = ", ".join(sorted(line.topic for line in states)) or "there are none"
             remedy = f"topics of {JOINT_STATE}: {present}; other joints: {left_out or 'none'}"
             raise error(str(path), problem, remedy)
     if others:
         warn(f"{path}: {left_out}: no joint of the robot, left out", LogWarning)
-    stamps = [sorted(rows) for (_, name), rows in samples.items() if name.startswith("qpos")]
-    if not stamps:
-        raise error(str(path), "has no positions", f"is {reading.topic} the topic of measurements?")
+    stamps = [sorted(rows) for column, rows in samples.items() if column.startswith("qpos:")]
     first = max(joint[0] for joint in stamps)
     last = min(joint[-1] for joint in stamps)
     time = np.array([stamp - first for stamp in max(stamps, key=len) if first <= stamp <= last])
     columns = {"time": time / 1e9}
-    for (_, name), rows in samples.items():
+    for column, rows in samples.items():
         moments = sorted(rows)
         values = [rows[stamp] for stamp in moments]
-        columns[name] = np.interp(time, [stamp - first for stamp in moments], values)
+        columns[column] = np.interp(time, [stamp - first for stamp in moments], values)
     return columns

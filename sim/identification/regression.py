@@ -34,6 +34,8 @@ from batchpid.sim.identification.simulator import (
 )
 from batchpid.sim.robot.robot import Robot
 
+VALUES = "armature", "damping", "friction", "strength", "bias", "cost"
+"""Results for a joint."""
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
 DELAYS = np.arange(0.0, 0.03, 1e-3)
@@ -81,11 +83,6 @@ class Motion(NamedTuple):
     qvel: Float64
     qacc: Float64
     command: Float64
-
-    @property
-    def top_speed(self) -> Float64:
-        """Speed (joints,) that is seldom exceeded."""
-        return np.quantile(np.abs(self.qvel), 0.99, axis=0)
 
 
 class LogData(NamedTuple):
@@ -141,80 +138,76 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
     return np.ascontiguousarray(sosfiltfilt(sections, table, axis=0, padlen=pad))
 
 
-def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
+def regress(data: Sequence[LogData]) -> list[Guess]:
     """Return the motors of logs at the delays of the least cost, the best first: one guess for each
     delay of the setpoints that explains the efforts about as well.
-
-    With ``has_slew`` the rate of setpoints is limited, by about the speed of the joints.
     """
-    dt = data[0].drive.timestep
     every = 1 + sum(len(part.motion.qpos) for part in data) // MOST_ROWS
     cutoff = min(_cutoff(part.log) for part in data)
-    delays = LOOP_DELAYS
-    tables = list[Any]()
-    for part in data:
-        drive = part.drive
-        # The beginning of a long log is enough for a start.
-        motion = Motion(*(table[: round(LONGEST / dt)] for table in part.motion))
-        part = part._replace(motion=motion)
-        edge = min(round(EDGE / dt), len(motion.qpos) // 5)
-        rows = np.arange(edge, len(motion.qpos) - edge, every)
-        # Efforts that the links need, and efforts of the motors by delay of the setpoints.
-        links = _force(part, motion.qpos[rows], motion.qvel[rows], motion.qacc[rows])
-        efforts = _commanded(part, has_slew)
-        if drive.compensate != "none":
-            speed = 0.0 if drive.compensate == "gravity" else 1.0
-            held = _force(part, motion.qpos, speed * motion.qvel)
-            if drive.through:
-                efforts = efforts + held
-            else:
-                links -= held[rows]
-        if drive.params is None:
-            efforts = lowpass(efforts[0], cutoff, dt)[None]
-            delays = DELAYS
-        time = dt * np.arange(len(motion.qpos))
-        late = [[interpolated(time[rows] - delay, time, u) for delay in delays] for u in efforts]
-        still = 0.01 * np.abs(motion.qvel).max(0) + 1e-9
-        sign = lowpass(np.clip(motion.qvel / still, -1, 1), cutoff, dt)[rows]
-        tables.append((links, motion.qacc[rows], motion.qvel[rows], sign, np.array(late)))
+    shifts, delays = SETPOINT_DELAYS, LOOP_DELAYS
+    if data[0].drive.params is None:
+        shifts, delays = np.zeros(1), DELAYS
+    tables = [_table(part, delays, every, cutoff) for part in data]
     *columns, efforts = (np.concatenate(parts, axis=-2) for parts in zip(*tables, strict=True))
     speed = np.abs(columns[2])
     moves = speed > MOVES * np.sqrt((speed**2).mean(0))
     moves |= moves.sum(0) < 50
     guesses = list[Guess]()
-    names = ("armature", "damping", "friction", "strength", "bias", "cost")
-    shifts = SETPOINT_DELAYS if len(efforts) > 1 else (0.0,)
-    for setpoint_delay, by_delay in zip(shifts, efforts, strict=True):
-        options = list[Guess]()
-        for delay, effort in zip(delays, by_delay, strict=True):
-            joints = []
-            for joint, fast in enumerate(moves.T):
-                joints.append(_solve([column[fast, joint] for column in (*columns, effort)]))
-            values = dict(zip(names, np.array(joints).T, strict=True))
-            costs = values.pop("cost")
-            values["delay"] = np.array([delay])
-            values["setpoint_delay"] = np.array([setpoint_delay])
-            options.append(Guess(values, costs))
-        guesses.append(min(options, key=attrgetter("cost")))
+    for shift, delay in np.ndindex(efforts.shape[:2]):
+        joints = []
+        for joint, fast in enumerate(moves.T):
+            table = [column[fast, joint] for column in (*columns, efforts[shift, delay])]
+            joints.append(_solve(table))
+        values = dict(zip(VALUES, np.array(joints).T, strict=True))
+        values |= {"delay": delays[[delay]], "setpoint_delay": shifts[[shift]]}
+        guesses.append(Guess(values, values.pop("cost")))
     # Logs show the sum of both delays; armature and damping can hide how it is divided.
+    guesses.sort(key=attrgetter("cost"))
+    alike = [guess for guess in guesses if guess.cost < guesses[0].cost + ALIKE]
     # Setpoints that were logged late are the last explanation.
-    least = min(guess.cost for guess in guesses) + ALIKE
-    alike = sorted([guess for guess in guesses if guess.cost < least], key=attrgetter("cost"))
     usual = [guess for guess in alike if guess.values["setpoint_delay"][0] > -1e-9]
-    return usual or alike
+    best = dict[float, Guess]()
+    for guess in usual or alike:
+        best.setdefault(float(guess.values["setpoint_delay"][0]), guess)
+    return list(best.values())
 
 
-def _force(part: LogData, qpos: Float64, qvel: Float64, qacc: Float64 | None = None) -> Float64:
+def _table(part: LogData, delays: Float64, every: int, cutoff: float) -> tuple[Float64, ...]:
+    """Return columns of a log (rows, joints): the effort that the links need, acceleration,
+    velocity, its sign, and the motors' efforts by delay of setpoints and of efforts.
+    """
+    dt = part.drive.timestep
+    # The beginning of a long log is enough for a start.
+    motion = Motion(*(table[: round(LONGEST / dt)] for table in part.motion))
+    part = part._replace(motion=motion)
+    edge = min(round(EDGE / dt), len(motion.qpos) // 5)
+    rows = np.arange(edge, len(motion.qpos) - edge, every)
+    links = _force(part, motion.qpos[rows], motion.qvel[rows], motion.qacc[rows])
+    efforts = _commanded(part)
+    if part.drive.compensate != "none":
+        speed = 0.0 if part.drive.compensate == "gravity" else 1.0
+        compensation = _force(part, motion.qpos, speed * motion.qvel, 0 * motion.qacc)
+        if part.drive.through:
+            efforts = efforts + compensation
+        else:
+            links -= compensation[rows]
+    if part.drive.params is None:
+        efforts = lowpass(efforts[0], cutoff, dt)[None]
+    time = dt * np.arange(len(motion.qpos))
+    late = [[interpolated(time[rows] - delay, time, u) for delay in delays] for u in efforts]
+    still = 0.01 * np.abs(motion.qvel).max(0) + 1e-9
+    sign = lowpass(np.clip(motion.qvel / still, -1, 1), cutoff, dt)[rows]
+    return links, motion.qacc[rows], motion.qvel[rows], sign, np.array(late)
+
+
+def _force(part: LogData, qpos: Float64, qvel: Float64, qacc: Float64) -> Float64:
     """Return the efforts (rows, joints) that the links need to move so, without motors."""
-    q, v = np.array(qpos), np.array(qvel)
-    dynamics = Dynamics(part.plant, [()] * len(q), q, v)
+    dynamics = Dynamics(part.plant, [()] * len(qpos), np.array(qpos), np.array(qvel))
     dynamics.update()
-    if qacc is None:
-        return dynamics.force
     return dynamics.force + (dynamics.matrix @ qacc[..., None])[..., 0]
 
 
-def _commanded(part: LogData, has_slew: bool) -> Float64:
+def _commanded(part: LogData) -> Float64:
     """Return logged efforts (1, steps, joints), or the law's along a motion (setpoint delays,
     steps, joints).
     """
@@ -222,8 +215,7 @@ def _commanded(part: LogData, has_slew: bool) -> Float64:
     if drive.params is None:
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
-    law = {"slew": np.tile(motion.top_speed, (count, 1))} if has_slew else {}
-    ideal = PlantCandidates(Actuators(), law, SETPOINT_DELAYS, [()] * count)
+    ideal = PlantCandidates(Actuators(), {}, SETPOINT_DELAYS, [()] * count)
     q, v = (np.repeat(table[:, None], count, axis=1) for table in motion[:2])
     dynamics = Dynamics(part.plant, ideal.masses, q[0], v[0])
     control = SimulatedControl(drive, ideal, dynamics, q[0], v[0])
@@ -273,21 +265,16 @@ def better_reading(robot: Robot, data: LogData, guess: Guess) -> str:
     limits = robot.effort_limit[list(log.joints)]
     beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > BEYOND * limits
     if guess.odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
-        part = log.part(log.time < log.time[0] + TRIED, log.command_time < log.time[0] + TRIED)
-
-        def changed(on_qpos: Float64, on_command: Float64) -> Guess:
-            other = replace(part, qpos=part.qpos @ on_qpos, command=part.command @ on_command)
-            motion = smooth(other, data.drive.timestep)
-            return regress([data._replace(log=other, motion=motion)])[0]
-
-        same = np.eye(len(log.joints))
-        present = changed(same, same)
+        begin = log.part(log.time < log.time[0] + TRIED, log.command_time < log.time[0] + TRIED)
         names = [robot.joint_names[joint] for joint in log.joints]
         costs = dict[str, float]()
-        for words, *matrices in _readings(log.kind, names, np.flatnonzero(present.odd).tolist()):
-            costs[words] = changed(*matrices).cost
+        for words, on_qpos, on_command in _readings(log.kind, names, guess.odd):
+            other = replace(begin, qpos=begin.qpos @ on_qpos, command=begin.command @ on_command)
+            motion = smooth(other, data.drive.timestep)
+            costs[words] = regress([data._replace(log=other, motion=motion)])[0].cost
+        present = costs.pop("")
         best = min(costs.values())
-        if best < min(present.cost - EVIDENCE, WORST):
+        if best < min(present - EVIDENCE, WORST):
             return next(words for words, cost in costs.items() if cost < best + ALIKE)
     delay = float(guess.values["setpoint_delay"][0])
     if delay < -1e-9:
@@ -295,23 +282,21 @@ def better_reading(robot: Robot, data: LogData, guess: Guess) -> str:
     return ""
 
 
-def _readings(
-    kind: str, names: Sequence[str], odd: list[int]
-) -> Iterator[tuple[str, Float64, Float64]]:
-    """Yield other readings of the ``odd`` joints: words, and the matrices (joints, joints) that
-    correct rows of positions and of commands.
+def _readings(kind: str, names: Sequence[str], odd: Bool) -> Iterator[tuple[str, Float64, Float64]]:
+    """Yield the present reading (""), and others of the ``odd`` joints: words, and the matrices
+    (joints, joints) that correct rows of positions and of commands.
     """
     same = np.eye(len(names))
+    yield "", same, same
     changes = dict[str, Float64]()
-    for joint in odd:
+    for joint in np.flatnonzero(odd).tolist():
         changes[f"of {names[joint]} with the other sign"] = same - 2 * np.diag(same[joint])
-    for pair in map(list, combinations(range(len(names)), 2)):
+    for first, second in combinations(range(len(names)), 2):
         # One of two exchanged joints may look as usual.
-        if not {*pair} & {*odd}:
-            continue
-        order = np.arange(len(names))
-        order[pair] = pair[::-1]
-        changes[f"of {names[pair[0]]} and {names[pair[1]]} exchanged"] = same[order]
+        if odd[first] or odd[second]:
+            order = np.arange(len(names))
+            order[[first, second]] = second, first
+            changes[f"of {names[first]} and {names[second]} exchanged"] = same[order]
     for words, matrix in changes.items():
         yield f"{kind} {words}", same, matrix
         yield f"qpos {words}", matrix, same

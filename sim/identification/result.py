@@ -17,7 +17,7 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.sim.identification.fit import INTERVAL, OUTLIER, STEP, Fit
+from batchpid.sim.identification.fit import INTERVAL, STEP, Fit, Problem, downweighted
 from batchpid.sim.identification.simulator import LogControl, changed_params
 from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknown, Unknowns
 from batchpid.sim.robot.robot import Robot
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
-LEAST_SHARE, LEAST_SHARE_OF_MASS = 0.1, 0.5
-"""Least share of the remaining squared error that an effect, or the mass of a link, has to explain
-to be named.
-"""
+LEAST_SHARE = 0.1
+"""Least share of the remaining squared error that an effect has to explain to be named."""
+ALIKE = 0.5
+"""Share of the best explanation from which another link is as likely."""
 EXPLAINS = 0.5
 """Share of the position error of the robot as described that a file may leave."""
 
@@ -42,24 +42,21 @@ class Identification:
     """Motors that explain the logs, with their uncertainty."""
 
     fit: Fit
-    """The fit; ``fit.intervals`` are the intervals of ``unknowns``."""
     still: tuple[str, ...]
     """Joints that did not move."""
 
     @cached_property
-    def errors(self) -> tuple[Float64, Float64, Float64]:
+    def errors(self) -> tuple[Float64, Float64]:
         """Root mean square of the position error by joint (joints,) on the held-out part of the
-        logs: of the robot as described and as identified, simulated from the logged state, and the
-        latter with the initial state of each window fitted.
+        logs, simulated from the logged state: of the robot as described and as identified.
         """
         problem = self.fit.problem
-        point = self.fit.solution.point
-        described = replace(problem, unknowns=replace(problem.unknowns, entries=()))
-        return (
-            described.error(np.zeros(0), free_states=False),
-            problem.error(point, free_states=False),
-            problem.error(point),
-        )
+        return self._described.error(np.zeros(0)), problem.error(self.fit.point)
+
+    @property
+    def _described(self) -> Problem:
+        """The problem without unknowns."""
+        return replace(self.fit.problem, unknowns=replace(self.unknowns, entries=()))
 
     @cached_property
     def advice(self) -> str:
@@ -88,16 +85,14 @@ class Identification:
 
     @property
     def values(self) -> Float64:
-        """Values of the unknowns (unknowns,)."""
-        values: Float64 = self.unknowns.values(self.fit.solution.point[None])[0]
-        return values
+        """Values of the unknowns (unknowns,), in addition to the robot's description."""
+        return self.unknowns.values(self.fit.point)
 
     @property
     def held_out_error(self) -> tuple[float, float]:
-        """Root mean square of the position error [rad or m] on the held-out part of the logs,
-        simulated from the logged state, of the robot as described and as identified.
-        """
-        return _rms(self.errors[0]), _rms(self.errors[1])
+        """Root mean square of :attr:`errors` over the joints [rad or m]."""
+        before, after = (float(np.sqrt((errors**2).mean())) for errors in self.errors)
+        return before, after
 
     @property
     def explains(self) -> bool:
@@ -108,12 +103,12 @@ class Identification:
     @property
     def converged(self) -> bool:
         """False if the fit has stopped at the largest number of evaluations."""
-        return self.fit.solution.converged
+        return self.fit.converged
 
     @property
     def not_identified(self) -> list[str]:
         """Unknowns that the logs do not identify, e.g. "elbow: strength"."""
-        return [self._name(entry) for entry in self.fit.hidden.entries]
+        return [f"{self._place(entry) or 'robot'}: {entry.kind}" for entry in self.fit.hidden]
 
     def interval(
         self, kind: str, joint: int | str | None = None
@@ -121,32 +116,39 @@ class Identification:
         """Return estimate, lower and upper end of the 95 % interval; None if the logs do not
         identify it.
 
-        ``kind`` is a name of :data:`batchpid.sim.identification.unknowns.KINDS`, ``joint`` the
-        number of a joint among :attr:`joints`, the name of a link for "mass", None for "delay",
-        "setpoint_delay" and "payload".
+        Friction and damping include the description's. ``kind`` is a name of
+        :data:`batchpid.sim.identification.unknowns.KINDS`, ``joint`` the number of a joint among
+        :attr:`joints`, the name of a link for "mass", None for "delay", "setpoint_delay" and
+        "payload".
 
         Raises
         ------
         InvalidArgumentError
             There is no such unknown.
         """
-        entries = self.unknowns.entries + self.fit.hidden.entries
-        for at, entry in enumerate(entries):
-            if (entry.kind, entry.link or entry.joint) == (kind, joint):
-                return self.row(at) if at < len(self.unknowns.entries) else None
-        kinds = ", ".join(sorted({entry.kind for entry in entries}))
-        problem = f"is no unknown of {joint!r}"
-        raise InvalidArgumentError("kind", problem, value=kind, remedy=f"there are {kinds}")
+        entries = [*self.unknowns.entries, *self.fit.hidden]
+        names = [(entry.kind, entry.link or entry.joint) for entry in entries]
+        if (kind, joint) not in names:
+            problem = f"is no unknown of {joint!r}"
+            remedy = f"there are {sorted({entry.kind for entry in entries})}"
+            raise InvalidArgumentError("kind", problem, value=kind, remedy=remedy)
+        rows = dict(zip(names, self._rows, strict=False))
+        return rows.get((kind, joint))
 
-    def row(self, at: int) -> tuple[float, float, float]:
-        """Return the interval of an unknown by its place among :attr:`unknowns`."""
-        entry = self.unknowns.entries[at]
-        value = float(self.values[at])
-        half = INTERVAL * float(self.fit.intervals.deviation[at])
-        low = value - half
-        if KINDS[entry.kind].positive:
-            low = max(low, entry.floor)
-        return value, low, value + half
+    @property
+    def _rows(self) -> list[tuple[float, float, float]]:
+        """Estimate and ends of the interval of each unknown."""
+        rows = list[Any]()
+        halves = INTERVAL * self.fit.deviation
+        for entry, value, half in zip(self.unknowns.entries, self.values, halves, strict=True):
+            low = max(value - half, 0.0) if KINDS[entry.kind].positive else value - half
+            described = 0.0
+            if entry.kind in DESCRIBED and entry.joint is not None:
+                table = getattr(self.robot, DESCRIBED[entry.kind])
+                described = table[self.joints[entry.joint]]
+            row = value, low, value + half
+            rows.append(tuple(float(described + number) for number in row))
+        return rows
 
     def _place(self, entry: Unknown) -> str | None:
         """Return the joint or link of an unknown."""
@@ -154,17 +156,13 @@ class Identification:
             return entry.link
         return self.robot.joint_names[self.joints[entry.joint]]
 
-    def _name(self, entry: Unknown) -> str:
-        place = self._place(entry)
-        return entry.kind if place is None else f"{place}: {entry.kind}"
-
     def actuators(self) -> bp.Actuators:
         """Return the identified actuators; joints that are not in the logs are ideal.
 
         Friction and damping are in addition to the robot's description.
         """
-        columns = _columns(self.unknowns, self.values[None])
-        options: dict[str, Any] = {name: column[0] for name, column in columns.items()}
+        fields = _of_all_joints(self.unknowns, self.values[None])
+        options: dict[str, Any] = {name: table[0] for name, table in fields.items()}
         return bp.make_actuators(self.robot.dof, **options, joint_names=self.robot.joint_names)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -174,7 +172,7 @@ class Identification:
         region = {
             "unknowns": [[entry.kind, self._place(entry)] for entry in self.unknowns.entries],
             "estimate": self.values.tolist(),
-            "root": self.fit.intervals.root.tolist(),
+            "root": self.fit.root.tolist(),
         }
         about = self.document() | {KEY: region}
         bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
@@ -184,14 +182,12 @@ class Identification:
             bp.save_params(Path(path).with_name(f"{Path(path).stem}-gains.yaml"), gains, names)
 
     def document(self) -> Document:
-        """Return the result as plain values: estimate and 95 % interval of each unknown, and the
-        errors.
+        """Return the result as plain values: estimate and 95 % interval of each unknown by joint,
+        link or "robot", and the errors.
         """
         intervals: Document = {}
-        for at, entry in enumerate(self.unknowns.entries):
-            place = self._place(entry)
-            table = intervals if place is None else intervals.setdefault(place, {})
-            table[entry.kind] = list(self.row(at))
+        for entry, row in zip(self.unknowns.entries, self._rows, strict=True):
+            intervals.setdefault(self._place(entry) or "robot", {})[entry.kind] = list(row)
         return {
             "intervals": intervals,
             "not_shown": self.not_identified,
@@ -223,8 +219,8 @@ class Identification:
         """Return the params of the identified law, of the logged joints; None without unknowns of
         the law.
         """
-        law = self.unknowns.candidates(self.values[None]).law
-        if self.drive.params is None or law.keys().isdisjoint(("gain", "kd", "saturation")):
+        law = self.unknowns.tables(self.values[None], "law")
+        if self.drive.params is None or law.keys() <= {"slew"}:
             return None
         return changed_params(self.drive.params, law)
 
@@ -233,15 +229,14 @@ class Identification:
         from batchpid.sim import plots
 
         windows = [window for window in self.fit.problem.windows if window.log == 0]
-        after = replace(self.fit.problem, windows=windows)
-        before = replace(after, unknowns=replace(self.unknowns, entries=()))
         tables = []
-        for problem, point in ((before, np.zeros(0)), (after, self.fit.solution.point)):
-            still = np.zeros((0, len(point)))
-            tables.append(problem.evaluate(point, still, free_states=False, held_out=True))
+        for problem in (self._described, self.fit.problem):
+            point = self.fit.point[: len(problem.unknowns.entries)]
+            first = replace(problem, windows=windows)
+            tables.append(first.evaluate(point, free_states=False, held_out=True))
         errors = []
-        for window, first, last in zip(windows, *tables, strict=True):
-            errors.append((window.time, window.fitted, first[..., 0], last[..., 0]))
+        for window, before, after in zip(windows, *tables, strict=True):
+            errors.append((window.time, window.fitted, before[..., 0], after[..., 0]))
         names = [self.robot.joint_names[joint] for joint in self.joints]
         units = [self.robot.units[joint] for joint in self.joints]
         title = f"{self.robot.name}: position error, shaded where it was not fitted"
@@ -249,11 +244,11 @@ class Identification:
 
     def report(self) -> str:
         """Return values, intervals and errors as text."""
-        rows = dict[str | None, list[str]]()
-        for at, entry in enumerate(self.unknowns.entries):
-            rows.setdefault(self._place(entry), []).append(f"{entry.kind} {self._cell(at)}")
+        document = self.document()
         lines = ["values with 95 % intervals, SI units"]
-        lines += [f"{place or 'robot'}: {', '.join(cells)}" for place, cells in rows.items()]
+        for place, table in document["intervals"].items():
+            cells = ", ".join(f"{kind} {_cell(kind, *row)}" for kind, row in table.items())
+            lines.append(f"{place}: {cells}")
         if self.drive.compensate != "none":
             path = "through its motors" if self.drive.through else "apart from its motors"
             friction = "" if self.drive.modelled is None else "+friction"
@@ -263,9 +258,6 @@ class Identification:
             "position error on the held-out part, simulated from the logged state:"
             f" {before:.3g} as described, {after:.3g} with these"
         )
-        if self.drive.params is None:
-            free = _rms(self.errors[2])
-            lines.append(f"with the initial state of each 0.3 s fitted: {free:.3g}")
         joints = zip(self.joints, self.errors[1], strict=True)
         errors = [f"{self.robot.joint_names[joint]} {error:.2g}" for joint, error in joints]
         lines.append(f"by joint: {', '.join(errors)}")
@@ -276,42 +268,28 @@ class Identification:
             lines.append("the fit has not converged: the values are the best so far")
         return "\n".join([*lines, self.advice])
 
-    def _cell(self, at: int) -> str:
-        value, _, high = self.row(at)
-        half = high - value
-        if half > abs(value) and KINDS[self.unknowns.entries[at].kind].positive:
-            return f"< {high:.2g}"
-        # As many digits as the first one of the interval has, and one more.
-        digits = np.log10(max(abs(value), half) / half)
-        return f"{value:.{1 + int(np.ceil(digits))}g} ± {half:.1g}"
+
+def _cell(kind: str, value: float, low: float, high: float) -> str:
+    """Return a value with its interval, or its bound where the interval is wider than itself."""
+    half = high - value
+    if half > abs(value) and KINDS[kind].positive:
+        return f"< {high:.2g}"
+    # As many digits as the first one of the interval has, and one more.
+    digits = np.log10(max(abs(value), half) / half)
+    return f"{value:.{1 + int(np.ceil(digits))}g} ± {half:.1g}"
 
 
-def _rms(errors: Float64) -> float:
-    return float(np.sqrt((errors**2).mean()))
-
-
-def _columns(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
-    """Return the fields of actuators (n, dof) with ``values`` (n, unknowns), without the
-    description's part.
-    """
-    robot = unknowns.robot
-    joints = list(unknowns.joints)
-    columns = dict[str, Float64]()
-    for name, table in unknowns.tables(values).items():
-        kind = KINDS[name]
-        if kind.target != "motor":
-            continue
-        if kind.positive:
-            described = getattr(robot, DESCRIBED[name])[joints] if name in DESCRIBED else 0.0
-            table = np.clip(table - described, 1e-3 * kind.neutral, kind.most)
-        column = np.full((len(values), robot.dof), kind.neutral)
-        column[:, joints] = table
-        if kind.per == "robot":
-            column[:] = table[:, :1]
-        columns[kind.field] = column
-    if "static" in columns:
-        columns["static"] += columns.get("coulomb", 0.0)
-    return columns
+def _of_all_joints(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
+    """Return the fields of actuators (n, dof) with ``values`` (n, unknowns)."""
+    fields = dict[str, Float64]()
+    neutral = {kind.field: kind.neutral for kind in KINDS.values()}
+    for name, table in unknowns.tables(values, "motor").items():
+        fields[name] = np.full((len(values), unknowns.robot.dof), neutral[name])
+        fields[name][:, unknowns.joints] = table
+        # A delay is that of the whole robot.
+        if name == "command_delay":
+            fields[name][:] = table[:, :1]
+    return fields
 
 
 def advice(fit: Fit) -> str:
@@ -320,49 +298,46 @@ def advice(fit: Fit) -> str:
     """
     problem = fit.problem
     unknowns = problem.unknowns
+    entries = unknowns.entries
+    present = {entry.kind for entry in entries}
+    kinds = [kind for kind in ("mass", "offset", "load_friction") if kind not in present]
     links = problem.data[0].plant.heavy_links
-    further = [Unknown("mass", None, 1.0, 1.0, link=link) for link in links]
-    for joint in range(len(unknowns.joints)):
-        further.append(Unknown("offset", joint, 0.0, 0.01))
-        further.append(Unknown("load_friction", joint, 1e-6, 1e-5))
-    present = {entry.kind for entry in unknowns.entries}
-    further = [entry for entry in further if entry.kind not in present]
-    names = [(entry.kind, entry.link) for entry in further]
-    point = np.append(fit.solution.point, [entry.coordinate(entry.start) for entry in further])
-    wide = replace(problem, unknowns=replace(unknowns, entries=(*unknowns.entries, *further)))
-    evaluation = wide.evaluate(point, STEP * np.eye(len(point)))
-    residual, matrix = wide.system(evaluation, point, fit.solution.size)
+    starts = {"load_friction": np.zeros(len(unknowns.joints))}
+    further = Unknowns.of(unknowns.robot, unknowns.joints, kinds, starts, {}, links).entries
+    wide = replace(unknowns, entries=(*entries, *further))
+    values = np.append(unknowns.values(fit.point), [entry.start for entry in further])
+    problem = replace(problem, unknowns=wide)
+    point = wide.points(values)
+    evaluation = problem.evaluate(point, STEP * np.eye(len(point)))
+    residual, matrix = problem.system(point, evaluation, fit.size)
     # Without the prior of the further unknowns: any size of an effect is as likely.
     rows = len(residual) - len(further)
-    table = np.column_stack([matrix, residual])[:rows]
-    weight = (1 + (residual[:rows] / OUTLIER) ** 2) ** -0.25
-    triangle: Any = np.linalg.qr(weight[:, None] * table, mode="r")
-    target = triangle[:, -1]
-    # Share of the squared error that each effect explains, and the changes of the unknowns.
-    effects = dict[tuple[str, str | None], tuple[float, Float64]]()
-    for name in dict.fromkeys(names):
-        columns = [True] * len(unknowns.entries) + [other == name for other in names]
-        slopes = triangle[:, :-1][:, columns]
-        change, *_ = np.linalg.lstsq(slopes, -target, rcond=1e-10)
-        share = 1 - float(((target + slopes @ change) ** 2).sum() / (target @ target))
-        if share > (LEAST_SHARE if name[1] is None else LEAST_SHARE_OF_MASS):
-            effects[name] = share, change
-    if not effects:
+    table = downweighted(np.column_stack([residual, matrix])[:rows])
+    triangle: Any = np.linalg.qr(table, mode="r")
+    target = -triangle[:, 0]
+    names = np.array([entry.link or entry.kind for entry in wide.entries])
+    is_factor = np.array([kind.neutral == 1.0 for kind in wide.kinds])
+    effects = []
+    for name in dict.fromkeys(names[len(entries) :].tolist()):
+        columns = names == name
+        columns[: len(entries)] = True
+        slopes = triangle[:, 1:][:, columns]
+        change, *_ = np.linalg.lstsq(slopes, target, rcond=1e-10)
+        share = 1 - float(((target - slopes @ change) ** 2).sum() / (target @ target))
+        factors = (values[columns] + change)[is_factor[columns]]
+        effects.append((share, float(np.abs(factors - 1).sum()), name, change[-1]))
+    share, _, name, _ = max(effects, default=(0.0, 0.0, "", 0.0))
+    if share < LEAST_SHARE:
         return "no further effect that was tried would explain a tenth of the remaining error"
-    kind, link = max(effects, key=lambda name: effects[name][0])
-    if link is None:
-        percent = 100 * effects[kind, link][0]
-        return f"{kind} would explain {percent:.0f} % of the squared error (extras: {kind})"
+    words = "would explain {:.0f} % of the squared error (extras: {})"
+    if name in KINDS:
+        return f"{name} {words.format(100 * share, name)}"
     # A heavier link looks like a lighter other one with weaker motors: take factors near 1.
-    factors = [KINDS[entry.kind].neutral == 1.0 for entry in (*unknowns.entries, further[0])]
-    sizes = dict[float, str]()
-    for (_, link), (_, change) in effects.items():
-        if link is not None:
-            values = np.append(fit.solution.point, 1.0) + change
-            more = "heavier" if change[-1] > 0 else "lighter"
-            sizes[float(np.abs(values - 1)[factors].sum())] = f"{link} {more}"
-    words = f"link {sizes[min(sizes)]} than described would explain most of the error"
-    return f"{words} (extras: mass), or the strengths: weigh it"
+    alike = [effect for effect in effects if effect[0] > ALIKE * share and effect[2] not in KINDS]
+    share, _, name, size = min(alike, key=lambda effect: effect[1])
+    more = "heavier" if size > 0 else "lighter"
+    words = words.format(100 * share, "mass")
+    return f"link {name} {more} than described {words}, or the strengths: weigh it"
 
 
 def draw_motors(
@@ -392,10 +367,13 @@ def draw_motors(
             joint = robot.joint_names.index(place) if KINDS[kind].per == "joint" else None
             entries.append(Unknown(kind, joint, 0.0, 1.0))
         normal = np.random.default_rng(seed).normal(size=(count, len(entries)))
-        points = region["estimate"] + normal @ np.transpose(region["root"])
+        values = region["estimate"] + normal @ np.transpose(region["root"])
     except (KeyError, IndexError, TypeError, ValueError) as bad:
         problem = f"is missing or cannot be read ({bad})"
         remedy = "write the file with `batchpid identify` of this robot"
         raise InvalidArgumentError(f"{path}: {KEY}", problem, remedy=remedy) from None
     unknowns = Unknowns(robot, tuple(range(robot.dof)), tuple(entries))
-    return nominal.replace(**_columns(unknowns, points))
+    for column, kind in enumerate(unknowns.kinds):
+        if kind.positive:
+            values[:, column] = values[:, column].clip(1e-3 * kind.neutral, kind.most)
+    return nominal.replace(**_of_all_joints(unknowns, values))

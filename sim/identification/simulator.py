@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,6 +58,7 @@ PAYLOAD = ""
 """Name of the payload among masses of links: no link has it."""
 Masses = tuple[tuple[str, float], ...]
 """Factors of the masses of some links, and the mass of the payload [kg] under PAYLOAD."""
+_NONE = Friction()
 
 
 class LogControl(NamedTuple):
@@ -75,10 +77,10 @@ class LogControl(NamedTuple):
 
 
 class PlantCandidates(NamedTuple):
-    """Motors, laws and robots of n candidates."""
+    """Motors, laws and robots of n simulations."""
 
     actuators: Actuators
-    """(n, joints), friction and damping of the description included."""
+    """(n, joints), in addition to friction and damping of the description."""
     law: Mapping[str, Float64]
     """Changes (n, joints) of the law: factors "gain" and "kd", "saturation" (effort limit over kp)
     and "slew" (limit of the setpoints' rate).
@@ -86,19 +88,6 @@ class PlantCandidates(NamedTuple):
     setpoint_delay: Float64
     """Delay of the setpoints (n,) [s]."""
     masses: Sequence[Masses]
-
-    def repeated(self, times: int) -> PlantCandidates:
-        """Return each candidate ``times`` times, one after the other."""
-
-        def rows(leaf: Float64) -> Float64:
-            return leaf if len(leaf) == 1 else np.repeat(leaf, times, axis=0)
-
-        return PlantCandidates(
-            mapped(rows, self.actuators),
-            {name: np.repeat(table, times, axis=0) for name, table in self.law.items()},
-            np.repeat(self.setpoint_delay, times),
-            [masses for masses in self.masses for _ in range(times)],
-        )
 
 
 class Stretch(NamedTuple):
@@ -133,43 +122,24 @@ class Plant:
             ratio = coupling.multiplier[joint]
             followers.append(Follower(number[joint], leader, ratio, coupling.offset[joint]))
         tree = robot.rigid_tree.fixed_at(coupling.positions(robot.start), moves)
-        self._tool = robot.rigid_tree.tool
-        self._description = replace(tree, coupling=Coupling.of(tree.dof, followers))
-        self._trees = dict[Masses, RigidTree]()
-        self.columns = number[logged] if followers else None
-        """Joints of the tree that are logged; None for all."""
+        self.tree = replace(tree, coupling=Coupling.of(tree.dof, followers))
+        """Rigid tree of the logged joints and their followers."""
+        self.tool = robot.rigid_tree.tool
+        # A slice is not copied, as it is for indices.
+        self.columns: Any = number[logged] if followers else slice(None)
+        """Joints of the tree that are logged."""
+        rubs = robot.friction[logged]
+        drags = robot.damping[logged]
+        self.friction = Friction(rubs[None] if rubs.any() else None, drags[None])
+        """Friction and damping of the description."""
         free = free | robot.continuous[logged]
         self.low = np.where(free, -np.inf, robot.lower[logged])[None]
         self.high = np.where(free, np.inf, robot.upper[logged])[None]
 
-    def tree_of(self, masses: Masses) -> RigidTree:
-        """Return the rigid tree of the logged joints with other masses.
-
-        A factor holds for all links of a body. The payload is at the tool's center of mass.
-        """
-        if masses in self._trees:
-            return self._trees[masses]
-        tree = self._description
-        bodies = np.array(tree.link_bodies)
-        mass = np.array(tree.mass)
-        inertia = np.array(tree.inertia)
-        for link, value in masses:
-            if link == PAYLOAD:
-                mass[tree.index(self._tool)] += value
-            else:
-                members = bodies == bodies[tree.index(link)]
-                mass[members] *= value
-                inertia[members] *= value
-        # An evaluation has some tens of robots; the next one has others.
-        if len(self._trees) > 100:
-            self._trees.clear()
-        self._trees[masses] = replace(tree, mass=mass, inertia=inertia)
-        return self._trees[masses]
-
     @property
     def heavy_links(self) -> list[str]:
         """First link of each moving body with a mass."""
-        tree = self._description
+        tree = self.tree
         bodies = dict[int, str]()
         for link, body, mass in zip(tree.links, tree.link_bodies, tree.mass, strict=True):
             if body >= 0 and mass > 0:
@@ -177,8 +147,28 @@ class Plant:
         return list(bodies.values())
 
 
+@lru_cache(maxsize=100)
+def _with_masses(tree: RigidTree, tool: str, masses: Masses) -> RigidTree:
+    """Return a tree with other masses: a factor holds for all links of a body, the payload is at
+    the tool's center of mass.
+    """
+    bodies = np.array(tree.link_bodies)
+    mass = np.array(tree.mass)
+    inertia = np.array(tree.inertia)
+    for link, value in masses:
+        if link == PAYLOAD:
+            mass[tree.index(tool)] += value
+        else:
+            members = bodies == bodies[tree.index(link)]
+            mass[members] *= value
+            inertia[members] *= value
+    return replace(tree, mass=mass, inertia=inertia)
+
+
 class Dynamics:
-    """Mass matrices and forces of n robots at the present poses of two arrays (n, joints)."""
+    """Mass matrices (n, joints, joints) and forces (n, joints) of n robots at the poses of two
+    arrays (n, joints).
+    """
 
     def __init__(
         self, plant: Plant, masses: Sequence[Masses], qpos: Float64, qvel: Float64
@@ -186,27 +176,29 @@ class Dynamics:
         rows, joints = qpos.shape
         self.matrix = np.empty((rows, joints, joints))
         self.force = np.empty((rows, joints))
+        self._state = qpos, qvel
         self._columns = plant.columns
         self._parts = list[Any]()
         # Robots of equal masses follow one another: one part for each kind.
-        starts = [row for row in range(rows) if not row or masses[row] != masses[row - 1]]
-        for first, last in zip(starts, [*starts[1:], rows], strict=True):
-            tree = plant.tree_of(masses[first])
-            q = qpos[first:last]
-            v = qvel[first:last]
-            if plant.columns is not None:
-                q = np.zeros((last - first, tree.dof))
-                v = np.zeros_like(q)
+        last = 0
+        for kind, robots in groupby(masses):
+            first = last
+            last += len(list(robots))
+            tree = _with_masses(plant.tree, plant.tool, kind)
+            q = np.zeros((last - first, tree.dof))
+            v = np.zeros_like(q)
             native = native_rows.bound(tree, ("mass_matrix", "bias"), q, v, 0)
             self._parts.append((slice(first, last), tree, q, v, native))
-        self._state = qpos, qvel
+        self.update()
 
     def update(self) -> None:
-        """Compute the matrices (n, joints, joints) and forces (n, joints) at the present poses."""
+        """Compute the matrices and forces at the present poses."""
+        columns = self._columns
+        qpos, qvel = self._state
         for rows, tree, q, v, native in self._parts:
-            if self._columns is not None:
-                q[:, self._columns] = self._state[0][rows]
-                v[:, self._columns] = self._state[1][rows]
+            q[:, columns] = qpos[rows]
+            v[:, columns] = qvel[rows]
+            if tree.coupling.shares:
                 q[...] = tree.positions(q)
                 v[...] = tree.rates(v)
             if native is None:
@@ -214,11 +206,8 @@ class Dynamics:
             else:
                 native[0]()
                 matrix, force = native[1]
-            if self._columns is not None:
-                matrix = matrix[:, self._columns[:, None], self._columns]
-                force = force[:, self._columns]
-            self.matrix[rows] = matrix
-            self.force[rows] = force
+            self.matrix[rows] = matrix[:, columns][:, :, columns]
+            self.force[rows] = force[:, columns]
 
 
 class SimulatedControl:
@@ -234,9 +223,10 @@ class SimulatedControl:
         qpos: Float64,
         qvel: Float64,
         efforts: Float64 | None = None,
+        described: Friction = _NONE,
     ) -> None:
         """Begin at ``qpos`` and ``qvel`` (n, joints), after the commanded ``efforts`` (samples, n,
-        joints), the latest first.
+        joints), the latest first; the motors' friction adds to that ``described``.
         """
         dt = drive.timestep
         count = len(qpos)
@@ -246,8 +236,7 @@ class SimulatedControl:
         if drive.params is not None:
             law = PIDLaw.of(drive.params)
             # The law of the layout decides on rates that are measured, not the params.
-            params = changed_params(_repeated(drive.params, count), candidates.law)
-            params = params._replace(measurement_rate=None)
+            params = changed_params(drive.params, candidates.law)._replace(measurement_rate=None)
             k = bp.discretise(params, dt, count)
             offset = 0.0 if actuators.position_offset is None else actuators.position_offset
             state = StepState(bp.init(params, qpos + offset))
@@ -261,7 +250,7 @@ class SimulatedControl:
                 history = history._replace(command=efforts[samples].swapaxes(0, 1))
             motors = motor_model.discretise(actuators, history, dt, count)
             state = state._replace(motors=history)
-        self.friction = added_friction(Friction(), actuators)
+        self.friction = added_friction(described, actuators)
         self.armature = np.zeros_like(qpos)
         if actuators.armature is not None:
             self.armature += actuators.armature
@@ -281,8 +270,19 @@ class SimulatedControl:
             guard=guard,
             motors=motors,
         )
-        self.state = mapped(lambda leaf: np.array(leaf, order="C"), state)
+        self._state = mapped(lambda leaf: np.array(leaf, order="C"), state)
         self._program: Any = None
+        if not obstacle():
+            inputs = (qpos,) * 4
+            constants = mapped(
+                lambda leaf: tuple(leaf) if leaf.ndim == 3 else leaf, self._constants
+            )
+            trees = constants, self._state, inputs
+            trace = _trace(self._layout, *map(structure, trees))
+            self._arrays = leaves(self._state)
+            self._results = *leaves(_returned(self._state)), np.zeros_like(qpos)
+            numbers = len(self._arrays) + len(inputs)
+            self._program = ArrayProgram(trace, leaves(constants), numbers, qpos.shape)
 
     def _inertia(self, matrix: Float64) -> Float64:
         return matrix + self.armature[:, :, None] * np.eye(matrix.shape[1])
@@ -292,36 +292,23 @@ class SimulatedControl:
         if self.friction.coulomb is None:
             return
         dt = self._constants.timestep
-        state = self.state.friction
+        state = self._state.friction
         fresh = friction_model.refresh(self.friction, state, self._inertia(matrix), dt)
         # In place: the program is bound to these arrays.
         state.gain[...] = fresh.gain
         state.memory[...] = fresh.memory
 
-    def advance(self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64) -> Any:
+    def advance(self, *inputs: Float64) -> Any:
         """Return the efforts of motors and friction (n, joints), which the next call may reuse.
 
-        ``command`` are setpoints or efforts, ``passive`` the compensated force.
+        ``inputs`` are setpoints or efforts, positions, velocities and the compensated force.
         """
-        inputs = command, qpos, qvel, passive
-        if obstacle():
-            self.state, effort = _step(self._layout, self._constants, self.state, inputs)
-            return effort
         if self._program is None:
-            self._program = self._compiled(inputs)
-        program, state, results = self._program
-        program(*state, *inputs, out=results)
-        return results[-1]
-
-    def _compiled(self, inputs: Any) -> Any:
-        """Return the program, the arrays of its state, and of its results: state and efforts."""
-        constants = mapped(lambda leaf: tuple(leaf) if leaf.ndim == 3 else leaf, self._constants)
-        trace = _trace(self._layout, *map(structure, (constants, self.state, inputs)))
-        effort = np.zeros_like(inputs[1])
-        state = leaves(self.state)
-        count = len(state) + len(leaves(inputs))
-        program = ArrayProgram(trace, leaves(constants), count, effort.shape)
-        return program, state, (*leaves(_returned(self.state)), effort)
+            self._state, effort = _step(self._layout, self._constants, self._state, inputs)
+        else:
+            self._program(*self._arrays, *inputs, out=self._results)
+            effort = self._results[-1]
+        return effort
 
 
 _MODEL = Model(when=lambda due, function, otherwise: otherwise)
@@ -354,15 +341,6 @@ def _returned(state: StepState) -> StepState:
     return state._replace(motors=state.motors._replace(command=None, sensor=None))
 
 
-def _repeated(params: bp.PIDParams, count: int) -> bp.PIDParams:
-    """Return ``params`` of some envs for ``count`` envs, one set after the other."""
-    times = count // len(params.kp)
-    tiled: bp.PIDParams = mapped(
-        lambda leaf: np.tile(leaf, (times, 1)) if leaf.ndim == 2 else leaf, params
-    )
-    return tiled
-
-
 def changed_params(params: bp.PIDParams, law: Mapping[str, Float64]) -> bp.PIDParams:
     """Return the params of n candidates."""
     gain = law.get("gain", 1.0)
@@ -380,61 +358,58 @@ def changed_params(params: bp.PIDParams, law: Mapping[str, Float64]) -> bp.PIDPa
 def simulate(
     plant: Plant,
     drive: LogControl,
-    candidates: PlantCandidates,
+    robots: PlantCandidates,
     states: Float64,
     stretches: Sequence[Stretch],
 ) -> list[Float64]:
     """Return the positions (candidates, rows, joints) of all candidates at the rows of each
     stretch.
 
-    ``states`` (candidates, 2, joints) are added to positions and velocities at the starts.
-    Positions are inf where a simulation has diverged.
+    ``robots`` and params have each candidate once for each stretch, one after the other. Their
+    ``states`` (n, 2, joints) are added to positions and velocities at the starts. Positions are
+    inf where a simulation has diverged.
     """
     dt = drive.timestep
     many = len(stretches)
-    count = len(states)
+    count = len(states) // many
     past = stretches[0].past
-    robots = candidates.repeated(many)
+    stretch_of = np.tile(np.arange(many), count)
+    starts = np.array([[stretch.qpos, stretch.qvel] for stretch in stretches])
+    begin = starts[stretch_of] + states
     offset: Any = robots.actuators.position_offset
     if offset is None:
         offset = 0.0
-    starts = np.array([[stretch.qpos, stretch.qvel] for stretch in stretches])
-    q = np.concatenate(starts[:, 0] + states[:, None, 0]) - offset
-    v = np.concatenate(starts[:, 1] + states[:, None, 1])
-    commands = _padded([stretch.command for stretch in stretches])
+    q = begin[:, 0] - offset
+    v = np.array(begin[:, 1])
+    # Shorter stretches hold their last command.
+    steps = np.arange(max(len(stretch.command) for stretch in stretches))
+    tables = [stretch.command[np.minimum(steps, len(stretch.command) - 1)] for stretch in stretches]
+    commands = np.stack(tables, axis=1)
     # State of the robots: dynamics, compensation, control with the efforts before the first step.
     dynamics = Dynamics(plant, robots.masses, q, v)
-    dynamics.update()
-    measured = np.array(q + offset)
+    measured = np.array(begin[:, 0])
     described = None
     if drive.compensate != "none":
         speed = np.zeros_like(v) if drive.compensate == "gravity" else v
         described = Dynamics(plant, [()] * len(q), measured, speed)
-        described.update()
     efforts = None
     if drive.params is None and past:
-        efforts = np.tile(commands[past - 1 :: -1][:past], (1, count, 1))
+        efforts = commands[past - 1 :: -1][:past][:, stretch_of]
         if described is not None and drive.through:
             efforts += described.force
-    control = SimulatedControl(drive, robots, dynamics, q, v, efforts)
+    control = SimulatedControl(drive, robots, dynamics, q, v, efforts, plant.friction)
     # Setpoints of each robot are late by whole steps and a share of a step.
     late = robots.setpoint_delay / dt
     whole = np.floor(late).astype(int)
     share = (late - whole)[:, None]
-    stretch_of = np.tile(np.arange(many), count)
     # Inertias that are added to the mass matrix: armature, and damping, which is implicit.
-    added = np.array(control.armature)
-    if control.friction.viscous is not None:
-        added += dt * control.friction.viscous
-    zero = np.zeros_like(q)
+    added = control.armature + dt * control.friction.viscous
+    passive = np.zeros_like(q)
     # Positions and velocities are stored at the steps of rows: a long log has many others.
-    stored = np.unique(np.concatenate([stretch.step for stretch in stretches]))
-    track = np.empty((len(stored), 2, *q.shape))
-    place = 0
+    stored = set(np.concatenate([stretch.step for stretch in stretches]).tolist())
+    track = dict[int, Float64]()
     with np.errstate(all="ignore"):
         for step in range(len(commands) - past):
-            if step:
-                dynamics.update()
             if step % REFRESH_STEPS == 0:
                 control.refresh(dynamics.matrix)
             newest = past + step - whole
@@ -443,26 +418,23 @@ def simulate(
                 command += share * (commands[np.maximum(newest - 1, 0), stretch_of] - command)
             # What the robot compensates is added to the command, or cancels forces exactly.
             force = dynamics.force
-            passive = zero
-            if described is not None:
-                measured[...] = q + offset
-                described.update()
-                if drive.through:
-                    passive = described.force
-                else:
-                    force = force - described.force
+            if described is not None and drive.through:
+                passive = described.force
+            elif described is not None:
+                force = force - described.force
             effort = control.advance(command, q, v, passive) - force
             _move(plant, dt, q, v, dynamics.matrix, effort, added)
-            if place < len(stored) and step == stored[place]:
-                track[place, 0] = q + offset
-                track[place, 1] = v
-                place += 1
-    track = track.reshape(len(track), 2, count, many, q.shape[1])
+            measured[...] = q + offset
+            if step in stored:
+                track[step] = np.array([measured, v])
+            dynamics.update()
+            if described is not None:
+                described.update()
     positions = []
     for number, stretch in enumerate(stretches):
-        rows = np.searchsorted(stored, stretch.step)
-        qpos, qvel = track[rows, :, :, number].swapaxes(0, 1)
-        qpos = qpos - stretch.before[:, None, None] * qvel
+        # Rows lie before the ends of their steps.
+        rows = np.array([track[step][:, number::many] for step in stretch.step.tolist()])
+        qpos = rows[:, 0] - stretch.before[:, None, None] * rows[:, 1]
         qpos = np.where(np.abs(qpos) < DIVERGED, qpos, np.inf)
         positions.append(qpos.swapaxes(0, 1))
     return positions
@@ -487,11 +459,3 @@ def _move(
     q += dt * v
     v[...] = np.where((q < plant.low) | (q > plant.high), 0.0, v)
     np.clip(q, plant.low, plant.high, out=q)
-
-
-def _padded(tables: Sequence[Float64]) -> Float64:
-    """Return tables (steps, joints) as one (most steps, tables, joints), each with its last row
-    repeated.
-    """
-    steps = np.arange(max(map(len, tables)))
-    return np.stack([table[np.minimum(steps, len(table) - 1)] for table in tables], axis=1)

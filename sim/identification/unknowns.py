@@ -9,7 +9,9 @@ that a logarithm would bend the valleys between them. The coordinate of the othe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import compress
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -28,7 +30,7 @@ LEAST_START = 0.02
 class Kind(NamedTuple):
     """Kind of unknown, in SI units."""
 
-    target: Literal["motor", "law", "robot", "log"]
+    target: Literal["motor", "law", "robot", "sensor", "setpoint"]
     """Part of a candidate that it changes. Only motors become actuators."""
     per: Literal["joint", "robot", "link"]
     size: str | float
@@ -49,10 +51,10 @@ KINDS = {
     "damping": Kind("motor", "joint", "damping", 4.0, field="viscous"),
     "friction": Kind("motor", "joint", "effort", 4.0, field="coulomb"),
     "strength": Kind("motor", "joint", 1.0, 0.3, 1.0, "strength"),
-    "effort_scale": Kind("log", "joint", 1.0, 0.3, 1.0, "strength"),
+    "effort_scale": Kind("sensor", "joint", 1.0, 0.3, 1.0, "strength"),
     "bias": Kind("motor", "joint", "effort", 10.0, field="bias", positive=False),
     "delay": Kind("motor", "robot", 2e-3, 3.0, field="command_delay", most=0.1),
-    "setpoint_delay": Kind("log", "robot", 5e-3, 10.0, most=0.2),
+    "setpoint_delay": Kind("setpoint", "robot", 5e-3, 10.0, most=0.2),
     "payload": Kind("robot", "robot", 0.1, 4.0),
     "load_friction": Kind("motor", "joint", 0.05, 2.0, field="load_friction", most=0.9),
     "static": Kind("motor", "joint", "friction", 2.0, field="static"),
@@ -83,13 +85,10 @@ EXTRAS = {
 }
 """Kinds that a fit has on request."""
 DESCRIBED = {"damping": "damping", "friction": "friction"}
-"""Kinds to which the robot's description contributes, and the name there. Values of a fit include
-that part.
-"""
+"""Kinds that add to a value of the robot's description, and the name there."""
 
 
-@dataclass(frozen=True)
-class Unknown:
+class Unknown(NamedTuple):
     """One unknown."""
 
     kind: str
@@ -99,41 +98,15 @@ class Unknown:
     """
     start: float
     size: float
-    floor: float = 0.0
-    """Part of the value that the robot's description has."""
     link: str | None = None
-
-    @property
-    def prior(self) -> tuple[float, float]:
-        """Mean and standard deviation of the prior, coordinates.
-
-        The mean is that of ideal motors for strengths, factors and signed unknowns, else the start.
-        """
-        kind = KINDS[self.kind]
-        if not kind.positive:
-            return 0.0, kind.spread
-        mean = self.coordinate(kind.neutral if kind.neutral == 1.0 else self.start)
-        return mean, kind.spread * max(mean, 1.0)
-
-    def coordinate(self, value: float) -> float:
-        """Return the coordinate of a value in the fit."""
-        share = (value - self.floor) / self.size
-        if not KINDS[self.kind].positive:
-            return share
-        share = max(share, 0.1 * ROUND)
-        return share - ROUND**2 / share
-
-    def values(self, coordinates: Float64) -> Float64:
-        """Return the values at some coordinates."""
-        shares = coordinates
-        if KINDS[self.kind].positive:
-            shares = 0.5 * (coordinates + np.sqrt(coordinates**2 + 4 * ROUND**2))
-        return np.minimum(self.floor + self.size * shares, KINDS[self.kind].most)
 
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Unknowns of the logged ``joints`` of ``robot``; points are their coordinates (unknowns,)."""
+    """Unknowns of the logged ``joints`` of ``robot``; points are their coordinates (unknowns,).
+
+    Values are in addition to the robot's description.
+    """
 
     robot: Robot
     joints: tuple[int, ...]
@@ -151,112 +124,122 @@ class Unknowns:
     ) -> Unknowns:
         """Return the unknowns of ``kinds``.
 
-        ``starts`` (joints,) or (1,) are values of some kinds, others begin at their typical size.
-        ``sizes`` (joints,) are typical values by name.
+        ``starts`` (joints,) or (1,) are values of some kinds, with the description's, others begin
+        at their typical size. ``sizes`` (joints,) are typical values by name.
         """
         entries = list[Unknown]()
         for name in kinds:
             kind = KINDS[name]
             if kind.per == "link":
-                entries += [Unknown(name, None, 1.0, 1.0, link=link) for link in links]
+                entries += [Unknown(name, None, 1.0, 1.0, link) for link in links]
                 continue
             for joint in range(len(joints)) if kind.per == "joint" else (None,):
                 column = joint or 0
                 size = sizes[kind.size][column] if isinstance(kind.size, str) else kind.size
-                floor = 0.0
-                if name in DESCRIBED:
-                    floor = getattr(robot, DESCRIBED[name])[joints[column]]
                 start = size * kind.positive
                 if name in starts:
                     start = starts[name][column]
+                if name in DESCRIBED:
+                    start -= getattr(robot, DESCRIBED[name])[joints[column]]
                 if kind.positive:
-                    start = max(start, floor + LEAST_START * size)
-                entries.append(Unknown(name, joint, float(start), float(size), float(floor)))
+                    start = max(start, LEAST_START * size)
+                entries.append(Unknown(name, joint, float(start), float(size)))
         return cls(robot, joints, tuple(entries))
 
-    @property
-    def start(self) -> Float64:
-        """Point at the start of a fit."""
-        values = np.array([[entry.start for entry in self.entries]])
-        return self.points(values).reshape(-1)
+    @cached_property
+    def kinds(self) -> list[Kind]:
+        """Kind of each unknown."""
+        return [KINDS[entry.kind] for entry in self.entries]
 
-    @property
-    def prior(self) -> Float64:
-        """Means and standard deviations of the prior (2, unknowns)."""
-        rows = [entry.prior for entry in self.entries]
-        return np.array(rows, dtype=np.float64).reshape(-1, 2).T
+    @cached_property
+    def sizes(self) -> Float64:
+        """Typical sizes (unknowns,)."""
+        return np.array([entry.size for entry in self.entries])
 
-    def values(self, points: Float64) -> Float64:
-        """Return the values (n, unknowns) at ``points`` (n, unknowns).
+    @cached_property
+    def spread(self) -> Float64:
+        """Standard deviations of the prior over the sizes (unknowns,)."""
+        return np.array([kind.spread for kind in self.kinds])
+
+    @cached_property
+    def positive(self) -> Bool:
+        """Mask (unknowns,) of the unknowns that are positive."""
+        return np.array([kind.positive for kind in self.kinds], bool)
+
+    @cached_property
+    def _late(self) -> Float64:
+        """Parts (unknowns, unknowns) of values in coordinates of others.
 
         The coordinate of a delay of setpoints holds for the sum with that of efforts: logs show the
         sum far better than its parts, and a fit follows a valley that is straight.
         """
-        values = np.array(points)
-        delay = np.zeros(len(points))
-        for column, entry in enumerate(self.entries):
-            coordinate = points[:, column]
-            if entry.kind == "setpoint_delay":
-                coordinate = coordinate - delay / entry.size
-            values[:, column] = entry.values(coordinate)
-            if entry.kind == "delay":
-                delay = values[:, column]
-        return values
+        names = np.array([entry.kind for entry in self.entries], dtype=object)
+        return np.outer(names == "delay", (names == "setpoint_delay") / self.sizes)
+
+    @property
+    def start(self) -> Float64:
+        """Point at the start of a fit."""
+        return self.points(np.array([entry.start for entry in self.entries]))
+
+    @property
+    def prior(self) -> tuple[Float64, Float64]:
+        """Means and standard deviations (unknowns,) of the prior, coordinates.
+
+        The mean is that of ideal motors for strengths, factors and signed unknowns, else the start.
+        """
+        pairs = zip(self.kinds, self.entries, strict=True)
+        means = np.array([1.0 if kind.neutral == 1.0 else entry.start for kind, entry in pairs])
+        mean = self._coordinates(means * self.positive)
+        return mean, self.spread * np.maximum(mean, 1.0)
+
+    def _coordinates(self, values: Float64) -> Float64:
+        """Return the coordinates of values (..., unknowns), one by one."""
+        shares = values / self.sizes
+        least = np.maximum(shares, 0.1 * ROUND)
+        return np.where(self.positive, least - ROUND**2 / least, shares)
 
     def points(self, values: Float64) -> Float64:
-        """Return the coordinates (n, unknowns) of ``values`` (n, unknowns)."""
-        points = np.array(values)
-        delay = np.zeros(len(values))
-        for column, entry in enumerate(self.entries):
-            points[:, column] = [entry.coordinate(value) for value in values[:, column]]
-            if entry.kind == "setpoint_delay":
-                points[:, column] += delay / entry.size
-            if entry.kind == "delay":
-                delay = values[:, column]
-        return points
+        """Return the points (..., unknowns) of ``values`` (..., unknowns)."""
+        return self._coordinates(values) + values @ self._late
 
-    def tables(self, values: Float64) -> dict[str, Float64]:
-        """Return the values (n, joints) of all kinds but masses, by kind; neutral or described
-        elsewhere.
+    def values(self, points: Float64) -> Float64:
+        """Return the values (..., unknowns) at ``points`` (..., unknowns)."""
+        most = [kind.most for kind in self.kinds]
+
+        def alone(points: Float64) -> Float64:
+            rounded = 0.5 * (points + np.sqrt(points**2 + 4 * ROUND**2))
+            return np.minimum(self.sizes * np.where(self.positive, rounded, points), most)
+
+        return alone(points - alone(points) @ self._late)
+
+    def tables(self, values: Float64, *targets: str) -> dict[str, Float64]:
+        """Return the ``values`` (n, unknowns) of kinds that change one of ``targets`` as tables (n,
+        joints), by field of actuators or kind.
         """
         tables = dict[str, Float64]()
-        shape = len(values), len(self.joints)
-        for name, described in DESCRIBED.items():
-            row = getattr(self.robot, described)[list(self.joints)]
-            if row.any():
-                tables[name] = np.tile(row, (len(values), 1)).astype(float)
-        for column, entry in enumerate(self.entries):
-            kind = KINDS[entry.kind]
-            if kind.target != "robot":
-                table = tables.setdefault(entry.kind, np.full(shape, kind.neutral))
-                where = slice(None) if entry.joint is None else slice(entry.joint, entry.joint + 1)
-                table[:, where] = values[:, column, None]
+        for column, (kind, entry) in enumerate(zip(self.kinds, self.entries, strict=True)):
+            if kind.target in targets:
+                neutral = np.full((len(values), len(self.joints)), kind.neutral)
+                table = tables.setdefault(kind.field or entry.kind, neutral)
+                joint = slice(None) if entry.joint is None else [entry.joint]
+                table[:, joint] = values[:, column, None]
+        # Friction at rest is found in addition to that in motion.
+        if "static" in tables:
+            tables["static"] += tables.get("coulomb", 0.0)
         return tables
 
     def candidates(self, values: Float64) -> PlantCandidates:
         """Return the candidates with ``values`` (n, unknowns)."""
-        law = {}
-        fields = {}
-        setpoint_delay = np.zeros(len(values))
-        for name, table in self.tables(values).items():
-            if KINDS[name].target == "law":
-                law[name] = table
-            elif name == "setpoint_delay":
-                setpoint_delay = table[:, 0]
-            else:
-                fields[KINDS[name].field] = table
-        if "static" in fields:
-            fields["static"] = fields["static"] + fields.get("coulomb", 0.0)
+        fields = self.tables(values, "motor", "sensor")
         if "command_delay" in fields:
             fields["max_delay"] = fields["command_delay"].max(keepdims=True)
-        masses = [list[tuple[str, float]]() for _ in values]
-        for column, entry in enumerate(self.entries):
-            if KINDS[entry.kind].target == "robot":
-                for row, value in zip(masses, values[:, column].tolist(), strict=True):
-                    row.append((entry.link or PAYLOAD, value))
-        return PlantCandidates(Actuators(**fields), law, setpoint_delay, list(map(tuple, masses)))
+        late = self.tables(values, "setpoint").get("setpoint_delay", np.zeros((len(values), 1)))
+        robots = [at for at, kind in enumerate(self.kinds) if kind.target == "robot"]
+        names = [self.entries[at].link or PAYLOAD for at in robots]
+        masses = [tuple(zip(names, row, strict=True)) for row in values[:, robots].tolist()]
+        law = self.tables(values, "law")
+        return PlantCandidates(Actuators(**fields), law, late[:, 0], masses)
 
     def only(self, mask: Bool) -> Unknowns:
         """Return the unknowns of a mask (unknowns,); the others have their neutral value."""
-        entries = tuple(entry for entry, stays in zip(self.entries, mask, strict=True) if stays)
-        return Unknowns(self.robot, self.joints, entries)
+        return replace(self, entries=tuple(compress(self.entries, mask)))

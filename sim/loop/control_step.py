@@ -241,10 +241,10 @@ def _controller(layout: Layout, constants: Constants, values: Values) -> Values:
 
 def _law(layout: Layout, constants: Constants, values: Values) -> Values:
     """Effort within the limits of params and motors."""
-    qpos, qvel, _ = values.seen
+    qvel = values.seen.qvel
     limits: tuple[Array, Array] = (None, None)
     if constants.motors is not None:
-        limits = command_limits(constants.motors, qpos, qvel)
+        limits = command_limits(constants.motors, qvel)
     values = _LAWS[layout.control](layout, constants, values, limits)
     return values._replace(outputs=values.outputs._replace(motor=values.outputs.qf))
 

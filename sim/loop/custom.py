@@ -165,7 +165,7 @@ def _like(before: Document, leaves: Document) -> Document:
         if is_fit and np.can_cast(new.dtype, old.dtype, "same_kind"):
             continue
         # Without the number of envs, which is that of a group.
-        returned = "no array" if new is None else f"{new.dtype} {new.shape[1:]} an env"
+        returned = "no array" if new is None else f"{new.dtype} {new.shape[1:]} per env"
         raise InvalidArgumentError(
             "control",
             f"returned {name!r} of {returned}",

@@ -50,7 +50,7 @@ _RESULTS = ("effort", "saturated", "guarded")
 class EnvGroup:
     """One pack and its control; runs the sim steps of ticks, and suspends or resets envs that fail.
 
-    ``envs`` are its rows in the loop's arrays, ``params`` the params of these envs, and ``ticks``
+    ``envs`` are its rows in the loop's arrays, ``params`` the params of these envs, and ``arrays``
     their input and output. ``controller`` is the caller's own, or None.
     """
 
@@ -117,7 +117,7 @@ class EnvGroup:
             self._executor = NativeExecutor(setup, state, self._last)
         else:
             self._executor = NumPyExecutor(setup, state)
-        if self._options.control == "drive" and hasattr(self.pack, "write_drive"):
+        if self._options.control == "drive":
             damping, stiffness = setup.constants.drive
             limit = self.acting.acting_params.effort_max
             if limit is None:

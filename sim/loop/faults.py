@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Bool, Float64, Rows
+from batchpid.sim.engine.model_pack import ORIGIN
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
@@ -34,8 +35,6 @@ so new causes are appended at the end.
 COMMAND_CAUSES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
 """Causes in an entry of the command, which need not be a joint."""
 
-ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
-"""Pose and twist (13,) of a base at rest at the origin."""
 LONGEST = 10_000
 """Largest number of events in a log."""
 

@@ -289,9 +289,9 @@ class Loop:
 
 def group_size(options: RunnerOptions) -> int:
     """Return the number of envs of a group, which changes no result."""
-    size = options.load_engine().group_size
-    is_native = options.backend == "numpy" and not native_obstacle(options)
+    engine = options.load_engine()
+    obstacle = engine.native_obstacle() or native_obstacle(options)
     # Calls of NumPy and XLA have an overhead, which more envs share.
-    if is_native:
-        return size
-    return max(size, ROWS)
+    if obstacle or options.backend != "numpy":
+        return max(engine.group_size, ROWS)
+    return engine.group_size

@@ -92,9 +92,10 @@ class NativeExecutor:
         """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
         # The tables of ticks are not used here, since the command may differ from theirs.
         # A program for each kind of tick is made once, at the first such tick.
-        program = self.start(moves, begin)
-        if program.control is not None:
-            program.control.load(command.setpoint)
+        self.start(moves, begin)
+        control = self._programs[moves].control
+        if control is not None:
+            control.load(command.setpoint)
         for array, rows in zip(self._buffers.command, command, strict=True):
             if array is not None:
                 array[...] = rows
@@ -102,8 +103,8 @@ class NativeExecutor:
         _, done = self.complete()
         return done
 
-    def start(self, moves: bool, step: int = 0, tick: int = 0) -> TickProgram:
-        """Prepare the next ticks, from sim step ``step`` of ``tick`` on; return their program."""
+    def start(self, moves: bool, step: int = 0, tick: int = 0) -> None:
+        """Prepare the next ticks, from sim step ``step`` of ``tick`` on."""
         if moves not in self._programs:
             layout = self.setup.layout._replace(moves=moves)
             noise = mapped(lambda block: block[0].copy(), self._noise())
@@ -119,7 +120,6 @@ class NativeExecutor:
                 self._change_state(law=program.control.state)
         self._program = program = self._programs[moves]
         program.tick.tick, program.tick.step = tick, step
-        return program
 
     def complete(self) -> tuple[int, int]:
         """Complete ticks that ran: return the first tick that is not observed, and its sim steps
@@ -144,7 +144,7 @@ class NativeExecutor:
             tick.noise[place] = block.ctypes.data
         return self._program.bound
 
-    def is_waiting(self) -> bool:
+    def count_steps(self) -> bool:
         """Count the sim steps that ran; return whether the rest waits for noise."""
         assert self._program is not None
         tick = self._program.tick
@@ -165,8 +165,8 @@ class NativeExecutor:
 def run_ticks(
     executors: Sequence[NativeExecutor], until: int, steps: int, whole: bool = True
 ) -> None:
-    """Run ticks of ``steps`` sim steps of several groups in one native call, up to the tick
-    ``until``, from where each was started; :meth:`NativeExecutor.complete` tells where each is.
+    """In one native call, run each group from its start to tick ``until``, of ``steps`` sim steps
+    each; :meth:`NativeExecutor.complete` tells where it stopped.
 
     A group stops at an event that needs Python: an env that may have failed, and with ``whole`` a
     command or velocities that are not finite. With ``whole``, commands and observations are those
@@ -175,7 +175,7 @@ def run_ticks(
     while executors:
         ticks = tuple([executor.prepare() for executor in executors])
         native.extension("_gateway").ticks(ticks, until, steps, whole)
-        executors = [executor for executor in executors if executor.is_waiting()]
+        executors = [executor for executor in executors if executor.count_steps()]
 
 
 def runs_natively(setup: Setup) -> bool:

@@ -175,7 +175,7 @@ class EngineSteps:
                 parts = (False, False)
             drives = self._setup.layout.control == "drive"
             self._bound = pack.calls
-            self._step = pack.compiled_step(*parts, True, self._setup.options.speed_limit, drives)
+            self._step = pack.compiled_step(*parts, self._setup.options.speed_limit, drives)
         return self._step
 
     def _passive_force(self, like: Float64) -> Float64:

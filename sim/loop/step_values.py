@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Array, Pytree
+from batchpid.arrays.array_types import Array, Pytree, T
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.computed_torque import advance_with_mass_matrix
@@ -216,7 +216,7 @@ class Constants(NamedTuple):
     """1 / (2 pi) on continuous joints with drives, 0 elsewhere; None without such joints."""
 
 
-def when(due: Array, function: Callable[[], Any], otherwise: Array) -> Any:
+def when(due: Array, function: Callable[[], T], otherwise: T) -> T:
     """Return ``function()`` if ``due``, a bool or an array, has a True entry; else
     ``otherwise``.
     """

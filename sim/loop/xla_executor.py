@@ -172,7 +172,7 @@ class XLAExecutor:
 
 def tick(
     layout: Layout,
-    controller: Any,
+    controller: object,
     span: Array,
     constants: Constants,
     bodies: tuple[Array, Array] | None,
@@ -232,7 +232,7 @@ def tick(
 
 
 @lru_cache(maxsize=8)
-def compiled(layout: Layout, controller: Any) -> Any:
+def compiled(layout: Layout, controller: object) -> Any:
     """Return :func:`tick` of this layout, compiled at its first call."""
     import jax
 

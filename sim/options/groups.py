@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Protocol, Self, get_args
 from numpy.typing import ArrayLike
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.array_types import Array, Document, Rows
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.field_tables import Field, plain
 from batchpid.checks.validate import choice, instance, joint_speeds, names
@@ -113,7 +113,7 @@ class Scene(OptionGroup):
         option(
             "snapshot",
             "recording",
-            flag="Physics engine; mujoco is several times as fast, and its contacts differ.",
+            flag="Physics engine; mujoco is several times as fast, with other contacts.",
         ),
     ] = DEFAULT_ENGINE
     """Physics engine: ``"sapien"``, the reference and the default where it is installed, or
@@ -345,7 +345,7 @@ class Controller(Protocol):
         qpos: Rows,
         qvel: Rows,
         passive: Rows,
-    ) -> tuple[Any, Any]:
+    ) -> tuple[Any, Array]:
         """Return the new state, and the joint efforts [N m or N], which the runner clips to the
         params' limits.
 
@@ -376,9 +376,7 @@ class Control(OptionGroup):
     """Link that control "osc" moves; default the last link of the robot's longest chain."""
     backend: Annotated[
         Backend,
-        option(
-            "snapshot", flag="Library of the law: NumPy, or JAX, as one program with the steps."
-        ),
+        option("snapshot", flag="Array library: NumPy, or JAX, which compiles law and sim steps."),
     ] = "numpy"
     """Library of the law: ``"numpy"``, the default, or ``"jax"``, which compiles law and sim steps
     of a tick, and a :class:`Controller`, into one XLA program for the CPU (docs/performance.md). It
@@ -391,7 +389,7 @@ class Control(OptionGroup):
         option(
             "snapshot",
             "recording",
-            flag="Passive force and known friction, added at every sim step.",
+            flag="Efforts added in every sim step against these forces.",
         ),
     ] = "gravity+coriolis+friction"
     """Compensation added to the effort at every sim step: the passive force (gravity, Coriolis and
@@ -526,7 +524,7 @@ class Workers(OptionGroup):
         Field(high=1024),
         option(
             "processes",
-            flag="Processes that step the scenes; 0: this one. Default: one per available core.",
+            flag="Processes that step the scenes; 0: this process. Default: one per available core.",
         ),
     ] = None
     """Processes that step the scenes; 0 runs the same code in this process. Default: one per

@@ -363,7 +363,7 @@ def default_params(
     return robot.designed("effort" if loops else None)
 
 
-def checked_option(name: str, value: Any) -> Any:
+def checked_option(name: str, value: object) -> Any:
     """Return the value of an argument in the canonical form of its declared type.
 
     Raises InvalidArgumentError if a number is out of bounds, or the value is of another type.
@@ -373,7 +373,7 @@ def checked_option(name: str, value: Any) -> Any:
 
 def arguments_of(
     record: Callable[P, object],
-) -> Callable[[Callable[..., None]], Callable[Concatenate[Any, P], None]]:
+) -> Callable[[Callable[..., None]], Callable[Concatenate[object, P], None]]:
     """Decorate an ``__init__`` that forwards its arguments to ``record``, so that editors show that
     signature.
     """

@@ -247,7 +247,7 @@ NOTHING = Draws(np.zeros((0, 2), np.int64), {})
 
 
 def generators(
-    seed: int, name: str, episodes: Episodes, constant: bool, number: ArrayLike = 0
+    seed: int, name: str, episodes: Episodes, constant: bool, number: ArrayLike
 ) -> Iterator[np.random.Generator]:
     """Yield a generator for each env, of draw ``number`` (an int, or one for each env) of one field
     in its episode.
@@ -287,9 +287,7 @@ def elements(name: str, robot: Robot) -> Sequence[str]:
     if name not in ("link_mass", "center_of_mass"):
         return robot.joint_names
     # A link without a stated mass has that of its shapes.
-    links = [
-        link.name for link in robot.links if link.mass or (link.mass is None and link.num_shapes)
-    ]
+    links = [link for link, mass in robot.link_masses.items() if mass.mass]
     if name == "link_mass":
         return links
     return [f"{link}.{axis}" for link in links for axis in "xyz"]
@@ -312,7 +310,7 @@ def parts(
         yield f"{name}.{element}", chosen, distribution
 
 
-def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None = None) -> Float64:
+def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None) -> Float64:
     """Return the nominal values of a field of the robot (elements,), 0 for others.
 
     ``mjcf`` is the file that the engine simulates, with its own friction.

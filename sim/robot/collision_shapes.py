@@ -9,12 +9,11 @@ import os
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64, MjModel, MjSpec, Rows
+from batchpid.arrays.array_types import Float64, MjModel, MjsBody, MjSpec, Rows
 from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.errors import RobotError
@@ -150,7 +149,7 @@ def inertia_of(shapes: Sequence[Shape]) -> SpatialInertia:
     return SpatialInertia(float(model.body_mass[1]), read_only(center), read_only(tensor))
 
 
-def add_geom(spec: MjSpec, body: Any, shape: Shape, **options: Any) -> None:
+def add_geom(spec: MjSpec, body: MjsBody, shape: Shape, **options: object) -> None:
     """Add a shape to a body of a ``mujoco.MjSpec``; equal hulls share a mesh."""
     import mujoco
 

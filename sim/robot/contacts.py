@@ -158,14 +158,14 @@ class Contacts:
         heights, _ = self._heights(qpos)
         return float(heights[(self._body[:-1] >= 0) | base_too].min(initial=np.inf))
 
-    def feet(self, qpos: Rows, within: float = 0.01) -> list[tuple[str, Float64]]:
+    def feet(self, qpos: Rows) -> list[tuple[str, Float64]]:
         """Return the links on which the robot stands at a pose (dof,), each with the point (3,) [m]
         that touches.
 
-        It belongs to a shape whose lowest point is at most ``within`` [m] above that of the robot.
+        It belongs to a shape whose lowest point is at most 0.01 m above that of the robot.
         """
         heights, centers = self._heights(qpos)
-        lowest = np.flatnonzero(heights <= heights.min(initial=np.inf) + within).tolist()
+        lowest = np.flatnonzero(heights <= heights.min(initial=np.inf) + 0.01).tolist()
         return [
             (self.links[self._link[at]], np.array([*centers[at, :2], heights[at]])) for at in lowest
         ]

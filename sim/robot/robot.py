@@ -6,7 +6,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -246,7 +245,7 @@ class Robot(RobotDescription):
             self, DESIGN_HZ, 0.82, integral_time=4.5 / (2 * np.pi * DESIGN_HZ), **options
         )
 
-    def kinematic_tree(self, **options: Any) -> RigidTree:
+    def kinematic_tree(self, **options: ArrayLike) -> RigidTree:
         """Return the kinematic tree of this robot, for :mod:`batchpid.task_space`, in float64.
 
         No engine is needed.

@@ -411,7 +411,7 @@ class _Reader:
         offset = numbers(mimic, "offset", "0")
         if multiplier is None or offset is None or multiplier[0] == 0:
             texts = ", ".join(f"{key} {mimic.get(key)!r}" for key in ("multiplier", "offset"))
-            self._report_mimic(name, mimic, f"with {texts} cannot lead it")
+            self._report_mimic(name, mimic, f"cannot lead it with {texts}")
             return None
         return Mimic(_text(mimic, "joint"), multiplier[0], offset[0])
 

@@ -15,9 +15,9 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.checks.validate import array, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.run_checks import SetpointCheck
+from batchpid.sim.engine.model_pack import ORIGIN
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.faults import ORIGIN
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot_model import base_start
 from batchpid.sim.runner.runner_state import Motion, RunnerState

@@ -55,8 +55,8 @@ class Reset(Operation):
     mask: Bool
     qpos: Float64
     qvel: Float64
-    draws: Draws = NOTHING
-    base: Float64 | None = None
+    draws: Draws
+    base: Float64 | None
     ticks = 1
 
     @classmethod
@@ -103,7 +103,7 @@ class Reset(Operation):
             setpoint, rate = motion
             rate = np.where(chosen, self.qvel, 0.0 if rate is None else rate)
             motion = np.where(chosen, self.qpos, setpoint), rate
-        faults = state.faults.without(self.mask).with_events(outcome.present)
+        faults = state.faults.without(self.mask).with_events(outcome.at(0))
         return state._replace(faults=faults, draws=self.draws, motion=motion)
 
 
@@ -220,7 +220,7 @@ class Restore(Operation):
     """Put every env into its state in ``snapshot``, with its params and ``draws``."""
 
     snapshot: Snapshot
-    draws: Draws = NOTHING
+    draws: Draws
     ticks = 1
 
     def apply(self, loop: Loop) -> None:

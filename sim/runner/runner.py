@@ -361,7 +361,7 @@ class Runner(SingleOwner):
         Raises
         ------
         InvalidArgumentError
-            There is no ``build``, or it returned more entities for one env than for another.
+            ``build`` returned more entities for one env than for another, or in SAPIEN is not given.
         """
         self._ready()
         rows = self._read(ReadPoses())
@@ -578,7 +578,8 @@ class Runner(SingleOwner):
         self.close()
 
     def __del__(self) -> None:
-        if hasattr(self, "_pool"):  # its options were right
+        # Without a pool its options were wrong.
+        if hasattr(self, "_pool") and not self.closed:
             self.close()
 
     # -- execution of commands

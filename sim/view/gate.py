@@ -16,6 +16,7 @@ from http import HTTPStatus
 from typing import Any
 
 import websockets.asyncio.server as websocket_server
+from viser import ViserServer
 
 from batchpid.errors import BatchPIDError
 
@@ -48,7 +49,7 @@ class Gate:
             return "the token is missing; open the address that was printed"
         return None
 
-    def start(self, make: Callable[[], Any]) -> Any:
+    def start(self, make: Callable[[], ViserServer]) -> ViserServer:
         """Return the server of viser that ``make()`` starts, behind this gate."""
         serve = websocket_server.serve
         handlers = []

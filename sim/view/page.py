@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, redirect_stdout
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.panel import Panel
 from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
 from batchpid.sim.view.view_data import HISTORY_SECONDS, ViewData
+
+if TYPE_CHECKING:
+    from viser import ViserServer
 
 CHARTS_EVERY = 5
 """Frames between two updates of charts and status."""
@@ -71,7 +74,7 @@ class View(AbstractContextManager["View"]):
             viser.ViserServer, host=HOST, port=gate.port, verbose=False, label="batchpid"
         )
         with redirect_stdout(io.StringIO()):  # viser's banner
-            self._server: Any = gate.start(make)
+            self._server = gate.start(make)
 
         # Controls on the right, charts on the left, the scene between them.
         gui = self._server.gui
@@ -171,7 +174,11 @@ class SceneNodes:
     """
 
     def __init__(
-        self, server: Any, scene: RobotScene, sets_positions: bool, select: Callable[[int], None]
+        self,
+        server: ViserServer,
+        scene: RobotScene,
+        sets_positions: bool,
+        select: Callable[[int], None],
     ) -> None:
         self._server = server
         self._scene = scene

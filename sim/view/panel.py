@@ -9,7 +9,7 @@ import math
 import queue
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,13 +17,16 @@ from batchpid.errors import BatchPIDError
 from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.view_data import GAINS, LiveSimulation, Playback, ViewData
 
+if TYPE_CHECKING:
+    from viser import GuiApi
+
 
 class Panel:
     """Controls of ``data`` in a viser ``gui``. viser calls back from other threads: their requests
     are queued.
     """
 
-    def __init__(self, gui: Any, data: ViewData) -> None:
+    def __init__(self, gui: GuiApi, data: ViewData) -> None:
         self._gui = gui
         self._data = data
         self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()

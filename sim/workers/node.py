@@ -50,7 +50,7 @@ class Node:
     def __init__(self) -> None:
         self._pool: Any = None
 
-    def start(self, message: bytes, workers: int) -> tuple[Any, Arrays | None]:
+    def start(self, message: bytes, workers: int) -> tuple[object, Arrays | None]:
         """Start the pool; return a :class:`NodeInfo`.
 
         ``message`` is pickled: the type of the pool, the :class:`Start` of its envs, and the most
@@ -71,7 +71,7 @@ class Node:
         address = ray.util.get_node_ip_address()
         return NodeInfo(address, start.envs, os.getpid(), pids), None
 
-    def execute(self, request: Request) -> tuple[Any, Arrays | None]:
+    def execute(self, request: Request) -> tuple[object, Arrays | None]:
         """Execute a request, which has the part of this node's envs."""
         try:
             outcome = self._pool.run(request)
@@ -176,7 +176,7 @@ class NodeWorker(Worker):
         else:
             self._call = self._actor.execute.remote(request.for_envs(self.envs))
 
-    def receive(self) -> Any:
+    def receive(self) -> object:
         exceptions = self._cluster.ray.exceptions
         try:
             result, arrays = self._cluster.ray.get(self._call, timeout=self._limit)

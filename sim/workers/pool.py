@@ -66,11 +66,6 @@ class Outcome(NamedTuple):
         """Ticks that all envs completed."""
         return [self.at(tick) for tick in range(self.num_ticks)]
 
-    @property
-    def present(self) -> Arrays:
-        """The last of them."""
-        return self.at(self.num_ticks - 1)
-
 
 class WorkerPool(SingleOwner):
     """Workers of a runner: processes, or with ``options.workers`` 0 the loop in this process.

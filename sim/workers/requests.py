@@ -54,7 +54,7 @@ class Request(ABC):
         return pickle.dumps(self.for_envs(envs))
 
     @abstractmethod
-    def apply(self, loop: Loop) -> Any:
+    def apply(self, loop: Loop) -> object:
         """Execute it and return its result."""
 
     def join(self, results: list[Any]) -> Any:

@@ -76,7 +76,7 @@ class Worker(SingleOwner, ABC):
         """Start the part of a request for the envs of this worker, whose rows are in the arrays."""
 
     @abstractmethod
-    def receive(self) -> Any:
+    def receive(self) -> object:
         """Wait for the result of the last request and return it; a Failure if the loop raised.
 
         Raises
@@ -116,7 +116,7 @@ class LocalWorker(Worker):
         except Exception as error:
             self._result = Failure.of(error)
 
-    def receive(self) -> Any:
+    def receive(self) -> object:
         return self._result
 
     def close(self) -> None:
@@ -127,7 +127,7 @@ class LocalWorker(Worker):
 class ProcessWorker(Worker):
     """Caller's end of a worker process, which runs on the core ``core`` alone if there is one."""
 
-    def __init__(self, start: Start, shared: SharedArrays, core: int | None = None) -> None:
+    def __init__(self, start: Start, shared: SharedArrays, core: int | None) -> None:
         super().__init__(start, shared)
         self._core = core
         # Once: a controller may change in the caller, and a replacement begins as the first worker
@@ -190,7 +190,7 @@ class ProcessWorker(Worker):
             self._raise_early(error)
             self._process.kill()  # receive() reports it
 
-    def receive(self) -> Any:
+    def receive(self) -> object:
         try:
             result = pickle.load(self._answers)
         except (EOFError, OSError, pickle.UnpicklingError) as error:

@@ -74,7 +74,7 @@ def test_the_command_limits_are_where_the_motor_clips(seed):
         rng.normal(0, 3, (1, joints)),
     )
     ends = [
-        actuators.command_limits(actuators.discretise(each, actuators.init(each, q, DT), DT), q, v)
+        actuators.command_limits(actuators.discretise(each, actuators.init(each, q, DT), DT), v)
         for each in (static, late)
     ]
     np.testing.assert_array_equal(*ends, "they have no dynamics")
@@ -95,7 +95,7 @@ def test_without_an_envelope_no_command_is_clipped():
         np.zeros((3, 2)),
     )
     k = actuators.discretise(chosen, actuators.init(chosen, q, DT), DT)
-    assert actuators.command_limits(k, q, q) == (None, None)
+    assert actuators.command_limits(k, q) == (None, None)
 
 
 def test_noise_has_the_moments_of_a_normal_distribution():

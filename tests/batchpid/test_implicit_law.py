@@ -185,4 +185,4 @@ def test_other_controllers_get_the_gains_of_their_time_step():
     )
     assert float(re.search(r"\bp: ([\d.]+)", text)[1]) == share
     integral = to_ros2_control(p.replace(ki=10.0), ["a"], 0.05, inertia=inertia).differences
-    assert any("lead of dt" in each for each in integral)
+    assert any("leads by dt" in each for each in integral)

@@ -152,7 +152,7 @@ class MujocoPack(ModelPack):
         """Do one sim step of every robot, with constraint efforts on coupled joints."""
         if self.steps_natively:
             if self._own_step is None:
-                self._own_step = self.compiled_step(False, False, True, None)
+                self._own_step = self.compiled_step(False, False, None)
             self._own_step.may_have_failed(self._own_step(self.qf, *np.empty((3, *self.qf.shape))))
             return
         effort = self.qf
@@ -186,7 +186,6 @@ class MujocoPack(ModelPack):
         self,
         gravity: bool,
         coriolis: bool,
-        velocities: bool,
         speed_limit: Float64 | None,
         drives: bool = False,
     ) -> MujocoStep:
@@ -205,7 +204,7 @@ class MujocoPack(ModelPack):
             self._constraint_address,
         )
 
-    def update_constraint(self, rows: Any = slice(None)) -> None:
+    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         if self._constraint is None:
             return
         if self.spec.fixed_base:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Float64, MjModel, MjSpec
+from batchpid.arrays.array_types import Float64, MjModel, MjsBody, MjSpec, Rows
+from batchpid.sim.engine.mujoco.file_scene import BodyFrame
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 _FOUND_AND_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND) | 1 << int(
@@ -30,7 +30,7 @@ def contact_bodies(spec: SceneSpec) -> list[str]:
 
 
 def add_link_sensors(
-    scene: MjSpec, spec: SceneSpec, names: dict[str, str], frames: Mapping[str, Any]
+    scene: MjSpec, spec: SceneSpec, names: dict[str, str], frames: Mapping[str, BodyFrame]
 ) -> None:
     """Add sensors for the links of ``spec.contacts`` and ``spec.wrenches``.
 
@@ -56,7 +56,7 @@ def add_link_sensors(
             scene.add_sensor(type=kind, objtype=objects.mjOBJ_SITE, objname=site)
 
 
-def _parts(body: Any, others: set[str]) -> Iterator[Any]:
+def _parts(body: MjsBody, others: set[str]) -> Iterator[MjsBody]:
     """Yield the body of a link, and its descendants that belong to the same link, since ``others``
     lacks them.
     """
@@ -77,7 +77,7 @@ class MujocoLinkSensors:
         # A body without a link of its own belongs to the nearest one above it that has one.
         while (lower := ~np.isin(owners, [*bodies.values()])).any():
             owners[lower] = model.body_parentid[owners[lower]]
-        self._rows: Sequence[Any] = [
+        self._rows: Sequence[Rows] = [
             np.flatnonzero(np.equal(owners, bodies[link])) for link in contact_bodies(spec)
         ]
         self._contacts = len(owners)

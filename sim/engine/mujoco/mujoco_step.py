@@ -137,7 +137,6 @@ class MujocoStep(NativeStep):
             mujoco=ctypes.addressof(robots),
             gravity=reads_force,
             coriolis=reads_force,
-            velocities=True,
             constraint=constraint,
         )
 

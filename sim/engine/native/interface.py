@@ -69,7 +69,7 @@ class Group(ctypes.Structure):
             "joints",
         ),
         *_all(ctypes.c_int64, "robots", "dof"),
-        *_all(ctypes.c_int32, "gravity", "coriolis", "velocities", "senses"),
+        *_all(ctypes.c_int32, "gravity", "coriolis", "senses"),
         ("message", ctypes.c_char * 256),
     ]
 

@@ -25,7 +25,6 @@ struct Group {
   Joint *const *joints;              // (robots, dof): in SAPIEN, or null without targets of drives that move
   std::int64_t robots, dof;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
-  std::int32_t velocities;           // whether to read velocities; otherwise they are zero
   std::int32_t senses;               // whether Python reads sensors after each sim step
   char message[256];                 // of an exception of the engine
 };
@@ -57,7 +56,6 @@ inline void step_in_sapien(Group const &group, double const *effort, double *qpo
   Gateway const &gateway = *group.gateway;
   Functions const &call = gateway.functions;
   std::ptrdiff_t const dof = gateway.dof, all = group.robots * dof;
-  bool const moves = group.velocities != 0 || group.speed_limit != nullptr;
   bool const bears = group.gravity != 0 || group.coriolis != 0;
   for (std::size_t row = 0; row < gateway.robots.size(); ++row) {
     Articulation *robot = gateway.robots[row];
@@ -68,12 +66,11 @@ inline void step_in_sapien(Group const &group, double const *effort, double *qpo
     if (!group.skip[row]) apply(call, robot, qf, dof);
     call.step(gateway.systems[row]);
     copy_row(call.get_qpos(robot), qpos + at, dof);
-    if (moves) copy_row(call.get_qvel(robot), qvel + at, dof);
+    copy_row(call.get_qvel(robot), qvel + at, dof);
     if (bears) {
       copy_row(call.compute_passive_force(robot, group.gravity != 0, group.coriolis != 0), passive + at, dof);
     }
   }
-  if (!moves) std::fill_n(qvel, all, 0.0);
   if (!bears) std::fill_n(passive, all, 0.0);
 }
 
@@ -152,7 +149,7 @@ inline void write_targets(Group const &group, double const *target, double const
   }
 }
 
-// Write R^T v for the rotation R of a quaternion (w, x, y, z), as turned_back in robot_model.py.
+// Write R^T v for the rotation R of a quaternion (w, x, y, z), as unrotate in task_space/frames.py.
 inline void turn_back(double const *q, double const *v, double *out) {
   double const w = q[0], x = q[1], y = q[2], z = q[3], s = 2 / (w * w + x * x + y * y + z * z);
   double const rows[3][3] = {{1 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)},

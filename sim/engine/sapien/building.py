@@ -147,7 +147,7 @@ def _principal(inertia: Float64, name: str) -> tuple[Float64, Float64]:
     return moments, axes
 
 
-def set_inertia(link: Any, inertia: SpatialInertia) -> None:
+def set_inertia(link: physx.PhysxArticulationLinkComponent, inertia: SpatialInertia) -> None:
     """Give one of SAPIEN's links this inertia, in the frame of the link."""
     principal, axes = np.linalg.eigh(inertia.tensor)
     link.set_mass(inertia.mass)
@@ -188,7 +188,7 @@ def engine_settings(spec: SceneSpec) -> Iterator[None]:
             )
 
 
-def new_system(spec: SceneSpec) -> Any:
+def new_system(spec: SceneSpec) -> physx.PhysxCpuSystem:
     """Return a new PhysX system with the solver, time step and gravity of ``spec``."""
     with engine_settings(spec):
         system = physx.PhysxCpuSystem()
@@ -196,7 +196,9 @@ def new_system(spec: SceneSpec) -> Any:
     return system
 
 
-def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
+def build_scene(
+    spec: SceneSpec, system: physx.PhysxCpuSystem
+) -> tuple[HeadlessScene, physx.PhysxArticulation]:
     """Return a new scene in ``system`` and the robot in it, with the ground and the dissipation of
     ``spec``.
 
@@ -229,7 +231,7 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
     return scene, robot
 
 
-def _set_words(spec: SceneSpec, robot: Any) -> None:
+def _set_words(spec: SceneSpec, robot: physx.PhysxArticulation) -> None:
     """Set the filter words of the shapes of a robot."""
     words = _shape_words(spec)
     for link in robot.links:
@@ -256,7 +258,7 @@ def _shape_words(spec: SceneSpec) -> dict[str, list[Words]]:
     return of_links
 
 
-def link_frames(spec: SceneSpec, robot: Any) -> Frames:
+def link_frames(spec: SceneSpec, robot: physx.PhysxArticulation) -> Frames:
     """Return all links of the URDF, in the entities of ``robot``, which is one of ``spec``."""
     entities = {link.name: link.entity for link in robot.links}
     return {

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import sapien
+from sapien.physx import PhysxArticulation, PhysxCpuSystem
 
 from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.sim.engine import native
@@ -70,8 +71,8 @@ class PythonCalls:
 
     def __init__(
         self,
-        robots: Sequence[Any],
-        systems: Sequence[Any],
+        robots: Sequence[PhysxArticulation],
+        systems: Sequence[PhysxCpuSystem],
         qf: Float32,
         skip: Bool,
     ) -> None:
@@ -135,8 +136,8 @@ class NativeCalls:
 
     def __init__(
         self,
-        robots: Sequence[Any],
-        systems: Sequence[Any],
+        robots: Sequence[PhysxArticulation],
+        systems: Sequence[PhysxCpuSystem],
         qf: Float32,
         skip: Bool,
     ) -> None:
@@ -238,10 +239,9 @@ class SapienStep(NativeStep):
         stepped: Bool,
         gravity: bool,
         coriolis: bool,
-        velocities: bool,
         speed_limit: Float64 | None,
         constraint: int | None = None,
-        joints: Sequence[Any] | None = None,
+        joints: Sequence[object] | None = None,
         sense: Callable[[], None] | None = None,
     ) -> None:
         assert isinstance(calls, NativeCalls)
@@ -260,7 +260,6 @@ class SapienStep(NativeStep):
             gateway=extension("_gateway").address(calls.gateway),
             gravity=gravity,
             coriolis=coriolis,
-            velocities=velocities,
             constraint=constraint,
             senses=sense is not None,
         )

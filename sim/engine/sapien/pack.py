@@ -177,18 +177,23 @@ class Pack(ModelPack):
         self,
         gravity: bool,
         coriolis: bool,
-        velocities: bool,
         speed_limit: Float64 | None,
         drives: bool = False,
     ) -> SapienStep:
-        reads = (gravity, coriolis, velocities)
         joints = self._joints if drives else None
         sense = None if self._sensors is None else self._sensors.add
         return SapienStep(
-            self.calls, self._stepped, *reads, speed_limit, self._constraint_address, joints, sense
+            self.calls,
+            self._stepped,
+            gravity,
+            coriolis,
+            speed_limit,
+            self._constraint_address,
+            joints,
+            sense,
         )
 
-    def update_constraint(self, rows: Any = slice(None)) -> None:
+    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         if self._constraint is not None:
             passive = self._calls.passive_force(True, True)
             self._constraint.update(self.joint_mass_matrix, self._calls.qpos(), passive, rows)

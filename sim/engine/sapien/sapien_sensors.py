@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from sapien.physx import PhysxArticulation, PhysxCpuSystem
 
 from batchpid.arrays.array_types import Float32, Float64
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -23,7 +24,9 @@ class SapienLinkSensors:
     lists.
     """
 
-    def __init__(self, spec: SceneSpec, robots: list[Any], systems: list[Any]) -> None:
+    def __init__(
+        self, spec: SceneSpec, robots: list[PhysxArticulation], systems: list[PhysxCpuSystem]
+    ) -> None:
         self._robots = robots
         self._systems = systems
         self._spec = spec

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import sapien
 from sapien.physx import (
+    PhysxArticulation,
     PhysxArticulationLinkComponent,
     PhysxCollisionShapeConvexMesh,
     PhysxCpuSystem,
@@ -45,11 +46,11 @@ class HeadlessScene(sapien.Scene):
         # ends the process.
         super().__init__([PhysxCpuSystem() if system is None else system])
 
-    def create_articulation_builder(self) -> Any:
+    def create_articulation_builder(self) -> ArticulationBuilder:
         """Return a builder of articulations for this scene."""
         return ArticulationBuilder().set_scene(self)
 
-    def create_actor_builder(self) -> Any:
+    def create_actor_builder(self) -> ActorBuilder:
         """Return a builder of actors for this scene."""
         return _HeadlessBuilder().set_scene(self)
 
@@ -195,14 +196,14 @@ def _call(
 ROOT_SIZE = 13
 
 
-def read_root(articulation: Any) -> Float32:
+def read_root(articulation: PhysxArticulation) -> Float32:
     """Return the state of the root link of a SAPIEN articulation (13,)."""
     pose = articulation.get_root_pose()
     velocity = articulation.get_root_linear_velocity(), articulation.get_root_angular_velocity()
     return np.concatenate([pose.p, pose.q, *velocity], dtype=np.float32)
 
 
-def write_root(articulation: Any, state: Float32) -> None:
+def write_root(articulation: PhysxArticulation, state: Float32) -> None:
     """Set the state of the root link of a SAPIEN articulation (13,)."""
     articulation.set_root_pose(sapien.Pose(state[:3], state[3:7]))
     articulation.set_root_linear_velocity(state[7:10])

@@ -56,7 +56,7 @@ def test_an_engine_has_the_members_of_each_protocol(name):
     pack = engine.make_pack(spec, 1)
     check_members(EnginePack, pack)
     if pack.steps_natively:
-        check_members(CompiledStep, pack.compiled_step(True, True, True, None))
+        check_members(CompiledStep, pack.compiled_step(True, True, None))
     pack.close()
 
 

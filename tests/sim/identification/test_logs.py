@@ -10,7 +10,6 @@ import batchpid as bp
 from batchpid.sim import Randomization, Recorder, Runner, Uniform, write_recording
 from batchpid.sim.identification import LogWarning, Reading, logs_of_rollout, read_logs
 from batchpid.sim.identification.log import checked
-from batchpid.sim.recording.recording_files import RecordingError
 
 JOINTS = ("shoulder", "elbow")
 TIME = 0.005 * np.arange(200)
@@ -84,8 +83,8 @@ def changed(name, row, value, kind="setpoint"):
 
 FAULTS = {
     r"has no column 'time', but a": {"a": TIME},
-    r"has no column qpos:JOINT": {"time": TIME, "effort:elbow": TIME},
-    r"has no column setpoint:JOINT": {"time": TIME, "qpos:elbow": TIME},
+    r"column qpos:elbow.* is missing": {"time": TIME, "effort:elbow": TIME},
+    r"column qpos:JOINT.* is missing": {"time": TIME},
     r"column setpoint:elbow.* is missing": (
         {"time": TIME, "qpos:elbow": TIME, "qpos:shoulder": TIME} | {"setpoint:shoulder": TIME}
     ),
@@ -128,14 +127,11 @@ def test_a_log_is_divided_at_gaps(robot, tmp_path):
 
 
 def test_wrapped_positions_become_continuous_once(robot, tmp_path):
-    """A joint whose type is not continuous is named in a warning. A log that was checked is not
-    checked again.
-    """
+    """A log that was checked is not checked again."""
     turning = 3.0 + np.sin(3 * TIME)
     wrapped = (turning + np.pi) % (2 * np.pi) - np.pi
     columns = table(**{"qpos:elbow": wrapped, "setpoint:elbow": wrapped})
-    with pytest.warns(LogWarning, match="positions of elbow jump by whole turns"):
-        (log,) = read(robot, tmp_path, columns)
+    (log,) = read(robot, tmp_path, columns)
     np.testing.assert_allclose(log.qpos[:, 1], turning, atol=1e-12)
     np.testing.assert_allclose(log.command[:, 1], turning, atol=1e-12)
     assert checked(robot, log) == [log]
@@ -143,24 +139,12 @@ def test_wrapped_positions_become_continuous_once(robot, tmp_path):
         read(robot, tmp_path, table(**{"qpos:elbow": np.where(TIME < 0.5, 0.0, 4.5)}))
 
 
-def test_an_hdf5_file_that_is_no_recording_is_refused(robot, tmp_path):
-    h5py = pytest.importorskip("h5py")
-    with h5py.File(tmp_path / "aloha.h5", "w") as file:
-        file["observations/qpos"], file["action"] = np.zeros((100, 2)), np.zeros((100, 2))
-    with pytest.raises(RecordingError, match="CSV files with the columns time, qpos:JOINT"):
-        read_logs(robot, [tmp_path / "aloha.h5"])
-
-
 def test_a_recording_says_what_it_knows(robot, tmp_path):
     rollout = run(robot, motion(1.0), compensate="gravity")
     pytest.importorskip("h5py")
     (log,) = read_logs(robot, [write_recording(rollout, tmp_path / "run.h5")])
-    assert (log.kind, log.held, log.timestep, log.compensate) == (
-        "setpoint",
-        True,
-        0.001,
-        "gravity",
-    )
+    assert (log.kind, log.held) == ("setpoint", True)
+    assert (log.timestep, log.compensate) == (0.001, "gravity")
     np.testing.assert_allclose(log.params.kp, gains().kp)
     np.testing.assert_allclose(log.command_time, rollout.time - rollout.tick)
 

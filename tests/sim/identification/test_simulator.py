@@ -131,15 +131,16 @@ def test_candidates_and_stretches_do_not_affect_each_other(tmp_path):
     robot, setpoints = load(tmp_path), motion(0.5)
     plant, drive = Plant(robot, (0, 1)), LogControl(DT, gains(), "gravity+coriolis")
     stretches = [stretch_of(setpoints, setpoints[0]), stretch_of(setpoints[20:60], setpoints[20])]
-    made = candidates(3, **TRUTH)
-    made = made._replace(
-        actuators=made.actuators._replace(strength=np.array([[1.0, 1.0], [0.9, 0.9], [0.5, 1.2]]))
-    )
-    states = np.zeros((3, 2, 2))
-    states[1, 1] = 0.1
+    # Each candidate comes once for each stretch.
+    strengths = np.array([[1.0, 1.0], [0.9, 0.9], [0.5, 1.2]])
+    made = candidates(6, **TRUTH)
+    motors = made.actuators._replace(strength=np.repeat(strengths, 2, axis=0))
+    states = np.zeros((6, 2, 2))
+    states[2:4, 1] = 0.1
+    made = made._replace(actuators=motors)
     tables = simulate(plant, drive, made, states, stretches)
     for number, stretch in enumerate(stretches):
-        for row, strength in enumerate(made.actuators.strength):
+        for row, strength in enumerate(strengths):
             one = candidates(**TRUTH | {"strength": strength})
-            (alone,) = simulate(plant, drive, one, states[row : row + 1], [stretch])
+            (alone,) = simulate(plant, drive, one, states[2 * row : 2 * row + 1], [stretch])
             np.testing.assert_allclose(alone[0], tables[number][row], atol=1e-9)

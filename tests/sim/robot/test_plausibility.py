@@ -13,6 +13,7 @@ from robots import load_bundled
 from tiny_urdf import LIMIT, joint, link, robot, write
 
 from batchpid.sim import Robot
+from batchpid.sim.randomization.distributions import elements
 
 CODES = {"scale", "mass", "inertia"}
 
@@ -127,6 +128,7 @@ def test_masses_are_those_of_the_simulation(tmp_path):
         **dict.fromkeys("abc", "shapes"),
     }
     assert masses["a"].mass == pytest.approx(4.0)
+    assert elements("link_mass", shaped) == [*"abc"]
     assert masses["a"].size == pytest.approx(np.sqrt(0.18))
     assert masses["a"].gyration == pytest.approx(np.sqrt(0.17 / 12))
     assert ", 3 links with the mass of shapes, path=" in repr(shaped)
