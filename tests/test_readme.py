@@ -32,7 +32,7 @@ def test_it_has_one_picture_one_program_and_two_commands():
         ("`mujoco.batch`, its own PID, without Coriolis compensation", "panda-accurate", "mujoco"),
         ('batchpid, SAPIEN, `physics="fast"`', "panda-fast", "closed loop"),
         ("batchpid, SAPIEN, its default solver", "panda-accurate", "closed loop"),
-        ("SAPIEN's tutorial, a process a core", "panda-accurate", "tutorial, a process a core"),
+        ("SAPIEN's tutorial, one process per core", "panda-accurate", "tutorial, a process a core"),
         ("SAPIEN's tutorial in Gymnasium's vector env", "panda-accurate", "gymnasium, all envs"),
     ],
 )

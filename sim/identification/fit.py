@@ -204,11 +204,11 @@ class Problem:
         size: Float64 = np.sqrt((errors**2).mean(0)) + RESOLUTION
         return size
 
-    def error(self, point: Float64, free_states: bool = False) -> Float64:
+    def error(self, point: Float64) -> Float64:
         """Return the root mean square (joints,) of the position error at the held-out rows,
         simulated from the logged state; at all rows if none is held out.
         """
-        evaluation = self.evaluate(point, None, free_states, held_out=True)
+        evaluation = self.evaluate(point, free_states=False, held_out=True)
         errors = np.concatenate(evaluation)[..., 0]
         held_out = ~np.concatenate([window.fitted for window in self.windows])
         if held_out.any():

@@ -118,7 +118,7 @@ def identify(
     read = _read(robot, logs, params, reading)
     moves, still = _moving(robot, read)
     robot, data = _prepared(robot, read, moves, params, compensate, timestep)
-    data, guesses = _regress(robot, data, "slew" in extras)
+    data, guesses = _regress(robot, data)
     unknowns = [_unknowns(robot, data, guess, kinds) for guess in guesses]
     windows = windows_of(data)
     with ExitStack() as stack:
@@ -262,19 +262,17 @@ def _of_joints(params: bp.PIDParams, robot: Robot, log: Log) -> bp.PIDParams:
     return params.for_joints(list(log.joints))
 
 
-def _regress(
-    robot: Robot, data: list[LogData], has_slew: bool
-) -> tuple[list[LogData], list[Guess]]:
+def _regress(robot: Robot, data: list[LogData]) -> tuple[list[LogData], list[Guess]]:
     """Return the logs, marked whether the compensation passes through the motors, and the guesses
     of the regression.
 
     Raises InvalidArgumentError where a log makes far more sense in another reading.
     """
-    guesses = regress(_fitted(data), has_slew)
+    guesses = regress(_fitted(data))
     if data[0].drive.compensate != "none":
         # A robot that adds the compensation by itself may do so exactly, whatever its motors.
         exact = [part._replace(drive=part.drive._replace(through=False)) for part in data]
-        others = regress(_fitted(exact), has_slew)
+        others = regress(_fitted(exact))
         if others[0].cost < guesses[0].cost - DETOUR:
             data = exact
             guesses = others
@@ -328,7 +326,7 @@ def _unknowns(robot: Robot, data: list[LogData], guess: Guess, extras: Sequence[
         "effort": effort,
         "friction": 0.3 * np.maximum(friction, 0.05 * effort),
         "speed": 0.1 * speed,
-        "top_speed": np.mean([part.motion.top_speed for part in data], axis=0),
+        "top_speed": np.quantile(np.abs(motion.qvel), 0.99, axis=0),
         "error": 0.7 * np.quantile(np.abs(motion.command - motion.qpos), 0.95, axis=0),
     }
     return Unknowns.of(robot, log.joints, kinds, starts, sizes, plant.heavy_links)

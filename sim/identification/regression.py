@@ -84,11 +84,6 @@ class Motion(NamedTuple):
     qacc: Float64
     command: Float64
 
-    @property
-    def top_speed(self) -> Float64:
-        """Speed (joints,) that is seldom exceeded."""
-        return np.quantile(np.abs(self.qvel), 0.99, axis=0)
-
 
 class LogData(NamedTuple):
     """A log, its smoothed motion, and the plant and control that made it."""
@@ -143,18 +138,16 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
     return np.ascontiguousarray(sosfiltfilt(sections, table, axis=0, padlen=pad))
 
 
-def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
+def regress(data: Sequence[LogData]) -> list[Guess]:
     """Return the motors of logs at the delays of the least cost, the best first: one guess for each
     delay of the setpoints that explains the efforts about as well.
-
-    With ``has_slew`` the rate of setpoints is limited, by about the speed of the joints.
     """
     every = 1 + sum(len(part.motion.qpos) for part in data) // MOST_ROWS
     cutoff = min(_cutoff(part.log) for part in data)
     shifts, delays = SETPOINT_DELAYS, LOOP_DELAYS
     if data[0].drive.params is None:
         shifts, delays = np.zeros(1), DELAYS
-    tables = [_table(part, delays, every, cutoff, has_slew) for part in data]
+    tables = [_table(part, delays, every, cutoff) for part in data]
     *columns, efforts = (np.concatenate(parts, axis=-2) for parts in zip(*tables, strict=True))
     speed = np.abs(columns[2])
     moves = speed > MOVES * np.sqrt((speed**2).mean(0))
@@ -179,9 +172,7 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
     return list(best.values())
 
 
-def _table(
-    part: LogData, delays: Float64, every: int, cutoff: float, has_slew: bool
-) -> tuple[Float64, ...]:
+def _table(part: LogData, delays: Float64, every: int, cutoff: float) -> tuple[Float64, ...]:
     """Return columns of a log (rows, joints): the effort that the links need, acceleration,
     velocity, its sign, and the motors' efforts by delay of setpoints and of efforts.
     """
@@ -192,7 +183,7 @@ def _table(
     edge = min(round(EDGE / dt), len(motion.qpos) // 5)
     rows = np.arange(edge, len(motion.qpos) - edge, every)
     links = _force(part, motion.qpos[rows], motion.qvel[rows], motion.qacc[rows])
-    efforts = _commanded(part, has_slew)
+    efforts = _commanded(part)
     if part.drive.compensate != "none":
         speed = 0.0 if part.drive.compensate == "gravity" else 1.0
         compensation = _force(part, motion.qpos, speed * motion.qvel, 0 * motion.qacc)
@@ -216,7 +207,7 @@ def _force(part: LogData, qpos: Float64, qvel: Float64, qacc: Float64) -> Float6
     return dynamics.force + (dynamics.matrix @ qacc[..., None])[..., 0]
 
 
-def _commanded(part: LogData, has_slew: bool) -> Float64:
+def _commanded(part: LogData) -> Float64:
     """Return logged efforts (1, steps, joints), or the law's along a motion (setpoint delays,
     steps, joints).
     """
@@ -224,8 +215,7 @@ def _commanded(part: LogData, has_slew: bool) -> Float64:
     if drive.params is None:
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
-    law = {"slew": np.tile(motion.top_speed, (count, 1))} if has_slew else {}
-    ideal = PlantCandidates(Actuators(), law, SETPOINT_DELAYS, [()] * count)
+    ideal = PlantCandidates(Actuators(), {}, SETPOINT_DELAYS, [()] * count)
     q, v = (np.repeat(table[:, None], count, axis=1) for table in motion[:2])
     dynamics = Dynamics(part.plant, ideal.masses, q[0], v[0])
     control = SimulatedControl(drive, ideal, dynamics, q[0], v[0])
@@ -277,19 +267,14 @@ def better_reading(robot: Robot, data: LogData, guess: Guess) -> str:
     if guess.odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
         begin = log.part(log.time < log.time[0] + TRIED, log.command_time < log.time[0] + TRIED)
         names = [robot.joint_names[joint] for joint in log.joints]
-
-        def changed(on_qpos: Float64, on_command: Float64) -> Guess:
+        costs = dict[str, float]()
+        for words, on_qpos, on_command in _readings(log.kind, names, guess.odd):
             other = replace(begin, qpos=begin.qpos @ on_qpos, command=begin.command @ on_command)
             motion = smooth(other, data.drive.timestep)
-            return regress([data._replace(log=other, motion=motion)])[0]
-
-        same = np.eye(len(names))
-        present = changed(same, same)
-        costs = dict[str, float]()
-        for words, *matrices in _readings(log.kind, names, present.odd):
-            costs[words] = changed(*matrices).cost
+            costs[words] = regress([data._replace(log=other, motion=motion)])[0].cost
+        present = costs.pop("")
         best = min(costs.values())
-        if best < min(present.cost - EVIDENCE, WORST):
+        if best < min(present - EVIDENCE, WORST):
             return next(words for words, cost in costs.items() if cost < best + ALIKE)
     delay = float(guess.values["setpoint_delay"][0])
     if delay < -1e-9:
@@ -298,10 +283,11 @@ def better_reading(robot: Robot, data: LogData, guess: Guess) -> str:
 
 
 def _readings(kind: str, names: Sequence[str], odd: Bool) -> Iterator[tuple[str, Float64, Float64]]:
-    """Yield other readings of the ``odd`` joints: words, and the matrices (joints, joints) that
-    correct rows of positions and of commands.
+    """Yield the present reading (""), and others of the ``odd`` joints: words, and the matrices
+    (joints, joints) that correct rows of positions and of commands.
     """
     same = np.eye(len(names))
+    yield "", same, same
     changes = dict[str, Float64]()
     for joint in np.flatnonzero(odd).tolist():
         changes[f"of {names[joint]} with the other sign"] = same - 2 * np.diag(same[joint])

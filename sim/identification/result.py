@@ -126,14 +126,14 @@ class Identification:
         InvalidArgumentError
             There is no such unknown.
         """
-        for entry, row in zip(self.unknowns.entries, self._rows, strict=True):
-            if (entry.kind, entry.link or entry.joint) == (kind, joint):
-                return row
-        if (kind, joint) in [(entry.kind, entry.link or entry.joint) for entry in self.fit.hidden]:
-            return None
-        kinds = ", ".join(dict.fromkeys(entry.kind for entry in self.unknowns.entries))
-        problem = f"is no unknown of {joint!r}"
-        raise InvalidArgumentError("kind", problem, value=kind, remedy=f"there are {kinds}")
+        entries = [*self.unknowns.entries, *self.fit.hidden]
+        names = [(entry.kind, entry.link or entry.joint) for entry in entries]
+        if (kind, joint) not in names:
+            problem = f"is no unknown of {joint!r}"
+            remedy = f"there are {sorted({entry.kind for entry in entries})}"
+            raise InvalidArgumentError("kind", problem, value=kind, remedy=remedy)
+        rows = dict(zip(names, self._rows, strict=False))
+        return rows.get((kind, joint))
 
     @property
     def _rows(self) -> list[tuple[float, float, float]]:
@@ -299,12 +299,11 @@ def advice(fit: Fit) -> str:
     problem = fit.problem
     unknowns = problem.unknowns
     entries = unknowns.entries
-    further = [Unknown("mass", None, 1.0, 1.0, link) for link in problem.data[0].plant.heavy_links]
-    for joint in range(len(unknowns.joints)):
-        further.append(Unknown("offset", joint, 0.0, 0.01))
-        further.append(Unknown("load_friction", joint, 1e-6, 1e-5))
     present = {entry.kind for entry in entries}
-    further = [entry for entry in further if entry.kind not in present]
+    kinds = [kind for kind in ("mass", "offset", "load_friction") if kind not in present]
+    links = problem.data[0].plant.heavy_links
+    starts = {"load_friction": np.zeros(len(unknowns.joints))}
+    further = Unknowns.of(unknowns.robot, unknowns.joints, kinds, starts, {}, links).entries
     wide = replace(unknowns, entries=(*entries, *further))
     values = np.append(unknowns.values(fit.point), [entry.start for entry in further])
     problem = replace(problem, unknowns=wide)
