@@ -314,7 +314,6 @@ def _unknowns(robot: Robot, data: list[LogData], guess: Guess, extras: Sequence[
     # The mean inertia of the links, on 200 poses of the motion.
     poses = np.ascontiguousarray(motion.qpos[:: 1 + len(motion.qpos) // 200])
     dynamics = Dynamics(plant, [()] * len(poses), poses, np.zeros_like(poses))
-    dynamics.update()
     links = np.diagonal(dynamics.matrix, axis1=1, axis2=2).mean(0)
     speed = np.maximum(np.sqrt((motion.qvel**2).mean(0)), 1e-3)
     acceleration = np.maximum(np.sqrt((motion.qacc**2).mean(0)), 0.1)

@@ -203,7 +203,6 @@ def _table(part: LogData, delays: Float64, every: int, cutoff: float) -> tuple[F
 def _force(part: LogData, qpos: Float64, qvel: Float64, qacc: Float64) -> Float64:
     """Return the efforts (rows, joints) that the links need to move so, without motors."""
     dynamics = Dynamics(part.plant, [()] * len(qpos), np.array(qpos), np.array(qvel))
-    dynamics.update()
     return dynamics.force + (dynamics.matrix @ qacc[..., None])[..., 0]
 
 
