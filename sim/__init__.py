@@ -1,8 +1,8 @@
 """Many robots in SAPIEN or MuJoCo: load a URDF or MJCF file, run N copies under explicit joint
 control.
 
-Importing it does not load SAPIEN; the first use of :class:`Runner` or of :meth:`Robot.dynamics`
-does.
+Importing it does not load an engine; the first :class:`Runner` or :meth:`Robot.dynamics` loads its
+own.
 """
 
 from __future__ import annotations

@@ -21,12 +21,20 @@ Kokotovic, Adaptive Control of Systems with Actuator and Sensor Nonlinearities, 
 2). Friction and armature are the simulator's: see :mod:`batchpid.motors.friction`.
 
 A new effect is, in :mod:`batchpid.motors.actuators`, a field of :class:`Actuators` with its
-``Field``, and an entry in the docstring of ``make_actuators``. Files, randomizations, exports and
-the table of docs/actuators.md (``python docs/tables.py``) take it from there. Here it is a field of
-:class:`MotorCoefficients`, a value in :func:`discretise`, and a term in ``_delivered`` (motor),
-``_play`` or ``_encode`` (sensor). An effect that changes the limits of commands has a term in
-:func:`command_limits`, too. Terms may use the operations of :mod:`batchpid.native.extensions` only,
-so that they also run in JAX and in native code.
+``Field``, and an entry in the docstring of ``make_actuators``; ``_check_together`` has conditions on
+several fields. Files, randomizations and the table of docs/actuators.md (``python docs/tables.py``)
+take it from there; each export has it, or lists it as a difference. Here it is a field of
+:class:`MotorCoefficients`, a value in :func:`discretise`, a start in :func:`init` if it has a state,
+and a term in ``_delivered`` (motor), ``_play`` or ``_encode`` (sensor). An effect that changes the
+limits of commands has a term in ``command_envelope``, too. Terms may use the operations of
+:mod:`batchpid.native.extensions` only (no sin, exp or pow), so that they also run in JAX and in
+native code; coefficients may use any.
+
+An effect on the joint's side (friction, armature) is in ``JOINT_SIDE`` and, if it acts on drives,
+``DRIVEN`` of :mod:`batchpid.motors`; ``added_friction`` of batchpid/sim/engine/scene_spec.py or
+``ModelPack._add_joints`` adds it to the joint. Joint-side effects and ``bias`` leave followers out,
+in ``fit_actuators`` (batchpid/sim/robot/robot_options.py) and ``OF_JOINTS``
+(batchpid/sim/randomization/randomization.py).
 """
 
 from __future__ import annotations

@@ -35,9 +35,8 @@ def passive_force(
     """Return the gravity part of :func:`batchpid.task_space.bias` (n, dof), its velocity part, or
     both.
 
-    ``base`` (n, 6) are gravity and the rate at which the base turns, in its own axes, of one that
-    floats, or with a tree on a fixed base of one that is held where it is. The gravity part of a
-    floating base is 0.
+    ``base`` (n, 6) are gravity and the rate at which a floating base turns, in the base's axes; with
+    a tree on a fixed base, of a base that is held. The gravity part of a floating base is 0.
     """
     zero = np.zeros_like(np.asarray(qpos, np.float64))
     turning = None

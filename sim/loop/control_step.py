@@ -374,7 +374,7 @@ class SimStage(NamedTuple):
     applies: Callable[[Layout, Constants], bool] = _always
     """Whether a group of envs needs it."""
     function: StageFunction | None = None
-    """Pure function of arrays; None for a stage that every executor has its own function for."""
+    """Pure function of arrays; None for a stage that executors do in their own ways."""
 
 
 STAGES = (

@@ -228,7 +228,7 @@ class EnvGroup:
         return self._start()
 
     def _start(self) -> list[NativeExecutor]:
-        """Start the next tick; return the executor if native code runs it, and more, as a whole."""
+        """Start the next tick; return the executor if native code can run it, else nothing."""
         self._step = 0
         # A suspended env needs neutral commands, which only Python gives.
         is_quiet = self._faults.begin_tick()

@@ -121,7 +121,7 @@ class EventLog:
         self._steps: Rows = np.full(num_envs, none)
 
     def without(self, mask: Bool) -> EventLog:
-        """Return a log without the last event of the envs of ``mask`` (envs,), which were reset."""
+        """Return a log in which the envs of ``mask`` (envs,), which were reset, have no last event."""
         return self.restored(np.where(mask, self._none, self._steps))
 
     def restored(self, steps: Rows) -> EventLog:

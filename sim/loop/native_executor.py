@@ -145,7 +145,7 @@ class NativeExecutor:
         return self._program.bound
 
     def count_steps(self) -> bool:
-        """Count the sim steps that ran; return whether the rest waits for noise."""
+        """Count the sim steps that ran; return whether the others wait for noise."""
         assert self._program is not None
         tick = self._program.tick
         motors = self._buffers.state.motors

@@ -292,7 +292,7 @@ _NATIVE: dict[str, Callable[[TickProgram, Values], Values]] = {
     "constraint": TickProgram._add_nothing,
     "engine": TickProgram._add_nothing,
 }
-"""Stages without a program or with a native function, and the arrays that each adds."""
+"""Stages that are not traced, with the method that adds their arrays."""
 
 _TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
 """Dtypes of arrays that are not float64."""
@@ -309,9 +309,7 @@ class _Traced(NamedTuple):
     changed: Pytree
     """Structure of the values :data:`_CHANGED` after it."""
     places: tuple[int, ...]
-    """Places of the arrays in these, among the inputs of the program and, after them, its
-    results.
-    """
+    """Index of each of their arrays: inputs first, then results."""
 
 
 @lru_cache(maxsize=64)

@@ -176,8 +176,8 @@ def _turns(pack: EnginePack) -> Array:
 def empty_state(
     options: RunnerOptions, law: Pytree, actuators: bp.Actuators | None, stiction: bool, envs: int
 ) -> StepState:
-    """Return the state of the control of ``envs`` envs with the state ``law`` of the law, and zeros
-    for the rest: actuators, unless None, and Coulomb friction if ``stiction``.
+    """Return the control state of ``envs`` envs: the law's state ``law``, and zeros for
+    ``actuators`` (unless None), guard, and Coulomb friction if ``stiction``.
     """
     rows = np.zeros((envs, options.robot.dof))
     state = StepState(law)

@@ -162,8 +162,8 @@ class Values(NamedTuple):
     """Reading of the robots before the step."""
     step: Step
     seen: Measured
-    """Reading as the sensors measure it, with the whole feedforward as its passive force from that
-    stage on.
+    """Reading as the sensors measure it. The stage "feedforward" replaces its passive force by the
+    whole feedforward.
     """
     noise: Pytree = None
     """Noise of the sensors in this step, if it is drawn in advance."""

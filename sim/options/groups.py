@@ -187,9 +187,9 @@ class Scene(OptionGroup):
         Raises
         ------
         InvalidArgumentError
-            No engine has this name.
+            No engine has this name, or SAPIEN is not installed.
         MissingDependencyError
-            The engine's package is not installed.
+            MuJoCo is too old.
         """
         return load_engine(self.engine)
 

@@ -139,7 +139,7 @@ class Tables:
 
 
 def breadth_first(bodies: Iterable[Body], shapes: Iterable[Shape]) -> Tables:
-    """Return the tables of the bodies below the one without a joint, siblings in their order."""
+    """Return the tables of the base, which has no joint, and all bodies below it, breadth first."""
     below: dict[str, list[Body]] = defaultdict(list)
     ordered = []
     for body in bodies:

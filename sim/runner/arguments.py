@@ -77,9 +77,9 @@ def accelerated(command: Command, motion: Motion, seconds: float) -> Command:
     with rates.
 
     The mean is the change of the rate over the tick, from ``motion`` before the first. It is taken
-    where the setpoints confirm that rates (and accelerations) are those at the tick's end, since
-    they change by the mean of the old and the new rate rather than by the new one, as increments
-    do. Elsewhere the acceleration of the command is kept, or 0.
+    where setpoints change by the mean of the old and the new rate, as they do if rates are those at
+    the tick's end. Elsewhere (setpoints that change by the new rate, as increments do) the
+    acceleration of the command is kept, or 0.
     """
     setpoint, rate, acceleration, _ = command
     position, velocity = motion

@@ -33,7 +33,7 @@ class RunWarnings:
         self._issued = set[type[Warning]]()
 
     def check_controller(self) -> None:
-        """Warn of such gains of operational-space control."""
+        """Warn of unstable operational-space gains."""
         if isinstance(self._control, OperationalSpace):
             self._control.check_stability()
 

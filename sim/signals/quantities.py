@@ -2,7 +2,8 @@
 
 A sensor is one line of :class:`Observation`: dtype, text, unit, columns, and the option that it
 belongs to. Shared memory, snapshots, recordings and rollouts take names and shapes from that line.
-Its value comes from ``EnvGroup.observe``, or from the engine's sensors of links.
+Its value comes from ``TickProgram._transfers`` in native ticks and ``EnvGroup.observe`` in others,
+or from the engine's sensors of links.
 """
 
 from __future__ import annotations
@@ -118,8 +119,8 @@ class Quantity(NamedTuple):
     columns: Mapping[str, str] | None = None
     """Names and units of columns; {} for one value. None: a column for each joint."""
     part: str = ""
-    """Part of a run without which there is no such quantity: "base", a floating one, "tool", or an
-    option that lists links, each with a row.
+    """What a run must have for this quantity: "base", a floating one, "tool", or an option that
+    lists links, each with a row.
     """
     links: tuple[str, ...] | None = None
     """Names of the links of that option."""

@@ -212,8 +212,8 @@ class WorkerPool(SingleOwner):
         return tuple.__new__(Outcome, (results, failure, count, self.arrays, self._at))
 
     def start_replay_from(self, request: Request | None) -> None:
-        """Drop the kept requests, because ``request``, whose arrays no one changes, brings a new
-        worker to the present state.
+        """Replace the kept requests by ``request``, which brings a new worker to the present state;
+        its arrays must not change.
         """
         if request is None:
             self._replay = [Build()]

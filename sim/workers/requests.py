@@ -33,7 +33,7 @@ class Request(ABC):
     """True if the ticks that every env completed before an error are kept."""
 
     def for_envs(self, envs: slice) -> Self:
-        """Return the part of some envs, of fields that are arrays (envs, ...) or have such a
+        """Return the request for some envs: fields are arrays (envs, ...), None, or have this
         method.
         """
 

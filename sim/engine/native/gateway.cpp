@@ -1,7 +1,7 @@
 // Gateway to the robots of a pack, in SAPIEN or MuJoCo: one call from Python for all of them, instead of one for each.
 //
 // It calls functions that SAPIEN's shared library exports. Their addresses and the objects' pointers come from Python
-// (sim/engine/native/__init__.py), so that nothing of SAPIEN, PhysX or Eigen is needed to compile this file.
+// (sim/engine/sapien/calls.py), so that nothing of SAPIEN, PhysX or Eigen is needed to compile this file.
 
 #include "tick.h"
 #include "xla_call.h"

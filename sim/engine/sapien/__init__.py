@@ -1,6 +1,4 @@
-"""SAPIEN: packs of scenes, dynamics, contacts. No other folder imports SAPIEN, except to draw
-pictures.
-"""
+"""SAPIEN: packs of scenes, dynamics, contacts. No other folder imports SAPIEN."""
 
 import warnings
 

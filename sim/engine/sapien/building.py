@@ -1,4 +1,4 @@
-"""Scenes of one robot: the engine's settings, the robot from its URDF, its collision groups, its
+"""Scenes of one robot: the engine's settings, the robot from its tables, its collision groups, its
 tree in PhysX.
 """
 

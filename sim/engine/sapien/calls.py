@@ -1,8 +1,8 @@
 """Calls into SAPIEN for all robots of a pack: reads, efforts, and steps of their systems.
 
 Native calls are one call of the extension for all robots. The extension calls functions that
-SAPIEN's shared library exports, so that it compiles without SAPIEN. It depends on the layout of two
-of SAPIEN's types, which SAPIEN does not guarantee: see :data:`TESTED`.
+SAPIEN's shared library exports, so that it compiles without SAPIEN. It depends on the layout of
+three of SAPIEN's types, which SAPIEN does not guarantee: see :data:`TESTED`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from batchpid.sim.engine.native_model import NativeStep
 TESTED = ("3.0.3",)
 """Versions of SAPIEN that native code calls; tests/sim/test_conformance.py must pass with each.
 
-The gateway repeats the layout of two types of SAPIEN (gateway.h). No header promises it, and the
+The gateway repeats the layout of three types of SAPIEN (gateway.h). No header promises it, and the
 names of the functions do not contain the type that they return: a version that changes it would
 corrupt memory.
 """
