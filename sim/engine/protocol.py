@@ -291,8 +291,8 @@ class Engine:
     physics: Mapping[str, Any]
     """Settings of its solver, frozen dataclasses of plain values, by the name of the preset."""
     group_size: int
-    """Envs that the loop steps together: enough to share the overhead of NumPy calls, few enough
-    for the working set to stay in the cache. It changes no result.
+    """Envs that the loop steps together in native code: few enough for the working set to stay in
+    the cache. It changes no result.
     """
     make_pack: Callable[..., EnginePack]
     """``make_pack(spec, size, first_env=0, variation=None, workspace=None)`` returns a new pack of

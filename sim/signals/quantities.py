@@ -152,8 +152,8 @@ class Observation(NamedTuple):
 
     ``effort``, ``saturated`` and ``guarded`` are from the last sim step; under control "drive" the
     effort is qf alone, since PhysX does not report drive efforts. ``ok`` is False for an env that
-    failed in this tick, or that is suspended since an earlier one: see
-    :attr:`batchpid.sim.Runner.faults`. ``tool_pose`` (envs, 7) is the pose of the tool at ``qpos``,
+    failed in this tick (by its state, its speed or its command), or is suspended since an earlier
+    one: see :attr:`batchpid.sim.Runner.faults`. ``tool_pose`` (envs, 7) is the pose of the tool at ``qpos``,
     where setpoints are poses: position [m] and unit quaternion (w, x, y, z); else None.
 
     ``base_pose`` (envs, 7) is the pose of the robot's root link in the world, where the base
