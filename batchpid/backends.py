@@ -115,7 +115,13 @@ class JAXBackend:
         separate.
         """
 
-        def packed(layout: Any, shared: Any, separate: Any, *inputs: Array, **named: Any) -> Any:
+        def packed(
+            layout: Any,
+            shared: Any,
+            separate: Any,
+            *inputs: Array,
+            **named: Any,
+        ) -> Any:
             tree, is_shared = layout
             shared = iter(shared)
             separate = iter(separate)
@@ -158,7 +164,12 @@ class JAXBackend:
             return state
 
     def step(
-        self, state: PIDState, out: Array, r: Array, y: Array, *rates: Array
+        self,
+        state: PIDState,
+        out: Array,
+        r: Array,
+        y: Array,
+        *rates: Array,
     ) -> tuple[PIDState, Array, Terms | None, Callable[..., Array]]:
         """Return the new state, the effort, the terms if they are kept, and no fast call; ``out``
         is None.

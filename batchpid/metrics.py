@@ -154,7 +154,11 @@ def step_metrics(
     # For a joint that hardly moves, rise and overshoot would measure noise; its deviation is still
     # reported.
     moves = size >= floor / band
-    beyond = np.where(moves, np.max(-final_error * direction, 0), np.max(np.abs(final_error), 0))
+    beyond = np.where(
+        moves,
+        np.max(-final_error * direction, 0),
+        np.max(np.abs(final_error), 0),
+    )
     beyond = np.maximum(beyond, 0.0)
     progress = 1.0 - final_error / move
     overshoot = np.where(moves, beyond / size, np.nan)
@@ -173,9 +177,19 @@ def step_metrics(
         steady_state_error=judged(np.abs(error[-tail_rows:]).max(0)),
         peak_deviation=judged(beyond),
         iae=judged(np.trapezoid(np.abs(error), t, axis=0)),
-        itae=judged(np.trapezoid(t[:, None, None] * np.abs(error), t, axis=0)),
+        itae=judged(
+            np.trapezoid(
+                t[:, None, None] * np.abs(error),
+                t,
+                axis=0,
+            )
+        ),
         effort_peak=np.where(is_sound, np.abs(u).max(0), np.inf),
-        effort_variation=np.where(is_sound, np.abs(np.diff(u, axis=0)).sum(0), np.inf),
+        effort_variation=np.where(
+            is_sound,
+            np.abs(np.diff(u, axis=0)).sum(0),
+            np.inf,
+        ),
         saturation_share=np.mean(limited, axis=0),
     )
 
@@ -189,7 +203,11 @@ def _first_crossing(t: Float64, progress: Float64, level: float) -> Float64:
     before = _row(progress, k - 1)
     after = _row(progress, k)
     share = np.clip((level - before) / (after - before), 0.0, 1.0)
-    return np.where(reached.any(0), t[k - 1] + share * (t[k] - t[k - 1]), np.inf)
+    return np.where(
+        reached.any(0),
+        t[k - 1] + share * (t[k] - t[k - 1]),
+        np.inf,
+    )
 
 
 def _settling_time(t: Float64, error: Float64, tolerance: Float64) -> Float64:
@@ -203,7 +221,11 @@ def _settling_time(t: Float64, error: Float64, tolerance: Float64) -> Float64:
     after = _row(error, k + 1)
     edge = np.copysign(tolerance, before)
     share = np.clip((edge - before) / (after - before), 0.0, 1.0)
-    settled = np.where(outside[-1], np.inf, t[k] + share * (t[k + 1] - t[k]))
+    settled = np.where(
+        outside[-1],
+        np.inf,
+        t[k] + share * (t[k + 1] - t[k]),
+    )
     return np.where(outside.any(0), settled, 0.0)
 
 

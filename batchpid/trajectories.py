@@ -129,7 +129,13 @@ def minimum_jerk(
     return _trajectory(time, x0, move, s, rate, acceleration, done=tau >= 1 - _ROUNDING)
 
 
-def straight_line(start: ArrayLike, target: ArrayLike, dt: float, *, duration: float) -> Trajectory:
+def straight_line(
+    start: ArrayLike,
+    target: ArrayLike,
+    dt: float,
+    *,
+    duration: float,
+) -> Trajectory:
     """Return the minimum-jerk move of a tool between two poses: on a straight line, while it turns
     about one axis (slerp; K. Shoemake, Animating rotation with quaternion curves, 1985).
 
@@ -199,7 +205,12 @@ def sine(
     rows = (a * sin, rate * sin + w * a * cos, (change - w**2 * a) * sin + 2 * w * rate * cos)
     # One wave for all joints, scaled by the amplitude of each.
     shares = [row[(...,) + (None,) * move.ndim] for row in rows]
-    return Trajectory(time, low + shares[0] * move, shares[1] * move, shares[2] * move)
+    return Trajectory(
+        time,
+        low + shares[0] * move,
+        shares[1] * move,
+        shares[2] * move,
+    )
 
 
 def trapezoidal(
@@ -246,10 +257,18 @@ def trapezoidal(
     s = np.where(
         t < ramp,
         as_ * t**2 / 2,
-        np.where(left < ramp, 1 - as_ * left**2 / 2, peak * (t - ramp / 2)),
+        np.where(
+            left < ramp,
+            1 - as_ * left**2 / 2,
+            peak * (t - ramp / 2),
+        ),
     )
     rate = np.minimum(np.minimum(as_ * t, as_ * left), peak)
-    acceleration = np.where(t < ramp, as_, np.where(left < ramp, -as_, 0.0))
+    acceleration = np.where(
+        t < ramp,
+        as_,
+        np.where(left < ramp, -as_, 0.0),
+    )
     return _trajectory(time, x0, move, s, rate, acceleration, done=left <= _ROUNDING * total)
 
 
@@ -290,7 +309,12 @@ def _move(start: ArrayLike, target: ArrayLike) -> tuple[Float64, Float64]:
     return x0, x1 - x0
 
 
-def _limits(name: str, value: ArrayLike, move: Float64, finite: bool = True) -> Float64:
+def _limits(
+    name: str,
+    value: ArrayLike,
+    move: Float64,
+    finite: bool = True,
+) -> Float64:
     """Return ``value`` > 0, shaped as ``move``."""
     return at_least(name, broadcast(name, value, move.shape), 0.0, above=True, infinite=not finite)
 
@@ -299,7 +323,11 @@ def _ticks(dt: float, total: Float64) -> Float64:
     """Return the times of the ticks' ends up to the longest of the durations ``total``, at least
     one.
     """
-    return time_step("dt", dt) * np.arange(1, _count(float(total.max()), dt) + 1, dtype=np.float64)
+    return time_step("dt", dt) * np.arange(
+        1,
+        _count(float(total.max()), dt) + 1,
+        dtype=np.float64,
+    )
 
 
 def _count(duration: float, dt: float) -> int:

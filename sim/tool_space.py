@@ -188,7 +188,12 @@ class OperationalSpace:
         return ts.init(self._params, np.repeat(self._posture, num_envs, axis=0))
 
     def __call__(
-        self, state: ts.OSCState, setpoint: Array, qpos: Array, qvel: Array, passive: Array
+        self,
+        state: ts.OSCState,
+        setpoint: Array,
+        qpos: Array,
+        qvel: Array,
+        passive: Array,
     ) -> tuple[Array, Array]:
         """Return the state and the efforts (envs, dof) [N m or N].
 
@@ -263,7 +268,13 @@ class OperationalSpace:
         parts = [pose, twist - change, setpoint[:, 13:]]
         return namespace(setpoint).concatenate(parts, axis=-1)
 
-    def bound(self, qpos: Array, qvel: Array, passive: Array, left: Array) -> BoundOSC:
+    def bound(
+        self,
+        qpos: Array,
+        qvel: Array,
+        passive: Array,
+        left: Array,
+    ) -> BoundOSC:
         """Return this controller as a native call on these arrays (envs, dof), and the time to the
         end of the tick ().
         """
@@ -302,7 +313,12 @@ class OperationalSpace:
         eye = 1e-4 * namespace(j).eye(6)
         motion = gram(j, solve(gram(rows, rows) + eye.astype(j.dtype), ahead[..., None]))[..., 0]
         chain = dynamics.chain
-        return compensation(coulomb, chain * motion + (1 - chain) * others, None, band)
+        return compensation(
+            coulomb,
+            chain * motion + (1 - chain) * others,
+            None,
+            band,
+        )
 
     def in_runner(self, timestep: float, compensate: str) -> OperationalSpace:
         """Return this controller for the time step [s] and the option ``compensate`` of a

@@ -52,7 +52,12 @@ def _as_dtype(x: Array, dtype: DType) -> Array:
     )  # in JAX float32 instead of float64, unless that is enabled
 
 
-def clip(x: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
+def clip(
+    x: Array,
+    low: Array,
+    high: Array,
+    xp: ArrayModule,
+) -> Array:
     """Return x within [low, high], either of which may be None; NaN stays NaN."""
     x = x if low is None else xp.maximum(x, low)
     if high is None:
@@ -125,7 +130,11 @@ def replace_envs(state: T, fresh: T, mask: Array) -> T:
     def choose(new: Array, old: Array) -> Array:
         if old is None:
             return None
-        return xp.where(chosen.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+        return xp.where(
+            chosen.reshape(-1, *[1] * (old.ndim - 1)),
+            new,
+            old,
+        )
 
     return type(state)(*map(choose, fresh, state))
 
@@ -139,7 +148,12 @@ def wrap(angle: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:
     return angle - TURN * xp.rint(angle * turns_per_rad)
 
 
-def nearest_turn(angle: Array, near: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:
+def nearest_turn(
+    angle: Array,
+    near: Array,
+    turns_per_rad: Array,
+    xp: ArrayModule,
+) -> Array:
     """Return ``angle`` plus the whole turns that bring it within half a turn of ``near``; other
     arguments as in :func:`wrap`.
     """

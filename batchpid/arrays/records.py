@@ -203,7 +203,13 @@ class LeafBuilder:
         """Return the leaves of all ``fields``."""
         return {name: self.option(name, values.get(name), field) for name, field in fields.items()}
 
-    def limits(self, size: str, low: str, high: str, values: Mapping[str, Array]) -> Ends:
+    def limits(
+        self,
+        size: str,
+        low: str,
+        high: str,
+        values: Mapping[str, Array],
+    ) -> Ends:
         """Return the leaves of a lower and an upper limit, each None where it is infinite
         everywhere.
 

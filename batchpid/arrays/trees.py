@@ -54,7 +54,10 @@ def filled(tree: Pytree, given: Iterator[Pytree]) -> Pytree:
 
 
 def flatten(
-    tree: Pytree, separator: str = "/", read: Callable[[Pytree], Array] = np.asarray, name: str = ""
+    tree: Pytree,
+    separator: str = "/",
+    read: Callable[[Pytree], Array] = np.asarray,
+    name: str = "",
 ) -> Document:
     """Return all values in a tree by name, converted to arrays by ``read``.
 
@@ -73,7 +76,10 @@ def flatten(
 
 
 def unflatten(
-    like: Pytree, named: Mapping[str, Array], separator: str = "/", name: str = ""
+    like: Pytree,
+    named: Mapping[str, Array],
+    separator: str = "/",
+    name: str = "",
 ) -> Pytree:
     """Return a tree with the structure of ``like`` from the arrays that :func:`flatten`
     returned.

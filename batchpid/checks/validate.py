@@ -26,7 +26,12 @@ LONGEST_STEP = 1.0
 AxisKind = Literal["joint", "entry"]
 
 
-def integer(argument: str, value: object, low: int, high: int) -> int:
+def integer(
+    argument: str,
+    value: object,
+    low: int,
+    high: int,
+) -> int:
     """Return ``value`` as an int within [low, high]."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise InvalidArgumentError(
@@ -39,7 +44,13 @@ def integer(argument: str, value: object, low: int, high: int) -> int:
     return int(value)
 
 
-def number(argument: str, value: object, low: float, high: float, unit: str) -> float:
+def number(
+    argument: str,
+    value: object,
+    low: float,
+    high: float,
+    unit: str,
+) -> float:
     """Return ``value`` as a finite float within [low, high]; an infinite bound does not limit."""
     value = _scalar(argument, value, unit)
     if not low <= value <= high or math.isinf(value):  # NaN is in no range
@@ -102,7 +113,12 @@ def flag(argument: str, value: object) -> bool:
     return bool(value)
 
 
-def instance(argument: str, value: object, kind: type[T], remedy: str) -> T:
+def instance(
+    argument: str,
+    value: object,
+    kind: type[T],
+    remedy: str,
+) -> T:
     """Return ``value`` if it is a ``kind``."""
     if not isinstance(value, kind):
         problem = f"must be of type {kind.__name__}"
@@ -154,7 +170,11 @@ def is_traced(value: object) -> bool:
 
 
 def read_array(
-    argument: str, value: ArrayLike, kinds: str = "iuf", *, traced: bool = False
+    argument: str,
+    value: ArrayLike,
+    kinds: str = "iuf",
+    *,
+    traced: bool = False,
 ) -> NDArray[Any]:
     """Return ``value`` as an array, of any shape, of a dtype whose kind is one of ``kinds``.
 
@@ -297,7 +317,10 @@ def at_least(
 
 
 def within(
-    argument: str, rows: NDArray[np.float64], far: float, joint_names: Sequence[str]
+    argument: str,
+    rows: NDArray[np.float64],
+    far: float,
+    joint_names: Sequence[str],
 ) -> NDArray[np.float64]:
     """Return ``rows`` (..., envs, dof) if no entry is beyond +-``far``; NaN passes."""
     near = ~(np.abs(rows) > far)

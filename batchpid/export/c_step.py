@@ -104,7 +104,11 @@ class Dialect(NamedTuple):
 
 
 def statements(
-    c: Dialect, traced: Trace, names: list[str], constants: int, places: list[str]
+    c: Dialect,
+    traced: Trace,
+    names: list[str],
+    constants: int,
+    places: list[str],
 ) -> str:
     """Return the statements of a step: loops over the joints, with the operations across joints
     between them.

@@ -48,7 +48,11 @@ class Differences(list[str]):
     """
 
     def __init__(
-        self, params: PIDParams, joint_names: Sequence[str], dt: float, inertia: ArrayLike | None
+        self,
+        params: PIDParams,
+        joint_names: Sequence[str],
+        dt: float,
+        inertia: ArrayLike | None,
     ) -> None:
         super().__init__()
         check_one_env(params)
@@ -129,7 +133,13 @@ class Differences(list[str]):
                 figures = f"; here {self.listed(values, where)} {unit}".rstrip()
             self.append(f"{option}: {problem}{figures}")
 
-    def lack(self, option: str, problem: str, off: float, unit: str = "") -> None:
+    def lack(
+        self,
+        option: str,
+        problem: str,
+        off: float,
+        unit: str = "",
+    ) -> None:
         """Add an option that the target lacks, where it is on."""
         values = self.value(option, off)
         self.add(option, problem, values != off, values, unit)

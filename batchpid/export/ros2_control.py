@@ -81,7 +81,11 @@ def to_ros2_control(
     _compare(law)
     _compare_anti_windup(law)
     text = f"the update rate is a whole number: {rate} Hz instead of {1 / law.dt:.6g} Hz"
-    law.add("dt", text, not math.isclose(rate * law.dt, 1.0, rel_tol=1e-9))
+    law.add(
+        "dt",
+        text,
+        not math.isclose(rate * law.dt, 1.0, rel_tol=1e-9),
+    )
     body = {
         "joints": law.joints,
         "command_interfaces": ["effort"],

@@ -9,7 +9,11 @@ from batchpid.law.params import PIDParams, make_params
 
 
 def tutorial(
-    joints: int, kp: Array = 0.0, ki: Array = 0.0, kd: Array = 0.0, **options: Any
+    joints: int,
+    kp: Array = 0.0,
+    ki: Array = 0.0,
+    kd: Array = 0.0,
+    **options: Any,
 ) -> PIDParams:
     """Return params of SimplePID of SAPIEN's tutorial "Drive Robot with PID Controller", for
     ``joints`` joints.

@@ -141,7 +141,12 @@ def stability_bound(
     return StabilityBound(ratio=0.5 * values[..., -1], participation=vectors[..., -1] ** 2)
 
 
-def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) -> StabilityBound:
+def _late_bound(
+    m: Float64,
+    unit: Float64,
+    columns: list[Float64],
+    dt: float,
+) -> StabilityBound:
     """Return the bound of loops whose efforts are late; ``columns`` are as in :func:`_loop`, each
     (..., joints).
     """
@@ -163,7 +168,13 @@ def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) ->
     return StabilityBound(ratio, participation)
 
 
-def _loop(z: Rows, m: Float64, unit: Float64, columns: list[Float64], dt: float) -> Rows:
+def _loop(
+    z: Rows,
+    m: Float64,
+    unit: Float64,
+    columns: list[Float64],
+    dt: float,
+) -> Rows:
     """Return L (frequencies, joints, joints) of one loop at the points ``z`` (frequencies,) of the
     unit circle.
 
@@ -203,7 +214,11 @@ def _crossing(z: Rows, values: Rows) -> tuple[float, int]:
     falls = (now.real < 0) & (then.real < 0) & (now.imag < 0) & (then.imag >= 0)
     # Between two frequencies the loci are straight.
     share = now.imag / np.where(falls, now.imag - then.imag, 1.0)
-    crossed = np.where(falls, -now.real - share * (then.real - now.real), 0.0)
+    crossed = np.where(
+        falls,
+        -now.real - share * (then.real - now.real),
+        0.0,
+    )
     return float(crossed.max()), int(crossed.max(1).argmax())
 
 

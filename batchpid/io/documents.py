@@ -205,7 +205,13 @@ class RecordFile(Generic[R]):
                 self.check_option(source, joint, name, value)
         return joints
 
-    def check_option(self, source: str, joint: str, name: str, value: object) -> None:
+    def check_option(
+        self,
+        source: str,
+        joint: str,
+        name: str,
+        value: object,
+    ) -> None:
         """Raise InvalidArgumentError for an unknown option, or a value of a wrong type."""
         if name not in self.fields:
             remedy = f"use one of {', '.join(self.fields)}"
@@ -219,7 +225,12 @@ class RecordFile(Generic[R]):
                 raise error(source, name, problem, remedy, joint)
 
 
-def _column(source: str, name: str, field: Field, joints: Mapping[str, Document]) -> Rows:
+def _column(
+    source: str,
+    name: str,
+    field: Field,
+    joints: Mapping[str, Document],
+) -> Rows:
     """Return an option of all joints as an array (1 | envs, joints), neutral where it is left
     out.
     """
@@ -293,7 +304,11 @@ def is_number(entry: object) -> bool:
 
 
 def error(
-    source: str, key: str, problem: str, remedy: str, joint: str | None = None
+    source: str,
+    key: str,
+    problem: str,
+    remedy: str,
+    joint: str | None = None,
 ) -> InvalidArgumentError:
     """Return the error of a key of a document."""
     return InvalidArgumentError(f"{source}: {key}", problem, joint=joint, remedy=remedy)

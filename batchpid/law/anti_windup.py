@@ -68,7 +68,12 @@ def clamped(clamp: Bool, effort: Ends) -> Ends:
 
 
 def tracking_time(
-    build: LeafBuilder, value: Array, back: Bool | None, kp: Array, ki: Array, kd: Array
+    build: LeafBuilder,
+    value: Array,
+    back: Bool | None,
+    kp: Array,
+    ki: Array,
+    kd: Array,
 ) -> Array:
     """Return the leaf of back-calculation's time constant, inf where a joint is not ``back``."""
     if back is None:
@@ -96,5 +101,9 @@ def _rule_of_thumb(kp: Array, ki: Array, kd: Array) -> Array:
     # Where ki is 0 the quotient is not used, but must be finite.
     safe = xp.where(ki > 0, ki, 1.0)
     # The inner where keeps the gradient of the square root finite where kd is 0.
-    times = xp.where(kd > 0, xp.sqrt(xp.where(kd > 0, kd, 1.0) / safe), kp / safe)
+    times = xp.where(
+        kd > 0,
+        xp.sqrt(xp.where(kd > 0, kd, 1.0) / safe),
+        kp / safe,
+    )
     return xp.where(ki > 0, times, math.inf)

@@ -105,7 +105,10 @@ def check_gain_units(params: PIDParams) -> None:
 
 
 def convert_integral(
-    state: PIDState, old: PIDParams, new: PIDParams, mass_matrix: Array
+    state: PIDState,
+    old: PIDParams,
+    new: PIDParams,
+    mass_matrix: Array,
 ) -> PIDState:
     """Return ``state`` with the integral I in the unit that ``new`` has, for a bumpless change of
     gain_units.
@@ -137,7 +140,12 @@ def _unlimited(k: Coefficients) -> Coefficients:
 
 
 def _to_effort(
-    k: Coefficients, old: PIDState, new: PIDState, a: Array, mass_matrix: Array, feedforward: Array
+    k: Coefficients,
+    old: PIDState,
+    new: PIDState,
+    a: Array,
+    mass_matrix: Array,
+    feedforward: Array,
 ) -> tuple[PIDState, Array, Array]:
     """Return the state, the effort of the acceleration ``a`` within the limits of ``k``, and
     without them.
@@ -176,7 +184,12 @@ def _to_effort(
     return new, effort, unsaturated
 
 
-def _towards(effort: Array, last: Array, step: Any, xp: ArrayModule) -> Array:
+def _towards(
+    effort: Array,
+    last: Array,
+    step: Any,
+    xp: ArrayModule,
+) -> Array:
     """Return the point nearest to ``effort`` on the line from ``last`` that no joint needs more
     than ``step`` for.
     """
@@ -185,10 +198,21 @@ def _towards(effort: Array, last: Array, step: Any, xp: ArrayModule) -> Array:
     late = size > step
     part = row_minimum(xp.where(late, step / xp.where(late, size, 1.0), 1.0))
     # Within the limit in spite of rounding, and exactly the effort where nothing is late.
-    return clip(xp.where(part < 1, last + part * change, effort), last - step, last + step, xp)
+    return clip(
+        xp.where(part < 1, last + part * change, effort),
+        last - step,
+        last + step,
+        xp,
+    )
 
 
-def _share(demand: Array, passive: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
+def _share(
+    demand: Array,
+    passive: Array,
+    low: Array,
+    high: Array,
+    xp: ArrayModule,
+) -> Array:
     """Return s (envs, 1): the share of ``demand`` that fits between ``passive`` and the limits."""
     above = xp.inf if high is None else high - passive
     below = xp.inf if low is None else passive - low

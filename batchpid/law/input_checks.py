@@ -32,7 +32,10 @@ for off.
 
 
 def checked_inputs(
-    params: PIDParams, state: PIDState, measurement: Array, **inputs: Array
+    params: PIDParams,
+    state: PIDState,
+    measurement: Array,
+    **inputs: Array,
 ) -> list[Array]:
     """Return ``measurement`` and ``inputs`` as arrays in the params' dtype that broadcast with
     params and state.

@@ -307,7 +307,12 @@ def reset(
     return replace_envs(state, fresh, mask)
 
 
-def wrapped_error(k: Coefficients, r: Array, y: Array, xp: ArrayModule) -> Array:
+def wrapped_error(
+    k: Coefficients,
+    r: Array,
+    y: Array,
+    xp: ArrayModule,
+) -> Array:
     """Return the wrapped error, less the dead zone."""
     error = wrap(r - y, k.turns, xp)
     if k.deadband is None:
@@ -324,7 +329,11 @@ def weighted_rate(k: Coefficients, r_rate: Array) -> Array:
 
 
 def origins(
-    k: Coefficients, state: PIDState, y: Array, r_rate: Array, xp: ArrayModule
+    k: Coefficients,
+    state: PIDState,
+    y: Array,
+    r_rate: Array,
+    xp: ArrayModule,
 ) -> tuple[Array, Array]:
     """Return the origins of setpoint weighting for this step and the next, moved by the whole turns
     that y jumped.
@@ -342,7 +351,12 @@ def origins(
     return (origin if k.acceleration_share is None else moved), moved
 
 
-def proportional(k: Coefficients, error: Array, y: Array, origin: Array) -> Array:
+def proportional(
+    k: Coefficients,
+    error: Array,
+    y: Array,
+    origin: Array,
+) -> Array:
     """Return kp (b e - (1 - b) (y - o)), which has no spike where y wraps."""
     return k.kp * (error if k.b is None else k.b * error - (1 - k.b) * (y - origin))
 
@@ -379,7 +393,11 @@ def drive_target(
 
 
 def advance_drive(
-    k: Coefficients, state: PIDState, setpoint: Array, measurement: Array, **inputs: Array
+    k: Coefficients,
+    state: PIDState,
+    setpoint: Array,
+    measurement: Array,
+    **inputs: Array,
 ) -> tuple[PIDState, Array]:
     """Return ``(state, target)`` with given coefficients, for loops with constant params; else as
     :func:`drive_target`.

@@ -150,7 +150,10 @@ def init(
 
 
 def discretise(
-    actuators: Actuators, state: ActuatorState, dt: Array, num_envs: int | None = None
+    actuators: Actuators,
+    state: ActuatorState,
+    dt: Array,
+    num_envs: int | None = None,
 ) -> MotorCoefficients:
     """Return the coefficients at ``dt`` [s], for :func:`advance_effort` and
     :func:`advance_measurement`.
@@ -206,7 +209,12 @@ def discretise(
 
 
 def deliver(
-    actuators: Actuators, state: ActuatorState, effort: Array, qpos: Array, qvel: Array, dt: Array
+    actuators: Actuators,
+    state: ActuatorState,
+    effort: Array,
+    qpos: Array,
+    qvel: Array,
+    dt: Array,
 ) -> tuple[ActuatorState, Array]:
     """Advance the motors by ``dt`` seconds; return ``(state, effort)``, the effort delivered [N m
     or N].
@@ -219,7 +227,11 @@ def deliver(
 
 
 def measure(
-    actuators: Actuators, state: ActuatorState, qpos: Array, qvel: Array, dt: Array
+    actuators: Actuators,
+    state: ActuatorState,
+    qpos: Array,
+    qvel: Array,
+    dt: Array,
 ) -> tuple[ActuatorState, Array, Array]:
     """Advance the sensors by ``dt`` seconds; return ``(state, qpos, qvel)`` as measured (envs,
     joints).
@@ -240,7 +252,11 @@ def _motor(k: MotorCoefficients, effort: Array) -> Array:
 
 
 def _delivered(
-    k: MotorCoefficients, behind: Array, effort: Array, qpos: Array, qvel: Array
+    k: MotorCoefficients,
+    behind: Array,
+    effort: Array,
+    qpos: Array,
+    qvel: Array,
 ) -> Array:
     """Return s u + b within the envelope, after the lag; ``behind`` is the effort of the step
     before, None without.
@@ -265,7 +281,12 @@ def command_limits(k: MotorCoefficients, qvel: Array) -> tuple[Array, Array]:
     return limits(k.commands, qvel)
 
 
-def _play(k: MotorCoefficients, encoder: Array, qpos: Array, qvel: Array) -> tuple[Array, Array]:
+def _play(
+    k: MotorCoefficients,
+    encoder: Array,
+    qpos: Array,
+    qvel: Array,
+) -> tuple[Array, Array]:
     """Return position and velocity behind the backlash; ``encoder`` is the position of the step
     before.
     """
@@ -277,7 +298,11 @@ def _play(k: MotorCoefficients, encoder: Array, qpos: Array, qvel: Array) -> tup
 
 
 def _encode(
-    k: MotorCoefficients, qpos: Array, qvel: Array, position: Array, velocity: Array
+    k: MotorCoefficients,
+    qpos: Array,
+    qvel: Array,
+    position: Array,
+    velocity: Array,
 ) -> tuple[Array, Array]:
     """Return position and velocity as encoded: with offset and noise, in steps of the resolution.
 
@@ -347,7 +372,11 @@ def advance_measurement(
 
 
 def measurement_noise(
-    k: MotorCoefficients, key: Array, step: Array, like: Array, xp: ArrayModule
+    k: MotorCoefficients,
+    key: Array,
+    step: Array,
+    like: Array,
+    xp: ArrayModule,
 ) -> tuple[Array, Array]:
     """Return the noise of positions and of velocities (..., envs, joints) at ``step`` (..., envs);
     None for none.

@@ -190,7 +190,11 @@ class Coupling(NamedTuple):
         is the same.
         """
         xp = namespace(matrix)
-        rows = xp.swapaxes(self.efforts(xp.swapaxes(matrix, -1, -2)), -1, -2)
+        rows = xp.swapaxes(
+            self.efforts(xp.swapaxes(matrix, -1, -2)),
+            -1,
+            -2,
+        )
         return self.efforts(rows) + xp.diag(
             xp.where(self.independent, 0.0, 1.0).astype(matrix.dtype)
         )

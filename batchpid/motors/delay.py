@@ -52,7 +52,12 @@ def samples_of(longest: Array, dt: float) -> int:
     return count
 
 
-def discretise(delay: Array, dt: Array, history: Array, begin: int = 0) -> Delay:
+def discretise(
+    delay: Array,
+    dt: Array,
+    history: Array,
+    begin: int = 0,
+) -> Delay:
     """Return ``delay`` (1 | envs, joints) [s] in samples of ``dt`` [s], at most the length of
     ``history`` (envs, samples, numbers).
 
@@ -81,7 +86,12 @@ def start(value: Array, samples: int) -> Array:
     return xp.broadcast_to(value[:, None], (value.shape[0], samples, value.shape[1])).copy()
 
 
-def read(history: Array, k: Delay, turns: Array, xp: ArrayModule) -> Array:
+def read(
+    history: Array,
+    k: Delay,
+    turns: Array,
+    xp: ArrayModule,
+) -> Array:
     """Return the delayed value (envs, joints); ``turns`` is 1 / (2 pi) where it is an angle, 0
     elsewhere, or None.
     """

@@ -171,13 +171,20 @@ def refresh(
     # Coupled joints share the gain, by Gershgorin: see above.
     correlation = xp.abs(inverse) / (scale[:, :, None] * scale[:, None, :])
     shared = (correlation * rubs.astype(correlation.dtype)[:, None, :]).sum(-1)
-    k = xp.where(rubs, SHARE / (dt * mobility * xp.where(rubs, shared, 1.0)), 0.0)
+    k = xp.where(
+        rubs,
+        SHARE / (dt * mobility * xp.where(rubs, shared, 1.0)),
+        0.0,
+    )
     w = 1 - dt * implicit * mobility
     return state._replace(gain=k * (1 + w - dt**2 * stiffness * mobility), memory=k * w)
 
 
 def advance(
-    friction: Friction, state: FrictionState, effort: Array, velocity: Array
+    friction: Friction,
+    state: FrictionState,
+    effort: Array,
+    velocity: Array,
 ) -> tuple[FrictionState, Array]:
     """Advance the model by one step; return the state and the effort to apply (envs, joints) [N m
     or N].
@@ -200,7 +207,12 @@ def advance(
     return state, total
 
 
-def bound_of(friction: Friction, sliding: Array, effort: Array, velocity: Array) -> Array:
+def bound_of(
+    friction: Friction,
+    sliding: Array,
+    effort: Array,
+    velocity: Array,
+) -> Array:
     """Return the largest friction other than viscous (envs, joints) [N m or N] under the motors'
     ``effort``.
 
@@ -220,7 +232,12 @@ def bound_of(friction: Friction, sliding: Array, effort: Array, velocity: Array)
     return bound
 
 
-def compensation(coulomb: Array, error: Array, rate: Array, band: Array) -> Array:
+def compensation(
+    coulomb: Array,
+    error: Array,
+    rate: Array,
+    band: Array,
+) -> Array:
     """Return the feedforward that cancels friction on the way to r: F times (e + LOOKAHEAD r') /
     band in [-1, 1].
 

@@ -117,7 +117,10 @@ def init(guard: Guard, qpos: Array) -> GuardState:
 
 
 def advance(
-    guard: Guard, state: GuardState, setpoint: Array, dt: float
+    guard: Guard,
+    state: GuardState,
+    setpoint: Array,
+    dt: float,
 ) -> tuple[GuardState, Array]:
     """Advance the guard by ``dt`` [s]; return the state, with the guarded ``setpoint``, and a mask
     of the changes.
@@ -145,7 +148,12 @@ def advance(
     return GuardState(guarded, rate), guarded != setpoint
 
 
-def _stop(acceleration: Array, distance: Array, dt: float, xp: ArrayModule) -> Array:
+def _stop(
+    acceleration: Array,
+    distance: Array,
+    dt: float,
+    xp: ArrayModule,
+) -> Array:
     """Return the largest rate that stops within ``distance``."""
     finite = xp.isfinite(acceleration)
     a = xp.where(finite, acceleration, 1.0)

@@ -36,7 +36,12 @@ def quantiles(dtype: DType) -> Rows:
     return table
 
 
-def pcg4d(x: Array, y: Array, z: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+def pcg4d(
+    x: Array,
+    y: Array,
+    z: Array,
+    w: Array,
+) -> tuple[Array, Array, Array, Array]:
     """Return four hashed words of uint32 arrays that broadcast against each other."""
     x, y, z, w = (word * _FACTOR + _SUMMAND for word in (x, y, z, w))
     for is_last in (False, True):
@@ -49,7 +54,12 @@ def pcg4d(x: Array, y: Array, z: Array, w: Array) -> tuple[Array, Array, Array, 
     return x, y, z, w
 
 
-def keys(seed: Array, envs: Array, episode: Array, xp: ArrayModule) -> Array:
+def keys(
+    seed: Array,
+    envs: Array,
+    episode: Array,
+    xp: ArrayModule,
+) -> Array:
     """Return the key of each env's noise (envs, 2) uint32, from a ``seed`` (1, 2) uint32 and
     numbers (envs,).
     """
@@ -58,7 +68,11 @@ def keys(seed: Array, envs: Array, episode: Array, xp: ArrayModule) -> Array:
 
 
 def normals(
-    key: Array, step: Array, joints: int, dtype: DType, xp: ArrayModule
+    key: Array,
+    step: Array,
+    joints: int,
+    dtype: DType,
+    xp: ArrayModule,
 ) -> tuple[Array, Array]:
     """Return two independent standard normal numbers for each step, env and joint.
 
@@ -66,5 +80,10 @@ def normals(
     """
     joint = xp.arange(joints, dtype=xp.uint32)[None]
     table = xp.asarray(quantiles(np.dtype(dtype)))
-    first, second, *_ = pcg4d(key[:, :1], key[:, 1:], step[..., None], joint)
+    first, second, *_ = pcg4d(
+        key[:, :1],
+        key[:, 1:],
+        step[..., None],
+        joint,
+    )
     return table.take(first >> _HALF), table.take(second >> _HALF)

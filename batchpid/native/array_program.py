@@ -114,7 +114,11 @@ class ArrayProgram:
         return out
 
     def bind(
-        self, inputs: Sequence[Rows], outputs: Sequence[Rows], given: int, full: int
+        self,
+        inputs: Sequence[Rows],
+        outputs: Sequence[Rows],
+        given: int,
+        full: int,
     ) -> Callable[..., Rows]:
         """Return a fast function with the first inputs, and all outputs but the last, fixed to
         these arrays.

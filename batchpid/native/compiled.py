@@ -42,7 +42,13 @@ class CompiledLaw:
     dtype.
     """
 
-    def __init__(self, k: Coefficients, num_envs: int, terms: bool, threads: int | None) -> None:
+    def __init__(
+        self,
+        k: Coefficients,
+        num_envs: int,
+        terms: bool,
+        threads: int | None,
+    ) -> None:
         self._k = k
         self._terms = terms
         self._threads = threads

@@ -34,7 +34,10 @@ class Trace(NamedTuple):
 
 
 def trace(
-    function: Callable[..., Iterable[Array]], constants: int, inputs: int, dtype: DType = np.float64
+    function: Callable[..., Iterable[Array]],
+    constants: int,
+    inputs: int,
+    dtype: DType = np.float64,
 ) -> Trace:
     """Return the trace of a function with this number of ``constants`` and ``inputs``, which
     returns a list of arrays.

@@ -279,7 +279,11 @@ def _cross_matrix(vector: Float64) -> Float64:
     """Return C (..., 3, 3) with C a = c x a for vectors c (..., 3)."""
     x, y, z = np.moveaxis(vector, -1, 0)
     zero = np.zeros_like(x)
-    return np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), (0, 1), (-2, -1))
+    return np.moveaxis(
+        np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]),
+        (0, 1),
+        (-2, -1),
+    )
 
 
 def total(parts: Sequence[SpatialInertia]) -> SpatialInertia:

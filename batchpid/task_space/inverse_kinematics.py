@@ -151,7 +151,14 @@ def inverse_kinematics(
                 number[left[nearer]] = first + 1 + at
     success = search.reached(best)
     steps = best.steps[:, 0].astype(np.intp)
-    result = IKResult(best.qpos, best.errors[:, 0], best.errors[:, 1], success, number, steps)
+    result = IKResult(
+        best.qpos,
+        best.errors[:, 0],
+        best.errors[:, 1],
+        success,
+        number,
+        steps,
+    )
     if on_failure != "return" and not success.all():
         _report(result, on_failure)
     return result
@@ -221,7 +228,11 @@ class _Search(NamedTuple):
             return _Found(*native)
         # The same search in NumPy: the definition of the native one.
         count = len(goal)
-        best = _Found(qpos.copy(), np.full((count, 2), np.inf), np.zeros((count, 1)))
+        best = _Found(
+            qpos.copy(),
+            np.full((count, 2), np.inf),
+            np.zeros((count, 1)),
+        )
         # Rows that have arrived leave, so the others pay for themselves alone.
         going = np.arange(count)
         q = qpos
@@ -240,7 +251,13 @@ class _Search(NamedTuple):
                 break
         return best
 
-    def _stepped(self, motions: Motions, place: Float64, qpos: Float64, error: Float64) -> Float64:
+    def _stepped(
+        self,
+        motions: Motions,
+        place: Float64,
+        qpos: Float64,
+        error: Float64,
+    ) -> Float64:
         """Return the positions (n, dof) after a step within the limits, of a tool at ``place`` (n, 3)."""
         tree = self.tree
         jacobian = jacobian_at(tree, tree.bodies, motions, self.link, place)

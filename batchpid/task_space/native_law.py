@@ -81,7 +81,11 @@ def law(
 
 
 def _of_tree(
-    native: Any, tree: RigidTree, link: str, point: Array, k: OSCCoefficients
+    native: Any,
+    tree: RigidTree,
+    link: str,
+    point: Array,
+    k: OSCCoefficients,
 ) -> tuple[tuple[Any, ...], Float64]:
     """Return the arguments of ``law`` and ``bind`` between sizes and arrays, and the chain to the
     tool (dof,).

@@ -85,7 +85,11 @@ def kinematics(
 
 
 def bound(
-    tree: RigidTree, wanted: tuple[str, ...], qpos: Float64, qvel: Float64, index: int
+    tree: RigidTree,
+    wanted: tuple[str, ...],
+    qpos: Float64,
+    qvel: Float64,
+    index: int,
 ) -> tuple[Callable[[], None], tuple[Float64, ...]] | None:
     """Return a function that computes the results of :func:`kinematics`, on a fixed base, and their
     arrays.
@@ -101,7 +105,12 @@ def bound(
 
 
 def _arguments(
-    native: Any, tree: RigidTree, outputs: dict[str, Float64], inputs: Any, index: int, point: Array
+    native: Any,
+    tree: RigidTree,
+    outputs: dict[str, Float64],
+    inputs: Any,
+    index: int,
+    point: Array,
 ) -> list[Any]:
     """Return the arguments of ``kinematics`` in task_space.cpp."""
     rows = len(inputs[0])

@@ -89,7 +89,12 @@ def init(params: OSCParams, qpos: Array) -> OSCState:
     return OSCState(posture, integral)
 
 
-def reset(params: OSCParams, state: OSCState, qpos: Array, mask: Array) -> OSCState:
+def reset(
+    params: OSCParams,
+    state: OSCState,
+    qpos: Array,
+    mask: Array,
+) -> OSCState:
     """Return the state with the envs of ``mask`` (envs,) bool restarted at ``qpos`` (envs, dof)."""
     xp = namespace(*state, qpos, mask)
     fresh = init(params, qpos)
@@ -194,7 +199,11 @@ def in_frame(k: OSCCoefficients, d: TaskDynamics, inputs: OSCInputs) -> Task:
     limits = (k.position_error_limit, k.rotation_error_limit)
     near = [
         _shortened(part, limit, xp)
-        for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)
+        for part, limit in zip(
+            (error[..., :3], error[..., 3:]),
+            limits,
+            strict=True,
+        )
     ]
     vectors: tuple[Array, ...] = (
         error,
@@ -220,7 +229,12 @@ def task_acceleration(k: OSCCoefficients, task: Task) -> Array:
     return a + k.acceleration_share * task.acceleration
 
 
-def _integrated(k: OSCCoefficients, integral: Array, task: Task, held: Array) -> Array:
+def _integrated(
+    k: OSCCoefficients,
+    integral: Array,
+    task: Task,
+    held: Array,
+) -> Array:
     """Return the integral after the step; it stays where it is ``held`` (envs, 6)."""
     xp = namespace(integral, task.near)
     new = integral + k.ki_dt * task.near
@@ -237,7 +251,11 @@ def _shortened(vector: Array, limit: Array, xp: ArrayModule) -> Array:
 
 
 def posture_acceleration(
-    k: OSCCoefficients, d: TaskDynamics, posture: Array, q: Array, v: Array
+    k: OSCCoefficients,
+    d: TaskDynamics,
+    posture: Array,
+    q: Array,
+    v: Array,
 ) -> tuple[Array, Array]:
     """Return a_n and its part a_s (envs, dof)."""
     xp = namespace(posture, q, v)
@@ -276,5 +294,10 @@ def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
     s1 = share(task, base)
     s2 = share(null, base + s1 * task)
     others = s1 * p.task_of_others + s2 * p.posture_of_others
-    effort = clip(base + s1 * task + s2 * null + others, low, high, xp)
+    effort = clip(
+        base + s1 * task + s2 * null + others,
+        low,
+        high,
+        xp,
+    )
     return effort, base + task + null + others, s1, s2

@@ -120,7 +120,11 @@ class OSCParams(Record, _OSCParamsFields):
 
 @with_fields(*FIELDS)
 def make_osc_params(
-    tree: RigidTree, *, frame: str = "world", discretization: str = "explicit", **options: ArrayLike
+    tree: RigidTree,
+    *,
+    frame: str = "world",
+    discretization: str = "explicit",
+    **options: ArrayLike,
 ) -> OSCParams:
     """Build validated :class:`OSCParams` for a tool of ``tree``.
 

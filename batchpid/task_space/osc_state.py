@@ -108,7 +108,13 @@ class OSCTerms(NamedTuple):
 
 
 def task_dynamics(
-    tree: RigidTree, qpos: Array, qvel: Array, link: str, *, point: Array = None, bias: Array = None
+    tree: RigidTree,
+    qpos: Array,
+    qvel: Array,
+    link: str,
+    *,
+    point: Array = None,
+    bias: Array = None,
 ) -> TaskDynamics:
     """Return the dynamics of ``tree`` with a tool: a ``point`` (3,) [m] of ``link``, default its
     origin.

@@ -109,7 +109,11 @@ def _inertias(
 
 
 def _selected_inverse(
-    mobility: Array, axes: Any, xp: ArrayModule, smallest: Array, *smooth: Array
+    mobility: Array,
+    axes: Any,
+    xp: ArrayModule,
+    smallest: Array,
+    *smooth: Array,
 ) -> tuple[Array, ...]:
     """Return S^T (S A S^T)^-1 S, for each bound, with the selected ``axes`` (1 | envs, 6), and
     where it is bounded.

@@ -414,7 +414,11 @@ class RigidTree:
             rows[:, body] = inertia_rows(spatial_matrix(nominal) + matrices)
         mass = rows[..., :1]
         center = rows[..., 1:4]
-        tensor = rows[..., 4:].reshape(*rows.shape[:-1], 3, 3)
+        tensor = rows[..., 4:].reshape(
+            *rows.shape[:-1],
+            3,
+            3,
+        )
         return self.bodies._replace(
             mass=mass[:, :-1],
             center=center[:, :-1],
@@ -453,7 +457,12 @@ def _along_x(axis: Float64) -> Float64:
     return np.column_stack([axis, across, np.cross(axis, across)])
 
 
-def _array(name: str, value: ArrayLike, rows: Sequence[str], *columns: int) -> Float64:
+def _array(
+    name: str,
+    value: ArrayLike,
+    rows: Sequence[str],
+    *columns: int,
+) -> Float64:
     """Return a copy of ``value`` (rows, columns) as float64, finite."""
     table = np.array(read_array(name, value), np.float64)
     shape = len(rows), *columns

@@ -38,7 +38,11 @@ def whitened(matrix: Array, right: Array) -> Array:
     # substitution, without pivots.
     sane: Array = np.where(positive, factor, _identity(matrix))
     reverse = sane[..., ::-1, ::-1]
-    return np.where(positive, np.linalg.solve(reverse, right[..., ::-1, :])[..., ::-1, :], np.nan)
+    return np.where(
+        positive,
+        np.linalg.solve(reverse, right[..., ::-1, :])[..., ::-1, :],
+        np.nan,
+    )
 
 
 def _cholesky(matrix: Array) -> Array:
@@ -102,7 +106,11 @@ def bounded_inverse(matrix: Array, smallest: Array, *smooth: Array) -> tuple[Arr
 
         def inverse_with(bound: Array, below: Array) -> Array:
             large = values >= bound
-            scale = xp.where(large, 1 / xp.where(large, values, 1.0), below / (bound * bound))
+            scale = xp.where(
+                large,
+                1 / xp.where(large, values, 1.0),
+                below / (bound * bound),
+            )
             return gram(rows * scale[..., None], rows)
 
         inverses = [inverse_with(s0, positive)]

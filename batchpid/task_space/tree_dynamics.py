@@ -73,7 +73,12 @@ class _Composite(NamedTuple):
     """Linear and angular (..., dof, 6)."""
 
 
-def _composite(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayModule) -> _Composite:
+def _composite(
+    tree: RigidTree,
+    bodies: Bodies,
+    motions: Motions,
+    xp: ArrayModule,
+) -> _Composite:
     turn = motions.frames[..., :3]
     center = rotate(turn, bodies.center) + motions.frames[..., 3]
     moment = bodies.mass * center
@@ -98,7 +103,12 @@ def _about_origin(moment: Array, center: Array, xp: ArrayModule) -> Array:
     return square - moment[..., :, None] * center[..., None, :]
 
 
-def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: ArrayModule) -> Array:
+def _of_base(
+    tree: RigidTree,
+    bodies: Bodies,
+    all_: _Composite,
+    xp: ArrayModule,
+) -> Array:
     """Return M_bb (..., 6, 6), linear parts first: the momenta of the whole robot under the motions
     of its base.
     """
@@ -121,14 +131,23 @@ def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: ArrayModule)
     return xp.concatenate([upper, xp.concatenate([crossed, tensor + zero], axis=-1)], axis=-2)
 
 
-def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayModule) -> Array:
+def mass_matrix_of(
+    tree: RigidTree,
+    bodies: Bodies,
+    motions: Motions,
+    xp: ArrayModule,
+) -> Array:
     """Return the mass matrices (..., dof, dof) at given motions of the joints."""
     all_ = _composite(tree, bodies, motions, xp)
     s = xp.concatenate([motions.linear, motions.angular], axis=-1)
     table = (s[..., :, None, :] * all_.momenta[..., None, :, :]).sum(-1)
     above = xp.swapaxes(bodies.moves, 0, 1) > 0
     # Only entries of joints on one branch differ from 0: one of them moves the other.
-    rest = xp.where(bodies.moves > 0, xp.swapaxes(table, -1, -2), xp.zeros_like(table))
+    rest = xp.where(
+        bodies.moves > 0,
+        xp.swapaxes(table, -1, -2),
+        xp.zeros_like(table),
+    )
     matrix = xp.where(above, table, rest)
     if not tree.fixed_base:
         # The free base yields to each joint's momentum.
@@ -163,7 +182,11 @@ def effort_of(
     # A free base falls with its joints: gravity cancels there.
     force = bodies.mass * (acceleration - bodies.gravity if tree.fixed_base else acceleration)
     spin = rotate(tensor, rates.angular_rate) + cross(w, rotate(tensor, w))
-    wrench = from_tips(tree, xp.concatenate([force, spin + cross(center, force)], axis=-1), xp)
+    wrench = from_tips(
+        tree,
+        xp.concatenate([force, spin + cross(center, force)], axis=-1),
+        xp,
+    )
     effort = (xp.concatenate([motions.linear, motions.angular], axis=-1) * wrench).sum(-1)
     if not tree.fixed_base:
         all_ = _composite(tree, bodies, motions, xp)

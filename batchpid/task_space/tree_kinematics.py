@@ -94,7 +94,12 @@ def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Array], Bodies, Arr
     )
 
 
-def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModule) -> Array:
+def frames_of_bodies(
+    tree: RigidTree,
+    bodies: Bodies,
+    qpos: Array,
+    xp: ArrayModule,
+) -> Array:
     """Return the frames (..., dof, 3, 4) of the bodies in the world."""
     with quiet():
         # Rodrigues' formula with the placement multiplied in: four constant matrices a joint.
@@ -112,16 +117,29 @@ def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModu
         return xp.stack(frames, axis=-3)
 
 
-def motions_of(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModule) -> Motions:
+def motions_of(
+    tree: RigidTree,
+    bodies: Bodies,
+    qpos: Array,
+    xp: ArrayModule,
+) -> Motions:
     """Return the frames of the bodies and the motions of the joints."""
     frames = frames_of_bodies(tree, bodies, qpos, xp)
     axis = frames[..., 0]
     turning = axis * (1 - bodies.slides)
-    return Motions(frames, cross(frames[..., 3], turning) + axis * bodies.slides, turning)
+    return Motions(
+        frames,
+        cross(frames[..., 3], turning) + axis * bodies.slides,
+        turning,
+    )
 
 
 def velocities_of(
-    tree: RigidTree, motions: Motions, qvel: Array, xp: ArrayModule, turning: Array = None
+    tree: RigidTree,
+    motions: Motions,
+    qvel: Array,
+    xp: ArrayModule,
+    turning: Array = None,
 ) -> Velocities:
     """Return the velocities of the bodies, and their accelerations at q'' = 0, on a base that turns
     at ``turning``.
@@ -158,7 +176,13 @@ def from_tips(tree: RigidTree, parts: Array, xp: ArrayModule) -> Array:
     return xp.stack(sums, axis=-2)
 
 
-def tool_frame(tree: RigidTree, bodies: Bodies, frames: Array, index: int, point: Array) -> Array:
+def tool_frame(
+    tree: RigidTree,
+    bodies: Bodies,
+    frames: Array,
+    index: int,
+    point: Array,
+) -> Array:
     """Return the frame (..., 3, 4) of a link, from the frames of the bodies, with its origin at
     ``point`` (..., 3) of the link.
     """
@@ -196,7 +220,11 @@ def read_point(like: Array, point: Array) -> Array:
 
 
 def jacobian_at(
-    tree: RigidTree, bodies: Bodies, motions: Motions, index: int, place: Array
+    tree: RigidTree,
+    bodies: Bodies,
+    motions: Motions,
+    index: int,
+    place: Array,
 ) -> Array:
     """Return the Jacobian (..., 6, dof) of a link's point at ``place`` (..., 3) in the world, J G
     of coupled joints.
@@ -209,10 +237,21 @@ def jacobian_at(
         moved = bodies.moves[body][:, None] > 0
     else:
         moved = xp.asarray(False)
-    return tree.efforts(xp.moveaxis(xp.where(moved, columns, xp.zeros_like(columns)), -1, -2))
+    return tree.efforts(
+        xp.moveaxis(
+            xp.where(moved, columns, xp.zeros_like(columns)),
+            -1,
+            -2,
+        )
+    )
 
 
-def rate_at(tree: RigidTree, velocities: Velocities, index: int, place: Array) -> Array:
+def rate_at(
+    tree: RigidTree,
+    velocities: Velocities,
+    index: int,
+    place: Array,
+) -> Array:
     """Return J' q' (..., 6) of a link's point at ``place`` (..., 3) in the world."""
     xp = namespace(place)
     body = tree.link_bodies[index]

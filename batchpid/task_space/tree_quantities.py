@@ -79,7 +79,11 @@ def evaluated(
 
 
 def link_poses(
-    tree: RigidTree, qpos: Array, links: Sequence[str] | None = None, *, point: Array = None
+    tree: RigidTree,
+    qpos: Array,
+    links: Sequence[str] | None = None,
+    *,
+    point: Array = None,
 ) -> Array:
     """Return the poses (..., links, 7) of ``links``, by default all, at ``qpos`` (..., dof) [rad or
     m].
@@ -92,7 +96,13 @@ def link_poses(
     return namespace(*poses).stack(poses, axis=-2)
 
 
-def jacobian(tree: RigidTree, qpos: Array, link: str, *, point: Array = None) -> Array:
+def jacobian(
+    tree: RigidTree,
+    qpos: Array,
+    link: str,
+    *,
+    point: Array = None,
+) -> Array:
     """Return the Jacobian (..., 6, dof) of a point of ``link`` at ``qpos`` (..., dof), in the axes
     of the world.
 
@@ -152,7 +162,12 @@ def gravity(tree: RigidTree, qpos: Array) -> Array:
     return bias(tree, q, 0 * q)
 
 
-def inverse_dynamics(tree: RigidTree, qpos: Array, qvel: Array, qacc: Array) -> Array:
+def inverse_dynamics(
+    tree: RigidTree,
+    qpos: Array,
+    qvel: Array,
+    qacc: Array,
+) -> Array:
     """Return the efforts (..., dof) [N m or N] of the accelerations ``qacc`` (..., dof): M q'' +
     h.
     """
@@ -162,7 +177,12 @@ def inverse_dynamics(tree: RigidTree, qpos: Array, qvel: Array, qacc: Array) -> 
         return product(results["mass_matrix"], tree.coupling.of_independent(a)) + results["bias"]
 
 
-def forward_dynamics(tree: RigidTree, qpos: Array, qvel: Array, effort: Array) -> Array:
+def forward_dynamics(
+    tree: RigidTree,
+    qpos: Array,
+    qvel: Array,
+    effort: Array,
+) -> Array:
     """Return the accelerations (..., dof) [rad/s^2 or m/s^2] under ``effort`` (..., dof): M^-1 (tau
     - h).
 

@@ -265,7 +265,11 @@ def _write(name: str, result: Any, path: Path) -> None:
 
 
 def check_output(
-    argument: str, path: Path, inputs: Iterable[Path], outputs: Iterable[Path], force: bool
+    argument: str,
+    path: Path,
+    inputs: Iterable[Path],
+    outputs: Iterable[Path],
+    force: bool,
 ) -> None:
     """Check that a file may be written at ``path``.
 

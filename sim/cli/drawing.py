@@ -137,7 +137,12 @@ def view(
             page.run(time_limit)
 
 
-def _live(robot: Robot, num_envs: int, gains: str | None, options: Document) -> LiveSimulation:
+def _live(
+    robot: Robot,
+    num_envs: int,
+    gains: str | None,
+    options: Document,
+) -> LiveSimulation:
     """Return the running robots."""
     from batchpid.sim.view import LiveSimulation
 

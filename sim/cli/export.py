@@ -143,7 +143,12 @@ def _gains(robot: Robot, gains: str | None) -> bp.PIDParams:
 
 
 def _c_header(
-    robot: Robot, params: bp.PIDParams, dt: float, limits: bool, prefix: str, dynamics: bool
+    robot: Robot,
+    params: bp.PIDParams,
+    dt: float,
+    limits: bool,
+    prefix: str,
+    dynamics: bool,
 ) -> Exported:
     """Return the C header."""
     from batchpid.export import to_c
@@ -160,7 +165,11 @@ def _c_header(
 
 
 def _controllers(
-    robot: Robot, params: bp.PIDParams, dt: float, limits: bool, name: str
+    robot: Robot,
+    params: bp.PIDParams,
+    dt: float,
+    limits: bool,
+    name: str,
 ) -> Exported:
     """Return the file of controllers for ros2_control."""
     from batchpid.export import to_ros2_control
@@ -188,7 +197,12 @@ def _with_followers(robot: Robot, exported: Exported, place: str) -> Exported:
     return exported._replace(differences=(*exported.differences, text))
 
 
-def _mjcf(robot: Robot, params: bp.PIDParams | None, dt: float, limits: bool) -> Exported:
+def _mjcf(
+    robot: Robot,
+    params: bp.PIDParams | None,
+    dt: float,
+    limits: bool,
+) -> Exported:
     """Return the MJCF of the robot with its motors."""
     from batchpid.sim.engine.protocol import load_engine
 

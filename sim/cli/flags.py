@@ -122,7 +122,12 @@ def check(record: Any) -> None:
             plain(entry.name, entry.type, getattr(record, entry.name))
 
 
-def _flag(name: str, kind: Kind, default: Any, text: str) -> tuple[str, Any, Any]:
+def _flag(
+    name: str,
+    kind: Kind,
+    default: Any,
+    text: str,
+) -> tuple[str, Any, Any]:
     """Return a field of a dataclass; its help leaves out the defaults None, False, True and ()."""
 
     def hint(default: str) -> str:

@@ -203,7 +203,12 @@ class RunReport:
         return plots.step_responses(self.rollout, mark=0, title=title)
 
 
-def speed_line(num_envs: int, simulated: float, timestep: float, wall: float) -> str:
+def speed_line(
+    num_envs: int,
+    simulated: float,
+    timestep: float,
+    wall: float,
+) -> str:
     """Return the speed of a run: ``simulated`` seconds of ``num_envs`` robots in ``wall``
     seconds.
     """

@@ -187,7 +187,13 @@ def rollout(
     return RunReport(robot, result, timestep, wall, backend, notes, is_held=trajectory is None)
 
 
-def start_poses(robot: Robot, num_envs: int, spread: float, seed: int, center: Rows) -> Float64:
+def start_poses(
+    robot: Robot,
+    num_envs: int,
+    spread: float,
+    seed: int,
+    center: Rows,
+) -> Float64:
     """Return poses (envs, dof) [rad or m] around ``center``, inside the limits; env 0 is that pose
     itself.
 

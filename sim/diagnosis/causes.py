@@ -77,7 +77,11 @@ def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
 
 
 def _finding(
-    run: _Run, rule: Rule, joint: int, rows: NDArray[np.intp], envs: NDArray[np.intp]
+    run: _Run,
+    rule: Rule,
+    joint: int,
+    rows: NDArray[np.intp],
+    envs: NDArray[np.intp],
 ) -> Finding:
     """Return one finding for the same cause in ``rows`` of the examined ``envs``, with the detail
     of the first.

@@ -132,7 +132,11 @@ def stability_report(
 
 
 def slow_oscillation(
-    robot: RobotDescription, params: bp.PIDParams, qpos: Float64, timestep: float, env: int
+    robot: RobotDescription,
+    params: bp.PIDParams,
+    qpos: Float64,
+    timestep: float,
+    env: int,
 ) -> Oscillation:
     """Return the least damped oscillation that lasts, of one env's ``params`` at ``qpos`` (dof,),
     with ideal motors.

@@ -184,7 +184,13 @@ class _Preflight:
             text = f"{name} outside the limits"
             self._warn("out-of-limits", text, "move it inside", joint.name, detail=detail)
 
-    def _check_joint(self, joint: Joint, friction: float, suggested: float, ranged: bool) -> None:
+    def _check_joint(
+        self,
+        joint: Joint,
+        friction: float,
+        suggested: float,
+        ranged: bool,
+    ) -> None:
         """Report oddities of a joint; ``suggested`` is the effort limit of designed gains."""
         name = joint.name
         if friction >= joint.effort_limit > 0:
@@ -264,7 +270,11 @@ class _Preflight:
                 self._note("near-unstable", text, report.remedy)
 
     def _check_ringing(
-        self, params: bp.PIDParams, start: Float64, timestep: float, env: int
+        self,
+        params: bp.PIDParams,
+        start: Float64,
+        timestep: float,
+        env: int,
     ) -> None:
         slow = slow_oscillation(self.robot, params, start, timestep, env)
         zeta = float(slow.damping_ratio)

@@ -64,7 +64,11 @@ class SetpointCheck:
     def _describe(self, index: int, positions: Rows, outside: NDArray[np.bool_]) -> str:
         """Return joint, limits, worst position and envs of ``positions`` (..., envs)."""
         joint = self._robot.joints[index]
-        excess = np.where(outside, np.abs(positions - (joint.lower + joint.upper) / 2), 0.0)
+        excess = np.where(
+            outside,
+            np.abs(positions - (joint.lower + joint.upper) / 2),
+            0.0,
+        )
         worst = positions.flat[np.argmax(excess)]
         place = f"joint {joint.name!r} at {worst:g} {joint.unit}"
         limits = f"[{joint.lower:g}, {joint.upper:g}]"

@@ -92,7 +92,11 @@ class MissedContacts:
         moves = np.vstack([tree.bodies.moves, np.zeros(tree.dof)])
         first, second = self._contacts.body_pairs.T
         # A joint that moves both bodies of a pair, or none, leaves their distance.
-        self._arms = np.where(moves[first] != moves[second], bounds[:-1], 0.0)
+        self._arms = np.where(
+            moves[first] != moves[second],
+            bounds[:-1],
+            0.0,
+        )
         self._centers = np.zeros((size, tree.dof))
         self._margins = np.zeros((size, len(first)))
 

@@ -172,7 +172,11 @@ class EnginePack(Protocol):
         """
 
     def write_state(
-        self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None
+        self,
+        rows: Sequence[int],
+        qpos: Rows,
+        qvel: Rows,
+        base: Float64 | None = None,
     ) -> None:
         """Set positions and velocities (len(rows), dof) of the envs ``rows``, and zero efforts.
 

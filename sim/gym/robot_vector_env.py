@@ -429,7 +429,11 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._success = observed.ok & success.astype(bool)
 
     def _returned(
-        self, hook: str, value: ArrayLike, shape: tuple[int, ...], mask: Bool | None = None
+        self,
+        hook: str,
+        value: ArrayLike,
+        shape: tuple[int, ...],
+        mask: Bool | None = None,
     ) -> Float64:
         """Return a hook's value as an array, 0 in envs that are not in ``mask``; raise
         InvalidArgumentError for another shape, NaN or infinity.

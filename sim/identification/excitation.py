@@ -184,7 +184,11 @@ def _chirp(
     powers = np.maximum(limits, 1e-12) ** -_SHARPNESS
     amplitude = share * powers.sum(0) ** (-1 / _SHARPNESS)
     angle = phase + np.cumsum(omega, axis=0) * dt
-    edge = np.clip(np.minimum(time, total - time) / (_WINDOW * total), 0.0, 1.0)[:, None]
+    edge = np.clip(
+        np.minimum(time, total - time) / (_WINDOW * total),
+        0.0,
+        1.0,
+    )[:, None]
     window = edge**3 * (10 - 15 * edge + 6 * edge**2)
     position = robot.coupled(center + window * amplitude * np.sin(angle))
     velocity = np.gradient(position, dt, axis=0)

@@ -381,7 +381,14 @@ def windows_of(data: Sequence[LogData]) -> list[Window]:
     return windows[:: 1 + len(windows) // MOST_WINDOWS]
 
 
-def _window(number: int, data: LogData, first: int, last: int, split: int, every: int) -> Window:
+def _window(
+    number: int,
+    data: LogData,
+    first: int,
+    last: int,
+    split: int,
+    every: int,
+) -> Window:
     """Return the window between two sim steps of a log's grid, of one row of ``every``; rows are
     held out from the step ``split`` on.
     """
@@ -400,4 +407,10 @@ def _window(number: int, data: LogData, first: int, last: int, split: int, every
     command = motion.command[np.maximum(np.arange(first - past, last), 0)]
     begin = motion.qpos[first], motion.qvel[first]
     stretch = Stretch(*begin, command, past, step - first - 1, before)
-    return Window(number, stretch, log.qpos[rows], log.time[rows], place <= split + 1e-6)
+    return Window(
+        number,
+        stretch,
+        log.qpos[rows],
+        log.time[rows],
+        place <= split + 1e-6,
+    )

@@ -128,7 +128,10 @@ def identify(
 
 
 def _read(
-    robot: Robot, logs: Iterable[Any], params: bp.PIDParams | None, reading: Reading | None
+    robot: Robot,
+    logs: Iterable[Any],
+    params: bp.PIDParams | None,
+    reading: Reading | None,
 ) -> list[Log]:
     """Return the logs of the arguments of :func:`identify`."""
     kind: CommandKind | None = None
@@ -223,7 +226,12 @@ def _resting(robot: Robot, start: Float64) -> Robot:
     return replace(robot, settings=None, defaults=FileDefaults(start))
 
 
-def _option(name: str, value: Any, recorded: list[Any], default: Any) -> Any:
+def _option(
+    name: str,
+    value: Any,
+    recorded: list[Any],
+    default: Any,
+) -> Any:
     """Return ``value``, else that of the recordings, else the default."""
     values = {option for option in (value, *recorded) if option is not None} or {default}
     if len(values) > 1:
@@ -288,7 +296,12 @@ def _fitted(data: list[LogData]) -> list[LogData]:
     return [part for part in data if not part.log.held_out]
 
 
-def _unknowns(robot: Robot, data: list[LogData], guess: Guess, extras: Sequence[str]) -> Unknowns:
+def _unknowns(
+    robot: Robot,
+    data: list[LogData],
+    guess: Guess,
+    extras: Sequence[str],
+) -> Unknowns:
     """Return the unknowns with starts from the regression, and typical sizes from the motion."""
     data = _fitted(data)
     log, _, plant, drive = data[0]

@@ -85,7 +85,12 @@ def read_logs(
     return logs
 
 
-def _read(robot: Robot, path: Path, kind: CommandKind | None, reading: Reading) -> list[Log]:
+def _read(
+    robot: Robot,
+    path: Path,
+    kind: CommandKind | None,
+    reading: Reading,
+) -> list[Log]:
     suffix = path.suffix.lower()
     if suffix in HDF5:
         return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
@@ -101,7 +106,10 @@ def _read(robot: Robot, path: Path, kind: CommandKind | None, reading: Reading) 
 
 
 def logs_of_rollout(
-    robot: Robot, rollout: Rollout, kind: CommandKind | None = None, source: str = "rollout"
+    robot: Robot,
+    rollout: Rollout,
+    kind: CommandKind | None = None,
+    source: str = "rollout",
 ) -> list[Log]:
     """Return one log for each env of ``rollout``, whose setpoints are efforts under control
     "effort".

@@ -172,7 +172,12 @@ def regress(data: Sequence[LogData]) -> list[Guess]:
     return list(best.values())
 
 
-def _table(part: LogData, delays: Float64, every: int, cutoff: float) -> tuple[Float64, ...]:
+def _table(
+    part: LogData,
+    delays: Float64,
+    every: int,
+    cutoff: float,
+) -> tuple[Float64, ...]:
     """Return columns of a log (rows, joints): the effort that the links need, acceleration,
     velocity, its sign, and the motors' efforts by delay of setpoints and of efforts.
     """
@@ -200,9 +205,19 @@ def _table(part: LogData, delays: Float64, every: int, cutoff: float) -> tuple[F
     return links, motion.qacc[rows], motion.qvel[rows], sign, np.array(late)
 
 
-def _force(part: LogData, qpos: Float64, qvel: Float64, qacc: Float64) -> Float64:
+def _force(
+    part: LogData,
+    qpos: Float64,
+    qvel: Float64,
+    qacc: Float64,
+) -> Float64:
     """Return the efforts (rows, joints) that the links need to move so, without motors."""
-    dynamics = Dynamics(part.plant, [()] * len(qpos), np.array(qpos), np.array(qvel))
+    dynamics = Dynamics(
+        part.plant,
+        [()] * len(qpos),
+        np.array(qpos),
+        np.array(qvel),
+    )
     return dynamics.force + (dynamics.matrix @ qacc[..., None])[..., 0]
 
 

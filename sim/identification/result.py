@@ -269,7 +269,12 @@ class Identification:
         return "\n".join([*lines, self.advice])
 
 
-def _cell(kind: str, value: float, low: float, high: float) -> str:
+def _cell(
+    kind: str,
+    value: float,
+    low: float,
+    high: float,
+) -> str:
     """Return a value with its interval, or its bound where the interval is wider than itself."""
     half = high - value
     if half > abs(value) and KINDS[kind].positive:
@@ -341,7 +346,10 @@ def advice(fit: Fit) -> str:
 
 
 def draw_motors(
-    path: str | os.PathLike[str], robot: Robot, count: int, seed: int = 0
+    path: str | os.PathLike[str],
+    robot: Robot,
+    count: int,
+    seed: int = 0,
 ) -> bp.Actuators:
     """Return ``count`` sets of motors of ``robot``, drawn from the confidence region in an
     actuators file.

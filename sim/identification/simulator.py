@@ -171,7 +171,11 @@ class Dynamics:
     """
 
     def __init__(
-        self, plant: Plant, masses: Sequence[Masses], qpos: Float64, qvel: Float64
+        self,
+        plant: Plant,
+        masses: Sequence[Masses],
+        qpos: Float64,
+        qvel: Float64,
     ) -> None:
         rows, joints = qpos.shape
         self.matrix = np.empty((rows, joints, joints))
@@ -315,7 +319,12 @@ _MODEL = Model(when=lambda due, function, otherwise: otherwise)
 """The simulation refreshes the friction model by itself."""
 
 
-def _step(layout: Layout, constants: Constants, state: StepState, inputs: Any) -> Any:
+def _step(
+    layout: Layout,
+    constants: Constants,
+    state: StepState,
+    inputs: Any,
+) -> Any:
     """Return state and efforts of a control step."""
     command, *reading = inputs
     measured = Measured(*reading)

@@ -76,7 +76,10 @@ def control_step(
 
 
 def sim_step(
-    layout: Layout, constants: Constants, values: Values, engine: Mapping[str, StageFunction]
+    layout: Layout,
+    constants: Constants,
+    values: Values,
+    engine: Mapping[str, StageFunction],
 ) -> Values:
     """Run the stages of a sim step in the order of the table; ``engine`` has the executor's own
     stages, by name.
@@ -102,7 +105,10 @@ def mass_matrix(layout: Layout, constants: Constants, qpos: Array) -> Array:
 
 
 def refreshed(
-    layout: Layout, constants: Constants, friction: FrictionState, qpos: Array
+    layout: Layout,
+    constants: Constants,
+    friction: FrictionState,
+    qpos: Array,
 ) -> FrictionState:
     """Return the state of the friction model with the inertia at ``qpos``, for the leaders only."""
     if layout.model.refresh is not None:
@@ -250,7 +256,10 @@ def _law(layout: Layout, constants: Constants, values: Values) -> Values:
 
 
 def _pid(
-    layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]
+    layout: Layout,
+    constants: Constants,
+    values: Values,
+    limits: tuple[Array, Array],
 ) -> Values:
     """qf = sat(PID(setpoint, qpos) + feedforward)."""
     qpos, qvel, forward = values.seen
@@ -272,7 +281,10 @@ def _pid(
 
 
 def _drive(
-    layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]
+    layout: Layout,
+    constants: Constants,
+    values: Values,
+    limits: tuple[Array, Array],
 ) -> Values:
     """The engine's drives with stiffness kp and damping kd; qf = feedforward.
 
@@ -294,7 +306,10 @@ def _drive(
 
 
 def _effort(
-    layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]
+    layout: Layout,
+    constants: Constants,
+    values: Values,
+    limits: tuple[Array, Array],
 ) -> Values:
     """qf = sat(the caller's effort + feedforward); the setpoint is the effort, and a follower's
     acts on its leader.
@@ -304,7 +319,10 @@ def _effort(
 
 
 def _custom(
-    layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]
+    layout: Layout,
+    constants: Constants,
+    values: Values,
+    limits: tuple[Array, Array],
 ) -> Values:
     """qf = sat(effort of the caller's own controller)."""
     # A follower's effort acts on its leader.
@@ -343,7 +361,10 @@ def _friction(layout: Layout, constants: Constants, values: Values) -> Values:
 
 
 def _saturated(
-    constants: Constants, total: Array, values: Values, limits: tuple[Array, Array]
+    constants: Constants,
+    total: Array,
+    values: Values,
+    limits: tuple[Array, Array],
 ) -> Values:
     """Return ``values`` with the effort ``total`` clipped to the limits of motors and params."""
     xp = namespace(total, *limits)

@@ -111,7 +111,11 @@ class EventLog:
     """
 
     def __init__(
-        self, num_envs: int, field: str, none: int, read: Callable[[int, Arrays], object]
+        self,
+        num_envs: int,
+        field: str,
+        none: int,
+        read: Callable[[int, Arrays], object],
     ) -> None:
         self.events: tuple[Any, ...] = ()
         """Latest last."""
@@ -184,7 +188,13 @@ class FaultContainment:
         self.suspended[mask] = self.failed[mask] = False
         self.step[mask], self.missed_contact[mask] = -1, 0
 
-    def fail(self, bad: Bool, cause: str, step: int, qpos: NDArray[np.float64]) -> None:
+    def fail(
+        self,
+        bad: Bool,
+        cause: str,
+        step: int,
+        qpos: NDArray[np.float64],
+    ) -> None:
         """Record a fault of the envs with a True entry in ``bad`` (M, dof); suspended envs stay at
         ``qpos`` (M, dof).
         """
@@ -227,7 +237,12 @@ class FaultContainment:
             self.fail(wrong & failed, "effort", step, before)
         self.fail(bad, "state", step, before)
         if speed_limit is not None:
-            self.fail((np.abs(qvel) > speed_limit) & ~failed, "speed", step, before)
+            self.fail(
+                (np.abs(qvel) > speed_limit) & ~failed,
+                "speed",
+                step,
+                before,
+            )
 
     def pop_unplaced(self) -> Bool:
         """Return the envs that failed since the last call (M,), which are to be placed."""

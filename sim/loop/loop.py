@@ -50,7 +50,13 @@ class Failure(Exception):
         The error.
     """
 
-    def __init__(self, step: int, env: int, ticks: int, error: Exception) -> None:
+    def __init__(
+        self,
+        step: int,
+        env: int,
+        ticks: int,
+        error: Exception,
+    ) -> None:
         super().__init__(step, env, ticks, error)
         self.step = step
         self.env = env
@@ -113,7 +119,11 @@ class Loop:
     """
 
     def __init__(
-        self, options: RunnerOptions, params: bp.PIDParams, envs: slice, arrays: Arrays
+        self,
+        options: RunnerOptions,
+        params: bp.PIDParams,
+        envs: slice,
+        arrays: Arrays,
     ) -> None:
         robot = options.robot
         self.options, self.arrays = options, arrays

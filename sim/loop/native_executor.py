@@ -88,7 +88,13 @@ class NativeExecutor:
         assert self._program is not None
         return self._program.outputs
 
-    def run(self, command: Command, moves: bool, begin: int, end: int) -> int:
+    def run(
+        self,
+        command: Command,
+        moves: bool,
+        begin: int,
+        end: int,
+    ) -> int:
         """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
         # The tables of ticks are not used here, since the command may differ from theirs.
         # A program for each kind of tick is made once, at the first such tick.
@@ -163,7 +169,10 @@ class NativeExecutor:
 
 
 def run_ticks(
-    executors: Sequence[NativeExecutor], until: int, steps: int, whole: bool = True
+    executors: Sequence[NativeExecutor],
+    until: int,
+    steps: int,
+    whole: bool = True,
 ) -> None:
     """In one native call, run each group from its start to tick ``until``, of ``steps`` sim steps
     each; :meth:`NativeExecutor.complete` tells where it stopped.

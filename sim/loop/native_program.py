@@ -76,7 +76,12 @@ class TickProgram:
     """
 
     def __init__(
-        self, setup: Setup, buffers: Buffers, table: Table, noise: Pytree, reads_force: bool
+        self,
+        setup: Setup,
+        buffers: Buffers,
+        table: Table,
+        noise: Pytree,
+        reads_force: bool,
     ) -> None:
         _, pack, layout, constants, _ = setup
         self._setup, self._buffers = setup, buffers
@@ -237,7 +242,11 @@ class TickProgram:
             # Native code sets the addresses of the noise, which is another in each sim step.
             drawn = [id(block) for block in leaves(values.noise)]
             noise = [at for at, array in enumerate(inputs) if id(array) in drawn]
-            self._add_stage("program", program=len(self._programs), noise=(*noise, -1, -1)[:2])
+            self._add_stage(
+                "program",
+                program=len(self._programs),
+                noise=(*noise, -1, -1)[:2],
+            )
             self._programs.append(self._native.bind(program.arguments, pairs, tuple(outputs)))
             self._references += inputs, outputs
         return after

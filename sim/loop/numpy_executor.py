@@ -74,7 +74,13 @@ class NumPyExecutor:
         """Return the results of the last sim step as NumPy arrays."""
         return self.outputs
 
-    def run(self, command: Command, moves: bool, begin: int, end: int) -> int:
+    def run(
+        self,
+        command: Command,
+        moves: bool,
+        begin: int,
+        end: int,
+    ) -> int:
         """Run sim steps ``begin`` to ``end`` of a tick under ``command`` (M, ...), or until an env
         may have failed; return the sim steps of the tick that are done.
 

@@ -174,7 +174,11 @@ def _turns(pack: EnginePack) -> Array:
 
 
 def empty_state(
-    options: RunnerOptions, law: Pytree, actuators: bp.Actuators | None, stiction: bool, envs: int
+    options: RunnerOptions,
+    law: Pytree,
+    actuators: bp.Actuators | None,
+    stiction: bool,
+    envs: int,
 ) -> StepState:
     """Return the control state of ``envs`` envs: the law's state ``law``, and zeros for
     ``actuators`` (unless None), guard, and Coulomb friction if ``stiction``.
@@ -228,7 +232,11 @@ def with_matrix(setup: Setup, state: StepState) -> StepState:
 
 
 def with_params(
-    before: Setup, setup: Setup, state: StepState, old: bp.PIDParams, new: bp.PIDParams
+    before: Setup,
+    setup: Setup,
+    state: StepState,
+    old: bp.PIDParams,
+    new: bp.PIDParams,
 ) -> StepState:
     """Return ``state`` for the params ``new`` of ``setup``, with the integral in the unit of the
     new gains; ``old`` are the params of the setup ``before``.
@@ -246,7 +254,12 @@ def with_params(
     return state._replace(law=law.matched_to(bp.init(new, qpos)))
 
 
-def reset_guard(setup: Setup, state: StepState, qpos: Float64, mask: Bool) -> StepState:
+def reset_guard(
+    setup: Setup,
+    state: StepState,
+    qpos: Float64,
+    mask: Bool,
+) -> StepState:
     """Return ``state`` with the guard of the envs of ``mask`` (M,) at rest at ``qpos``."""
     guard = setup.constants.guard
     if guard is None:
@@ -274,7 +287,10 @@ def init_motors(
 
 
 def model_functions(
-    pack: EnginePack, layout: Layout, constants: Constants, controller: OwnController | None
+    pack: EnginePack,
+    layout: Layout,
+    constants: Constants,
+    controller: OwnController | None,
 ) -> Model:
     """Return the functions for NumPy arrays of the robots of ``pack``."""
     native = pack.steps_natively

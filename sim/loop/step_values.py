@@ -287,7 +287,12 @@ class Layout(NamedTuple):
         return int(self.control == "drive" or self.implicit)
 
 
-def half_way(qpos: Array, qvel: Array, steps: Array, timestep: float) -> Array:
+def half_way(
+    qpos: Array,
+    qvel: Array,
+    steps: Array,
+    timestep: float,
+) -> Array:
     """Return the pose for the mass matrix of the next ``steps`` sim steps from ``qpos``: half way
     through them.
 

@@ -139,7 +139,13 @@ class XLAExecutor:
         outputs: Outputs = self._numpy(self._outputs)
         return outputs
 
-    def run(self, command: Command, moves: bool, begin: int, end: int) -> int:
+    def run(
+        self,
+        command: Command,
+        moves: bool,
+        begin: int,
+        end: int,
+    ) -> int:
         """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
         setup = self.setup
         step = self._engine.compiled()

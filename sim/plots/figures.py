@@ -95,7 +95,11 @@ def step_responses(
     if pose is not None:
         # Of the two quaternions of an orientation, the one that is nearer to the setpoint's.
         products = (pose[..., 3:] * rollout.setpoint[..., 3:7]).sum(-1, keepdims=True)
-        turned = np.where(products < 0, -pose[..., 3:], pose[..., 3:])
+        turned = np.where(
+            products < 0,
+            -pose[..., 3:],
+            pose[..., 3:],
+        )
         pose = np.concatenate([pose[..., :3], turned], axis=-1)
     for entry, (above, below) in enumerate(blocks[len(chosen) :]):
         _draw_line(above, run.time, rollout.setpoint[..., entry])
@@ -238,7 +242,10 @@ def _joint_axes(
 
 
 def _grid(
-    names: Sequence[str], rows: int, title: str, end: float
+    names: Sequence[str],
+    rows: int,
+    title: str,
+    end: float,
 ) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure, and for each of ``names`` a column of ``rows`` axes, positions above
     efforts, up to the time ``end`` [s].
@@ -282,7 +289,12 @@ def _add_legend(figure: Figure) -> None:
     )
 
 
-def _draw_fan(axes: Axes, time: Rows, values: Rows, mark: int | None) -> None:
+def _draw_fan(
+    axes: Axes,
+    time: Rows,
+    values: Rows,
+    mark: int | None,
+) -> None:
     """Draw each env of ``values`` (ticks, envs) as a thin line, their median as a bold one, env
     ``mark`` in colour.
     """
@@ -300,10 +312,22 @@ def _draw_fan(axes: Axes, time: Rows, values: Rows, mark: int | None) -> None:
     (median,) = _quantiles(values, 0.5)
     axes.plot(time, median, color=MEDIAN, lw=1.5, label="median")
     if mark is not None:
-        axes.plot(time, values[:, mark], color=MARKED, lw=1.1, label=f"env {mark}")
+        axes.plot(
+            time,
+            values[:, mark],
+            color=MARKED,
+            lw=1.1,
+            label=f"env {mark}",
+        )
 
 
-def _draw_band(axes: Axes, time: Rows, values: Rows, colour: str, label: str) -> None:
+def _draw_band(
+    axes: Axes,
+    time: Rows,
+    values: Rows,
+    colour: str,
+    label: str,
+) -> None:
     """Draw the median of the envs as a line, and 10 to 90 % of them as a band."""
     low, median, high = _quantiles(values, 0.1, 0.5, 0.9)
     axes.fill_between(time, low, high, color=colour, alpha=0.2, lw=0)
@@ -321,7 +345,14 @@ def _draw_setpoint(axes: Axes, run: Rollout, joint: int) -> None:
     if move.size and np.ptp(last) == 0:
         half = BAND * float(np.median(move))
         label = f"settling band, {BAND:.0%} of the move"
-        axes.axhspan(last[0] - half, last[0] + half, color=SETPOINT, alpha=0.2, lw=0, label=label)
+        axes.axhspan(
+            last[0] - half,
+            last[0] + half,
+            color=SETPOINT,
+            alpha=0.2,
+            lw=0,
+            label=label,
+        )
 
 
 def _draw_line(axes: Axes, time: Rows, values: Rows) -> None:
@@ -341,7 +372,12 @@ def _draw_limits(axes: Axes, low: float, high: float) -> None:
             axes.axhline(limit, color=LIMIT, lw=0.9, zorder=2, label="limit")
 
 
-def _draw_efforts(axes: Axes, run: Rollout, joint: int, mark: int | None) -> None:
+def _draw_efforts(
+    axes: Axes,
+    run: Rollout,
+    joint: int,
+    mark: int | None,
+) -> None:
     """Draw the efforts against their limit, with their peak and the share of saturated samples."""
     values = run.effort[..., joint]
     limit = float(run.info.effort_limit[joint])

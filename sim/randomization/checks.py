@@ -62,7 +62,12 @@ def _check_events(randomization: Randomization, robot: Robot) -> None:
         raise InvalidArgumentError("push", problem, remedy=remedy)
 
 
-def _extremes(name: str, field: Field, columns: Sequence[str], nominal: Rows) -> Iterator[Rows]:
+def _extremes(
+    name: str,
+    field: Field,
+    columns: Sequence[str],
+    nominal: Rows,
+) -> Iterator[Rows]:
     """Yield ``nominal`` (rows, elements, ...) with the least and with the largest draw of each part
     of a field.
     """

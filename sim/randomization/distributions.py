@@ -247,7 +247,11 @@ NOTHING = Draws(np.zeros((0, 2), np.int64), {})
 
 
 def generators(
-    seed: int, name: str, episodes: Episodes, constant: bool, number: ArrayLike
+    seed: int,
+    name: str,
+    episodes: Episodes,
+    constant: bool,
+    number: ArrayLike,
 ) -> Iterator[np.random.Generator]:
     """Yield a generator for each env, of draw ``number`` (an int, or one for each env) of one field
     in its episode.

@@ -156,7 +156,13 @@ class Randomization:
                 draws[name] = self._draw(name, robot, episodes)
         return Draws(episodes, draws)
 
-    def _draw(self, name: str, robot: Robot, episodes: Episodes, number: ArrayLike = 0) -> Float64:
+    def _draw(
+        self,
+        name: str,
+        robot: Robot,
+        episodes: Episodes,
+        number: ArrayLike = 0,
+    ) -> Float64:
         """Return draws of a field (envs, elements), NaN where nothing is drawn; see
         :func:`generators`.
         """
@@ -173,7 +179,13 @@ class Randomization:
                 row[chosen] = distribution.sample(generator, size)
         return rows
 
-    def next_push(self, name: str, robot: Robot, episodes: Episodes, number: Episodes) -> Float64:
+    def next_push(
+        self,
+        name: str,
+        robot: Robot,
+        episodes: Episodes,
+        number: Episodes,
+    ) -> Float64:
         """Return one field of the push after push ``number`` (n,) of these episodes (n, 2); number
         0 is the reset.
 
@@ -218,7 +230,13 @@ class Randomization:
             episodes = _first_episodes(streams)
         return draws.replaced(mask, self.draw(robot, episodes[mask]))
 
-    def apply(self, name: str, nominal: ArrayLike, draws: Draws, robot: Robot) -> Float64:
+    def apply(
+        self,
+        name: str,
+        nominal: ArrayLike,
+        draws: Draws,
+        robot: Robot,
+    ) -> Float64:
         """Return the values of a field (envs, joints or links) that result from ``nominal``, which
         broadcasts to it.
         """
@@ -229,7 +247,13 @@ class Randomization:
             values[:, chosen] = distribution.apply(values[:, chosen], drawn[:, chosen])
         return values
 
-    def randomized(self, group: str, record: T, draws: Draws | None, robot: Robot) -> T:
+    def randomized(
+        self,
+        group: str,
+        record: T,
+        draws: Draws | None,
+        robot: Robot,
+    ) -> T:
         """Return params or actuators, the fields of the ``group``, with the draws applied: one row
         for each env; the same if nothing is drawn for them.
 
@@ -248,7 +272,11 @@ class Randomization:
         return record._replace(**values)
 
     def start(
-        self, qpos: Float64, qvel: Float64, draws: Draws, robot: Robot
+        self,
+        qpos: Float64,
+        qvel: Float64,
+        draws: Draws,
+        robot: Robot,
     ) -> tuple[Float64, Float64]:
         """Return position and velocity (envs, dof) at a reset to ``qpos`` and ``qvel``; NaN
         stays.

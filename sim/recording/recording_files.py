@@ -156,7 +156,10 @@ def check_path(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
 
 
 def create_datasets(
-    file: h5py.File, info: RunInfo, num_envs: int, tick: float
+    file: h5py.File,
+    info: RunInfo,
+    num_envs: int,
+    tick: float,
 ) -> dict[str, h5py.Dataset]:
     """Write ``info`` to a new file; return empty datasets that can grow: time and
     :attr:`RunInfo.recorded`.

@@ -59,7 +59,12 @@ class Setpoints(NamedTuple):
     """Number of changes that count as steps of the setpoint, with rate 0."""
 
 
-def error(source: str, problem: str, remedy: str, value: object = None) -> InvalidArgumentError:
+def error(
+    source: str,
+    problem: str,
+    remedy: str,
+    value: object = None,
+) -> InvalidArgumentError:
     """Return the error of a file."""
     return InvalidArgumentError(source, problem, remedy=remedy, value=value)
 
@@ -110,7 +115,13 @@ def read_csv(
     return columns, numbers
 
 
-def _number(source: str, place: str, column: str, cell: str, quantities: Sequence[str]) -> float:
+def _number(
+    source: str,
+    place: str,
+    column: str,
+    cell: str,
+    quantities: Sequence[str],
+) -> float:
     """Return the number in a cell; NaN for an empty one, and for text in a column of another
     quantity.
     """
@@ -207,13 +218,20 @@ def _rates(robot: Robot, position: Float64, dt: float) -> tuple[Float64, int]:
     change = wrap(np.diff(position, axis=0), period, np) / dt
     is_step = np.abs(change) > STEP * robot.velocity_limit
     following = np.concatenate([change[1:], change[-1:]])
-    following = np.where(np.concatenate([is_step[1:], is_step[-1:]]), change, following)
+    following = np.where(
+        np.concatenate([is_step[1:], is_step[-1:]]),
+        change,
+        following,
+    )
     rate = np.where(is_step, 0.0, 0.5 * (change + following))
     return rate, int(is_step[:, robot.independent].sum())
 
 
 def _tables(
-    robot: Robot, source: str, columns: dict[str, Float64], lines: list[int]
+    robot: Robot,
+    source: str,
+    columns: dict[str, Float64],
+    lines: list[int],
 ) -> dict[str, Float64]:
     """Return a finite table (rows, dof) for each quantity of the file; followers without column
     have 0.
@@ -242,7 +260,12 @@ def _tables(
     return tables
 
 
-def _substeps(source: str, time: Float64, lines: list[int], timestep: float) -> tuple[int, bool]:
+def _substeps(
+    source: str,
+    time: Float64,
+    lines: list[int],
+    timestep: float,
+) -> tuple[int, bool]:
     """Return the sim steps from row to row, and whether the first row is for time 0.
 
     Raises InvalidArgumentError for other times than 0, if it is there, and the ends of all ticks.

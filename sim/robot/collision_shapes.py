@@ -149,7 +149,12 @@ def inertia_of(shapes: Sequence[Shape]) -> SpatialInertia:
     return SpatialInertia(float(model.body_mass[1]), read_only(center), read_only(tensor))
 
 
-def add_geom(spec: MjSpec, body: MjsBody, shape: Shape, **options: object) -> None:
+def add_geom(
+    spec: MjSpec,
+    body: MjsBody,
+    shape: Shape,
+    **options: object,
+) -> None:
     """Add a shape to a body of a ``mujoco.MjSpec``; equal hulls share a mesh."""
     import mujoco
 

@@ -148,7 +148,11 @@ class Contacts:
         """Return the two links nearest to each other; one if the other is the ground, none if none
         are near.
         """
-        nearest = min(self.near(qpos), key=lambda pair: pair.distance, default=Near("", "", np.inf))
+        nearest = min(
+            self.near(qpos),
+            key=lambda pair: pair.distance,
+            default=Near("", "", np.inf),
+        )
         return tuple(name for name in nearest[:2] if name)
 
     def height(self, qpos: Rows, base_too: bool = False) -> float:

@@ -44,7 +44,10 @@ POSES = 50
 
 
 def suggested_effort_limit(
-    gravity: Float64, mass_matrix: Float64, friction: ArrayLike, damping: ArrayLike
+    gravity: Float64,
+    mass_matrix: Float64,
+    friction: ArrayLike,
+    damping: ArrayLike,
 ) -> Float64:
     """Return an effort limit for each joint (dof,) [N m or N], from gravity (n, dof) and M (n, dof,
     dof) at n poses.
@@ -279,7 +282,11 @@ class RobotDescription:
 
         Raises RobotError if a link's mass comes from its shapes, and a mesh cannot be read.
         """
-        low, high = np.where(self.continuous, [[-np.inf], [np.inf]], [self.lower, self.upper])
+        low, high = np.where(
+            self.continuous,
+            [[-np.inf], [np.inf]],
+            [self.lower, self.upper],
+        )
         limits = {"lower": low, "upper": high}
         return rigid_tree(self.tables, coupling=self.coupling, fixed_base=self.fixed_base, **limits)
 

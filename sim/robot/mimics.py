@@ -55,7 +55,11 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     share = np.abs(coupling.multiplier)
     friction, damping = np.zeros((2, len(joints)))
     np.add.at(friction, coupling.leader, share * [joint.friction for joint in joints])
-    np.add.at(damping, coupling.leader, share**2 * [joint.damping for joint in joints])
+    np.add.at(
+        damping,
+        coupling.leader,
+        share**2 * [joint.damping for joint in joints],
+    )
     coupled = []
     for index, joint in enumerate(joints):
         low, high = limits[index]

@@ -77,7 +77,10 @@ def read_couplings(model: MjModel, robot: RobotInFile, findings: list[Finding]) 
 
 
 def read_motors(
-    model: MjModel, robot: RobotInFile, couplings: Couplings, findings: list[Finding]
+    model: MjModel,
+    robot: RobotInFile,
+    couplings: Couplings,
+    findings: list[Finding],
 ) -> Motors:
     """Return the motors of the joints, with findings for effects that are not simulated."""
     motors = Motors()
@@ -155,7 +158,12 @@ def _servo(model: MjModel, actuator: int) -> tuple[float, float]:
 
 
 def _add(
-    model: MjModel, actuator: int, name: str, arm: float, motors: Motors, findings: list[Finding]
+    model: MjModel,
+    actuator: int,
+    name: str,
+    arm: float,
+    motors: Motors,
+    findings: list[Finding],
 ) -> None:
     """Add armature and effort limit of an actuator to a joint."""
     motors.armature[name] += arm**2 * float(np.ravel(model.actuator_armature[actuator])[0])

@@ -219,7 +219,11 @@ class RobotInFile:
         return int(self._roots[body]) not in self._left_out
 
     def _find_base(
-        self, model: MjModel, joints: dict[int, str], path: Path, findings: list[Finding]
+        self,
+        model: MjModel,
+        joints: dict[int, str],
+        path: Path,
+        findings: list[Finding],
     ) -> int:
         """Return the base, after the bodies that are not of the robot are left out."""
         # Every child of the world is the root of an object; some of them are the robot.

@@ -47,7 +47,12 @@ _ELSEWHERE = "expect another motion in SAPIEN"
 """Remedy for content that only the engine MuJoCo simulates."""
 
 
-def read_mjcf(path: Path, name: str, fixed_base: bool | None, missing_meshes: str) -> Source:
+def read_mjcf(
+    path: Path,
+    name: str,
+    fixed_base: bool | None,
+    missing_meshes: str,
+) -> Source:
     """Return the content of the MJCF file at ``path`` as the robot ``name``.
 
     For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses
@@ -101,7 +106,12 @@ def home(model: MjModel) -> int | None:
     return next((key for key in range(model.nkey) if model.key(key).name == _KEYFRAME), None)
 
 
-def _file(path: Path, compiled: Compiled, robot: RobotInFile, fixed_base: bool) -> MjcfFile:
+def _file(
+    path: Path,
+    compiled: Compiled,
+    robot: RobotInFile,
+    fixed_base: bool,
+) -> MjcfFile:
     """Return the data of the file that the engine MuJoCo needs."""
     model = compiled.model
     # Loops between links, which MuJoCo closes and a tree cannot have.

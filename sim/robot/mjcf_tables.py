@@ -49,7 +49,11 @@ class TableReader:
     """
 
     def __init__(
-        self, model: MjModel, robot: RobotInFile, findings: list[Finding], motors: Motors
+        self,
+        model: MjModel,
+        robot: RobotInFile,
+        findings: list[Finding],
+        motors: Motors,
     ) -> None:
         self._model = model
         self._robot = robot
@@ -117,7 +121,13 @@ class TableReader:
             turn = NO_TURN
         self._add(body, row, anchor)
 
-    def _read_joint(self, number: int, parent: str, link: str, couplings: Couplings) -> Joint:
+    def _read_joint(
+        self,
+        number: int,
+        parent: str,
+        link: str,
+        couplings: Couplings,
+    ) -> Joint:
         model = self._model
         name = self._robot.joints[number]
         dof = model.jnt_dofadr[number]

@@ -78,7 +78,10 @@ def load_robot_actuators(
 
 
 def fit_actuators(
-    actuators: bp.Actuators, robot: RobotDescription, num_envs: int, control: object
+    actuators: bp.Actuators,
+    robot: RobotDescription,
+    num_envs: int,
+    control: object,
 ) -> bp.Actuators:
     """Return ``actuators`` if they fit robot and control, with the robot's continuous joints.
 
@@ -127,7 +130,11 @@ def setpoint_guard(
 
 
 def fit_guard(
-    guard: object, joints: Sequence[Joint], num_envs: int, control: str, sets_positions: bool
+    guard: object,
+    joints: Sequence[Joint],
+    num_envs: int,
+    control: str,
+    sets_positions: bool,
 ) -> bp.Guard | None:
     """Return the guard for a runner's option ``guard``; None means no guard.
 

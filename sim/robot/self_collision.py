@@ -222,7 +222,10 @@ def collision_groups(
 
 
 def link_groups(
-    tables: Tables, separate: Separate, fixed_base: bool, ignored: Collection[Pair]
+    tables: Tables,
+    separate: Separate,
+    fixed_base: bool,
+    ignored: Collection[Pair],
 ) -> tuple[dict[str, Words], frozenset[Pair]]:
     """Return :func:`collision_groups` of the links of ``tables`` that have shapes, to ignore the
     pairs ``ignored``.
@@ -249,7 +252,11 @@ def link_groups(
             free.add(frozenset((first, second)))
         elif bodies[first] == bodies[second]:
             ignored.add(frozenset((first, second)))
-    return collision_groups(links, {pair for pair in ignored if pair <= set(links)} - free, free)
+    return collision_groups(
+        links,
+        {pair for pair in ignored if pair <= set(links)} - free,
+        free,
+    )
 
 
 def _cliques(

@@ -44,7 +44,10 @@ class BodyParts(NamedTuple):
 
 
 def varied_bodies(
-    tables: Tables, separate: Separate, carrier: str, links: Sequence[str]
+    tables: Tables,
+    separate: Separate,
+    carrier: str,
+    links: Sequence[str],
 ) -> dict[str, BodyParts]:
     """Return the simulated bodies with varying mass, by name: they contain ``links`` or
     ``carrier``.

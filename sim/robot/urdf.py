@@ -68,7 +68,10 @@ _EXPAND = "expand it first: xacro FILE.xacro > FILE.urdf"
 
 
 def read_robot(
-    path: Path, fixed_base: bool | None, package_dirs: tuple[Path, ...], missing_meshes: str
+    path: Path,
+    fixed_base: bool | None,
+    package_dirs: tuple[Path, ...],
+    missing_meshes: str,
 ) -> Source:
     """Return the robot in the URDF or MJCF file at ``path``.
 
@@ -534,15 +537,32 @@ class _Reader:
 
 
 def read_shape(
-    geometry: etree._Element, link: str, place: tuple[Float64, Float64], where: str
+    geometry: etree._Element,
+    link: str,
+    place: tuple[Float64, Float64],
+    where: str,
 ) -> Shape:
     """Return the shape of a ``<geometry>`` of ``link``, at a position and orientation."""
     kind = geometry.tag
     sizes = [read_numbers(geometry, key, text, where) for key, text in SHAPES[kind].items()]
     if kind == "mesh":
-        return Shape(link, link, kind, (), *place, geometry.get("filename", "").strip(), sizes[0])
+        return Shape(
+            link,
+            link,
+            kind,
+            (),
+            *place,
+            geometry.get("filename", "").strip(),
+            sizes[0],
+        )
     if kind == "box":
-        return Shape(link, link, kind, tuple(0.5 * side for side in sizes[0]), *place)
+        return Shape(
+            link,
+            link,
+            kind,
+            tuple(0.5 * side for side in sizes[0]),
+            *place,
+        )
     size = sizes[0]
     if kind != "sphere":
         size = (sizes[0][0], 0.5 * sizes[1][0])

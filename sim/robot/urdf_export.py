@@ -137,7 +137,12 @@ def _shape_attributes(shape: Shape) -> dict[str, str]:
     return attributes
 
 
-def _placed(parent: etree._Element, tag: str, position: Float64, wxyz: Float64) -> etree._Element:
+def _placed(
+    parent: etree._Element,
+    tag: str,
+    position: Float64,
+    wxyz: Float64,
+) -> etree._Element:
     """Return a new element below ``parent`` with an ``<origin>``."""
     element = etree.SubElement(parent, tag)
     etree.SubElement(element, "origin", xyz=_text(position), rpy=_text(to_rpy(wxyz)))
@@ -150,7 +155,10 @@ def _text(values: Iterable[float]) -> str:
 
 
 def _copy_unused(
-    source: etree._Element, root: etree._Element, path: Path, packages: tuple[Path, ...]
+    source: etree._Element,
+    root: etree._Element,
+    path: Path,
+    packages: tuple[Path, ...],
 ) -> None:
     """Copy the elements without effect here into ``root``."""
     owners = {

@@ -121,7 +121,10 @@ def _lenient(data: bytes) -> etree._Element:
 
 
 def numbers(
-    element: etree._Element | None, key: str, default: str, limit: bool = False
+    element: etree._Element | None,
+    key: str,
+    default: str,
+    limit: bool = False,
 ) -> tuple[float, ...] | None:
     """Return the numbers in an attribute, as many as there are in ``default``, which replaces a
     missing or empty one; commas may stand between them.
@@ -156,7 +159,10 @@ def fault(element: etree._Element | None, key: str, default: str) -> str | None:
 
 
 def read_numbers(
-    element: etree._Element | None, key: str, default: str, where: str
+    element: etree._Element | None,
+    key: str,
+    default: str,
+    where: str,
 ) -> tuple[float, ...]:
     """Return :func:`numbers`, or raise a RobotError whose message begins with ``where``."""
     values = numbers(element, key, default)

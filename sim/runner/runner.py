@@ -695,7 +695,11 @@ class Runner(SingleOwner):
             self.recorder.prepare()
 
     def _record(
-        self, recorder: TickRecorder, run: Run, before: RunnerState, outcome: Outcome
+        self,
+        recorder: TickRecorder,
+        run: Run,
+        before: RunnerState,
+        outcome: Outcome,
     ) -> None:
         """Pass completed ticks on to the recorder."""
         for number, arrays in enumerate(outcome.completed):

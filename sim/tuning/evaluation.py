@@ -81,7 +81,11 @@ def tuning_engine(build: object) -> EngineName:
 
 
 def step_response_metrics(
-    robot: Robot, rollout: Rollout, start: Rows, *, with_effort: bool = True
+    robot: Robot,
+    rollout: Rollout,
+    start: Rows,
+    *,
+    with_effort: bool = True,
 ) -> StepMetrics:
     """Return the metrics of a rollout from rest at ``start`` (envs, dof); inf for envs that
     diverged.

@@ -82,7 +82,11 @@ class Moves(NamedTuple):
     def take(self, rows: Iterable[int]) -> Moves:
         """Return the moves ``rows``."""
         rows = list(rows)
-        return Moves(self.start[rows], self.target[rows], tuple(self.names[row] for row in rows))
+        return Moves(
+            self.start[rows],
+            self.target[rows],
+            tuple(self.names[row] for row in rows),
+        )
 
 
 def tutorial_move(robot: Robot) -> Moves:
@@ -94,7 +98,11 @@ def tutorial_move(robot: Robot) -> Moves:
 
 
 def random_moves(
-    robot: Robot, count: int, seed: int = 0, size: float = 2.0, ground: bool | None = None
+    robot: Robot,
+    count: int,
+    seed: int = 0,
+    size: float = 2.0,
+    ground: bool | None = None,
 ) -> Moves:
     """Return ``count`` seeded moves within the joint limits, free of contact on the straight line
     and 5 % beyond it.
@@ -133,7 +141,11 @@ def random_moves(
     for _ in range(200 * count + 200):
         if len(moves) == count:
             ends = np.reshape([move[:2] for move in moves], (count, 2, robot.dof))
-            return Moves(ends[:, 0], ends[:, 1], tuple(move.names[0] for move in moves))
+            return Moves(
+                ends[:, 0],
+                ends[:, 1],
+                tuple(move.names[0] for move in moves),
+            )
         if in_vain == PATIENCE:
             share /= 2
             in_vain = 0
@@ -206,7 +218,11 @@ def shortest_durations(robot: Robot, moves: Moves) -> Float64:
     # The second half is the first one backwards in time, with the opposite acceleration.
     left = np.minimum(time, 1 - time)
     is_early = time < 0.5
-    position = np.where(is_early, 2 * left**2, 1 - 2 * left**2)
+    position = np.where(
+        is_early,
+        2 * left**2,
+        1 - 2 * left**2,
+    )
     acceleration = np.where(is_early, 4.0, -4.0)
     return _durations(robot, moves, position, 4 * left, acceleration)
 
@@ -239,7 +255,12 @@ def smooth_durations(robot: Robot, moves: Moves) -> Float64:
 
 
 def _durations(
-    robot: Robot, moves: Moves, z: Float64, rate: Float64, acceleration: Float64, share: float = 1.0
+    robot: Robot,
+    moves: Moves,
+    z: Float64,
+    rate: Float64,
+    acceleration: Float64,
+    share: float = 1.0,
 ) -> Float64:
     """Return the shortest time (moves,) [s] of a motion z in unit time that takes ``share`` of the
     room; inf: none.
@@ -266,7 +287,12 @@ def _durations(
     return durations
 
 
-def motion_effort(robot: Robot, qpos: Float64, qvel: Float64, qacc: Float64) -> Float64:
+def motion_effort(
+    robot: Robot,
+    qpos: Float64,
+    qvel: Float64,
+    qacc: Float64,
+) -> Float64:
     """Return the efforts (n, dof) [N m or N] of a motion, gravity included; followers have none,
     their leaders more.
     """
@@ -274,7 +300,12 @@ def motion_effort(robot: Robot, qpos: Float64, qvel: Float64, qacc: Float64) -> 
     return efforts
 
 
-def smooth_effort(robot: Robot, start: Float64, target: Float64, duration: float) -> Float64:
+def smooth_effort(
+    robot: Robot,
+    start: Float64,
+    target: Float64,
+    duration: float,
+) -> Float64:
     """Return the efforts (:data:`SAMPLES`, dof) of the minimum-jerk motion from ``start`` to
     ``target`` in ``duration`` [s]: they overcome the joints' friction and damping.
     """

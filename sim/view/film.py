@@ -42,7 +42,13 @@ _NEARER = 0.85
 class Painter:
     """Camera of ``size`` (width, height) [pixels] on a scene of ``count`` robots."""
 
-    def __init__(self, robot: Robot, count: int, ground: bool, size: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        count: int,
+        ground: bool,
+        size: tuple[int, int],
+    ) -> None:
         self._scene = scene = RobotScene(robot, count, ground, deviation=8e-3)
         self._size = size
         self._eye = scene.target + _NEARER * (scene.eye - scene.target)
@@ -56,7 +62,12 @@ class Painter:
         x, y = np.meshgrid(np.arange(-half_x, half_x, TILE), np.arange(-half_y, half_y, TILE))
         edges = TILE * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         self._tiles = (
-            np.stack([x, y, np.full_like(x, scene.floor)], axis=-1).reshape(-1, 1, 3) + edges
+            np.stack([x, y, np.full_like(x, scene.floor)], axis=-1).reshape(
+                -1,
+                1,
+                3,
+            )
+            + edges
         )
 
     def picture(self, qpos: Rows, base_pose: Rows | None = None) -> NDArray[np.uint8]:

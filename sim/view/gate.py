@@ -54,7 +54,12 @@ class Gate:
         serve = websocket_server.serve
         handlers = []
 
-        def guarded(handler: Any, *_: Any, process_request: Any, **options: Any) -> Any:
+        def guarded(
+            handler: Any,
+            *_: Any,
+            process_request: Any,
+            **options: Any,
+        ) -> Any:
             def process(connection: Any, request: Any) -> Any:
                 hosts = request.headers.get_all("Host")
                 origins = request.headers.get_all("Origin")

@@ -237,7 +237,13 @@ class SceneNodes:
                 setpoint = self._scene.poses(frame.setpoint[0, [env]], np.array([env]))
                 _place(self._setpoints, setpoint)
 
-    def _add_surface(self, path: str, surface: Surface, copies: int, **options: Any) -> Any:
+    def _add_surface(
+        self,
+        path: str,
+        surface: Surface,
+        copies: int,
+        **options: Any,
+    ) -> Any:
         """Return a new node of a surface, in as many copies."""
         return self._server.scene.add_batched_meshes_simple(
             path,
@@ -271,7 +277,12 @@ def _add_chart(gui: Any, *curves: Document) -> Any:
     )
 
 
-def _draw(chart: Any, title: str, past: Float64, *curves: Rows) -> None:
+def _draw(
+    chart: Any,
+    title: str,
+    past: Float64,
+    *curves: Rows,
+) -> None:
     """Show curves over the past in a chart."""
     if chart.title != title:
         chart.title = title

@@ -31,7 +31,13 @@ class RobotScene:
     pose. ``deviation`` [m] is the largest distance of a triangle from a round surface.
     """
 
-    def __init__(self, robot: Robot, count: int, ground: bool, deviation: float) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        count: int,
+        ground: bool,
+        deviation: float,
+    ) -> None:
         self._tree = robot.rigid_tree
         self.ground = ground
         self.findings: list[Finding] = []

@@ -136,7 +136,13 @@ class LiveSimulation:
     def _frame(self, observation: Observation, time: float) -> Rollout:
         """Return an observation as a rollout of one tick."""
         row = observation.map(lambda array: array[None])
-        return Rollout(np.array([time]), self.setpoint[None].copy(), row, self.period, self._info)
+        return Rollout(
+            np.array([time]),
+            self.setpoint[None].copy(),
+            row,
+            self.period,
+            self._info,
+        )
 
 
 class Playback:

@@ -116,7 +116,11 @@ class Cluster:
         most = min(len(large), options.nodes or num_envs, num_envs)
         parts = (large[:count] for count in range(most, 0, -1))
         fixed = options.cpus_per_node
-        used = max(parts, key=lambda part: len(part) * (fixed or part[-1]), default=[])
+        used = max(
+            parts,
+            key=lambda part: len(part) * (fixed or part[-1]),
+            default=[],
+        )
         if not used:
             remedy = "lower cpus_per_node, or add larger machines"
             raise InvalidArgumentError("cluster", f"has no machine of {least} CPUs", remedy=remedy)
@@ -146,7 +150,11 @@ class NodeWorker(Worker):
     """Caller's end of a node."""
 
     def __init__(
-        self, start: Start, shared: SharedArrays, cluster: Cluster, pool_type: type
+        self,
+        start: Start,
+        shared: SharedArrays,
+        cluster: Cluster,
+        pool_type: type,
     ) -> None:
         super().__init__(start, shared)
         self._cluster = cluster

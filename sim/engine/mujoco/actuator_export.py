@@ -55,7 +55,13 @@ class MjcfActuators:
         Mask (joints,) of the joints with a rate-limited setpoint.
     """
 
-    def __init__(self, drive: Drive, independent: Bool, is_law: bool, guard: Guard | None) -> None:
+    def __init__(
+        self,
+        drive: Drive,
+        independent: Bool,
+        is_law: bool,
+        guard: Guard | None,
+    ) -> None:
         self._drive = drive
         self._independent = independent
         self.is_law = is_law

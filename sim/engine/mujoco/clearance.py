@@ -138,7 +138,11 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:
         moved = np.hstack([moved, floats])
         bounds = np.insert(bounds, dof, 1.0)
     arms = bounds[: moved.shape[1]]
-    return np.where(moved[pairs[:, 0]] != moved[pairs[:, 1]], arms, 0.0), travel
+    return np.where(
+        moved[pairs[:, 0]] != moved[pairs[:, 1]],
+        arms,
+        0.0,
+    ), travel
 
 
 @cache

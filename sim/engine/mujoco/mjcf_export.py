@@ -136,7 +136,12 @@ def to_mjcf(
     return Exported(f"{head}{etree.tostring(root, encoding='unicode')}\n", tuple(drive))
 
 
-def _set_inertia(body: Any, inertia: SpatialInertia, link: str, drive: Drive) -> None:
+def _set_inertia(
+    body: Any,
+    inertia: SpatialInertia,
+    link: str,
+    drive: Drive,
+) -> None:
     """Set the inertia of a body: the nearest of a physical body, which MuJoCo requires."""
     low, middle, high = np.linalg.eigvalsh(inertia.tensor)
     if low <= 0 or low + middle < high:
@@ -146,7 +151,11 @@ def _set_inertia(body: Any, inertia: SpatialInertia, link: str, drive: Drive) ->
 
 
 def _set_joints(
-    scene: MjSpec, robot: RobotDescription, drive: Drive, friction: Friction, effort_range: Float64
+    scene: MjSpec,
+    robot: RobotDescription,
+    drive: Drive,
+    friction: Friction,
+    effort_range: Float64,
 ) -> None:
     """Set damping, friction, armature and effort limits of the joints, and tie the followers."""
     rubs = joint_values(friction.coulomb, robot.dof, 0.0)

@@ -323,7 +323,12 @@ def _contact(spec: SceneSpec) -> Document:
     }
 
 
-def set_inertia(model: MjModel, robot: RobotMj, link: str, inertia: SpatialInertia) -> None:
+def set_inertia(
+    model: MjModel,
+    robot: RobotMj,
+    link: str,
+    inertia: SpatialInertia,
+) -> None:
     """Give a simulated link in a ``mujoco.MjModel`` this inertia, in the link's frame;
     ``mj_setConst`` comes next.
     """

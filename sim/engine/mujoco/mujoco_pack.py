@@ -268,7 +268,11 @@ class MujocoPack(ModelPack):
         self._evaluate(rows)
 
     def write_state(
-        self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None
+        self,
+        rows: Sequence[int],
+        qpos: Rows,
+        qvel: Rows,
+        base: Float64 | None = None,
     ) -> None:
         """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root
         at ``base``.
@@ -278,7 +282,11 @@ class MujocoPack(ModelPack):
         bases = np.tile(ORIGIN, (len(rows), 1)) if base is None else base.copy()
         at, moves = self._robot.base or (0, 0)
         # MuJoCo's angular velocities are in the body's axes.
-        bases[:, 10:] = np.einsum("eji,ej->ei", matrix_of(bases[:, 3:7]), bases[:, 10:])
+        bases[:, 10:] = np.einsum(
+            "eji,ej->ei",
+            matrix_of(bases[:, 3:7]),
+            bases[:, 10:],
+        )
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
             data = everyone[row]
             # Everything else of the scene returns to its start, but drives keep their targets.

@@ -30,7 +30,10 @@ def contact_bodies(spec: SceneSpec) -> list[str]:
 
 
 def add_link_sensors(
-    scene: MjSpec, spec: SceneSpec, names: dict[str, str], frames: Mapping[str, BodyFrame]
+    scene: MjSpec,
+    spec: SceneSpec,
+    names: dict[str, str],
+    frames: Mapping[str, BodyFrame],
 ) -> None:
     """Add sensors for the links of ``spec.contacts`` and ``spec.wrenches``.
 

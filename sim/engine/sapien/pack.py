@@ -304,7 +304,11 @@ class Pack(ModelPack):
         return self._sensors.take()
 
     def write_state(
-        self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None
+        self,
+        rows: Sequence[int],
+        qpos: Rows,
+        qvel: Rows,
+        base: Float64 | None = None,
     ) -> None:
         """Place robots ``rows``: positions and velocities (len(rows), dof), the root at ``base``;
         their efforts become zero, and the content of their scenes is reset.
@@ -317,7 +321,13 @@ class Pack(ModelPack):
         self._place(rows, qpos, qvel, bases.astype(np.float32))
         self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
-    def _place(self, rows: Sequence[int], qpos: Rows, qvel: Rows, roots: Float32) -> None:
+    def _place(
+        self,
+        rows: Sequence[int],
+        qpos: Rows,
+        qvel: Rows,
+        roots: Float32,
+    ) -> None:
         """Do :meth:`write_state` with these states of the root (len(rows), 13).
 
         They are always set, since a robot whose state is NaN has lost its root, too.

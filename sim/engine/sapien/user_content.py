@@ -74,7 +74,12 @@ class SceneContent:
     """
 
     def __init__(
-        self, spec: SceneSpec, build: Build, scene: HeadlessScene, env: int, links: Frames
+        self,
+        spec: SceneSpec,
+        build: Build,
+        scene: HeadlessScene,
+        env: int,
+        links: Frames,
     ) -> None:
         # What exists now is the robot and the ground; the rest is the user's.
         before = {entity.per_scene_id for entity in scene.entities}
@@ -162,7 +167,10 @@ def _check_shapes(scene: HeadlessScene, env: int, collisions: bool) -> None:
 
 
 def _call(
-    build: Build, scene: HeadlessScene, env: int, links: Frames
+    build: Build,
+    scene: HeadlessScene,
+    env: int,
+    links: Frames,
 ) -> list[tuple[sapien.Entity, sapien.Pose | None]]:
     """Return the entities and frames that ``build`` returns; its errors become an
     InvalidArgumentError.
