@@ -140,6 +140,7 @@ def osc(
     except ValueError:
         _check_shapes(k, inputs)
         raise
+    inputs = OSCInputs(*in_dtype_of(k, *inputs))
     if isinstance(dynamics, Tool):
         dynamics = task_dynamics(dynamics.tree, *inputs[1:3], dynamics.link, point=dynamics.point)
     with quiet():
