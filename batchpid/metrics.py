@@ -126,7 +126,7 @@ def step_metrics(
     r = broadcast("setpoint", setpoint, y.shape)
     floor = broadcast("absolute_band", absolute_band, y.shape[1:])
     u = broadcast("effort", np.nan if effort is None else effort, y.shape)
-    # Figures without efforts are NaN; those of efforts with a NaN lose every comparison.
+    # Without efforts the figures are NaN; with a NaN among the efforts they lose every comparison.
     is_sound = np.isfinite(u).all(0) | (effort is None)
     if saturated is None:
         limited: Rows = np.full(y.shape, np.nan)

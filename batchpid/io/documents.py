@@ -252,9 +252,7 @@ def _column(
 
 
 def read(path: str | os.PathLike[str]) -> Any:
-    """Return the document in a file. Raises InvalidArgumentError for a text that is no such
-    document.
-    """
+    """Return the document in a file. Raises InvalidArgumentError for a file that holds none."""
     path = file_path("path", path, SUFFIXES)
     return parse(str(path), path.read_bytes(), SUFFIXES[path.suffix.lower()])
 

@@ -166,7 +166,7 @@ class RigidTree:
         # Gravity belongs to the world, and to no link or joint.
         tables["gravity"] = _array("gravity", self.gravity, "xyz")
         for name in ("armature", "lower", "upper"):
-            # A number stands for all joints; an infinite limit of position counts as no limit.
+            # A number holds for all joints; an infinite limit means none.
             number = getattr(self, name)
             tables[name] = array(name, number, (len(moving),), moving, finite=False).copy()
         at_least("mass", tables["mass"], 0.0, links, kind="entry")

@@ -134,8 +134,8 @@ def _obstacle(robot: Robot, motion: Trajectory) -> tuple[str, list[int]]:
     velocity = motion.velocity[rows]
     effort = motion_effort(robot, position, velocity, motion.acceleration[rows])
     effort += robot.damping * velocity + robot.friction * np.sign(velocity)
-    outside = (position < robot.lower - 1e-9) | (position > robot.upper + 1e-9)
-    outside |= np.abs(velocity) > robot.velocity_limit
+    outside = (motion.position < robot.lower - 1e-9) | (motion.position > robot.upper + 1e-9)
+    outside |= np.abs(motion.velocity) > robot.velocity_limit
     # A joint that stays still may be too weak to hold itself.
     weak = (np.abs(effort) > robot.design_effort_limit) & (np.ptp(position, axis=0) > 0)
     for exceeds, words in ((outside, "exceeds its limits"), (weak, "is too weak to move")):

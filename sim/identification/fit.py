@@ -325,10 +325,10 @@ def intervals(problem: Problem, point: Float64, size: Float64) -> tuple[Float64,
     variance = np.maximum(jackknife, curvature) + (inverse @ matrix.T @ residual) ** 2
     deviation = np.sqrt(np.minimum(variance, prior**2)) * unknowns.sizes
     deviation = np.maximum(deviation, LEAST * np.abs(values))
-    # Correlations are those of the curvature.
+    # Correlations come from the curvature.
     ratio = deviation / np.sqrt(np.diagonal(inverse))
     root = ratio[:, None] * root
-    # A short delay of setpoints is left out: that of efforts explains the rest.
+    # A short delay of setpoints is left out: the delay of efforts explains the rest.
     late = np.array([entry.kind == "setpoint_delay" for entry in unknowns.entries])
     shown = (np.sqrt(curvature) < SHOWN * prior) & ~(late & (values < SHORT))
     return deviation, root, shown

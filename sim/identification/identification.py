@@ -111,7 +111,7 @@ def identify(
     if find_spec("scipy") is None:
         raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
-    kinds = [choice("extras", name, [*EXTRAS]) for name in dict.fromkeys(extras)]
+    kinds = [choice("extras", name, EXTRAS) for name in dict.fromkeys(extras)]
     if flag("payload", payload):
         kinds.append("payload")
     evaluations = integer("evaluations", evaluations, 2, 1000)
@@ -232,11 +232,13 @@ def _option(
     recorded: list[Any],
     default: Any,
 ) -> Any:
-    """Return ``value``, else that of the recordings, else the default."""
+    """Return ``value``, else the recordings' one, else the default."""
     values = {option for option in (value, *recorded) if option is not None} or {default}
     if len(values) > 1:
         problem = f"contradicts recordings, which were made with {recorded}"
-        raise InvalidArgumentError(name, problem, value=value, remedy="fit them one by one")
+        raise InvalidArgumentError(
+            name, problem, value=value, remedy="leave it out, or fit them one by one"
+        )
     return values.pop()
 
 
@@ -248,7 +250,7 @@ def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | 
         gains = [0.0 if getattr(table, name) is None else getattr(table, name) for table in laws]
         if not np.allclose(gains[:1], gains[-1:], rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
-            remedy = "leave them out: a recording has its own"
+            remedy = "leave them out, and give params to logs without"
             raise InvalidArgumentError("params", problem, remedy=remedy)
     if (law is None) != (log.kind == "effort"):
         remedy = "give the params that drove the robot" if law is None else "give no params"
@@ -310,7 +312,9 @@ def _unknowns(
     if drive.params is not None:
         kinds.append("setpoint_delay")
     for name in extras:
-        kinds += EXTRAS.get(name, (name,))
+        if name == "stribeck":
+            kinds.append("static")
+        kinds.append(name)
         if KINDS[kinds[-1]].target == "law" and drive.params is None:
             problem = "is of a law, and the logs hold efforts"
             remedy = "leave it out, or give the params of the law"

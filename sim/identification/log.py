@@ -65,7 +65,7 @@ class Log:
     measured: bool = False
     """True if the efforts of ``command`` were measured and not commanded: they have no delay."""
     params: bp.PIDParams | None = None
-    """Params that drove the robot, of all its joints or of those of the log; None: as given to
+    """Params that drove the robot, of all its joints or of the log's; None: as given to
     ``identify``.
     """
     robot: Robot | None = None

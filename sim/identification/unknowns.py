@@ -73,17 +73,8 @@ all gains of the law, "kd" of kd alone, "saturation" the law's effort limit over
 """
 BASIC = ("armature", "damping", "friction", "strength", "bias", "delay")
 """Kinds that every fit has."""
-EXTRAS = {
-    "load_friction": ("load_friction",),
-    "stribeck": ("static", "stribeck"),
-    "offset": ("offset",),
-    "mass": ("mass",),
-    "gain": ("gain",),
-    "kd": ("kd",),
-    "saturation": ("saturation",),
-    "slew": ("slew",),
-}
-"""Kinds that a fit has on request."""
+EXTRAS = ("load_friction", "stribeck", "offset", "mass", "gain", "kd", "saturation", "slew")
+"""Kinds that a fit has on request; "stribeck" brings "static" with it."""
 DESCRIBED = {"damping": "damping", "friction": "friction"}
 """Kinds that add to a value of the robot's description, and the name there."""
 
@@ -223,7 +214,7 @@ class Unknowns:
                 table = tables.setdefault(kind.field or entry.kind, neutral)
                 joint = slice(None) if entry.joint is None else [entry.joint]
                 table[:, joint] = values[:, column, None]
-        # Friction at rest is found in addition to that in motion.
+        # An unknown of friction at rest is in addition to friction in motion.
         if "static" in tables:
             tables["static"] += tables.get("coulomb", 0.0)
         return tables
