@@ -86,9 +86,9 @@ def test_files_hold_the_name_and_pictures_show_it(tmp_path_factory, name):
 
 @pytest.mark.parametrize("name", ["a\nb", "a\tb", "a\x85b", "a\u2028b"])
 def test_names_of_several_lines_are_refused(name, tmp_path):
+    escaped = name.replace("\n", "&#10;").replace("\t", "&#9;")
+    path = write(tmp_path, robot(link("base"), link("upper"), joint(escaped, "base", "upper")))
     with pytest.raises(RobotError, match="control character or a line break"):
-        escaped = name.replace("\n", "&#10;").replace("\t", "&#9;")
-        parts = [link("base"), link("upper"), joint(escaped, "base", "upper")]
-        Robot.load(write(tmp_path, robot(*parts)))
+        Robot.load(path)
     with pytest.raises(InvalidArgumentError, match="control character or a line break"):
         to_c(bp.make_params(1, 1.0), 0.01, joint_names=[name])
