@@ -59,7 +59,7 @@ ODDITIES = {
         one_joint(arm=INERTIAL + BOX.format(1e-3)),
         {},
         "units",
-        r"at most 0.0017 m.* 1 m long: sizes",
+        r"at most 0.0017 m.* 1 m long\): sizes",
     ),
     "degrees": (
         one_joint(LIMIT.replace('"-1"', '"-90"')),
