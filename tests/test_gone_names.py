@@ -41,6 +41,7 @@ GONE = (
     r"\bLogSettings\b",
     r"\bjerk_limited\b|import ruckig",
     r"\bmesa-vulkan-drivers\b",
+    r"\bMissedContact(Warning)?\b|\bmissed_contacts\b",
     r"\bpid_controller\b",
     r"\bposition_limit\b|\blimit_positions\b|\blimit_efforts\b",
     r"\bPushEnv\b",

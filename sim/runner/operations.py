@@ -141,15 +141,12 @@ class Run(Operation):
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         setpoint, rate, *_ = self.command
         faults = state.faults
-        contacts = state.contacts
         motion = state.motion
         count = outcome.num_ticks
         are_ok = np.logical_and.reduce(outcome.arrays.observation.ok[:count], axis=None)
-        if not are_ok or contacts is not None:
+        if not are_ok:
             for arrays in outcome.completed:
                 faults = faults.with_events(arrays)
-                if contacts is not None:
-                    contacts = contacts.with_events(arrays)
         if motion is not None and count:
             motion = setpoint[count - 1], None if rate is None else rate[count - 1]
         steps = count * self.substeps
@@ -158,7 +155,7 @@ class Run(Operation):
         else:
             work = (tuple(outcome.results), count)
         since = state.steps_since_checkpoint + steps
-        values = faults, contacts, motion, state.steps + steps, since, work
+        values = faults, motion, state.steps + steps, since, work
         # Not _replace(), which is a call of Python in the path of a tick.
         return tuple.__new__(RunnerState, (state.params, state.actuators, state.draws, *values))
 

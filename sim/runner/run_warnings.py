@@ -6,7 +6,7 @@ import batchpid as bp
 from batchpid.errors import warn
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
-from batchpid.sim.loop.faults import EventLog, FaultWarning, MissedContactWarning
+from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.tool_space import OperationalSpace
@@ -48,18 +48,12 @@ class RunWarnings:
             self._moving.set_params(params)
             self.moving = self._moving if self._moving.is_watching else None
 
-    def issue(self, faults: EventLog, contacts: EventLog | None, lost: list[str]) -> None:
-        """Warn of lost workers (the messages ``lost``, which are removed), faults and missed
-        contacts.
-        """
+    def issue(self, faults: FaultLog, lost: list[str]) -> None:
+        """Warn of lost workers (the messages ``lost``, which are removed) and faults."""
         while lost:
             warn(lost.pop(), RecoveryWarning)
         if faults.events:
             self._warn_once(f"{faults.events[0]}; see runner.faults for more", FaultWarning)
-        if contacts is not None and contacts.events:
-            problem = "robots passed through links or the ground, since collisions are off"
-            remedy = "Use collisions=True, or other moves; see runner.missed_contacts for more"
-            self._warn_once(f"{problem}: {contacts.events[0]}. {remedy}", MissedContactWarning)
 
     def _warn_once(self, text: str, kind: type[Warning]) -> None:
         if kind not in self._issued:

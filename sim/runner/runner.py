@@ -28,7 +28,7 @@ from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, S
 from batchpid.io.files import package_versions
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.backend import describe
-from batchpid.sim.loop.faults import Fault, MissedContact
+from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.options.options import KINDS, OPTIONS, RunnerOptions, arguments_of, checked_option
@@ -500,16 +500,6 @@ class Runner(SingleOwner):
         return self._state.faults.events
 
     @property
-    def missed_contacts(self) -> tuple[MissedContact, ...]:
-        """First contact that each robot without shapes would have had since its reset; latest
-        last.
-        """
-        contacts = self._state.contacts
-        if contacts is None:
-            return ()
-        return contacts.events
-
-    @property
     def draws(self) -> dict[str, NDArray[np.float64]]:
         """Draws of the randomization for the present episodes, by field: (envs, joints or links),
         as copies.
@@ -681,8 +671,8 @@ class Runner(SingleOwner):
             rates = run.command.setpoint_rate
             moving.see(rows, rates is not None, run.substeps * self.timestep)
         state = self._state
-        if pool.warnings or state.faults.events or state.contacts is not None:
-            self._warnings.issue(state.faults, state.contacts, pool.warnings)
+        if pool.warnings or state.faults.events:
+            self._warnings.issue(state.faults, pool.warnings)
         return outcome
 
     def _prepare_ticks(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, EventLog, Fault, MissedContact
+from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, Fault, FaultLog
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 
@@ -26,9 +26,7 @@ class RunnerState(NamedTuple):
     params: bp.PIDParams
     actuators: bp.Actuators | None
     draws: Draws
-    faults: EventLog
-    contacts: EventLog | None
-    """None if contacts are not watched: the robots have collision shapes."""
+    faults: FaultLog
     motion: Motion | None
     """Setpoint of the last tick and its rate, or position and velocity after a reset. None for
     other setpoints.
@@ -46,14 +44,11 @@ class RunnerState(NamedTuple):
         draws = NOTHING
         if options.randomization is not None:
             draws = options.randomization.first(robot, count, options.first_env)
-        faults = EventLog(count, "step", -1, partial(_fault, options))
-        contacts = None
-        if options.misses_contacts:
-            contacts = EventLog(count, "missed_contact", 0, partial(_missed_contact, options))
+        faults = FaultLog(count, partial(_fault, options))
         motion = None
         if options.sets_positions:
             motion = (np.tile(robot.start, (count, 1)), None)
-        return cls(options.params, options.actuators, draws, faults, contacts, motion)
+        return cls(options.params, options.actuators, draws, faults, motion)
 
 
 def _fault(options: RunnerOptions, env: int, arrays: Arrays) -> Fault:
@@ -66,10 +61,3 @@ def _fault(options: RunnerOptions, env: int, arrays: Arrays) -> Fault:
         kind, names = "entry", command.names
     joint = names[arrays.fault.joint[env]]
     return Fault(env, step, step * options.timestep, joint, cause, options.on_fault, kind)
-
-
-def _missed_contact(options: RunnerOptions, env: int, arrays: Arrays) -> MissedContact:
-    """Return the first missed contact of an env in the arrays of a tick."""
-    time = int(arrays.fault.missed_contact[env]) * options.timestep
-    contacts = options.robot.dynamics().contacts
-    return MissedContact(env, time, contacts.nearest_links(arrays.observation.qpos[env]))

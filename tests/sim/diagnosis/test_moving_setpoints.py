@@ -15,7 +15,6 @@ from batchpid.trajectories import minimum_jerk, trapezoidal
 
 N, DT = 2, 0.01
 QUIET = pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
-pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.MissedContactWarning")
 
 
 def moves(robot, count=N, seed=0, profile=minimum_jerk, **limits):
