@@ -15,6 +15,7 @@ import numpy as np
 from lxml import etree
 
 from batchpid.arrays.array_types import Document, Float64
+from batchpid.checks.validate import is_name
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
@@ -79,6 +80,22 @@ def read_robot(
     be read, a structure or number without repair, a bad mesh, or an MJCF file that MuJoCo does not
     compile.
     """
+    source = _read(path, fixed_base, package_dirs, missing_meshes)
+    joints = [joint.name for joint in source.tables.joints]
+    for name in (source.name, *joints, *(body.name for body in source.tables.bodies)):
+        if not is_name(name):
+            raise RobotError(
+                f"{path}: the name {name!r} has a control character or a line break; rename it"
+            )
+    return source
+
+
+def _read(
+    path: Path,
+    fixed_base: bool | None,
+    package_dirs: tuple[Path, ...],
+    missing_meshes: str,
+) -> Source:
     findings: list[Finding] = []
     root = parse_xml(path, findings)
     if not is_mjcf(root):
