@@ -131,7 +131,7 @@ class Header:
         if guard is None:
             held = None
         else:
-            held = GuardState(nan, np.zeros_like(nan))
+            held = guard_model.init(guard, nan)
         self.state = pid.init(params, nan), held
         """State after init; NaN where it is the measurement."""
 
