@@ -190,14 +190,15 @@ class SceneNodes:
         copies = len(scene.positions)
         self._robots: list[Any] = []
         for index, surface in enumerate(scene.surfaces):
-            *rgb, alpha = surface.rgba
-            node = api.add_batched_meshes_simple(
+            colour = np.round(255 * np.asarray(surface.rgba)).astype(np.uint8)
+            alpha = surface.rgba[3]
+            node: Any = api.add_batched_meshes_simple(
                 f"/robots/{index}",
                 surface.vertices.astype(np.float32),
                 surface.faces.astype(np.uint32),
                 batched_wxyzs=np.tile(np.array([1, 0, 0, 0], np.float32), (copies, 1)),
                 batched_positions=np.zeros((copies, 3), np.float32),
-                batched_colors=tuple(round(255 * value) for value in rgb),
+                batched_colors=np.tile(colour[:3], (copies, 1)),
                 opacity=alpha if alpha < 1 else None,
                 lod="off",
             )
