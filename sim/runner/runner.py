@@ -141,7 +141,6 @@ class Runner(SingleOwner):
             self._call.end()
         self._execute(start)
         checks.check_stability(self._state)
-        checks.set_params(options.params)
         checks.check_controller()
 
     def __repr__(self) -> str:
@@ -413,7 +412,6 @@ class Runner(SingleOwner):
         checked = self.options.check_params(params)
         self._execute(SetParams(checked))
         self._warnings.check_stability(self._state)
-        self._warnings.set_params(checked)
 
     @property
     def actuators(self) -> bp.Actuators | None:
@@ -463,7 +461,6 @@ class Runner(SingleOwner):
         restore = restored(self.options, snapshot, self._present)
         self._execute(restore)
         self._pool.replay.start_from(restore)
-        self._warnings.set_params(self._state.params)
         return self.observe()
 
     # -- properties
@@ -677,11 +674,6 @@ class Runner(SingleOwner):
         if outcome.failure is not None:
             raise outcome.failure.error
         # Warnings come last: as errors they must leave a runner that can go on.
-        moving = self._warnings.moving
-        if run is not None and moving is not None:
-            rows = run.command.setpoint[: outcome.num_ticks]
-            rates = run.command.setpoint_rate
-            moving.see(rows, rates is not None, run.substeps * self.timestep)
         state = self._state
         if pool.warnings or state.faults.events:
             self._warnings.issue(state.faults, pool.warnings)
