@@ -25,11 +25,13 @@ from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.task_space.rigid_tree import RigidTree
 
-Capability = Literal["build", "partial_force", "base_state", "sapien_dissipation"]
+Capability = Literal["build", "partial_force", "base_state", "complete_state", "sapien_dissipation"]
 """
 - ``"build"``: the user's function ``build`` adds content to scenes;
 - ``"partial_force"``: compiled steps read gravity or Coriolis forces alone;
 - ``"base_state"``: compiled steps read state and passive force of robots on a floating base;
+- ``"complete_state"``: :meth:`EnginePack.read_state` holds everything that later steps depend on, so
+  that a pack in use can be restored, and a snapshot changes no bit;
 - ``"sapien_dissipation"``: SAPIEN's own friction and damping in place of the URDF's.
 """
 
@@ -89,9 +91,6 @@ class EnginePack(Protocol):
         Whether native code does the sim steps, by :meth:`compiled_step`.
     content
         Digest of the content that the user's ``build`` added to each env (M,); empty without one.
-    state_is_complete
-        Whether :meth:`read_state` holds everything that later steps depend on, so that a pack in
-        use can be restored.
     """
 
     spec: SceneSpec
@@ -100,7 +99,6 @@ class EnginePack(Protocol):
     first_env: int
     qf: Rows
     content: Rows
-    state_is_complete: bool
     friction: Friction
     armature: Float64
     steps_natively: bool

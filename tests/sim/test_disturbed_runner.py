@@ -231,7 +231,19 @@ def test_a_request_that_kills_every_worker_is_given_up(monkeypatch, tmp_path) ->
     assert runner.closed
 
 
-def test_only_the_requests_since_the_last_checkpoint_are_replayed(tmp_path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("engine", "resets", "replayed"),
+    [
+        ("mujoco", {}, 10),
+        # Env 0 is reset at 20 and 30 sim steps, env 1 at 25: from a checkpoint at 20.
+        ("sapien", {4: [0], 5: [1], 6: [0]}, 30),
+        ("sapien", {4: [0], 6: [0]}, 50),
+        ("sapien", {4: [0, 1]}, 30),
+    ],
+)
+def test_only_the_requests_since_the_last_checkpoint_are_replayed(
+    tmp_path, monkeypatch, engine, resets, replayed
+) -> None:
     monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 20)
     path = tmp_path / "steps"
 
@@ -239,14 +251,66 @@ def test_only_the_requests_since_the_last_checkpoint_are_replayed(tmp_path, monk
         with path.open("ab") as file:
             file.write(b".")
 
-    with acting(write_a_dot, 1) as runner:
-        for _ in range(9):
-            runner.step(ROBOT.start)  # checkpoints after 20 and 40 sim steps
+    with acting(write_a_dot, 1, engine=engine) as runner:
+        # In MuJoCo checkpoints come after 20 and 40 sim steps.
+        for tick in range(9):
+            if tick in resets:
+                runner.reset(mask=np.isin([0, 1], resets[tick]))
+            runner.step(ROBOT.start)
         before = path.stat().st_size
         send(runner.pids[0], signal.SIGKILL)
         with pytest.warns(RecoveryWarning):
             runner.step(ROBOT.start)
-    assert (before, path.stat().st_size - before) == (45, 10)
+    assert (before, path.stat().st_size - before) == (45, replayed)
+
+
+DOG = Robot.load("quadruped", fixed_base=False)
+WALK = DOG.start + 0.15 * np.sin(np.arange(24))[:, None, None] * np.ones((1, 3, DOG.dof))
+
+
+def test_an_episode_in_contact_does_not_depend_on_the_time_before_it(engine, monkeypatch) -> None:
+    """Neither do checkpoints change it, of which there are several."""
+    monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 60)
+    episodes = []
+    for ticks in (1, 2, 5):
+        with Runner(DOG, 3, workers=0, engine=engine) as runner:
+            runner.rollout(WALK[:ticks])
+            runner.reset()
+            episodes.append(runner.rollout(WALK))
+    assert np.ptp(episodes[0].qpos, axis=0).max() > 1e-3
+    for episode in episodes[1:]:
+        assert_identical(episode.observation, episodes[0].observation)
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
+def test_a_replay_from_resets_of_some_envs_in_contact(engine, monkeypatch) -> None:
+    monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 60)
+    masks = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 1], [0, 1, 0], [0, 0, 0]], bool)
+    with (
+        Runner(DOG, 3, workers=2, engine=engine) as runner,
+        Runner(DOG, 3, workers=0, engine=engine) as model,
+    ):
+        for number, mask in enumerate(masks):
+            send(runner.pids[number % 2], signal.SIGKILL)
+            part = slice(4 * number, 4 * number + 4)
+            for each in (runner, model):
+                if mask.any():
+                    each.reset(mask=mask)
+            assert_identical(runner.rollout(WALK[part]), model.rollout(WALK[part]))
+
+
+def test_a_run_whose_commands_are_too_many_cannot_be_replayed(monkeypatch) -> None:
+    monkeypatch.setattr("batchpid.sim.workers.pool.MOST_BYTES", 4 * 8 * N * ROBOT.dof * 8)
+    with make(1, engine="sapien") as runner:
+        runner.rollout(np.tile(NEAR, (20, 1)))
+        runner.snapshot()
+        send(runner.pids[0], signal.SIGKILL)
+        with pytest.warns(RecoveryWarning):
+            runner.step(NEAR)
+        runner.rollout(np.tile(NEAR, (20, 1)))
+        send(runner.pids[0], signal.SIGKILL)
+        with pytest.raises(WorkerError, match=r"too many to be replayed: .*runner\.snapshot"):
+            runner.step(NEAR)
 
 
 # -- Ctrl-C and other signals
