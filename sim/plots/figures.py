@@ -403,6 +403,7 @@ def _blank_failed(rollout: Rollout) -> Rollout:
     """Return the rollout with NaN where an env has failed, and for setpoints that are not
     positions.
     """
+    rollout.check_ticks()
     alive = rollout.ok[..., None]
     blank = {}
     for name in ("qpos", "effort", "tool_pose"):

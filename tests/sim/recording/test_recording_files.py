@@ -113,7 +113,10 @@ def test_files_that_are_no_recordings_are_refused_by_name(tmp_path, rollout):
     with h5py.File(shape, "r+") as file:
         del file["qpos"]
         file["qpos"] = np.zeros((6, 2, 9), np.float32)
-    for path in (text, other, shape):
+    start = write_recording(rollout, tmp_path / "start.h5")
+    with h5py.File(start, "r+") as file:
+        file.attrs["start"] = np.zeros((1, 2))
+    for path in (text, other, shape, start):
         with pytest.raises(RecordingError, match=rf"{path.name}: cannot be read as a recording: "):
             read_recording(path)
 
