@@ -449,7 +449,12 @@ def _quantiles(values: Rows, *at: float) -> Rows:
 def _blank_failed(rollout: Rollout) -> Rollout:
     """Return the rollout with NaN where an env has failed, and for setpoints that are not
     positions.
+
+    Raises InvalidArgumentError for one without ticks.
     """
+    if not len(rollout.time):
+        remedy = "run it again: it was cut short"
+        raise InvalidArgumentError("rollout", "holds no tick", remedy=remedy)
     alive = rollout.ok[..., None]
     blank = {}
     for name in ("qpos", "effort", "tool_pose"):

@@ -15,6 +15,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.errors import MissingDependencyError
+from batchpid.io.packages import uninterrupted
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.shapes import Surface
 from batchpid.sim.signals.rollout import Rollout
@@ -58,9 +59,11 @@ class View(AbstractContextManager["View"]):
 
     def __init__(self, data: ViewData, *, port: int = 8080) -> None:
         try:
-            import viser
+            with uninterrupted():
+                import viser
 
-            from batchpid.sim.view.gate import HOST, Gate  # needs what viser needs
+                # It needs what viser needs.
+                from batchpid.sim.view.gate import HOST, Gate
         except ImportError:
             raise MissingDependencyError("viser", "the browser view", "view") from None
         self.data = data
