@@ -402,6 +402,8 @@ def _quantiles(values: Rows, *at: float) -> Rows:
 def _blank_failed(rollout: Rollout) -> Rollout:
     """Return the rollout with NaN where an env has failed, and for setpoints that are not
     positions.
+
+    Raises InvalidArgumentError for one without ticks.
     """
     rollout.check_ticks()
     alive = rollout.ok[..., None]

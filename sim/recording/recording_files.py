@@ -118,8 +118,8 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
                 raise ValueError(f"its format is not {FORMAT}")
             info = read_info(file.attrs)
             num_envs = int(file.attrs["num_envs"])
-            tick = float(file.attrs["tick"])
             _check_info(info, num_envs)
+            tick = float(file.attrs["tick"])
             time = file["time"][:]
             # The rows of a run that still goes on, or was killed, end at the first without a time.
             count = int(np.append(np.isfinite(time), False).argmin())
@@ -147,10 +147,10 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
 
 
 def _check_info(info: RunInfo, num_envs: int) -> None:
-    """Raise ValueError unless the arrays of ``info`` are those of its joints and envs."""
-    joints = len(info.joint_names)
-    shapes = dict.fromkeys(("units", "lower", "upper", "effort_limit"), (joints,))
-    shapes |= {"start": (num_envs, joints), "episodes": (num_envs, 2)}
+    """Raise ValueError for an array of a file whose shape is not that of its field."""
+    joints: tuple[int, ...] = (len(info.joint_names),)
+    shapes = dict.fromkeys(("units", "lower", "upper", "effort_limit"), joints)
+    shapes |= {"start": (num_envs, *joints), "episodes": (num_envs, 2)}
     for name, shape in shapes.items():
         value = getattr(info, name)
         if value is not None and np.shape(value) != shape:

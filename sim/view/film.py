@@ -61,7 +61,7 @@ class Painter:
         self._scene = scene = RobotScene(robot, count, ground, deviation=8e-3)
         self._size = size
         self._eye = scene.target + _NEARER * (scene.eye - scene.target)
-        distance = np.linalg.norm(scene.target - self._eye)
+        distance = float(np.linalg.norm(scene.target - self._eye))
         forward = (scene.target - self._eye) / distance
         right = np.cross(forward, [0.0, 0.0, 1.0]) / np.linalg.norm(forward[:2])
         self._axes = np.stack([right, np.cross(right, forward), forward])  # right, up, forward

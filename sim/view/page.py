@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from batchpid.errors import MissingDependencyError
+from batchpid.io.packages import uninterrupted
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.panel import Panel
@@ -54,9 +55,11 @@ class View(AbstractContextManager["View"]):
 
     def __init__(self, data: ViewData, *, port: int = 8080) -> None:
         try:
-            import viser
+            with uninterrupted():
+                import viser
 
-            from batchpid.sim.view.gate import HOST, Gate  # needs what viser needs
+                # It needs what viser needs.
+                from batchpid.sim.view.gate import HOST, Gate
         except ImportError:
             raise MissingDependencyError("viser", "the browser view", "view") from None
         self.data = data
