@@ -76,9 +76,6 @@ class MujocoPack(ModelPack):
                 size, coupling, np.zeros(self.dof, bool), spec.timestep
             )
             self._constraint.implicit[...] = spec.timestep * (0.0 if viscous is None else viscous)
-            if self.steps_natively:
-                reads = spec.fixed_base and self.steps_read_force(True, True)
-                self._constraint.use(self.joint_model, None if reads else self._bias_model)
         if spec.mjcf is not None:
             links = *(spec.contacts or ()), *(spec.wrenches or ()), spec.carrier
             check_links(spec, spec.mjcf, filter(None, links))
@@ -99,6 +96,10 @@ class MujocoPack(ModelPack):
         self._free: FreeMotions | None = None
         if self.steps_natively and self._moves_freely:
             self._free = FreeMotions(robot, self.size, self.joint_model)
+        if self._constraint is not None and self.steps_natively:
+            reads = self.spec.fixed_base and self.steps_read_force(True, True)
+            is_read = reads and self._free is None
+            self._constraint.use(self.joint_model, None if is_read else self._bias_model)
         self._change_world(range(self.size))
         self._change_masses(range(self.size))
         self._update(range(self.size))

@@ -352,11 +352,7 @@ inline void update_constraint(Group const &group, double const *qpos, double con
                dof);
       continue;
     }
-    FreeMotion const *free = group.mujoco->free;
-    for (std::int64_t j = 0; j < dof; ++j) {
-      own[j] = free != nullptr ? free->bias[row / WIDTH * dof + j].of[row % WIDTH]
-                               : group.mujoco->bias[row][group.mujoco->qvel_at[j]];
-    }
+    for (std::int64_t j = 0; j < dof; ++j) own[j] = group.mujoco->bias[row][group.mujoco->qvel_at[j]];
   }
   update_constraint(*group.constraint, group.robots, qpos, passive.data(), nullptr);
 }
