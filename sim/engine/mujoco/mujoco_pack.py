@@ -53,8 +53,6 @@ class MujocoPack(ModelPack):
     Implements :class:`batchpid.sim.engine.protocol.EnginePack`.
     """
 
-    state_is_complete = True
-
     def __init__(
         self,
         spec: SceneSpec,
@@ -551,7 +549,7 @@ class MujocoPack(ModelPack):
 ENGINE = Engine(
     name="mujoco",
     title="MuJoCo",
-    capabilities=frozenset({"base_state"}),
+    capabilities=frozenset({"base_state", "complete_state"}),
     physics=SOLVERS,
     group_size=64,
     make_pack=MujocoPack,
