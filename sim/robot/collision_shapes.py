@@ -19,7 +19,7 @@ from batchpid.arrays.elementwise import read_only
 from batchpid.errors import RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.robot.inertia import DENSITY
-from batchpid.sim.robot.meshes import note_meshes, read_mesh
+from batchpid.sim.robot.meshes import mesh_bytes, read_mesh
 from batchpid.sim.robot.tables import Shape
 from batchpid.task_space.frames import SpatialInertia
 
@@ -31,7 +31,7 @@ def hull(shape: Shape) -> Float64:
     """
     if shape.vertices is not None:
         return shape.vertices
-    return read_only(mesh_vertices(shape.file) * shape.scale)
+    return read_only(mesh_vertices(shape.file, shape.content) * shape.scale)
 
 
 def mesh_file(shape: Shape) -> str:
@@ -77,18 +77,19 @@ def half_extents(shape: Shape) -> tuple[Float64, Float64]:
 
 
 @lru_cache(maxsize=256)
-def mesh_vertices(filename: str) -> Float64:
-    """Return the vertices (n, 3) of the convex hull of a mesh file, unscaled [m]. Raises
-    RobotError.
+def mesh_vertices(file: str, content: str) -> Float64:
+    """Return the vertices (n, 3) of the convex hull of a mesh file with this digest, unscaled [m].
+
+    Raises RobotError.
     """
-    note_meshes([filename])
+    data = mesh_bytes(file, content)
     try:
-        rows = np.ascontiguousarray(read_mesh(filename).vertices, float) + 0.0  # no -0.0
+        rows = np.ascontiguousarray(read_mesh(file, data).vertices, float) + 0.0  # no -0.0
         # Unique by their bytes, which is much faster than along an axis.
         vertices, _ = convex_hull(np.unique(rows.view("V24")).view(float))
     except Exception as error:
         raise RobotError(
-            f"{filename}: cannot be read: {error}; repair the file, or remove that <collision>"
+            f"{file}: cannot be read: {error}; repair the file, or remove that <collision>"
         ) from error
     return vertices
 

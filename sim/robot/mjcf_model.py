@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import MjModel, MjSpec
+from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
@@ -40,6 +40,7 @@ _PREFIXES = (
     "wrap_",
     "mesh_vert",
     "flex",
+    "plugin_",
 )
 """Beginnings of the names of the model's arrays that the simulation depends on."""
 _FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
@@ -66,9 +67,16 @@ class Compiled(NamedTuple):
         """Digest of the elements that move, collide or act."""
         model = self.model
         names = [name for name in dir(model) if name.startswith(_PREFIXES)]
-        # The last bits may differ between kinds of processors.
-        arrays = {name: np.round(1.0 * getattr(model, name), 9) + 0.0 for name in names}
+        arrays = {name: _rounded(np.asarray(getattr(model, name), float)) for name in names}
         return digest(arrays, model.names, str(model.opt))
+
+
+def _rounded(values: Float64) -> Float64:
+    """Return ``values`` to nine digits: the last bits may differ between kinds of processors."""
+    # What cancels out leaves a rest of rounding.
+    shares, exponents = np.frexp(np.where(np.abs(values) < 1e-12, 0.0, values))
+    rounded: Float64 = np.ldexp(np.round(shares, 9), exponents)
+    return rounded
 
 
 def compile_file(path: Path, missing_meshes: str, findings: list[Finding]) -> Compiled:
@@ -100,6 +108,8 @@ def compile_scene(path: Path, is_whole: bool) -> Compiled:
     Raises RobotError if MuJoCo refuses it.
     """
     missing: tuple[str, ...] = ()
+    # MuJoCo takes a file of the same name, size and second for the one that it has read.
+    mujoco.mj_clearCache(mujoco.mj_getCache())
     try:
         scene = mujoco.MjSpec.from_file(str(path))
         if not is_whole:

@@ -18,7 +18,7 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
-from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
+from batchpid.sim.robot.meshes import check_mesh, find_mesh
 from batchpid.sim.robot.mjcf_model import unique
 from batchpid.sim.robot.mjcf_reader import read_mjcf
 from batchpid.sim.robot.parts import MOVING_TYPES, Joint, Mimic
@@ -510,13 +510,14 @@ class _Reader:
         if shape.kind != "mesh":
             return shape
         file = find_mesh(shape.file, self._path, self._package_dirs)
-        problem = None if file is None else mesh_problem(file)
-        if file is None or problem is not None:
-            self._missing.append(shape.file if problem is None else f"{shape.file} ({problem})")
+        if file is None:
+            self._missing.append(shape.file)
             return None
-        # SAPIEN would simulate the file that it read before.
-        check_unchanged(file)
-        return shape._replace(file=str(file))
+        content, problem = check_mesh(file)
+        if problem is not None:
+            self._missing.append(f"{shape.file} ({problem})")
+            return None
+        return shape._replace(file=str(file), content=content)
 
     def report_missing(self, missing_meshes: str) -> None:
         """Report meshes that are missing or cannot be read, or raise RobotError if that is
