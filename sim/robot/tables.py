@@ -86,12 +86,12 @@ class Shape(NamedTuple):
     """Orientation of the shape in the frame of the body (4,)."""
     file: str = ""
     """Absolute path of a mesh, which counts as its convex hull; "" for other shapes."""
-    content: str = ""
-    """Digest of the bytes of ``file``, which say what it is: paths and time stamps do not."""
     scale: tuple[float, ...] = (1.0, 1.0, 1.0)
     """Factors of the vertices of the file; an odd number of negative ones mirrors the mesh."""
     vertices: Float64 | None = None
     """Vertices (n, 3) [m] of a mesh without a file, in the frame of the shape."""
+    content: str = ""
+    """Digest of the bytes of ``file``, which say what it is: paths and time stamps do not."""
 
     @property
     def is_mirrored(self) -> bool:
