@@ -18,11 +18,13 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import slow_oscillation, stability_report
+from batchpid.sim.engine.protocol import load_engine
+from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
 from batchpid.sim.robot.inertia import DENSITY, triangle_excess
 from batchpid.sim.robot.parts import Joint
-from batchpid.sim.robot.plausibility import implausible_figures
+from batchpid.sim.robot.plausibility import changed_shapes, implausible_figures
 from batchpid.sim.robot.urdf import GIVE_RANGE
 
 # of the triangle inequality of principal moments, above which it is reported; less is rounding
@@ -40,6 +42,7 @@ def check(
     setpoint: ArrayLike | None,
     timestep: float,
     control: str,
+    engine: str | None,
 ) -> Findings:
     """Return the findings, most severe first; :meth:`batchpid.sim.Robot.check` describes the
     arguments.
@@ -65,6 +68,11 @@ def check(
         preflight.check_params(params, control)
         if control == "pid":
             preflight.check_stability(params, start, timestep)
+    if engine is not None:
+        chosen = load_engine(engine)
+        ground = {"ground": robot.has_ground, "mjcf": robot.mjcf}
+        scene = SceneSpec.of(robot, timestep, chosen.physics["accurate"], **ground)
+        preflight.findings += [*chosen.refusals(scene), *chosen.shortfalls(scene)]
     return Findings(sorted(preflight.findings, key=lambda it: SEVERITIES.index(it.severity)))
 
 
@@ -74,6 +82,7 @@ class _Preflight:
     def __init__(self, robot: RobotDescription) -> None:
         self.robot = robot
         self.findings = [*implausible_figures(robot), *robot.repairs, *robot.srdf.findings]
+        self.findings += changed_shapes(robot)
 
     def _note(
         self,
@@ -153,11 +162,8 @@ class _Preflight:
         report("no-inertia", f"no <inertial>: {effect}", remedy, link=link, detail=detail)
 
     def _check_contacts(self, start: Float64) -> None:
-        """Report pairs that PhysX's filter does not hold, and contacts at the start pose."""
+        """Report contacts at the start pose."""
         robot = self.robot
-        if left_over := robot.self_contact.left_over:
-            text = f"{len(left_over)} pairs should not collide, but PhysX's filter cannot hold them"
-            self._note("pairs-left-over", text, "disable fewer pairs in the .srdf")
         for pair in robot.self_contact.pairs:
             if pair.reason == "Default" and pair not in robot.srdf.disabled:
                 text = (

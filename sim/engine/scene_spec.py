@@ -20,6 +20,7 @@ from batchpid.sim.robot.contacts import Contacts
 from batchpid.sim.robot.merging import merge_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.simulated_links import BodyParts, rigid_tree, varied_bodies
 from batchpid.sim.robot.tables import Tables
 from batchpid.task_space.frames import SpatialInertia, spatial_matrix, total
@@ -62,6 +63,26 @@ class SceneSpec:
     mjcf: MjcfFile | None = None
     carrier: str = ""
     varied_links: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        robot: Robot,
+        timestep: float,
+        physics: object,
+        **options: Any,
+    ) -> SceneSpec:
+        """Return the description of scenes of ``robot``; ``options`` are further fields."""
+        return cls(
+            robot.tables,
+            robot.ignored_pairs,
+            robot.joints,
+            timestep,
+            physics,
+            dissipation=robot.dissipation,
+            fixed_base=robot.fixed_base,
+            **options,
+        )
 
     @property
     def simulated(self) -> Tables:

@@ -1,6 +1,7 @@
 """Collision shapes as plain values for engines, distances and masses.
 
-A mesh counts as its convex hull, in both engines.
+A mesh collides as its convex hull, in both engines; a mass from shapes is that of the mesh itself
+where it encloses a volume.
 """
 
 from __future__ import annotations
@@ -9,11 +10,12 @@ import os
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64, MjModel, MjsBody, MjSpec, Rows
+from batchpid.arrays.array_types import Document, Float64, MjModel, MjsBody, MjSpec, Rows
 from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.errors import RobotError
@@ -24,6 +26,18 @@ from batchpid.sim.robot.tables import Shape
 from batchpid.task_space.frames import SpatialInertia
 
 
+class Triangles(NamedTuple):
+    """Triangles: ``vertices`` (v, 3) [m], and ``faces`` (f, 3), numbers of vertices."""
+
+    vertices: Float64
+    faces: NDArray[np.int64]
+
+    @property
+    def volume(self) -> float:
+        """Volume within a closed surface [m^3]."""
+        return float(np.linalg.det(self.vertices[self.faces]).sum() / 6)
+
+
 def hull(shape: Shape) -> Float64:
     """Return the vertices of the convex hull of a mesh (n, 3) [m], in the frame of the shape.
 
@@ -31,7 +45,7 @@ def hull(shape: Shape) -> Float64:
     """
     if shape.vertices is not None:
         return shape.vertices
-    return read_only(mesh_vertices(shape.file, shape.content) * shape.scale)
+    return read_only(mesh_hull(shape.file, shape.content).vertices * shape.scale)
 
 
 def mesh_file(shape: Shape) -> str:
@@ -77,25 +91,53 @@ def half_extents(shape: Shape) -> tuple[Float64, Float64]:
 
 
 @lru_cache(maxsize=256)
-def mesh_vertices(file: str, content: str) -> Float64:
-    """Return the vertices (n, 3) of the convex hull of a mesh file with this digest, unscaled [m].
+def mesh_hull(file: str, content: str) -> Triangles:
+    """Return the convex hull of a mesh file with this digest, unscaled [m]. Raises RobotError."""
+    try:
+        hull_of_mesh = convex_hull(_mesh_surface(file, content).vertices)
+    except ValueError as error:
+        raise RobotError(
+            f"{file}: cannot be read: {error}; repair the file, or remove that <collision>"
+        ) from error
+    return hull_of_mesh
 
-    Raises RobotError.
-    """
+
+def _mesh_surface(file: str, content: str) -> Triangles:
+    """Return the triangles of a mesh file, without copies of vertices, unscaled [m]."""
     data = mesh_bytes(file, content)
     try:
-        rows = np.ascontiguousarray(read_mesh(file, data).vertices, float) + 0.0  # no -0.0
+        mesh = read_mesh(file, data)
+        rows = np.ascontiguousarray(mesh.vertices, float) + 0.0  # no -0.0
         # Unique by their bytes, which is much faster than along an axis.
-        vertices, _ = convex_hull(np.unique(rows.view("V24")).view(float))
+        vertices, numbers = np.unique(rows.view("V24"), return_inverse=True)
     except Exception as error:
         raise RobotError(
             f"{file}: cannot be read: {error}; repair the file, or remove that <collision>"
         ) from error
-    return vertices
+    return Triangles(vertices.view(float).reshape(-1, 3), numbers.ravel()[mesh.faces])
 
 
-def convex_hull(points: Float64) -> tuple[Float64, NDArray[np.int64]]:
-    """Return the vertices (n, 3) of the convex hull of points, and its triangles (m, 3), by MuJoCo.
+@lru_cache(maxsize=256)
+def mesh_solid(file: str, content: str) -> Triangles | None:
+    """Return the surface of a mesh file that encloses a volume, unscaled [m]; None for others."""
+    surface = _mesh_surface(file, content)
+    edges = surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    forth, back = ({*map(tuple, rows.tolist())} for rows in (edges, edges[:, ::-1]))
+    # Around a volume every edge is one of two triangles, once in each direction.
+    is_closed = len(forth) == len(edges) and forth == back
+    return surface if is_closed and surface.volume > 0 else None
+
+
+def hull_share(shape: Shape) -> float:
+    """Return the volume of a mesh's hull over that of the mesh; 1.0 where it encloses none."""
+    solid = mesh_solid(shape.file, shape.content) if shape.file else None
+    if solid is None:
+        return 1.0
+    return mesh_hull(shape.file, shape.content).volume / solid.volume
+
+
+def convex_hull(points: Float64) -> Triangles:
+    """Return the convex hull of points, by MuJoCo.
 
     Raises ValueError if MuJoCo's compiler refuses the points.
     """
@@ -108,14 +150,12 @@ def convex_hull(points: Float64) -> tuple[Float64, NDArray[np.int64]]:
     model = spec.compile()
     # The hull's graph has two counts, the addresses and numbers of the vertices, edges, triangles.
     graph = model.mesh_graph[model.mesh_graphadr[0] :]
-    corners, triangles = graph[:2].tolist()
+    corners, count = graph[:2].tolist()
     numbers = graph[2 + corners : 2 + 2 * corners]
-    faces = graph[2 + 3 * corners + 3 * triangles :][: 3 * triangles]
+    faces = graph[2 + 3 * corners + 3 * count :][: 3 * count]
     row = {number: index for index, number in enumerate(numbers.tolist())}
-    return (
-        read_only(vertices_in_file(model, numbers)),
-        np.array([row[number] for number in faces.tolist()], np.int64).reshape(-1, 3),
-    )
+    triangles = np.array([row[number] for number in faces.tolist()], np.int64).reshape(-1, 3)
+    return Triangles(read_only(vertices_in_file(model, numbers)), triangles)
 
 
 def vertices_in_file(model: MjModel, indices: Rows) -> Float64:
@@ -162,14 +202,19 @@ def add_geom(
     kinds = mujoco.mjtGeom
     if shape.kind == "mesh":
         vertices = hull(shape)
-        options["meshname"] = name = f"hull {digest(vertices)}"
+        inertias = mujoco.mjtMeshInertia
+        # A flat hull has no volume, which a mass from the density alone needs.
+        mesh: Document = {"inertia": inertias.mjMESH_INERTIA_SHELL}
+        if "density" in options:
+            mesh["inertia"] = inertias.mjMESH_INERTIA_CONVEX
+            solid = mesh_solid(shape.file, shape.content) if shape.file else None
+            if solid is not None:
+                vertices = solid.vertices * shape.scale
+                faces = solid.faces[:, :: -1 if np.prod(shape.scale) < 0 else 1]
+                mesh = {"inertia": inertias.mjMESH_INERTIA_EXACT, "userface": faces.ravel()}
+        options["meshname"] = name = f"mesh {digest(vertices)}"
         if spec.mesh(name) is None:
-            # Only a mass from the density needs the volume, which a flat hull does not have.
-            inertias = mujoco.mjtMeshInertia
-            inertia = inertias.mjMESH_INERTIA_SHELL
-            if "density" in options:
-                inertia = inertias.mjMESH_INERTIA_CONVEX
-            spec.add_mesh(name=name, uservert=vertices.ravel(), inertia=inertia)
+            spec.add_mesh(name=name, uservert=vertices.ravel(), **mesh)
     else:
         options["size"] = np.pad(shape.size, (0, 3 - len(shape.size)))
     body.add_geom(

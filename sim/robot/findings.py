@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from batchpid.errors import RobotError, warn
 
@@ -105,23 +106,50 @@ def _sentence(same: Sequence[Finding]) -> str:
     )
 
 
+class Notes(NamedTuple):
+    """Findings of a file that is read: ``repairs`` are what is simulated otherwise than the file
+    says, ``losses`` what is lost where MuJoCo does not simulate an MJCF file itself.
+    """
+
+    repairs: list[Finding]
+    losses: list[Finding]
+
+    def lose(
+        self,
+        code: str,
+        text: str,
+        joint: str | None = None,
+        link: str | None = None,
+        severity: str = "warning",
+    ) -> None:
+        """Add a loss."""
+        remedy = "use the engine 'mujoco', which simulates the file itself"
+        self.losses.append(Finding(severity, code, text, remedy, joint, link))
+
+
 class RepairWarning(UserWarning):
     """A robot's file was read with repairs."""
 
 
 def report(path: Path, repairs: Sequence[Finding], strict: bool) -> None:
-    """Warn of the ``repairs`` of the file at ``path``; if ``strict``, raise a RobotError that lists
-    them.
+    """Warn of the ``repairs`` of the file at ``path`` that change the motion; if ``strict``, raise
+    a RobotError that lists them.
     """
-    if not repairs:
+    severe = [finding for finding in repairs if finding.severity == "warning"]
+    if not severe:
         return
-    if len(repairs) == 1:
-        count = "1 repair"
-    else:
-        count = f"{len(repairs)} repairs"
+    count = "1 repair" if len(severe) == 1 else f"{len(severe)} repairs"
     if not strict:
         warn(f"{path}: {count}; robot.check() and batchpid inspect list them", RepairWarning)
         return
-    sentences = [sentence.partition(": ")[2] for sentence in summary(repairs)]
+    sentences = [sentence.partition(": ")[2] for sentence in summary(severe)]
     listed = "".join(f"\n  {sentence}" for sentence in sentences)
     raise RobotError(f"{path}: needs {count}, which strict=True refuses:{listed}")
+
+
+def report_shortfalls(path: Path, engine: str, shortfalls: Iterable[Finding]) -> None:
+    """Warn of what an engine runs otherwise than the file at ``path`` says."""
+    count = sum(finding.severity == "warning" for finding in shortfalls)
+    if count:
+        text = f"engine {engine!r} runs otherwise than the file says in {count} findings"
+        warn(f"{path}: {text}; robot.check(engine={engine!r}) lists them", RepairWarning)

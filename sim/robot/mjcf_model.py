@@ -19,10 +19,8 @@ import numpy as np
 from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.findings import Finding, Notes
 
-ALONE = "engine 'mujoco' alone simulates"
-"""First words of the findings for elements without equivalent in a URDF."""
 PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 _PREFIXES = (
     "body_",
@@ -203,7 +201,7 @@ class RobotInFile:
     Raises RobotError for a ball joint, and for several robots.
     """
 
-    def __init__(self, model: MjModel, path: Path, findings: list[Finding]) -> None:
+    def __init__(self, model: MjModel, path: Path, notes: Notes) -> None:
         names = [model.body(body).name for body in range(1, model.nbody)]
         self.link_names = {"world", *names}
         self.joint_names = {model.joint(joint).name for joint in range(model.njnt)}
@@ -217,7 +215,7 @@ class RobotInFile:
             for joint in range(model.njnt)
             if int(model.jnt_type[joint]) not in (_FREE, _BALL)
         }
-        self.base = self._find_base(model, joints, path, findings)
+        self.base = self._find_base(model, joints, path, notes)
         self.joints = {
             joint: name
             for joint, name in joints.items()
@@ -233,7 +231,7 @@ class RobotInFile:
         model: MjModel,
         joints: dict[int, str],
         path: Path,
-        findings: list[Finding],
+        notes: Notes,
     ) -> int:
         """Return the base, after the bodies that are not of the robot are left out."""
         # Every child of the world is the root of an object; some of them are the robot.
@@ -267,9 +265,8 @@ class RobotInFile:
                 problem = f"the ball joint {label(model.joint(joint))} has no single position"
                 raise RobotError(f"{where}: {problem} to control; replace it by three hinges")
         for body in sorted(self._left_out - soft):
-            text = f"is apart from the robot: {ALONE} it"
-            remedy = "in SAPIEN add it with build="
-            findings.append(Finding("note", "loose-link", text, remedy, link=self.bodies[body]))
+            text = "is apart from the robot: left out"
+            notes.lose("loose-link", text, link=self.bodies[body], severity="note")
         if floating:
             return floating.pop()
         # The only body, if it is held at the origin, is the root in place of the world.

@@ -26,6 +26,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from batchpid.sim.robot.collision_shapes import hull_share
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
 
@@ -39,6 +40,9 @@ SHORT = 0.3
 """Least reach [m] that is assumed, e.g. for robots with all joints at one point."""
 JUDGED = 0.01
 """Share of the total mass from which the mass and inertia of a link are checked."""
+
+HULL = 1.2
+"""Volume of a mesh's hull over that of the mesh, from which it is reported."""
 
 FARTHEST, PLACEHOLDER = 4 * np.pi, 1000.0
 """Bounds between which limits of a hinge are taken for degrees [rad]; larger ones mean "no
@@ -87,6 +91,16 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
             detail = f"{mass.gyration:.3g} m"
             yield Finding("warning", "inertia", text, remedy, link=name, detail=detail)
     yield from _degrees(robot)
+
+
+def changed_shapes(robot: RobotDescription) -> Iterator[Finding]:
+    """Yield a finding for each mesh of a URDF that collides as a much larger hull."""
+    for shape in robot.tables.shapes:
+        if shape.file and (share := hull_share(shape)) > HULL:
+            text = "a collision mesh is not convex: its convex hull collides, which is larger"
+            remedy = "divide it into convex parts"
+            detail = f"{share:.3g} times its volume"
+            yield Finding("note", "hull", text, remedy, link=shape.owner, detail=detail)
 
 
 def _degrees(robot: RobotDescription) -> Iterator[Finding]:

@@ -34,6 +34,8 @@ from batchpid.task_space.frames import SpatialInertia, matrix_of
 ORIGIN = read_only(np.zeros(3))
 NO_TURN = read_only(np.array([1.0, 0.0, 0.0, 0.0]))
 NO_INERTIA = read_only(np.zeros((3, 3)))
+LEAST_MASS = 1e-9
+"""Mass [kg] of a row without mass: 0 stands for a mass that the file does not give."""
 
 
 ShapeKind = Literal["sphere", "box", "capsule", "cylinder", "mesh"]
@@ -138,6 +140,12 @@ class Tables:
     def joints(self) -> tuple[Joint, ...]:
         """Joints of all bodies but the base, in their order."""
         return tuple(body.joint for body in self.bodies if body.joint is not None)
+
+
+def without_mass(body: Body) -> Body:
+    """Return ``body`` with next to no mass, in place of that of its shapes."""
+    tensor = 1e-3 * LEAST_MASS * np.eye(3)
+    return body._replace(mass=LEAST_MASS, center=ORIGIN, inertia=tensor, inertia_wxyz=NO_TURN)
 
 
 def breadth_first(bodies: Iterable[Body], shapes: Iterable[Shape]) -> Tables:

@@ -20,7 +20,7 @@ from batchpid.sim.robot.findings import Finding
 SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
 LFS_POINTER = b"version https://git-lfs"  # beginning of git-lfs's file in place of another
 MOST_PREFIXES = 100  # of namespaces that nobody declared
-LARGEST = 1e18  # magnitude of a number whose square fits in PhysX's single precision
+LARGEST = 1e18  # magnitude of a number whose square fits in single precision
 
 
 def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Element:
@@ -154,7 +154,7 @@ def fault(element: etree._Element | None, key: str, default: str) -> str | None:
         return None
     count = len(default.split())
     need = f"{count} finite number" + "s" * (count > 1)
-    within = f"within +-{LARGEST:g}, which PhysX can hold"
+    within = f"within +-{LARGEST:g}"
     return f"<{element.tag} {key}={element.get(key)!r}> needs {need} {within}"
 
 

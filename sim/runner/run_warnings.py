@@ -8,6 +8,7 @@ from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
 from batchpid.sim.loop.faults import EventLog, FaultWarning, MissedContactWarning
 from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.robot.findings import report_shortfalls
 from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.pool import RecoveryWarning
@@ -18,6 +19,8 @@ class RunWarnings:
 
     def __init__(self, options: RunnerOptions) -> None:
         robot = options.robot
+        shortfalls = options.load_engine().shortfalls(options.scene)
+        report_shortfalls(robot.path, options.engine, shortfalls)
         timestep = options.timestep
         control = options.control
         self.limits = SetpointCheck(robot)

@@ -18,6 +18,7 @@ import numpy as np
 from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.findings import Notes
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.mjcf_model import RobotInFile, compile_scene
 from batchpid.sim.robot.mjcf_reader import home
@@ -81,7 +82,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
         raise RobotError(
             f"{file.path}: has changed since the robot was loaded; load the robot again"
         )
-    names = RobotInFile(model, Path(file.path), [])
+    names = RobotInFile(model, Path(file.path), Notes([], []))
     robot = {body: name for body, name in names.bodies.items() if names.is_of_robot(body)}
     for joint in scene.joints:
         joint.name = names.joints.get(joint.id, joint.name)

@@ -84,16 +84,7 @@ def to_mjcf(
                 remedy="pass params, or leave it out",
             )
     drive = Drive(law, robot.joint_names, dt, inertia, actuators)
-    spec = SceneSpec(
-        robot.tables,
-        robot.ignored_pairs,
-        robot.joints,
-        drive.dt,
-        SOLVERS["accurate"],
-        dissipation=robot.dissipation,
-        ground=robot.has_ground,
-        fixed_base=robot.fixed_base,
-    )
+    spec = SceneSpec.of(robot, drive.dt, SOLVERS["accurate"], ground=robot.has_ground)
     # The bodies are those that the engine simulates; inertias and efforts are then written with all
     # their digits.
     scene, names = robot_spec(spec)

@@ -17,12 +17,12 @@ from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
+from batchpid.sim.engine.sapien.limits import Words, filter_words
 from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import hull, mesh_file
 from batchpid.sim.robot.meshes import mesh_bytes
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
-from batchpid.sim.robot.self_collision import Words, link_groups
 from batchpid.sim.robot.simulated_links import rigid_tree
 from batchpid.sim.robot.tables import Body, Shape, Tables
 from batchpid.task_space.frames import SpatialInertia, from_rpy, matrix_of
@@ -259,8 +259,7 @@ def _set_words(spec: SceneSpec, robot: physx.PhysxArticulation) -> None:
 @lru_cache(maxsize=8)
 def _shape_words(spec: SceneSpec) -> dict[str, list[Words]]:
     """Return the filter words of the shapes of each simulated link, in the order of its shapes."""
-    ignored = {frozenset(pair) for pair in spec.ignored}
-    words, _ = link_groups(spec.tables, spec.separate, spec.fixed_base, ignored)
+    words, _ = filter_words(spec)
     of_links: dict[str, list[Words]] = {body.name: [] for body in spec.simulated.bodies}
     for shape in spec.simulated.shapes if spec.collisions else ():
         of_links[shape.body].append(words[shape.owner])
