@@ -88,6 +88,8 @@ class EnginePack(Protocol):
         :meth:`joint_mass_matrix`.
     steps_natively
         Whether native code does the sim steps, by :meth:`compiled_step`.
+    content
+        Digest of the content that the user's ``build`` added to each env (M,); empty without one.
     state_is_complete
         Whether :meth:`read_state` holds everything that later steps depend on, so that a pack in
         use can be restored.
@@ -98,6 +100,7 @@ class EnginePack(Protocol):
     dof: int
     first_env: int
     qf: Rows
+    content: Rows
     state_is_complete: bool
     friction: Friction
     armature: Float64

@@ -110,14 +110,14 @@ def read_couplings(model: MjModel, robot: RobotInFile, notes: Notes) -> Coupling
         is_linear = leader in robot.joints and multiplier and not any(higher)
         if not is_linear or name in couplings:
             text = "without the joint's equality, which is not linear in one other joint"
-            notes.lose("mimic", text, name)
+            notes.lose(text, name)
             continue
         rest, rest_of_leader = model.qpos0[model.jnt_qposadr[[follower, leader]]].tolist()
         offset += rest - multiplier * rest_of_leader
         couplings[name] = robot.joints[leader], multiplier, offset
     if others:
         text = "closed loops are open, without the equality constraints other than between the"
-        notes.lose("equality", f"{text} robot's joints: {', '.join(others)}")
+        notes.lose(f"{text} robot's joints: {', '.join(others)}")
     return couplings
 
 
@@ -145,9 +145,7 @@ def read_motors(
             text = f"actuator {label(model.actuator(actuator))} has effects that are not simulated"
             text += ": only motors and servos of one joint are"
             remedy = "check gains and limits of the joint"
-            findings += [
-                Finding("warning", "actuator", text, remedy, name) for name in arms or [None]
-            ]
+            findings += [Finding("actuator", text, remedy, name) for name in arms or [None]]
             law = Law(law.kp, kv=law.kv) if len(arms) == 1 else Law()
         for name, arm in arms.items():
             _add_limits(model, actuator, name, arm, motors, findings)
@@ -158,7 +156,7 @@ def read_motors(
         if model.nu and name not in motors.effort_limit and name not in couplings:
             text = "no actuator of the file moves the joint: it is controlled like all others"
             remedy = "give it gains of 0 to let it move freely"
-            findings.append(Finding("warning", "actuator", text, remedy, name))
+            findings.append(Finding("actuator", text, remedy, name))
         # A limit of 0 counts as none.
         limit = motors.effort_limit.get(name, math.inf) or math.inf
         if model.jnt_actfrclimited[joint]:
@@ -171,7 +169,7 @@ def read_motors(
     ]
     if tendons:
         text = "joints move freely, without springs, damping, friction, armature and limits of tendons: "
-        notes.lose("tendon", text + ", ".join(tendons))
+        notes.lose(text + ", ".join(tendons))
     return motors
 
 
@@ -344,5 +342,5 @@ def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
         text = "effort limits differ by direction: the smaller one above zero is used in both"
         detail = f"{min(ends):g} to {max(ends):g}"
         remedy = "pass effort_min= and effort_max= to robot.params()"
-        findings.append(Finding("warning", "limits", text, remedy, name, detail=detail))
+        findings.append(Finding("limits", text, remedy, name, detail=detail))
     return smaller or larger

@@ -96,7 +96,7 @@ def compile_file(path: Path, missing_meshes: str, findings: list[Finding]) -> Co
             raise
     text = f"collision meshes not found, simulated without: {', '.join(lean.missing)}"
     remedy = "put the files where the MJCF names them"
-    findings.append(Finding("warning", "missing-mesh", text, remedy))
+    findings.append(Finding("missing-mesh", text, remedy))
     return lean
 
 
@@ -266,7 +266,7 @@ class RobotInFile:
                 raise RobotError(f"{where}: {problem} to control; replace it by three hinges")
         for body in sorted(self._left_out - soft):
             text = "is apart from the robot: left out"
-            notes.lose("loose-link", text, link=self.bodies[body], severity="note")
+            notes.lose(text, link=self.bodies[body])
         if floating:
             return floating.pop()
         # The only body, if it is held at the origin, is the root in place of the world.

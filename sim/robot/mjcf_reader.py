@@ -153,24 +153,23 @@ def _report_unused(model: MjModel, robot: RobotInFile, notes: Notes) -> None:
         "sensors": model.nsensor,
         "cameras": model.ncam,
         "keyframes": model.nkey - (home(model) is not None),
+        "<flag sleep='enable'>": int(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP > 0),
     }
     left_out = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
     if left_out:
         text = f"elements that the simulation does not use are left out: {left_out}"
-        notes.repairs.append(Finding("note", "unknown-element", text, "expect no effect"))
+        notes.repairs.append(Finding("unknown-element", text, "expect no effect"))
     option = model.opt
     bits = mujoco.mjtDisableBit
     if tuple(option.gravity) != GRAVITY:
         text = f"gravity is {GRAVITY} m/s^2, not the file's"
         remedy = "draw the file's with Randomization(gravity=...)"
-        notes.repairs.append(Finding("warning", "option", text, remedy))
-    if option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-        notes.repairs.append(Finding("note", "option", "no body sleeps", "expect no effect"))
+        notes.repairs.append(Finding("option", text, remedy))
     for switch in ("GRAVITY", "ACTUATION"):
         if option.disableflags & getattr(bits, f"mjDSBL_{switch}"):
             text = f"<flag {switch.lower()}='disable'/> has no effect"
             remedy = "expect gravity, and the efforts of the controller"
-            notes.repairs.append(Finding("warning", "option", text, remedy))
+            notes.repairs.append(Finding("option", text, remedy))
     disabled = ", ".join(
         switch.lower()
         for switch in _SWITCHES
@@ -184,15 +183,15 @@ def _report_unused(model: MjModel, robot: RobotInFile, notes: Notes) -> None:
         ((model.body_plugin >= 0).any(), "without the plugins of bodies"),
     ):
         if is_there:
-            notes.lose("option", text)
+            notes.lose(text)
     for joint, name in robot.joints.items():
         if model.jnt_stiffness[joint] or model.jnt_stiffnesspoly[joint].any():
-            notes.lose("spring", "without the spring of the joint", name)
+            notes.lose("without the spring of the joint", name)
         if model.dof_dampingpoly[model.jnt_dofadr[joint]].any():
-            notes.lose("dynamics", "the damping that grows with the speed is left out", name)
+            notes.lose("the damping that grows with the speed is left out", name)
     for body in np.flatnonzero(model.body_gravcomp).tolist():
         if robot.is_of_robot(body):
             text = "gravity compensation of this body (gravcomp) is not simulated"
             remedy = "let the controller compensate"
-            finding = Finding("note", "gravcomp", text, remedy, link=robot.bodies[body])
+            finding = Finding("option", text, remedy, link=robot.bodies[body])
             notes.repairs.append(finding)

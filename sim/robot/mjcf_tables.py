@@ -154,7 +154,7 @@ class TableReader:
             text = "its servo in the file limits position or rate of the setpoint"
             remedy = "pass guard=True to a runner for these limits"
             detail = f"{soft_lower:g} to {soft_upper:g}, {rate:g}/s"
-            finding = Finding("note", "limits", text, remedy, name, detail=detail)
+            finding = Finding("limits", text, remedy, name, detail=detail)
             self._notes.repairs.append(finding)
         return Joint(
             name,
@@ -193,7 +193,7 @@ class TableReader:
                 text, detail = repair
                 remedy = "correct <inertia>"
                 self._notes.repairs.append(
-                    Finding("warning", "inertia", text, remedy, link=row.name, detail=detail)
+                    Finding("inertia", text, remedy, link=row.name, detail=detail)
                 )
             axes = model.body_iquat[body].copy()
             row = row._replace(mass=mass, center=center, inertia=inertia, inertia_wxyz=axes)
@@ -239,7 +239,7 @@ class TableReader:
                 absent.append(f"{kind} {label(model.geom(geom))}")
         if absent:
             text = f"without planes, height fields and shapes of the world: {', '.join(absent)}"
-            self._notes.lose("collision", text)
+            self._notes.lose(text)
 
 
 def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair, ...]:

@@ -16,6 +16,7 @@ import numpy as np
 from lxml import etree
 
 from batchpid.arrays.array_types import Document, Float64
+from batchpid.checks.validate import is_name
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
@@ -99,6 +100,22 @@ def read_robot(
     be read, a structure or number without repair, a bad mesh, or an MJCF file that MuJoCo does not
     compile.
     """
+    source = _read(path, fixed_base, package_dirs, missing_meshes)
+    joints = [joint.name for joint in source.tables.joints]
+    for name in (source.name, *joints, *(body.name for body in source.tables.bodies)):
+        if not is_name(name):
+            raise RobotError(
+                f"{path}: the name {name!r} has a control character or a line break; rename it"
+            )
+    return source
+
+
+def _read(
+    path: Path,
+    fixed_base: bool | None,
+    package_dirs: tuple[Path, ...],
+    missing_meshes: str,
+) -> Source:
     findings: list[Finding] = []
     root = parse_xml(path, findings)
     if not is_mjcf(root):
@@ -188,7 +205,7 @@ class _Reader:
         link: str | None = None,
         detail: str = "",
     ) -> None:
-        self._findings.append(Finding("warning", code, text, remedy, joint, link, detail))
+        self._findings.append(Finding(code, text, remedy, joint, link, detail))
 
     # -- Structure
 
@@ -214,11 +231,10 @@ class _Reader:
         if unknown:
             # A robot may lack the parts of a macro that is not expanded.
             is_xacro = any(name.startswith("<xacro:") for name in unknown)
-            severity = "warning" if is_xacro else "note"
             listed = ", ".join(f"{count} {name}" for name, count in unknown.most_common(8))
             text = f"elements that the simulation does not use are left out: {listed}"
             remedy = _EXPAND if is_xacro else "remove them, or expect no effect"
-            self._findings.append(Finding(severity, "unknown-element", text, remedy))
+            self._findings.append(Finding("xml" if is_xacro else "unknown-element", text, remedy))
 
     def _report_repeated(self, root: etree._Element) -> None:
         """Report elements of which the first is read."""
@@ -229,7 +245,7 @@ class _Reader:
                     if count > 1 and tag != "<collision>":
                         text = f"<{parent.tag}> has several {tag}: the first is used"
                         owner = {part.tag: _text(part, "name")}
-                        self._warn("repeated-element", text, "remove the others", **owner)
+                        self._warn("repeated", text, "remove the others", **owner)
 
     def _refuse_xacro(self, root: etree._Element) -> None:
         for element in root.iter():
@@ -247,7 +263,7 @@ class _Reader:
             if not name or name in links:
                 text = "has no name, or a repeated one: left out"
                 remedy = "give every link a unique name"
-                self._warn("repeated-name", text, remedy, link=name or None)
+                self._warn("repeated", text, remedy, link=name or None)
                 continue
             links[name] = element
         return links
@@ -260,13 +276,13 @@ class _Reader:
             name = _text(element, "name")
             ends = _ends(element)
             if name in joints and _ends(joints[name]) == ends:
-                self._warn("repeated-name", "given twice: the first is kept", "remove it", name)
+                self._warn("repeated", "given twice: the first is kept", "remove it", name)
                 continue
             new = name
             if not name or name in joints:
                 new = unique(name or "{}_to_{}".format(*ends), names)
                 text = f"no name, or a repeated one: renamed {new!r}"
-                self._warn("repeated-name", text, "name it in the URDF", name or None)
+                self._warn("repeated", text, "name it in the URDF", name or None)
             joints[new] = element
         return joints
 
@@ -285,7 +301,7 @@ class _Reader:
             if name not in self._links:
                 self._links[name] = etree.Element("link")
                 text = "named by joints, but not in the file: added, without mass and shape"
-                self._warn("missing-link", text, "correct the name, or add the link", link=name)
+                self._warn("loose-link", text, "correct the name, or add the link", link=name)
         for name in [name for name in self._links if name not in joined]:
             text = "no joint holds it: left out"
             self._warn("loose-link", text, "join it, or remove it", link=name)
@@ -358,7 +374,7 @@ class _Reader:
             remedy = "use revolute, continuous or prismatic joints"
             if kind == "floating":
                 remedy = "load with fixed_base=False for a robot that is free to move"
-            self._warn("joint-type", text, remedy, name)
+            self._warn("joint", text, remedy, name)
             kind = "fixed"
         # The other elements mean nothing for a fixed joint, and their faults are none.
         if kind == "fixed":
@@ -370,7 +386,7 @@ class _Reader:
         if axis is None or math.hypot(*axis) < 1e-3:
             text = f"<axis xyz={_text(element.find('axis'), 'xyz')!r}> has no direction: the x"
             text += " axis is used, the URDF's default"
-            self._warn("axis", text, "correct the axis", name)
+            self._warn("joint", text, "correct the axis", name)
             axis = (1.0, 0.0, 0.0)
         dynamics = element.find("dynamics")
         for key in ("damping", "friction"):
@@ -399,7 +415,7 @@ class _Reader:
         if placeholders:
             text = f"<limit {' '.join(placeholders)}> is a placeholder or not within"
             text += f" +-{LARGEST:g}: no limit"
-            self._warn("placeholder", text, "give <limit effort= velocity=> of the motor", name)
+            self._warn("limits", text, "give <limit effort= velocity=> of the motor", name)
         # A guard has one limit for both.
         braking = limits.pop("deceleration_limit")
         limits["acceleration_limit"] = min(limits["acceleration_limit"], braking)
@@ -499,9 +515,6 @@ class _Reader:
             self._warn("inertia", text, "give a mass > 0 [kg]", link=body.name)
             return body
         if value[0] == 0:
-            text = "<mass value='0'>: the link has no mass, as given, nor that of its shapes"
-            finding = Finding("note", "inertia", text, "give its mass, if it has one")
-            self._findings.append(replace(finding, link=body.name))
             return without_mass(body)
         # One unreadable entry makes the whole tensor unknown.
         entries = [numbers(inertia, key, "0") for key in MOMENTS]

@@ -45,9 +45,8 @@ RESET = np.arange(N) % 2 == 0
 ENGINES = ("sapien", "mujoco")
 pytestmark = [
     pytest.mark.usefixtures("small_groups"),
-    pytest.mark.filterwarnings(
-        "ignore::UserWarning"
-    ),  # of faults, lost workers, missed contacts and past bounds
+    # Of faults, lost workers and past bounds.
+    pytest.mark.filterwarnings("ignore::UserWarning"),
 ]
 
 
@@ -339,7 +338,6 @@ class Result(NamedTuple):
     """Rollout after the snapshot."""
     end: Snapshot
     faults: Any
-    missed: Any
     poses: Any
     """Poses of the user's content."""
 
@@ -347,7 +345,7 @@ class Result(NamedTuple):
 def second_half(runner: Runner, given: dict[str, np.ndarray], rollout: Any) -> tuple[Any, ...]:
     second = rollout(runner, part(given, slice(SPLIT, None)))
     poses = None if runner.options.build is None else runner.poses()
-    return second, runner.snapshot(), runner.faults, runner.missed_contacts, poses
+    return second, runner.snapshot(), runner.faults, poses
 
 
 def program(
@@ -397,7 +395,7 @@ def check_equal(ours: Result, theirs: Result) -> None:
     """Raise AssertionError unless two results are bit-identical."""
     for name in ("first", "placed", "second"):
         assert_identical(getattr(ours, name), getattr(theirs, name))
-    for name in ("snapshot", "end", "faults", "missed", "poses"):
+    for name in ("snapshot", "end", "faults", "poses"):
         pairs = zip(leaves(getattr(ours, name)), leaves(getattr(theirs, name)), strict=True)
         for (path, mine), (other_path, other) in pairs:
             assert path == other_path

@@ -136,8 +136,13 @@ def set_ground(scene: MjSpec, ground: bool) -> None:
     one at height 0.
     """
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    planes = [geom for geom in scene.worldbody.geoms if geom.type == plane]
-    planes = [geom for geom in planes if geom.contype or geom.conaffinity]
+    # A <pair> makes geoms collide whatever their masks say.
+    paired = {name for pair in scene.pairs for name in (pair.geomname1, pair.geomname2)}
+    planes = [
+        geom
+        for geom in scene.worldbody.geoms
+        if geom.type == plane and (geom.contype or geom.conaffinity or geom.name in paired)
+    ]
     if ground and not planes:
         added = scene.worldbody.add_geom(type=plane, size=[0, 0, 1])
         plain = mujoco.MjSpec().worldbody.add_geom()
@@ -147,6 +152,9 @@ def set_ground(scene: MjSpec, ground: bool) -> None:
     if not ground:
         for geom in planes:
             geom.contype = geom.conaffinity = 0
+        for pair in list(scene.pairs):
+            if {pair.geomname1, pair.geomname2} & {geom.name for geom in planes}:
+                scene.delete(pair)
 
 
 def _start(model: MjModel) -> Document:

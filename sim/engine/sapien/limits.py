@@ -46,7 +46,7 @@ def refusals(spec: SceneSpec) -> Iterator[Finding]:
     count = len(spec.simulated.bodies)
     if count > MAX_LINKS:
         text = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
-        yield Finding("warning", "engine", text, f"{_MUJOCO}, or split the robot")
+        yield Finding("engine", text, f"{_MUJOCO}, or split the robot")
 
 
 def shortfalls(spec: SceneSpec) -> Iterator[Finding]:
@@ -59,7 +59,7 @@ def shortfalls(spec: SceneSpec) -> Iterator[Finding]:
         first, second = sorted(pair)
         text = "should not collide with another link, but PhysX's filter of pairs is full"
         remedy = f"{_MUJOCO}, or disable fewer pairs in the .srdf"
-        yield Finding("warning", "pairs", text, remedy, link=first, detail=f"with {second!r}")
+        yield Finding("engine", text, remedy, link=first, detail=f"with {second!r}")
     joints = {body.name: body.joint for body in spec.simulated.bodies}
     for shape in spec.simulated.shapes:
         joint = joints[shape.body]
@@ -69,7 +69,7 @@ def shortfalls(spec: SceneSpec) -> Iterator[Finding]:
         if abs(matrix_of(shape.wxyz)[:, 2] @ axis) > _PARALLEL:
             text = "a wheel with a cylinder is a prism in PhysX, which rolls several percent slow"
             remedy = f"{_MUJOCO}, or a sphere as its shape"
-            yield Finding("warning", "cylinder", text, remedy, link=shape.owner)
+            yield Finding("engine", text, remedy, link=shape.owner)
 
 
 @lru_cache(maxsize=8)
