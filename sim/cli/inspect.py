@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass
 
 from batchpid.arrays.array_types import Document
 from batchpid.sim import Finding, Robot
+from batchpid.sim.geometry.inertia import DENSITY
 from batchpid.sim.robot.findings import summary
-from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.parts import HEADERS, joint_rows
 from batchpid.sim.tuning.comparison import gain_set, table
 

@@ -25,10 +25,10 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
 from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.collision_shapes import hull_share
+from batchpid.sim.geometry.inertia import triangle_excess
+from batchpid.sim.geometry.shapes import hull_share
 from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import KINDS, SEVERITIES, Finding, Findings
-from batchpid.sim.robot.inertia import triangle_excess
 from batchpid.sim.robot.tables import LEAST_MASS
 from batchpid.sim.robot.urdf import GIVE_RANGE
 

@@ -86,7 +86,7 @@ OF_ROBOTS = (
          "sizes or angles are not those of a robot: millimetres read as metres, or degrees as radians",
          "give metres and radians, meshes in millimetres with <mesh scale='0.001 0.001 0.001'>"),
     Kind("no-inertia", "warning",
-         "no <inertial>: its collision shapes give mass and inertia, or without shapes it weighs"
+         "no <inertial>: its collision shapes give mass and inertia; without shapes, or with a mass of 0, it weighs"
          " 1e-6 kg",
          "add <inertial> with mass and inertia: gains in efforts cannot control a link without mass"),
     Kind("out-of-limits", "warning",

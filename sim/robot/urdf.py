@@ -18,23 +18,23 @@ from lxml import etree
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import is_name
 from batchpid.errors import RobotError
+from batchpid.sim.geometry.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
+from batchpid.sim.geometry.mesh_files import LARGEST, check_mesh, find_mesh
+from batchpid.sim.geometry.shapes import Shape
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
-from batchpid.sim.robot.meshes import check_mesh, find_mesh
-from batchpid.sim.robot.mjcf_model import unique
-from batchpid.sim.robot.mjcf_reader import read_mjcf
+from batchpid.sim.robot.mjcf.model import unique
+from batchpid.sim.robot.mjcf.reader import read_mjcf
 from batchpid.sim.robot.parts import MOVING_TYPES, Joint, Mimic
 from batchpid.sim.robot.tables import (
     NO_TURN,
     ORIGIN,
     Body,
-    Shape,
     Source,
     Tables,
     breadth_first,
     without_mass,
 )
-from batchpid.sim.robot.xml import LARGEST, fault, numbers, parse_xml, read_numbers
+from batchpid.sim.robot.xml import fault, numbers, parse_xml, read_numbers
 from batchpid.task_space.frames import from_rpy
 
 MOST_READ = 4096  # links and joints of a file

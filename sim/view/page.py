@@ -16,10 +16,10 @@ import numpy as np
 from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.errors import MissingDependencyError
 from batchpid.sim.robot.findings import summary
-from batchpid.sim.robot.shapes import Surface
 from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.panel import Panel
 from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
+from batchpid.sim.view.surfaces import Surface
 from batchpid.sim.view.view_data import HISTORY_SECONDS, ViewData
 
 if TYPE_CHECKING:

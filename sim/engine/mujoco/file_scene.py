@@ -20,8 +20,8 @@ from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.findings import Notes
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.mjcf_model import RobotInFile, compile_scene
-from batchpid.sim.robot.mjcf_reader import home
+from batchpid.sim.robot.mjcf.model import RobotInFile, compile_scene
+from batchpid.sim.robot.mjcf.reader import home
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.task_space.frames import inverse, matrix_of, rotate
 

@@ -20,11 +20,11 @@ from batchpid.errors import RobotError
 from batchpid.sim.engine.sapien.limits import Words, filter_words
 from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.collision_shapes import hull, mesh_file
-from batchpid.sim.robot.meshes import mesh_bytes
+from batchpid.sim.geometry.mesh_files import mesh_bytes
+from batchpid.sim.geometry.shapes import Shape, hull, mesh_file
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
 from batchpid.sim.robot.simulated_links import rigid_tree
-from batchpid.sim.robot.tables import Body, Shape, Tables
+from batchpid.sim.robot.tables import Body, Tables
 from batchpid.task_space.frames import SpatialInertia, from_rpy, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 

@@ -10,7 +10,7 @@ import os
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,42 @@ from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.errors import RobotError
 from batchpid.io.files import write_atomically
-from batchpid.sim.robot.inertia import DENSITY
-from batchpid.sim.robot.meshes import mesh_bytes, read_mesh
-from batchpid.sim.robot.tables import Shape
+from batchpid.sim.geometry.inertia import DENSITY
+from batchpid.sim.geometry.mesh_files import mesh_bytes, read_mesh
 from batchpid.task_space.frames import SpatialInertia
+
+ShapeKind = Literal["sphere", "box", "capsule", "cylinder", "mesh"]
+
+
+class Shape(NamedTuple):
+    """Convex collision shape."""
+
+    body: str
+    """Body that has the shape."""
+    owner: str
+    """Link of the file that has the shape; another than ``body`` after a merge."""
+    kind: ShapeKind
+    size: tuple[float, ...]
+    """Radius; half lengths of a box's sides; radius and half length, without the ends of a capsule
+    [m]; () for a mesh. Capsules and cylinders lie along the z axis of the shape.
+    """
+    position: Float64
+    """Place of the shape in the frame of the body (3,) [m]."""
+    wxyz: Float64
+    """Orientation of the shape in the frame of the body (4,)."""
+    file: str = ""
+    """Absolute path of a mesh, which counts as its convex hull; "" for other shapes."""
+    scale: tuple[float, ...] = (1.0, 1.0, 1.0)
+    """Factors of the vertices of the file; an odd number of negative ones mirrors the mesh."""
+    vertices: Float64 | None = None
+    """Vertices (n, 3) [m] of a mesh without a file, in the frame of the shape."""
+    content: str = ""
+    """Digest of the bytes of ``file``, which say what it is: paths and time stamps do not."""
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether a factor of a mesh is negative: SAPIEN builds such shapes last."""
+        return min(self.scale) < 0
 
 
 class Triangles(NamedTuple):

@@ -15,11 +15,15 @@ from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
+from lxml import etree
 
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
-from batchpid.sim.robot.xml import LARGEST, LFS_POINTER, parse_bytes
 
+LARGEST = 1e18
+"""Largest magnitude of a number of a file, whose square fits in single precision."""
+LFS_POINTER = b"version https://git-lfs"
+"""Beginning of git-lfs's file in place of another."""
 FORMATS = (".stl", ".obj", ".dae", ".glb")
 SIZE_LIMIT = 2**27  # bytes of a mesh file
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attributes", "<u2")])
@@ -162,6 +166,15 @@ def _problem(path: Path, data: bytes) -> str | None:
     if (np.abs(corners) <= LARGEST).all():
         return None
     return f"vertices beyond {LARGEST:g} m"
+
+
+def parse_bytes(data: bytes, **options: bool) -> etree._Element:
+    """Return the root element of untrusted XML, without entities, DTD and network.
+
+    ``options`` are more of those of lxml's parser.
+    """
+    safe = {"resolve_entities": False, "no_network": True, "load_dtd": False}
+    return etree.fromstring(data, etree.XMLParser(**safe, **options))
 
 
 def _has_its_numbers(data: bytes) -> bool:

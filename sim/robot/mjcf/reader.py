@@ -10,12 +10,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Float64, MjModel
+from batchpid.arrays.array_types import Document, Float64, MjModel
 from batchpid.arrays.elementwise import read_only
 from batchpid.motors import make_actuators
 from batchpid.sim.robot.findings import Finding, Notes
-from batchpid.sim.robot.mjcf_actuators import read_couplings, read_motors
-from batchpid.sim.robot.mjcf_model import (
+from batchpid.sim.robot.mjcf.bodies import TableReader, excluded_pairs
+from batchpid.sim.robot.mjcf.model import (
     PLANE,
     Compiled,
     RobotInFile,
@@ -23,7 +23,7 @@ from batchpid.sim.robot.mjcf_model import (
     compile_file,
     label,
 )
-from batchpid.sim.robot.mjcf_tables import TableReader, excluded_pairs
+from batchpid.sim.robot.mjcf.motors import read_couplings, read_motors
 from batchpid.sim.robot.parts import FileDefaults, MjcfFile
 from batchpid.sim.robot.tables import Source
 from batchpid.task_space.rigid_tree import GRAVITY
@@ -84,7 +84,7 @@ def read_mjcf(
         columns["integral_limit"] = column(motors.integral_limit, np.inf)
     else:
         columns = {}
-    effects = {"armature": column(motors.armature), "lag": column(motors.lag)}
+    effects: Document = {"armature": column(motors.armature), "lag": column(motors.lag)}
     for effect in ("saturation_effort", "no_load_speed"):
         effects[effect] = column(getattr(motors, effect), np.inf)
     actuators = None

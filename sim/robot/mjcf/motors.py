@@ -22,7 +22,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import MjModel
 from batchpid.sim.robot.findings import Finding, Notes
-from batchpid.sim.robot.mjcf_model import RobotInFile, label
+from batchpid.sim.robot.mjcf.model import RobotInFile, label
 
 Couplings = dict[str, tuple[str, float, float]]
 """Leader, multiplier and offset of each follower, as in ``<mimic>``."""
