@@ -9,11 +9,12 @@ from __future__ import annotations
 import os
 
 from batchpid.errors import BatchPIDError
+from batchpid.io.packages import imported
 
 try:
-    import mujoco  # noqa: F401
+    imported("mujoco")
 except Exception as error:
-    # It loads the library that this variable names, although nothing is drawn here.
+    # MuJoCo loads the library that this variable names, although nothing is drawn here.
     if (library := os.environ.get("MUJOCO_GL")) is None:
         raise
     problem = f"MuJoCo cannot be imported with MUJOCO_GL={library!r}: {error}"

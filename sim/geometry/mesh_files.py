@@ -19,6 +19,7 @@ from lxml import etree
 
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
+from batchpid.io.packages import imported
 
 LARGEST = 1e18
 """Largest magnitude of a number of a file, whose square fits in single precision."""
@@ -102,11 +103,10 @@ def read_mesh(path: str | Path, data: bytes | None = None) -> Any:
 
     Raises errors of many types.
     """
-    from trimesh import load
-
     data = Path(path).read_bytes() if data is None else data
     kind = Path(path).suffix.lower().removeprefix(".")
     # Materials are textures to decode, of which nothing here needs any.
+    load = imported("trimesh").load
     mesh: Any = load(
         BytesIO(data), file_type=kind, force="mesh", process=False, skip_materials=True
     )

@@ -52,8 +52,6 @@ class MujocoPack(ModelPack):
     Implements :class:`batchpid.sim.engine.protocol.EnginePack`.
     """
 
-    state_is_complete = True
-
     def __init__(
         self,
         spec: SceneSpec,
@@ -483,7 +481,7 @@ def _without_warnings() -> Iterator[None]:
 ENGINE = Engine(
     name="mujoco",
     title="MuJoCo",
-    capabilities=frozenset({"base_state"}),
+    capabilities=frozenset({"base_state", "complete_state"}),
     physics=SOLVERS,
     group_size=64,
     make_pack=MujocoPack,
