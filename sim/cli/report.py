@@ -175,7 +175,7 @@ class RunReport:
 
         info = self.rollout.info
         title = f"{self.robot.name}, {info.engine}, control {info.control}"
-        return plots.step_responses(self.rollout, mark=0, title=title)
+        return plots.step_responses(self.rollout, title=title)
 
 
 def speed_line(

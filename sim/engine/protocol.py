@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from importlib.util import find_spec
 from sys import modules
 from typing import Any, Literal, Protocol
@@ -20,6 +19,7 @@ from typing import Any, Literal, Protocol
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.io.packages import imported
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
@@ -350,13 +350,13 @@ def load_engine(name: str = "sapien") -> Engine:
     if name == "sapien" and module not in modules and find_spec("sapien") is None:
         problem = "is not installed: SAPIEN is for Linux on x86-64"
         raise InvalidArgumentError("engine", problem, value=name, remedy="use 'mujoco'")
-    engine: Engine = import_module(module).ENGINE
+    engine: Engine = imported(module).ENGINE
     return engine
 
 
 def _require_mujoco() -> None:
     try:
         # A module that came with the oldest version that has all that is used here.
-        import_module("mujoco.batch")
+        imported("mujoco.batch")
     except ImportError as error:
         raise MissingDependencyError("mujoco>=3.17", "the engine 'mujoco'") from error

@@ -145,8 +145,8 @@ class RunnerOptions(RunnerKeywords):
             lacks_force = True
         obstacle = engine.native_obstacle() or xla.obstacle()
         if obstacle:
-            problem = f"'jax' needs native code: {obstacle}"
-            remedy = "build the extensions, or use backend='numpy'"
+            problem = f"'jax' needs native code and JAX on the CPU: {obstacle}"
+            remedy = "mend that, or use backend='numpy'"
             raise InvalidArgumentError("backend", problem, remedy=remedy)
         for argument, problem, is_lacking in (
             ("control", "is 'drive'", self.control == "drive"),

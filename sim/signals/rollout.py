@@ -389,11 +389,17 @@ class Rollout:
             raise InvalidArgumentError("robot", problem, remedy=remedy)
         return unsettled_findings(self, robot)
 
+    def check_ticks(self) -> None:
+        """Raise InvalidArgumentError if the run holds no tick, so that nothing can be shown."""
+        if not len(self.time):
+            remedy = "its run was cut short: run it again"
+            raise InvalidArgumentError("rollout", "holds no tick", remedy=remedy)
+
     def plot(self, **options: Any) -> Figure:
         """Return a Matplotlib figure of the run, which a notebook shows: positions above efforts
         for each joint.
 
-        ``options`` are arguments of :func:`batchpid.sim.plots.step_responses`: joints, mark, title.
+        ``options`` are arguments of :func:`batchpid.sim.plots.step_responses`: joints, title.
         """
         from batchpid.sim.plots import step_responses
 

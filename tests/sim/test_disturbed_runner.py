@@ -9,6 +9,8 @@ import gc
 import os
 import random
 import signal
+import subprocess
+import sys
 import threading
 import time
 import warnings
@@ -191,6 +193,52 @@ def test_a_lost_worker_is_named_and_the_others_stay() -> None:
             with pytest.raises(RecoveryWarning):
                 runner.step(NEAR)
         assert runner.time == 2 * SUBSTEPS * runner.timestep
+
+
+WITH_SIGPIPE = """
+import os, signal, sys, time, warnings
+from batchpid.sim import Robot, Runner
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+warnings.simplefilter("ignore")
+robot = Robot.load("panda")
+with Runner(robot, 1, workers=1, engine="mujoco") as runner:
+    os.kill(runner.pids[0], signal.SIGKILL)
+    time.sleep(0.3)
+    runner.step(robot.start)
+    print(runner.recoveries)
+"""
+WITH_CHILD = """
+import os, sys, time
+from batchpid.sim import Robot, Runner
+robot = Robot.load("panda")
+runner = Runner(robot, 2, workers=2, engine="mujoco")
+child = os.fork()
+if child == 0:
+    time.sleep(600)
+print(child, *runner.pids, flush=True)
+time.sleep(600)
+"""
+
+
+def start(program: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", program]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
+def test_a_dead_worker_does_not_end_a_caller_with_sigpipe_at_its_default() -> None:
+    with start(WITH_SIGPIPE) as process:
+        assert process.communicate()[0].split() == ["1"]
+
+
+def test_a_forked_child_does_not_keep_the_workers_of_a_killed_caller() -> None:
+    with start(WITH_CHILD) as process:
+        assert process.stdout is not None
+        child, *workers = map(int, process.stdout.readline().split())
+        process.kill()
+    try:
+        assert have_ended(workers)
+    finally:
+        os.kill(child, signal.SIGKILL)
 
 
 def test_closing_does_not_wait_for_a_worker_that_is_stopped_in_a_tick() -> None:
