@@ -207,7 +207,7 @@ class GroupClearance:
             "shares": aligned(blocks, 3, WIDTH),
             **{name: aligned(blocks, ways, WIDTH) for name in ("moved", "rate", "near_rate")},
             "open": np.zeros((robots, bodies), np.int8),
-            "left": np.zeros((robots, pairs), np.uint16),
+            "left": np.zeros((robots, -(-pairs // WIDTH) * WIDTH), np.uint16),
             "wait": np.ones(robots, np.int32),
             "no_shapes": np.zeros(bodies, np.int32),
             "some_types": np.zeros(bodies, np.int32),

@@ -38,7 +38,7 @@ struct Clearance {
   Lanes *last;                       // (blocks, dof): positions after the last sim step
   double *poses;                     // (robots, 7): of floating bases, or null
   Lanes *moved;                      // (blocks, ways): sum of |dq| since the last proof
-  std::uint16_t *left;               // (robots, pairs): clearances [m], as from `shortened`, or NOT_PROVED
+  std::uint16_t *left;               // (robots, pairs rounded up): clearances [m], as from `shortened`, or NOT_PROVED
   Lanes *rate, *near_rate;           // (blocks, ways): largest arm over clearance of other pairs, and those in `near`
   // (blocks, 3): shares of the clearances that are used since the last proof by `rate` and, since the pairs in `near` were
   // checked, by `near_rate`; and that of the latter at which they have to be checked again.
@@ -58,6 +58,7 @@ struct Clearance {
 
 constexpr double MARGIN = 1e-4;        // [m], far above the rounding of positions and of MuJoCo's own distances
 constexpr double SHARE = 0.25;         // share of a clearance after whose use the clearance is computed again
+constexpr double LEAST_CLEARANCE = 1e-30;  // [m], that has two bytes other than 0
 constexpr double TIGHT = 0.7;          // share of the true distance at which a lower bound is good enough
 constexpr int MOST_POINTS = 16;        // largest number of iterations of Gilbert's algorithm
 constexpr std::int32_t RETRY_STEPS = 50;  // sim steps between attempts to prove the open pairs
@@ -88,6 +89,29 @@ inline double widened(std::uint16_t value) {
   float single = 0.0f;
   std::memcpy(&single, &bits, sizeof bits);
   return single;
+}
+
+// The same for WIDTH numbers.
+inline __attribute__((always_inline)) Lanes widened(std::uint16_t const *from) {
+  typedef std::uint16_t Halves __attribute__((vector_size(WIDTH * sizeof(std::uint16_t))));
+  typedef std::uint32_t Bits __attribute__((vector_size(WIDTH * sizeof(std::uint32_t))));
+  typedef float Singles __attribute__((vector_size(WIDTH * sizeof(float))));
+  Halves halves;
+  std::memcpy(&halves, from, sizeof halves);
+  Bits const bits = __builtin_convertvector(halves, Bits) << 16;
+  Singles singles;
+  std::memcpy(&singles, &bits, sizeof singles);
+  return __builtin_convertvector(singles, Lanes::Packed);
+}
+inline __attribute__((always_inline)) void write_shortened(Lanes positive, std::uint16_t *to) {
+  typedef std::uint16_t Halves __attribute__((vector_size(WIDTH * sizeof(std::uint16_t))));
+  typedef std::uint32_t Bits __attribute__((vector_size(WIDTH * sizeof(std::uint32_t))));
+  typedef float Singles __attribute__((vector_size(WIDTH * sizeof(float))));
+  Singles const singles = __builtin_convertvector(positive.of, Singles);
+  Bits bits;
+  std::memcpy(&bits, &singles, sizeof bits);
+  Halves const halves = __builtin_convertvector((bits - 1) >> 16, Halves);
+  std::memcpy(to, &halves, sizeof halves);
 }
 
 // One shape of one robot.
@@ -199,7 +223,7 @@ inline double near_share(Clearance const &clearance, std::int64_t row) {
     for (std::int64_t way = 0; way < ways; ++way) {
       used += clearance.arms[way * blocks + near[at] / WIDTH].of[near[at] % WIDTH] * moved[way].of[row % WIDTH];
     }
-    most = std::max(most, used / widened(clearance.left[row * clearance.number + near[at]]));
+    most = std::max(most, used / widened(clearance.left[row * blocks * WIDTH + near[at]]));
   }
   return most;
 }
@@ -209,49 +233,59 @@ inline double near_share(Clearance const &clearance, std::int64_t row) {
 FOR_EACH_PROCESSOR static bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
   std::int64_t const ways = clearance.ways, at = row / WIDTH * ways, k = row % WIDTH;
   std::int64_t const blocks = (clearance.number + WIDTH - 1) / WIDTH;
-  std::uint16_t *left = clearance.left + row * clearance.number;
+  std::uint16_t *left = clearance.left + row * blocks * WIDTH;
   std::int32_t *near = clearance.near + row * MOST_NEAR;
   char *open = clearance.open + row * clearance.size;
   double const *places = clearance.places[row], *turns = clearance.turns[row];
   double const age = clearance.age[row];
-  thread_local std::vector<Lanes> use, inverse, near_inverse;
-  for (auto *table : {&use, &inverse, &near_inverse}) table->assign(static_cast<std::size_t>(blocks), Lanes{});
+  static thread_local std::vector<Lanes> room;
+  room.assign(static_cast<std::size_t>(3 * blocks), Lanes{});
+  Lanes *use = room.data(), *inverse = use + blocks, *near_inverse = inverse + blocks;
   for (std::int64_t way = 0; way < ways; ++way) {
     Lanes const moved = clearance.moved[at + way].of[k];
     Lanes const *arms = clearance.arms + way * blocks;
     for (std::int64_t block = 0; block < blocks; ++block) use[block] += arms[block] * moved;
   }
-  auto const of = [](std::vector<Lanes> &table, std::int64_t pair) -> double & {
-    return reinterpret_cast<double *>(table.data())[pair];
-  };
   NearPairs first;
   bool all = true;
   std::fill(open, open + clearance.size, char{0});
-  for (std::int64_t pair = 0; pair < clearance.number; ++pair) {
-    bool proved = left[pair] != NOT_PROVED;
-    if (proved || retry) {
-      double const used = of(use, pair);
-      double rest = widened(left[pair]) - used;
-      bool const anew = !proved || !(used < SHARE * rest);
-      if (anew) {
-        std::int64_t const a = clearance.pairs[2 * pair], b = clearance.pairs[2 * pair + 1];
-        rest = distance_bound({clearance, a, places + 3 * a, turns + 9 * a},
-                              {clearance, b, places + 3 * b, turns + 9 * b}) - MARGIN;
+  for (std::int64_t block = 0; block < blocks; ++block) {
+    std::uint16_t *own = left + block * WIDTH;
+    Lanes const before = widened(own), rests = before - use[block], shares = use[block] / rests;
+    // Proofs that stay: most pairs.
+    Lanes const stays = below_mask(use[block], SHARE * rests) * below_mask(LEAST_CLEARANCE, rests);
+    write_shortened(at_least(rests, 0.0), own);
+    double const least = age >= LONG_STEPS ? 1.0 : first.size < MOST_NEAR ? -1.0 : first.shares[MOST_NEAR - 1];
+    if (any_positive(1.0 - stays) || any_positive(1.0 - at_least_mask(least, shares))) {
+      for (std::int64_t i = 0, pair = block * WIDTH; i < WIDTH && pair < clearance.number; ++i, ++pair) {
+        bool proved = before.of[i] > 0.0;
+        double const used = use[block].of[i];
+        double rest = rests.of[i];
+        if (!(stays.of[i] > 0.0)) {
+          bool fades = true;
+          if (proved || retry) {
+            std::int64_t const a = clearance.pairs[2 * pair], b = clearance.pairs[2 * pair + 1];
+            rest = distance_bound({clearance, a, places + 3 * a, turns + 9 * a},
+                                  {clearance, b, places + 3 * b, turns + 9 * b}) - MARGIN;
+            fades = (!proved || age < LEAST_STEPS) && !(LEAST_STEPS * used < age * rest);
+          }
+          own[i] = fades ? NOT_PROVED : shortened(rest);
+        }
+        proved = own[i] != NOT_PROVED;
+        if (proved && age < LONG_STEPS) first.add(pair, used / rest);
+        if (proved) continue;
+        open[clearance.bodies[2 * pair]] = open[clearance.bodies[2 * pair + 1]] = 1;
+        all = false;
       }
-      bool const fades = anew && (!proved || age < LEAST_STEPS) && !(LEAST_STEPS * used < age * rest);
-      left[pair] = fades ? NOT_PROVED : shortened(rest);
-      proved = left[pair] != NOT_PROVED;
-      if (proved && age < LONG_STEPS) first.add(pair, used / rest);
     }
-    if (proved) {
-      of(inverse, pair) = 1.0 / widened(left[pair]);
-    } else {
-      open[clearance.bodies[2 * pair]] = open[clearance.bodies[2 * pair + 1]] = 1;
-      all = false;
-    }
+    Lanes const after = widened(own);
+    inverse[block] = where_positive(after, 1.0 / after, 0.0);
   }
   first.write(near);
-  for (int i = 0; i < first.size; ++i) std::swap(of(inverse, near[i]), of(near_inverse, near[i]));
+  for (int i = 0; i < first.size; ++i) {
+    Lanes &from = inverse[near[i] / WIDTH], &to = near_inverse[near[i] / WIDTH];
+    std::swap(from.of[near[i] % WIDTH], to.of[near[i] % WIDTH]);
+  }
   for (std::int64_t way = 0; way < ways; ++way) {
     Lanes const *arms = clearance.arms + way * blocks;
     Lanes most{}, near_most{};
@@ -314,7 +348,7 @@ FOR_EACH_PROCESSOR static void add_motion(Clearance const &clearance, std::int64
 // Return the shapes that MuJoCo has to check of a robot, after a new proof if one is due; `place` writes its positions to
 // its mjData.
 template <class Place>
-Looked looked_at(Clearance const &clearance, std::int64_t row, Holding const &holding, Place place) {
+inline __attribute__((always_inline)) Looked looked_at(Clearance const &clearance, std::int64_t row, Holding const &holding, Place place) {
   std::int64_t const k = row % WIDTH;
   if (!(holding.inside.of[k] > 0.0)) return Looked::ALL;
   std::int32_t &wait = clearance.wait[row], &age = clearance.age[row];
