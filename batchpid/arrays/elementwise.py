@@ -5,7 +5,7 @@ read-only views.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache, wraps
 from types import NoneType
 from typing import Any, TypeVar
@@ -14,8 +14,9 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule, DType
 from batchpid.arrays.choices import CHOICE_TYPES
+from batchpid.arrays.trees import parts, rebuilt_as
 
-T = TypeVar("T", bound=tuple[Any, ...])
+T = TypeVar("T")
 V = TypeVar("V")
 TURN = 2 * math.pi
 _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
@@ -121,22 +122,19 @@ def read_history(history: Array, places: Array) -> Array:
 
 
 def replace_envs(state: T, fresh: T, mask: Array) -> T:
-    """Return ``state``, a named tuple of arrays (envs, ...), with the envs of ``mask`` (envs,) bool
-    as in ``fresh``.
+    """Return ``state``, a tree of arrays (envs, ...), with the envs of ``mask`` (envs,) bool as in
+    ``fresh``, which has the same structure.
     """
-    xp = namespace(*state, mask)
-    chosen = xp.asarray(mask)
-
-    def choose(new: Array, old: Array) -> Array:
-        if old is None:
-            return None
-        return xp.where(
-            chosen.reshape(-1, *[1] * (old.ndim - 1)),
-            new,
-            old,
-        )
-
-    return type(state)(*map(choose, fresh, state))
+    if state is None:
+        return state
+    if isinstance(state, Mapping | tuple):
+        pairs = zip(parts(state).values(), parts(fresh).values(), strict=True)
+        rebuilt: T = rebuilt_as(state, [replace_envs(old, new, mask) for old, new in pairs])
+        return rebuilt
+    old: Any = state
+    xp = namespace(old, fresh, mask)
+    chosen: T = xp.where(xp.asarray(mask).reshape(-1, *[1] * (old.ndim - 1)), fresh, old)
+    return chosen
 
 
 def wrap(angle: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:

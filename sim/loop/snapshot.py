@@ -26,7 +26,7 @@ from batchpid.checks.validate import file_path, integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 
-_FORMAT = 16
+_FORMAT = 17
 
 
 @dataclass(frozen=True, eq=False)
