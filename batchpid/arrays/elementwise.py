@@ -128,8 +128,10 @@ def replace_envs(state: T, fresh: T, mask: Array) -> T:
     if state is None:
         return state
     if isinstance(state, Mapping | tuple):
-        pairs = zip(parts(state).values(), parts(fresh).values(), strict=True)
-        rebuilt: T = rebuilt_as(state, [replace_envs(old, new, mask) for old, new in pairs])
+        new = parts(fresh)  # by name: JAX sorts the keys of a mapping
+        rebuilt: T = rebuilt_as(
+            state, [replace_envs(old, new[name], mask) for name, old in parts(state).items()]
+        )
         return rebuilt
     old: Any = state
     xp = namespace(old, fresh, mask)

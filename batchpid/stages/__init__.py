@@ -63,7 +63,8 @@ def stages_of(control: Control) -> tuple[Any, ...]:
     for stage in control.further:
         names = [kind.name for kind in kinds]
         kinds.insert(len(names) - names[::-1].index(stage.after), stage)
-    return tuple([stage for kind in kinds if (stage := kind.of(control)) is not None])
+    made = [kind if isinstance(kind, Stage) else kind.of(control) for kind in kinds]
+    return tuple([stage for stage in made if stage is not None])
 
 
 def fit_stages(stages: Sequence[Stage]) -> tuple[Stage, ...]:
@@ -74,7 +75,7 @@ def fit_stages(stages: Sequence[Stage]) -> tuple[Stage, ...]:
     """
     names = [kind.name for kind in STAGES]
     fitted = list[Stage]()
-    for stage in stages:
+    for stage in stages if isinstance(stages, Sequence) else [stages]:
         if not (isinstance(stage, Stage) and is_dataclass(stage)):
             problem = f"has a {type(stage).__name__}"
             remedy = "make it a frozen dataclass with the base batchpid.stages.Stage"

@@ -41,6 +41,13 @@ class Stage:
     starting: ClassVar[tuple[str, ...]] = ()
     """Constants that ``init`` needs, and ``step`` does not."""
 
+    @classmethod
+    def of(cls, control: Control) -> Any:
+        """Return the stage of a control, or None where it does not apply. Stages of the caller's
+        are made by the caller.
+        """
+        raise NotImplementedError
+
     @property
     def every(self) -> int:
         """Sim steps of a tick from one run of a native stage to the next."""

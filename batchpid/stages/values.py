@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Pytree, T
+from batchpid.arrays.elementwise import namespace
 
 
 class Command(NamedTuple):
@@ -126,6 +127,8 @@ class Values(NamedTuple):
     """Reading of the robots before the step."""
     seen: Measured
     """The reading as the sensors measure it."""
+    timestep: Any = None
+    """[s]"""
     step: Step = Step(0, 1)
     model: Model = Model()
     last: Outputs = Outputs()
@@ -145,6 +148,16 @@ class Values(NamedTuple):
     limited: Array = None
     """Joints whose effort the caller's own controller has limited; None if it does not tell."""
     outputs: Outputs = Outputs()
+
+    def within(self, low: Array, high: Array) -> Values:
+        """Return these values with the limits of efforts within ``low`` and ``high`` [N m or N]."""
+        least, most = self.limits
+        xp = namespace(low, high, least, most)
+        if least is not None:
+            low = xp.maximum(low, least)
+        if most is not None:
+            high = xp.minimum(high, most)
+        return self._replace(limits=(low, high))
 
     def told(self, **outputs: Array) -> Values:
         """Return these values with other outputs."""

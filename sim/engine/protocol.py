@@ -35,9 +35,7 @@ Capability = Literal["build", "partial_force", "base_state", "sapien_dissipation
 
 
 class CompiledStep(Protocol):
-    """Sim step of a pack as one native call, also from XLA
-    (:func:`batchpid.sim.engine.native.xla.sim_step`).
-    """
+    """Sim step of a pack as one native call."""
 
     def prepare(self) -> int:
         """Return the address of the native group for the next steps."""
@@ -87,6 +85,8 @@ class EnginePack(Protocol):
         :meth:`joint_mass_matrix`.
     steps_natively
         Whether native code does the sim steps, by :meth:`compiled_step`.
+    content
+        Digest of the content that the user's ``build`` added to each env (M,); empty without one.
     state_is_complete
         Whether :meth:`read_state` holds everything that later steps depend on, so that a pack in
         use can be restored.
@@ -97,6 +97,7 @@ class EnginePack(Protocol):
     dof: int
     first_env: int
     qf: Rows
+    content: Rows
     state_is_complete: bool
     friction: Friction
     armature: Float64
@@ -241,7 +242,7 @@ class EnginePack(Protocol):
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
 
-    # Sim steps in native code and in programs of XLA, where they are native.
+    # Sim steps in native code, where they are native.
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether a compiled step reads this part of the passive force; otherwise call

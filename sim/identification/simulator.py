@@ -1,8 +1,9 @@
 r"""Simulation of many candidates along stretches of logs: the Runner's stages on a rigid tree.
 
-Control, motors and friction are the stages of a sim step (:mod:`batchpid.stages`), as in a Runner. In place of an engine the rigid tree of the logged joints moves by
-semi-implicit Euler with steps of dt, as in SAPIEN and MuJoCo, with mass matrix M, armature A,
-viscous damping B, gravity and Coriolis forces h, and the effort u of motors and friction::
+Control, motors and friction are the stages of a sim step (:mod:`batchpid.stages`), as in a Runner.
+In place of an engine the rigid tree of the logged joints moves by semi-implicit Euler with steps of
+dt, as in SAPIEN and MuJoCo, with mass matrix M, armature A, viscous damping B, gravity and Coriolis
+forces h, and the effort u of motors and friction::
 
     (M + A + dt B) (v+ - v) = dt (u - h),     q+ = q + dt v+
 
@@ -217,8 +218,9 @@ class SimulatedControl:
         efforts: Float64 | None = None,
         described: Friction = _NONE,
     ) -> None:
-        """Begin at ``qpos`` and ``qvel`` (n, joints), two arrays that the caller changes, after the commanded ``efforts`` (samples, n,
-        joints), the latest first; the motors' friction adds to that ``described``.
+        """Begin at ``qpos`` and ``qvel`` (n, joints), which the caller changes in place, after the
+        commanded ``efforts`` (samples, n, joints), the latest first; the motors' friction adds to
+        that ``described``.
         """
         actuators = candidates.actuators
         self.friction = added_friction(described, actuators)
@@ -250,7 +252,8 @@ class SimulatedControl:
             load=lambda: dynamics.force,
         )
         reading = Measured(qpos, qvel, self.passive)
-        self._values = Values(Command(self.command, feedforward=0.0), reading, reading, model=model)
+        command = Command(self.command, feedforward=0.0)
+        self._values = Values(command, reading, reading, drive.timestep, model=model)
         stages = stages_of(control)
         start = self._values._replace(measured=reading._replace(passive=None))
         states = by_name(stages, started(stages, start))

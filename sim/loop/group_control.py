@@ -26,7 +26,7 @@ from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint
 from batchpid.sim.robot.robot_options import BAND, known_joints
-from batchpid.stages import Control, stages_of
+from batchpid.stages import Control, Stage, stages_of
 from batchpid.stages.friction import REFRESH_STEPS
 from batchpid.stages.program import StageProgram
 from batchpid.stages.stage import States, started
@@ -124,8 +124,21 @@ def control_of(
         turns=turns if turns.any() else None,
         armature=armature,
         damping=damping if damping.any() else None,
-        further=tuple(options.stages),
+        further=tuple([_for_envs(stage, options.num_envs, envs) for stage in options.stages]),
     )
+
+
+def _for_envs(stage: Stage, num_envs: int, envs: slice) -> Stage:
+    """Return a stage of the caller's with the rows ``envs`` of constants that have one for each of
+    ``num_envs`` envs.
+    """
+
+    def rows(leaf: Array) -> Array:
+        has_rows = leaf.ndim >= 2 and leaf.shape[0] == num_envs
+        return leaf[envs] if has_rows else leaf
+
+    part: Stage = mapped(rows, stage)
+    return part
 
 
 def empty_states(
@@ -149,7 +162,8 @@ def empty_states(
         load=lambda: rows,
     )
     measured = Measured(rows, rows, rows)
-    return stages, started(stages, Values(Command(None), measured, measured, model=model))
+    values = Values(Command(None), measured, measured, options.timestep, model=model)
+    return stages, started(stages, values)
 
 
 def untraceable(options: RunnerOptions) -> str:
@@ -159,7 +173,8 @@ def untraceable(options: RunnerOptions) -> str:
     names = {stage.name for stage in options.stages}
     row = np.zeros((options.num_envs, options.robot.dof))
     reading = Measured(row, row, row)
-    values = Values(Command(*[row] * 4), reading, reading, Step(0, 1, np.zeros(())))
+    step = Step(0, 1, np.zeros(()))
+    values = Values(Command(*[row] * 4), reading, reading, options.timestep, step)
     values = values._replace(last=Outputs(row, row), forward=row, limits=(row, row))
     values = values.told(qf=row, motor=row, saturated=row, guarded=row)
     for stage in stages:

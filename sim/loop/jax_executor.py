@@ -24,7 +24,7 @@ One program then serves all groups, and the results of an env do not depend on i
 """
 
 
-_KEPT = ("measured", "step", "model", "matrix", "inertia")
+_KEPT = ("measured", "timestep", "step", "model", "matrix", "inertia")
 """Values that stages in programs do not change."""
 
 

@@ -291,7 +291,7 @@ def group_size(options: RunnerOptions) -> int:
     """Return the number of envs of a group, which changes no result."""
     engine = options.load_engine()
     obstacle = engine.native_obstacle() or native_obstacle(options)
-    # Calls of NumPy and XLA have an overhead, which more envs share.
+    # Calls of NumPy and JAX have an overhead, which more envs share.
     if obstacle or options.backend != "numpy":
         return max(engine.group_size, ROWS)
     return engine.group_size

@@ -71,7 +71,7 @@ class NativeExecutor:
 
     def read_state(self) -> States:
         """Return the states as new NumPy arrays."""
-        return _copied(self._buffers.states)
+        return tuple(map(_copied, self._buffers.states))
 
     def write_state(self, states: States) -> None:
         """Replace the states; they have the arrays of the states before."""

@@ -104,6 +104,7 @@ class TickProgram:
             command=buffers.command if moves else buffers.command.resting(),
             measured=buffers.measured,
             seen=buffers.measured,
+            timestep=control.timestep,
             step=Step(0, 1, self._left if moves else None),
             noise=noise,
         )

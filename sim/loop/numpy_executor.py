@@ -89,7 +89,8 @@ class NumPyExecutor:
         for index in range(begin, end):
             step = Step(index, end, control.left(index, end))
             self.before = self.measured.qpos  # where a robot that fails now is suspended
-            values = Values(command, self.measured, self.measured, step, setup.model)
+            measured = self.measured
+            values = Values(command, measured, measured, control.timestep, step, setup.model)
             with controller_errors(control.controller, index + 1):
                 self.outputs = outputs = self._stepped(values).outputs
             # Writing the targets of drives costs a call for each joint.

@@ -73,6 +73,11 @@ class Snapshot:
         for name in ours | theirs:
             kind, other = theirs.get(name), ours.get(name)
             _expect(kind == other, f"has {kind} for {name}, not {other}")
+        # An env of a fork may have come from one for which build made something else.
+        content = self.rows.get("content/digest")
+        if content is not None:
+            is_same = np.array_equal(content, own["content/digest"])
+            _expect(is_same, "is of envs for which build made other content")
         # The engine's values of an env end where NaN begin.
         lengths = np.isnan(self.rows["engine"]) == np.isnan(own["engine"])
         _expect(lengths.all(), "holds other content than this runner's build makes")
@@ -88,8 +93,9 @@ class Snapshot:
         """Return a snapshot of the envs with these numbers, in this order, and repeatedly where a
         number repeats.
 
-        A runner of as many envs restores it. An env continues bit by bit as the original would,
-        with the noise of the original's sensors, until it is reset.
+        A runner of as many envs restores it, if its ``build`` makes the same content for each as
+        for the original. An env continues bit by bit as the original would, with the noise of the
+        original's sensors, until it is reset.
 
         Raises
         ------

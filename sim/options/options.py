@@ -153,13 +153,6 @@ class RunnerOptions(RunnerKeywords):
         """Quantities that the loop observes."""
         return observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
 
-    @property
-    def misses_contacts(self) -> bool:
-        """True if robots have no collision shapes, and contacts that they would have had are
-        reported.
-        """
-        return not self.collisions
-
     @cached_property
     def own_command(self) -> CommandSpec | None:
         """Command that a :class:`Controller` declares; None for commands of joints."""

@@ -254,7 +254,7 @@ def _grid(
     lines = math.ceil(len(names) / columns)
     heights = (1.7, 0.85)[:rows]
     figure = Picture(figsize=(4.0 * columns, sum(heights) * lines + 0.8), layout="constrained")
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(_plain(title), fontsize=11)
     grid = figure.add_gridspec(lines * rows, columns, height_ratios=heights * lines)
     blocks = []
     for place, name in enumerate(names):
@@ -265,7 +265,7 @@ def _grid(
             axes.spines[["top", "right"]].set_visible(False)
             axes.set_xlim(0, end)
             axes.yaxis.set_major_locator(MaxNLocator(4))
-        block[0].set_title(name, fontsize=8, loc="left", pad=3, fontweight="bold")
+        block[0].set_title(_plain(name), fontsize=8, loc="left", pad=3, fontweight="bold")
         # The lowest axes of a column have the unit of time.
         if place + columns >= len(names):
             block[-1].set_xlabel("time [s]", fontsize=SMALL)
@@ -273,12 +273,17 @@ def _grid(
     return figure, blocks
 
 
+def _plain(text: str) -> str:
+    """Return ``text`` so that Matplotlib draws it as it is, where two ``$`` begin a formula."""
+    return text.replace("$", r"\$")
+
+
 def _add_legend(figure: Figure) -> None:
     """Add a legend with each label of the figure's artists once."""
     entries: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
+            entries.setdefault(_plain(label), handle)
     figure.legend(
         entries.values(),
         entries.keys(),
@@ -416,7 +421,7 @@ def _show_efforts(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
 
 def _show(axes: Axes, values: Rows, unit: str) -> None:
     """Set the range of the axes so that it holds the finite ``values``, and their unit."""
-    axes.set_ylabel(unit, fontsize=SMALL)
+    axes.set_ylabel(_plain(unit), fontsize=SMALL)
     finite = _finite(values)
     if finite.size:
         low = float(finite.min())

@@ -95,7 +95,7 @@ def surfaces(
             for mesh, reason in (error.args for error in unreadable):
                 text = f"mesh cannot be read ({reason}): collision shapes are drawn, if any"
                 findings.append(
-                    Finding("warning", "visual-mesh", text, _REMEDY, link=name, detail=repr(mesh))
+                    Finding("missing-mesh", text, _REMEDY, link=name, detail=repr(mesh))
                 )
         for rgba, same in parts.items():
             joined: Any = concatenate(same)

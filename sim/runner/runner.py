@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Progress
+from batchpid.arrays.array_types import Progress, Rows
 from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
 from batchpid.sim.loop.backend import describe, native_obstacle
-from batchpid.sim.loop.faults import Fault, MissedContact
+from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.options.options import KINDS, OPTIONS, RunnerOptions, arguments_of, checked_option
@@ -66,9 +66,15 @@ class TickRecorder(Protocol):
     def prepare(self) -> None:
         """Prepare for the next tick; raise if it cannot be recorded."""
 
-    def append(self, time_: float, command: Command, observation: Observation) -> None:
+    def append(
+        self,
+        time_: float,
+        command: Command,
+        observation: Observation,
+        changes: Rows | None,
+    ) -> None:
         """Record the state at ``time_`` [s] after a tick under ``command`` (envs, ...), which may
-        change afterwards.
+        change afterwards, and the ``changes`` (envs,) before it.
 
         It must return soon, and without an error: Ctrl-C waits for it.
         """
@@ -135,7 +141,6 @@ class Runner(SingleOwner):
             self._call.end()
         self._execute(start)
         checks.check_stability(self._state)
-        checks.set_params(options.params)
         checks.check_controller()
 
     def __repr__(self) -> str:
@@ -331,6 +336,10 @@ class Runner(SingleOwner):
         seen = empty_observation(ticks, self.num_envs, options.robot.dof, observed=options.observed)
         info = self.info
         steps = self._state.steps + options.substeps * np.arange(1.0, ticks + 1)
+        changes = None
+        if self._state.changes is not None:
+            changes = np.zeros((ticks, self.num_envs), np.uint8)
+            changes[:1] = self._state.changes
         done = 0
         shown = iter(range(ticks) if progress is None else progress(range(ticks)))
         for number in range(ticks):  # not over ``shown``, which may yield anything
@@ -349,7 +358,7 @@ class Runner(SingleOwner):
         rated = command.setpoint_rate is not None
         info = replace(info, rates=rated, faults=self._state.faults.events)
         times = steps * options.timestep
-        return Rollout(times, command.setpoint, seen, seconds, info, command.feedforward)
+        return Rollout(times, command.setpoint, seen, seconds, info, command.feedforward, changes)
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
@@ -405,7 +414,6 @@ class Runner(SingleOwner):
         checked = self.options.check_params(params)
         self._execute(SetParams(checked))
         self._warnings.check_stability(self._state)
-        self._warnings.set_params(checked)
 
     @property
     def actuators(self) -> bp.Actuators | None:
@@ -455,7 +463,6 @@ class Runner(SingleOwner):
         restore = restored(self.options, snapshot, self._present)
         self._execute(restore)
         self._pool.start_replay_from(restore)
-        self._warnings.set_params(self._state.params)
         return self.observe()
 
     # -- properties
@@ -500,16 +507,6 @@ class Runner(SingleOwner):
     def faults(self) -> tuple[Fault, ...]:
         """Envs that failed, latest last: the last ten thousand."""
         return self._state.faults.events
-
-    @property
-    def missed_contacts(self) -> tuple[MissedContact, ...]:
-        """First contact that each robot without shapes would have had since its reset; latest
-        last.
-        """
-        contacts = self._state.contacts
-        if contacts is None:
-            return ()
-        return contacts.events
 
     @property
     def draws(self) -> dict[str, NDArray[np.float64]]:
@@ -677,14 +674,9 @@ class Runner(SingleOwner):
         if outcome.failure is not None:
             raise outcome.failure.error
         # Warnings come last: as errors they must leave a runner that can go on.
-        moving = self._warnings.moving
-        if run is not None and moving is not None:
-            rows = run.command.setpoint[: outcome.num_ticks]
-            rates = run.command.setpoint_rate
-            moving.see(rows, rates is not None, run.substeps * self.timestep)
         state = self._state
-        if pool.warnings or state.faults.events or state.contacts is not None:
-            self._warnings.issue(state.faults, state.contacts, pool.warnings)
+        if pool.warnings or state.faults.events:
+            self._warnings.issue(state.faults, pool.warnings)
         return outcome
 
     def _prepare_ticks(self) -> None:
@@ -710,6 +702,7 @@ class Runner(SingleOwner):
                 time,
                 run.command.map(itemgetter(number)),
                 arrays.observation.copied(self._derived),
+                None if number else before.changes,
             )
 
     def _fail(self, error: BaseException) -> None:

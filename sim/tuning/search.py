@@ -16,7 +16,6 @@ the designed ones. For such robots the first generation consists of other design
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
@@ -31,7 +30,6 @@ from batchpid.arrays.array_types import Document, Float64, Progress
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import package_versions
-from batchpid.sim.loop.faults import MissedContactWarning
 from batchpid.sim.options.groups import EngineName
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
@@ -290,21 +288,18 @@ def _evolve(
     points = []
     history = []
     numbers = range(generations)
-    with warnings.catch_warnings():
-        # Bad gains may leave the way of a move.
-        warnings.simplefilter("ignore", MissedContactWarning)
-        for generation in numbers if progress is None else progress(numbers):
-            samples = np.array([optimizer.ask() for _ in range(population)])
-            if generation == 0:
-                samples[: len(first)] = first
-            costs = evaluate(samples)
-            if generation == 0 and len(first) > 1:
-                # Points far outside its spread would upset CMA-ES: it starts anew at the best one.
-                optimizer = make(mean=samples[int(np.argmin(costs))])
-            else:
-                optimizer.tell(list(zip(samples, costs.tolist(), strict=True)))
-            points.append(samples)
-            history.append(tuple(costs.tolist()))
+    for generation in numbers if progress is None else progress(numbers):
+        samples = np.array([optimizer.ask() for _ in range(population)])
+        if generation == 0:
+            samples[: len(first)] = first
+        costs = evaluate(samples)
+        if generation == 0 and len(first) > 1:
+            # Points far outside its spread would upset CMA-ES: it starts anew at the best one.
+            optimizer = make(mean=samples[int(np.argmin(costs))])
+        else:
+            optimizer.tell(list(zip(samples, costs.tolist(), strict=True)))
+        points.append(samples)
+        history.append(tuple(costs.tolist()))
     return np.concatenate(points), tuple(history)
 
 

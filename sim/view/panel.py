@@ -4,7 +4,6 @@ between two frames.
 
 from __future__ import annotations
 
-import html
 import math
 import queue
 from collections.abc import Callable
@@ -19,6 +18,14 @@ from batchpid.sim.view.view_data import GAINS, LiveSimulation, Playback, ViewDat
 
 if TYPE_CHECKING:
     from viser import GuiApi
+
+
+def _plain(text: str) -> str:
+    """Return ``text`` so that the page shows it as it is, where Markdown and HTML would be read."""
+    return "".join(
+        character if character.isalnum() or character == " " else f"&#{ord(character)};"
+        for character in text
+    )
 
 
 class Panel:
@@ -82,7 +89,7 @@ class Panel:
             try:
                 self._requests.get()()
             except BatchPIDError as error:
-                self._problem = html.escape(str(error))
+                self._problem = _plain(str(error))
         return count > 0
 
     def update_status(self, frame: Rollout, rate: float) -> None:
@@ -96,7 +103,7 @@ class Panel:
         saturated = int(frame.saturated.any(-1).sum())
         diverged = int((~frame.ok).sum())
         lines = [
-            f"**{data.num_envs} x {data.robot.name}**",
+            f"**{data.num_envs} x {_plain(data.robot.name)}**",
             pace if self.frames_left else "paused",
             f"{saturated} saturated, {diverged} diverged",
             self._problem,

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel
-from batchpid.sim.engine.missed_contacts import speed_bounds
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
+from batchpid.sim.engine.mujoco.speed_bounds import speed_bounds
 from batchpid.sim.engine.native.interface import Clearance
 
 Arrays = dict[str, NDArray[Any]]

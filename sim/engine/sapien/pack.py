@@ -97,6 +97,7 @@ class Pack(ModelPack):
                     SceneContent(spec, spec.build, scene, env, frames[env - first_env])
                     for env, scene in envs
                 ]
+            self.content = np.array([content.digest for content in self._contents])
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
         coupling = coupling_of(spec.joints)

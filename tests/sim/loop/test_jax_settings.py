@@ -14,7 +14,7 @@ jax = pytest.importorskip("jax")
 jnp = jax.numpy
 pytestmark = [
     pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning"),
-    pytest.mark.usefixtures("needs_programs"),
+    pytest.mark.usefixtures("needs_jax"),
 ]
 
 
