@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 
 from batchpid.arrays.array_types import Array, Pytree
 from batchpid.arrays.elementwise import replace_envs
+from batchpid.stages.control import Control
 from batchpid.stages.values import Told, Values
 
 States = tuple[Pytree, ...]

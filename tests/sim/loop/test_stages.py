@@ -53,7 +53,8 @@ def test_a_thermal_limit_keeps_motors_at_the_heat_that_they_hold_for_ever(panda)
     with Runner(panda, 2, workers=0, stages=[Thermal(8.0, 0.05)]) as runner:
         rollout = runner.rollout(np.broadcast_to(panda.target, (30, 2, panda.dof)))
         heat = runner.snapshot().rows["control/thermal"]
-    assert np.abs(rollout.effort).max() > 8.0 and rollout.saturated.any()
+    assert np.abs(rollout.effort).max() > 8.0
+    assert rollout.saturated.any()
     assert 0.9 < heat.max() < 1.01
 
 
