@@ -52,6 +52,8 @@ between two of them the loci are interpolated.
 """
 _SLOWEST = 0.01
 """Lowest of them, over 1 / (delay + lag)."""
+_LATEST_STEPS = 1e9
+"""Time steps of the longest delay and lag that the bound tells from longer ones."""
 
 
 class StabilityBound(NamedTuple):
@@ -141,6 +143,8 @@ def _late_bound(
     participation = np.zeros(m.shape[:-1])
     for at in np.ndindex(*m.shape[:-2]):
         local = [column[at] for column in columns]
+        # With later efforts z would round to 1 at the lowest frequency.
+        local[-2:] = [np.minimum(late, _LATEST_STEPS * dt) for late in local[-2:]]
         # Frequencies are spaced by ratio where loci bend, and evenly up to the highest.
         slowest = _SLOWEST / (1 + float(np.max(local[-2] + local[-1])) / dt)
         slow = np.geomspace(slowest, np.pi / 4, _FREQUENCIES)

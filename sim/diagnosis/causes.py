@@ -215,19 +215,23 @@ class _Run:
 
     @cached_property
     def pressed(self) -> list[str]:
-        """Nearest links at the end, per env, that a step of the unsettled joints brings nearer
-        still; "" if there are none.
+        """Nearest links at the end, per env, that a step of the unsettled joints towards their
+        setpoints brings nearer still; "" if there are none.
         """
         links = [""] * len(self.failed)
-        # A floating base stands on its ground.
-        ground = bool(self.info.ground and self.robot.fixed_base)
         most = 20 * absolute_band(self.robot)
         steps = np.clip(self.error[-1], -most, most) * self.unsettled
+        # A floating base stands on its ground.
+        ground = bool(self.info.ground and self.robot.fixed_base)
         for env in np.flatnonzero(~self.failed & (self.info.collisions is not False)):
-            before = touching_links(self.robot, self.qpos[-1, env], ground, TOUCH)
-            next_pose = self.robot.coupled(self.qpos[-1, env] + steps[env])
-            after = touching_links(self.robot, next_pose, ground, TOUCH)
-            pressed = [pair for pair in before if after.get(pair, TOUCH) < before[pair] - 1e-4]
+            end = self.qpos[-1, env]
+            before = touching_links(self.robot, end, ground, TOUCH)
+            # Links that slide along each other are pressed by single joints, not by all at once.
+            moves = [steps[env], *np.diag(steps[env])] if before else []
+            pressed = set[str]()
+            for move in moves:
+                after = touching_links(self.robot, self.robot.coupled(end + move), ground, TOUCH)
+                pressed |= {pair for pair in before if after.get(pair, TOUCH) < before[pair] - 1e-4}
             links[env] = min(pressed, key=before.__getitem__, default="")
         return links
 

@@ -200,14 +200,16 @@ def _massless(plan: _Plan) -> Iterator[Place]:
 
 
 def _touching(plan: _Plan) -> Iterator[Place]:
-    """Yield the robot if links touch at the start pose."""
+    """Yield the robot if links touch at the start pose or at the setpoint."""
     robot = plan.robot
     # A floating base starts on its ground, which is no fault.
     ground = robot.fixed_base and robot.has_ground
-    pairs = touching_links(robot, plan.start, ground, 0.0)
-    if pairs:
-        *_, nearest = pairs
-        yield Place(detail=f"start pose: {nearest}")
+    goal = robot.target if plan.goal is None else robot.coupled(plan.goal)
+    for name, qpos in (("start pose", plan.start), ("setpoint", goal)):
+        pairs = touching_links(robot, qpos, ground, 0.0)
+        if pairs:
+            *_, nearest = pairs
+            yield Place(detail=f"{name}: {nearest}")
 
 
 def _outside(plan: _Plan) -> Iterator[Place]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Pytree
-from batchpid.arrays.jax_settings import own_settings
+from batchpid.arrays.jax_settings import precision
 from batchpid.arrays.trees import filled, leaves, structure
 from batchpid.sim.loop.group_control import GroupControl
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
@@ -53,7 +53,7 @@ class JAXExecutor(NumPyExecutor):
         """
         import jax
 
-        with own_settings("float64"):
+        with precision("float64"):
             rows = [self._padded(leaf, leaf.ndim - 2) for leaf in leaves(part)]
             return list(jax.device_put(rows, jax.local_devices(backend="cpu")[0]))
 
@@ -72,7 +72,7 @@ class JAXExecutor(NumPyExecutor):
         stages, states = self.setup.stages, self._states
         values = recalled(stages, states, values)
         new = list[Pytree]()
-        with own_settings("float64"):
+        with precision("float64"):
             for part, program in self._parts:
                 if program is None:
                     changed, values = stepped(stages[part], states[part], values)

@@ -438,6 +438,11 @@ class Control(OptionGroup):
             raise InvalidArgumentError("tool", problem, value=tool, remedy="leave it out")
         if self.backend == "jax":
             require_jax()
+            platforms = os.environ.get("JAX_PLATFORMS") or "cpu"
+            if "cpu" not in platforms.split(","):
+                problem = f"'jax' needs JAX on the CPU, and JAX_PLATFORMS is {platforms!r}"
+                remedy = "add cpu to it, or use backend='numpy'"
+                raise InvalidArgumentError("backend", problem, remedy=remedy)
         return self.changed(control=control, tool=link, stages=fit_stages(self.stages))
 
     @property

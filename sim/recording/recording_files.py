@@ -118,6 +118,7 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
                 raise ValueError(f"its format is not {FORMAT}")
             info = read_info(file.attrs)
             num_envs = int(file.attrs["num_envs"])
+            _check_info(info, num_envs)
             tick = float(file.attrs["tick"])
             time = file["time"][:]
             # The rows of a run that still goes on, or was killed, end at the first without a time.
@@ -143,6 +144,17 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
         ) from error
     inputs = {name: arrays.pop(name) for name in ("time", "setpoint", *OPTIONAL)}
     return Rollout(**inputs, observation=Observation(**arrays), tick=tick * every, info=info)
+
+
+def _check_info(info: RunInfo, num_envs: int) -> None:
+    """Raise ValueError for an array of a file whose shape is not that of its field."""
+    joints: tuple[int, ...] = (len(info.joint_names),)
+    shapes = dict.fromkeys(("units", "lower", "upper", "effort_limit"), joints)
+    shapes |= {"start": (num_envs, *joints), "episodes": (num_envs, 2)}
+    for name, shape in shapes.items():
+        value = getattr(info, name)
+        if value is not None and np.shape(value) != shape:
+            raise ValueError(f"its {name} has shape {np.shape(value)}, not {shape}")
 
 
 def check_path(path: str | os.PathLike[str], *, overwrite: bool) -> Path:

@@ -60,6 +60,10 @@ class Reset(Operation):
     base: Float64 | None
     ticks = 1
 
+    @property
+    def placed(self) -> Bool:
+        return self.mask
+
     @classmethod
     def read(
         cls,

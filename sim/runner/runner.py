@@ -55,7 +55,7 @@ from batchpid.sim.workers.pool import Outcome, WorkerPool
 from batchpid.stages.values import Command
 
 CHECKPOINT_STEPS = 8000
-"""Sim steps between checkpoints, from the last of which a lost worker is replayed."""
+"""Least number of sim steps between checkpoints, from the last of which a lost worker is replayed."""
 
 
 class TickRecorder(Protocol):
@@ -462,7 +462,7 @@ class Runner(SingleOwner):
         snapshot.check_options(self.options.described)
         restore = restored(self.options, snapshot, self._present)
         self._execute(restore)
-        self._pool.start_replay_from(restore)
+        self._pool.replay.start_from(restore)
         return self.observe()
 
     # -- properties
@@ -649,6 +649,8 @@ class Runner(SingleOwner):
         is_due = self.recorder is not None or self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
         if is_due and run is not None and not is_sent:
             self._prepare_ticks()
+        elif is_due and isinstance(operation, Reset):
+            self._prepare_reset()
         # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
@@ -683,10 +685,29 @@ class Runner(SingleOwner):
         """Take a checkpoint if one is due, and let the recorder keep the state before its first
         tick.
         """
-        if self._state.steps_since_checkpoint >= CHECKPOINT_STEPS:
+        if self._keeps_bits and self._state.steps_since_checkpoint >= CHECKPOINT_STEPS:
             self._take_snapshot()
         if self.recorder is not None:
             self.recorder.prepare()
+
+    def _prepare_reset(self) -> None:
+        """Take a checkpoint before a reset, if one is due that the loops must not notice.
+
+        It holds all that there is of an env after its next reset. With ``build`` that is not so:
+        the user's content is not rebuilt.
+        """
+        is_wanted = not self._keeps_bits and self.options.build is None
+        if is_wanted and not self._pool.replay.waits:
+            state = self._state
+            snapshot = snapshot_of(self.options, state, self._read(ReadRows()))
+            restore = Restore(snapshot.copy(), state.draws)
+            self._pool.replay.start_at_resets(restore, self.num_envs)
+            self._state = state._replace(steps_since_checkpoint=0)
+
+    @cached_property
+    def _keeps_bits(self) -> bool:
+        """Whether envs go on with the same bits after a snapshot as without it."""
+        return "complete_state" in self.options.load_engine().capabilities
 
     def _record(
         self,
@@ -718,7 +739,7 @@ class Runner(SingleOwner):
         """
         state = self._state
         snapshot = snapshot_of(self.options, state, self._read(TakeSnapshot()))
-        self._pool.start_replay_from(Restore(snapshot.copy(), state.draws))
+        self._pool.replay.start_from(Restore(snapshot.copy(), state.draws))
         return snapshot
 
     def _max_ticks(self) -> int:

@@ -393,7 +393,7 @@ class Rollout:
         """Return a Matplotlib figure of the run, which a notebook shows: positions above efforts
         for each joint.
 
-        ``options`` are arguments of :func:`batchpid.sim.plots.step_responses`: joints, mark, title.
+        ``options`` are arguments of :func:`batchpid.sim.plots.step_responses`: joints, title.
         """
         from batchpid.sim.plots import step_responses
 

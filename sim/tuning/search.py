@@ -17,7 +17,7 @@ the designed ones. For such robots the first generation consists of other design
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,9 +33,10 @@ from batchpid.io.files import package_versions
 from batchpid.sim.options.groups import EngineName
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tuning.candidates import FACTORS, Candidates, Weights
-from batchpid.sim.tuning.comparison import Comparison, GainSet, compare
+from batchpid.sim.tuning.candidates import FACTORS, Candidates
+from batchpid.sim.tuning.comparison import Comparison, compare
 from batchpid.sim.tuning.evaluation import SUBSTEPS, reseeded, tuning_engine
+from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 if TYPE_CHECKING:
@@ -114,7 +115,6 @@ def tune(
     seed: int = 0,
     seconds: float = 1.5,
     gain_units: Literal["mass_matrix", "effort"] = "mass_matrix",
-    weights: Weights | None = None,
     moves: Moves | None = None,
     randomization: Randomization | None = None,
     motors: bp.Actuators | None = None,
@@ -141,9 +141,6 @@ def tune(
         Simulated time of each move of the search [s].
     gain_units
         Gains per mass matrix (all joints respond equally fast), or as efforts (for any controller).
-    weights
-        Of the terms of the cost. Default: 1 for a second of a step's settling time and 1 for the
-        logarithm of the following error.
     moves
         Default: the tutorial's move and SEARCH_MOVES random ones, and FINAL_MOVES others in the
         final round. Given moves replace them, with contacts, since they may touch something. There
@@ -187,7 +184,6 @@ def tune(
     if motors is not None and runner_options.get("actuators") is not None:
         remedy = "leave it out: the control knows the actuators of the robot"
         raise InvalidArgumentError("actuators", "cannot be combined with motors", remedy=remedy)
-    weights = Weights() if weights is None else weights
     build = runner_options.get("build")
     engine = tuning_engine(build) if engine is None else engine
     # Options of all rollouts; the search adds fast ones where moves are free of contact.
@@ -209,7 +205,6 @@ def tune(
             gain_units,
             moves,
             seconds,
-            weights,
             headroom=headroom,
             drawn=differs and motors is None,
             motors=motors,
@@ -248,7 +243,6 @@ def tune(
         "population": population,
         "seconds": seconds,
         "gain_units": gain_units,
-        "weights": asdict(weights),
         "moves": list(moves.names),
         "randomization": None if randomization is None else randomization.to_dict(),
         "engine": engine,

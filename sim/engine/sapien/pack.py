@@ -69,8 +69,6 @@ class Pack(ModelPack):
         Whether the calls into the engine are native.
     """
 
-    state_is_complete = False  # PhysX remembers contacts
-
     def __init__(
         self,
         spec: SceneSpec,

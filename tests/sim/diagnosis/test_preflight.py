@@ -144,9 +144,9 @@ def test_each_oddity_of_a_file_has_its_finding(name, tmp_path):
     suffix = "xml" if text.startswith("<mujoco") else "urdf"
     path = write(tmp_path, text, f"test.{suffix}")
     loading = {key: value for key, value in options.items() if key != "srdf"}
-    findings = codes(Robot.load(path, **loading).check())
-    assert re.search(message, str(findings[code])), findings
-    assert findings[code].remedy
+    findings = [each for each in Robot.load(path, **loading).check() if each.code == code]
+    assert re.search(message, str(findings[0])), findings
+    assert all(each.remedy for each in findings)
 
 
 def test_every_kind_of_finding_has_a_case():

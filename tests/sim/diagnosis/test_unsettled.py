@@ -92,6 +92,7 @@ LOADED = {"compensate": "none"}
 """Options without compensation of gravity."""
 CASES = {
     "pressed into the ground": Case("touching", "bar3 on the ground", (0.7, 0.3, 0.0)),
+    "along the ground, into which single joints press": Case("touching", "bar3 on the ground", (1.3, -0.3, -1.0)),
     "links that touch": Case("touching", "bar1", (-0.3, 2.3, 2.4)),
     "a start inside the ground": Case("touching", "bar3 on the ground", (0.75, 0.3, 0.0), start=(0.75, 0.3, 0.0)),
     "gravity above the effort limit": Case("effort-limit", "elbow", (0.0, -0.5, 0.0), robot={"effort": 3.0}),

@@ -36,6 +36,36 @@ def test_a_controller_that_cannot_be_traced_is_an_error(panda, needs_jax):
         runner.step(np.zeros(panda.dof))
 
 
+class Integrator:
+    """Controller whose init makes its state by JAX."""
+
+    def init(self, robot, num_envs, timestep):
+        import jax
+
+        return {"sum": jax.numpy.zeros((num_envs, robot.dof))}
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        return {"sum": state["sum"] + (setpoint - qpos)}, passive
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_the_state_of_a_controller_has_the_precision_of_the_runner(panda, needs_jax, wide):
+    import jax
+
+    jax.config.update("jax_enable_x64", wide)
+    try:
+        with Runner(panda, 2, backend="jax", control=Integrator(), workers=0) as runner:
+            assert runner.snapshot().rows["control/law/sum"].dtype == np.float64
+    finally:
+        jax.config.update("jax_enable_x64", False)
+
+
+def test_jax_without_the_cpu_is_refused(panda, needs_jax, monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    with pytest.raises(InvalidArgumentError, match="JAX_PLATFORMS is 'cuda': add cpu"):
+        Runner(panda, 2, backend="jax", workers=0)
+
+
 def test_a_sensor_that_is_late_in_flight_begins_with_the_present_velocity(panda):
     """It began with velocity 0, whatever the robot did."""
     control = Recording()

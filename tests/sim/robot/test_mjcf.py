@@ -17,7 +17,7 @@ from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.robot.shapes import surfaces
-from batchpid.sim.tuning import gain_set
+from batchpid.sim.tuning.gain_sets import gain_set
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
