@@ -62,7 +62,7 @@ def test_the_state_of_a_controller_has_the_precision_of_the_runner(panda, needs_
 
 def test_jax_without_the_cpu_is_refused(panda, needs_jax, monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
-    with pytest.raises(InvalidArgumentError, match="JAX_PLATFORMS is 'cuda': add cpu"):
+    with pytest.raises(InvalidArgumentError, match="JAX_PLATFORMS is 'cuda'; add cpu"):
         Runner(panda, 2, backend="jax", workers=0)
 
 
@@ -80,12 +80,12 @@ def test_a_sensor_that_is_late_in_flight_begins_with_the_present_velocity(panda)
 
 
 def test_a_thermal_limit_keeps_motors_at_the_heat_that_they_hold_for_ever(panda):
-    with Runner(panda, 2, workers=0, stages=[Thermal(8.0, 0.05)]) as runner:
-        rollout = runner.rollout(np.broadcast_to(panda.target, (30, 2, panda.dof)))
+    with Runner(panda, 2, workers=0, stages=[Thermal(4.0, 0.05)]) as runner:
+        rollout = runner.rollout(np.broadcast_to(panda.target, (24, 2, panda.dof)))
         heat = runner.snapshot().rows["control/thermal"]
-    assert np.abs(rollout.effort).max() > 8.0
+    assert np.abs(rollout.effort).max() > 4.0
     assert rollout.saturated.any()
-    assert 0.9 < heat.max() < 1.01
+    assert 0.99 < heat.max() < 1.01
 
 
 @dataclass(frozen=True)
