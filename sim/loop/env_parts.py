@@ -73,20 +73,6 @@ class ActingDraws:
         return actuators
 
 
-def scene_of(options: RunnerOptions) -> SceneSpec:
-    """Return the scene of a runner's envs."""
-    robot = options.robot
-    return SceneSpec(
-        tables=robot.tables,
-        ignored=robot.ignored_pairs,
-        joints=robot.joints,
-        dissipation=robot.dissipation,
-        fixed_base=robot.fixed_base,
-        mjcf=options.mjcf,
-        **options.values_for("scene"),
-    )
-
-
 def make_pack(
     options: RunnerOptions,
     scene: SceneSpec,

@@ -22,7 +22,7 @@ from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.backend import native_obstacle
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_group import EnvGroup
-from batchpid.sim.loop.env_parts import make_pack, scene_of
+from batchpid.sim.loop.env_parts import make_pack
 from batchpid.sim.loop.jax_executor import ROWS
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks
 from batchpid.sim.loop.snapshot import Snapshot, join_rows
@@ -126,7 +126,7 @@ class Loop:
     ) -> None:
         self.options, self.arrays = options, arrays
         self._first_env = envs.start
-        self._scene = scene_of(options)
+        self._scene = options.scene
         self._steps = 0
         self._given: tuple[bool, ...] = ()
         self._workspace: dict[object, object] = {}

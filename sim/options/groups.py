@@ -150,10 +150,6 @@ class Scene(OptionGroup):
             "snapshot",
             "recording",
             "scene",
-            flag=(
-                "Ground at height 0. Default: on, unless links of a fixed robot reach it at the"
-                " start pose."
-            ),
         ),
     ] = None
     """Add a ground plane at height 0 to every scene. Default :attr:`Robot.has_ground`: True, unless
@@ -376,7 +372,7 @@ class Control(OptionGroup):
     """Link that control "osc" moves; default the last link of the robot's longest chain."""
     backend: Annotated[
         Backend,
-        option("snapshot", flag="Array library of the control: NumPy or JAX."),
+        option("snapshot"),
     ] = "numpy"
     """Library of the control: ``"numpy"``, the default, or ``"jax"``, which compiles the stages of
     a sim step, a :class:`Controller` among them, for the CPU: for a controller or stages in JAX. The
@@ -385,11 +381,7 @@ class Control(OptionGroup):
     """
     compensate: Annotated[
         Compensation,
-        option(
-            "snapshot",
-            "recording",
-            flag="Efforts added in every sim step against these forces.",
-        ),
+        option("snapshot", "recording"),
     ] = "gravity+coriolis+friction"
     """Compensation added to the effort at every sim step: the passive force (gravity, Coriolis and
     centrifugal forces) and the known Coulomb friction in the direction of the setpoint.
