@@ -19,6 +19,8 @@ from batchpid.arrays.trees import parts, rebuilt_as
 T = TypeVar("T")
 V = TypeVar("V")
 TURN = 2 * math.pi
+NAMED_TUPLES: list[type] = [*CHOICE_TYPES]
+"""Types of records and choices, as ``jax.export`` writes them into files."""
 _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
 
 
@@ -30,8 +32,19 @@ def namespace(*leaves: Array) -> ArrayModule:
         for leaf in leaves:
             if not isinstance(leaf, np.ndarray) and hasattr(leaf, "__array_namespace__"):
                 module: ArrayModule = leaf.__array_namespace__()
+                if getattr(module, "__name__", "") == "jax.numpy":
+                    _register_in_jax()
                 return module
     return np
+
+
+@cache
+def _register_in_jax() -> None:
+    """Let ``jax.export`` serialize functions of records; for all else JAX knows named tuples."""
+    from jax.export import register_namedtuple_serialization
+
+    for kind in NAMED_TUPLES:
+        register_namedtuple_serialization(kind, serialized_name=f"batchpid.{kind.__name__}")
 
 
 def in_dtype_of(params: Iterable[Array], *arrays: Array) -> list[Array]:
@@ -135,7 +148,9 @@ def replace_envs(state: T, fresh: T, mask: Array) -> T:
         return rebuilt
     old: Any = state
     xp = namespace(old, fresh, mask)
-    chosen: T = xp.where(xp.asarray(mask).reshape(-1, *[1] * (old.ndim - 1)), fresh, old)
+    wanted = xp.asarray(mask)
+    wanted = wanted.reshape(*wanted.shape, *[1] * (old.ndim - wanted.ndim))
+    chosen: T = xp.where(wanted, fresh, old)
     return chosen
 
 
