@@ -405,9 +405,7 @@ def _blank_failed(rollout: Rollout) -> Rollout:
 
     Raises InvalidArgumentError for one without ticks.
     """
-    if not len(rollout.time):
-        remedy = "run it again: it was cut short"
-        raise InvalidArgumentError("rollout", "holds no tick", remedy=remedy)
+    rollout.check_ticks()
     alive = rollout.ok[..., None]
     blank = {}
     for name in ("qpos", "effort", "tool_pose"):

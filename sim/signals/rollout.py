@@ -389,6 +389,12 @@ class Rollout:
             raise InvalidArgumentError("robot", problem, remedy=remedy)
         return unsettled_findings(self, robot)
 
+    def check_ticks(self) -> None:
+        """Raise InvalidArgumentError if the run holds no tick, so that nothing can be shown."""
+        if not len(self.time):
+            remedy = "its run was cut short: run it again"
+            raise InvalidArgumentError("rollout", "holds no tick", remedy=remedy)
+
     def plot(self, **options: Any) -> Figure:
         """Return a Matplotlib figure of the run, which a notebook shows: positions above efforts
         for each joint.

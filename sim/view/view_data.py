@@ -136,13 +136,14 @@ class Playback:
     Raises
     ------
     InvalidArgumentError
-        The run has more robots than fit on a page, or another number of joints than the robot; or
-        the recording holds no robot.
+        The run has no tick, more robots than fit on a page, or another number of joints than the
+        robot; or the recording holds no robot.
     """
 
     def __init__(
         self, rollout: Rollout, robot: Robot | None = None, *, period: float = 1 / 30
     ) -> None:
+        rollout.check_ticks()
         robot = recorded_robot(rollout) if robot is None else robot
         joints = rollout.qpos.shape[2]
         if joints != robot.dof:
