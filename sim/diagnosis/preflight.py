@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,11 +22,14 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
-from batchpid.sim.robot.description import POSES, RobotDescription
-from batchpid.sim.robot.findings import KINDS, SEVERITIES, Finding, Findings
+from batchpid.sim.findings import KINDS, SEVERITIES, Finding, Findings
 from batchpid.sim.robot.inertia import triangle_excess
-from batchpid.sim.robot.urdf import GIVE_RANGE
 
+if TYPE_CHECKING:
+    from batchpid.sim.robot.description import RobotDescription
+
+HELD_POSES = 50
+"""Poses in which joints should hold themselves."""
 LEAST_EXCESS = 0.01
 """Excess over the triangle inequality of principal moments from which it is reported; less is
 rounding.
@@ -223,7 +226,7 @@ def _outside(plan: _Plan) -> Iterator[Place]:
 
 def _without_range(plan: _Plan) -> Iterator[Place]:
     """Yield joints that cannot move, apart from those of which a repair says so."""
-    reported = {repair.joint for repair in plan.robot.repairs if repair.remedy == GIVE_RANGE}
+    reported = {repair.joint for repair in plan.robot.repairs if repair.code == "limits"}
     for joint in plan.robot.joints:
         if joint.lower == joint.upper and not joint.continuous and joint.name not in reported:
             text = "lower and upper limit are equal: no motion"
@@ -236,7 +239,7 @@ def _weak(plan: _Plan) -> Iterator[Place]:
     """Yield joints that cannot be held, or not be moved, in some poses."""
     robot = plan.robot
     limits = robot.effort_limit
-    load = np.abs(robot.holding_efforts(robot.sample(POSES, seed=0)))
+    load = np.abs(robot.holding_efforts(robot.sample(HELD_POSES, seed=0)))
     share = (load + robot.friction >= limits).mean(0)
     for index in np.flatnonzero((share > 0) & (limits > 0)):
         joint = robot.joints[index]

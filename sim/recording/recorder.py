@@ -23,8 +23,8 @@ from batchpid.errors import ClosedError, InvalidArgumentError, SingleOwner
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import RecordingError
+from batchpid.sim.rollout import RunInfo
 from batchpid.sim.signals.quantities import Observation
-from batchpid.sim.signals.rollout import RunInfo
 
 if TYPE_CHECKING:
     import h5py

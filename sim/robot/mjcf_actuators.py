@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import MjModel
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
 from batchpid.sim.robot.mjcf_model import ALONE, RobotInFile, label
 
 Couplings = dict[str, tuple[str, float, float]]

@@ -19,7 +19,7 @@ import numpy as np
 from batchpid.arrays.array_types import MjModel, MjSpec
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
 
 ALONE = "engine 'mujoco' alone simulates"
 """First words of the findings for elements without equivalent in a URDF."""

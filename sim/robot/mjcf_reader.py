@@ -14,7 +14,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.arrays.elementwise import read_only
 from batchpid.motors import make_actuators
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
 from batchpid.sim.robot.mjcf_actuators import read_couplings, read_motors
 from batchpid.sim.robot.mjcf_model import (
     ALONE,

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjModel
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
 from batchpid.sim.robot.inertia import possible_inertia
 from batchpid.sim.robot.mjcf_actuators import Couplings, Motors
 from batchpid.sim.robot.mjcf_model import ALONE, RobotInFile, can_collide, label, unique

@@ -17,8 +17,8 @@ from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.elementwise import read_only
 from batchpid.checks.validate import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
+from batchpid.sim.findings import Findings, report
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.findings import Findings, report
 from batchpid.sim.robot.mimics import couple
 from batchpid.sim.robot.parts import DISSIPATION, Joint, Settings
 from batchpid.sim.robot.robot_options import load_robot_actuators, setpoint_guard

@@ -17,9 +17,9 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from batchpid.io.packages import imported
+from batchpid.sim.findings import Finding
 from batchpid.sim.robot.collision_shapes import convex_hull
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.meshes import find_mesh, read_mesh
 from batchpid.sim.robot.tables import Shape
 from batchpid.sim.robot.urdf import SHAPES, is_mjcf, read_origin, read_shape

@@ -27,7 +27,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.motors import Actuators
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
 from batchpid.sim.robot.parts import DisabledPair, FileDefaults, Joint, MjcfFile, Placement
 from batchpid.task_space.frames import SpatialInertia, matrix_of
 

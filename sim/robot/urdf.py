@@ -17,7 +17,7 @@ from lxml import etree
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import is_name
 from batchpid.errors import RobotError
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
 from batchpid.sim.robot.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
 from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
 from batchpid.sim.robot.mjcf_model import unique

@@ -14,9 +14,9 @@ from lxml import etree
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.export.differences import Exported
+from batchpid.sim.findings import summary
 from batchpid.sim.robot.collision_shapes import mesh_file
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.inertia import MOMENTS
 from batchpid.sim.robot.merging import link_inertias
 from batchpid.sim.robot.meshes import find_mesh

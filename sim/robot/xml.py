@@ -15,7 +15,7 @@ from pathlib import Path
 from lxml import etree
 
 from batchpid.errors import RobotError
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
 
 SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
 LFS_POINTER = b"version https://git-lfs"  # beginning of git-lfs's file in place of another
