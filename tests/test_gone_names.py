@@ -25,7 +25,7 @@ GONE = (
     r"batchpid tune --resume",
     r"--per-joint\b|--versus\b",
     r"--package-dirs|--missing-meshes|--dissipation\b",
-    r"\bshortfalls\b|\.demands\(|\.drawback\(",
+    r"\.demands\(|\.drawback\(",
     r"\bcheck_guard\b|\bmotors\.check_actuators\b",
     r"\bcheck_renderer\b",
     r"\bcompiled_stages\b",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
@@ -23,7 +23,8 @@ from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
 from batchpid.sim.findings import KINDS, SEVERITIES, Finding, Findings
-from batchpid.sim.robot.inertia import triangle_excess
+from batchpid.sim.geometry.inertia import LEAST_MASS, triangle_excess
+from batchpid.sim.geometry.shapes import hull_share
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.description import RobotDescription
@@ -40,6 +41,8 @@ extreme ratios of the bundled robots and of example-robot-data 6.0.0 are 3.2 and
 """
 SHORTEST_CHAIN = 0.3
 """Least length of the chain [m] that is assumed, e.g. for robots with all joints at one point."""
+LARGEST_HULL = 1.2
+"""Volume of a mesh's hull over that of the mesh, from which it is reported."""
 MOST_RADIANS, PLACEHOLDER = 4 * np.pi, 1000.0
 """Bounds between which limits of a hinge are taken for degrees [rad]; larger ones mean "no
 limit".
@@ -53,9 +56,10 @@ def check(
     setpoint: ArrayLike | None,
     timestep: float,
     control: str,
+    of_engine: Iterable[Finding],
 ) -> Findings:
-    """Return the findings, most severe first; :meth:`batchpid.sim.Robot.check` describes the
-    arguments.
+    """Return the findings, most severe first, those of an engine included;
+    :meth:`batchpid.sim.Robot.check` describes the other arguments.
     """
     timestep = number("timestep", timestep, 1e-6, 0.1, "seconds")
     choice("control", control, ("pid", "drive", "effort"))
@@ -83,6 +87,7 @@ def check(
             remedy = place.remedy or kind.done
             where = place.joint, place.link, place.detail
             findings.append(Finding(kind.code, text, remedy, *where))
+    findings += of_engine
     return Findings(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
@@ -187,7 +192,7 @@ def _massless(plan: _Plan) -> Iterator[Place]:
     bodies = {name: place.link for name, place in robot.bodies.items()}
     root = bodies[robot.all_joints[0].parent_link]
     masses = robot.link_masses
-    loaded = {bodies[name] for name, mass in masses.items() if mass.mass}
+    loaded = {bodies[name] for name, mass in masses.items() if mass.mass > LEAST_MASS}
     # Bodies with mass in them, or in the links that they carry.
     for joint in reversed(robot.all_joints):
         if bodies[joint.child_link] in loaded:
@@ -199,6 +204,15 @@ def _massless(plan: _Plan) -> Iterator[Place]:
             yield Place(link=name, detail=f"{mass.mass:.3g} kg")
         elif name == bodies[name] and name not in loaded:
             yield Place(link=name, detail="1e-6 kg")
+
+
+def _changed_meshes(plan: _Plan) -> Iterator[Place]:
+    """Yield links with a mesh that is much smaller than the hull that collides in its place."""
+    for shape in plan.robot.tables.shapes:
+        if (share := hull_share(shape)) > LARGEST_HULL:
+            text = "a collision mesh is not convex, and collides as its convex hull"
+            detail = f"{share:.3g} times its volume"
+            yield Place(None, shape.owner, detail, text, "divide the mesh into convex parts")
 
 
 def _touching(plan: _Plan) -> Iterator[Place]:
@@ -297,6 +311,7 @@ ODDITIES = (
     Oddity("units", _odd_angles),
     Oddity("inertia", _odd_inertia),
     Oddity("no-inertia", _massless),
+    Oddity("collision", _changed_meshes),
     Oddity("touching", _touching),
     Oddity("out-of-limits", _outside),
     Oddity("limits", _without_range),

@@ -10,7 +10,7 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from sys import modules
@@ -23,6 +23,8 @@ from batchpid.io.packages import imported
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.findings import Finding
+from batchpid.sim.robot.robot import Robot
 from batchpid.task_space.rigid_tree import RigidTree
 
 Capability = Literal["build", "partial_force", "base_state", "complete_state", "sapien_dissipation"]
@@ -283,6 +285,11 @@ class EnginePack(Protocol):
         """Free the envs. The pack cannot be used afterwards."""
 
 
+def _nothing(spec: SceneSpec) -> Iterator[Finding]:
+    """Yield the limits of an engine that has none: nothing."""
+    return iter(())
+
+
 @dataclass
 class Engine:
     """Physics engine: it makes packs of robots."""
@@ -311,6 +318,10 @@ class Engine:
     """
     native_obstacle: Callable[[], str]
     """Reason for which native code cannot call the engine, in a sentence; "" if it can."""
+    refusals: Callable[[SceneSpec], Iterator[Finding]] = _nothing
+    """Yields what of a scene it cannot run at all."""
+    shortfalls: Callable[[SceneSpec], Iterator[Finding]] = _nothing
+    """Yields what of a scene it runs otherwise than the robot's file says."""
 
     def is_physics(self, settings: object) -> bool:
         """Return whether ``settings`` are settings of its solver."""
@@ -352,6 +363,15 @@ def load_engine(name: str = "sapien") -> Engine:
         raise InvalidArgumentError("engine", problem, value=name, remedy="use 'mujoco'")
     engine: Engine = imported(module).ENGINE
     return engine
+
+
+def engine_findings(robot: Robot, name: str, timestep: float) -> Iterator[Finding]:
+    """Yield what of ``robot`` an engine cannot run, or runs otherwise than the file says."""
+    engine = load_engine(name)
+    ground = {"ground": robot.has_ground, "mjcf": robot.mjcf}
+    scene = SceneSpec.of(robot, timestep, engine.physics["accurate"], **ground)
+    yield from engine.refusals(scene)
+    yield from engine.shortfalls(scene)
 
 
 def _require_mujoco() -> None:
