@@ -29,6 +29,7 @@ from batchpid.sim.cli.identify import identify_logs
 from batchpid.sim.cli.inspect import inspect_robot
 from batchpid.sim.cli.rollout import demo, rollout
 from batchpid.sim.engine.protocol import load_engine
+from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.tuning.comparison import compare
 from batchpid.sim.tuning.evaluation import load_randomization
@@ -213,8 +214,6 @@ def _arguments(command: CommandFunction, values: Document) -> Document:
             arguments["randomization"] = load_randomization(values["randomize"], robot)
         if not is_recorded:
             print(f"{robot.name}: {', '.join(_settings(robot, values))}", flush=True)
-        if values.get("engine") == "sapien":
-            print("MuJoCo is several times as fast, with other contacts: --engine mujoco")
     if "progress" in accepted:
         arguments["progress"] = bar(command.function.__name__)
     return arguments
@@ -227,7 +226,7 @@ def _settings(robot: Robot, values: Document) -> Iterator[str]:
     yield f"{robot.dof} dof"
     if "engine" in values:
         # A comparison may have two engines.
-        engines = values["engine"] or ("mujoco",)
+        engines = values["engine"] or (DEFAULT_ENGINE,)
         names = (engines,) if isinstance(engines, str) else engines
         yield " and ".join(load_engine(name).title for name in names)
     gains = values.get("gains")
