@@ -16,10 +16,10 @@ BLOCK = re.compile(
 )
 SHORTER = {
     # command: flags that make it short
-    "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
+    "demo": ["--num-envs", "2", "--seconds", "0.1"],
     "rollout": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
     "excite": ["--seconds", "1"],
-    "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1", "--engine", "mujoco"],
+    "compare": ["--moves", "1", "--engine", "mujoco"],
     "view": ["--num-envs", "2", "--workers", "0", "--time-limit", "0.1", "--port", "8765"],
 }
 SHORTER_CODE = {

@@ -1,8 +1,7 @@
 """Preflight: oddities of a robot, its gains and its setpoint, reported before the first step.
 
 ``Robot.load`` raises an error if no engine can run the file. A :class:`batchpid.sim.Finding`
-reports a robot that runs, but differently than the file or the user intends. :data:`RULES` is the
-table of the oddities.
+reports a robot that runs, but differently than the file or the user intends: :data:`ODDITIES`.
 """
 
 from __future__ import annotations
@@ -74,9 +73,9 @@ def check(
         params = params if control == "pid" else None
     plan = _Plan(robot, start, goal, params, timestep)
     findings = [*robot.repairs, *robot.srdf.findings]
-    for rule in RULES:
-        kind = KINDS[rule.code]
-        for place in rule.places(plan):
+    for oddity in ODDITIES:
+        kind = KINDS[oddity.code]
+        for place in oddity.places(plan):
             text = place.text or kind.when
             remedy = place.remedy or kind.done
             where = place.joint, place.link, place.detail
@@ -96,7 +95,7 @@ class Place(NamedTuple):
     remedy: str = ""
 
 
-class Rule(NamedTuple):
+class Oddity(NamedTuple):
     """Kind of finding, and the places that have it."""
 
     code: str
@@ -290,17 +289,17 @@ def _unstable(plan: _Plan) -> Iterator[Place]:
     yield Place(joint, detail=detail, remedy=report.remedy)
 
 
-RULES = (
-    Rule("units", _odd_sizes),
-    Rule("units", _odd_angles),
-    Rule("inertia", _odd_inertia),
-    Rule("no-inertia", _massless),
-    Rule("touching", _touching),
-    Rule("out-of-limits", _outside),
-    Rule("limits", _without_range),
-    Rule("effort-limit", _weak),
-    Rule("no-effort-limit", _without_effort_limit),
-    Rule("continuous", _wrong_turns),
-    Rule("unstable", _unstable),
+ODDITIES = (
+    Oddity("units", _odd_sizes),
+    Oddity("units", _odd_angles),
+    Oddity("inertia", _odd_inertia),
+    Oddity("no-inertia", _massless),
+    Oddity("touching", _touching),
+    Oddity("out-of-limits", _outside),
+    Oddity("limits", _without_range),
+    Oddity("effort-limit", _weak),
+    Oddity("no-effort-limit", _without_effort_limit),
+    Oddity("continuous", _wrong_turns),
+    Oddity("unstable", _unstable),
 )
 """Every oddity, in the order in which they are listed."""
