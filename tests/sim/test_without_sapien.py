@@ -55,7 +55,7 @@ os.chdir(tempfile.mkdtemp())
 for command in (
     "inspect panda",
     "rollout panda --seconds 0.5 --num-envs 2 --workers 0 --out run.h5",
-    "compare panda --moves 1 --workers 0 --seconds 0.2",
+    "compare panda --moves 1",
     "export panda --to mjcf --out panda.xml",
 ):
     sys.argv = ["batchpid", *command.split()]
