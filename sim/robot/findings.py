@@ -34,7 +34,8 @@ OF_FILES = (
          "the first `<robot>`; a default namespace (`xmlns=`) is ignored. `${...}` or `$(...)` in an attribute is an"
          " error: the file was never expanded"),
     FindingKind("unknown-element", "note",
-         "elements that no URDF has; in an MJCF file sites, sensors, and keyframes other than \"home\"",
+         "elements and attributes that no URDF has, or that have no effect here; in an MJCF file sites, sensors,"
+         " cameras, sleep, and keyframes other than \"home\"",
          "without them"),
     FindingKind("repeated", "warning",
          "names used twice or missing; several `<limit>`, `<origin>`, `<inertial>`, ... of one element, or shapes of"
@@ -48,8 +49,8 @@ OF_FILES = (
          "fixed joints, a floating one at the root a floating base; the x axis, the URDF's default"),
     FindingKind("limits", "warning",
          "limits that are swapped, missing, unreadable, all 0 or equal; `effort` or `velocity` of 0 or -1; in an MJCF"
-         " file effort limits that differ by direction",
-         "swapped back; no limit (equal ones stay); the smaller limit"),
+         " file effort limits that differ by direction, and limits of a servo's setpoints",
+         "swapped back; no limit (equal ones stay); the smaller limit; `guard=True` keeps to those of setpoints"),
     FindingKind("dynamics", "warning", "friction or damping that is negative or no number", "0"),
     FindingKind("mimic", "warning",
          "a mimic of a fixed or unknown joint, of itself, in a circle, or by 0",
@@ -58,8 +59,8 @@ OF_FILES = (
          "an inertia tensor that no body has, or none; a mass that is no number",
          "the nearest possible tensor, or as given, see below; no mass"),
     FindingKind("collision", "warning",
-         "shapes without geometry, extent or place",
-         "without the shape"),
+         "shapes without geometry, extent or place; meshes of a URDF that are not convex",
+         "without the shape; the convex hull of the mesh collides"),
     FindingKind("missing-mesh", "warning",
          "a mesh that is not there or cannot be read",
          "without the shape; `missing_meshes=\"error\"` refuses"),
@@ -75,7 +76,8 @@ OF_FILES = (
          "gravity of -9.81 m/s^2, without compensation"),
     FindingKind("engine", "warning",
          "content that an engine simulates otherwise than the file says: in SAPIEN closed loops, tendons, springs,"
-         " `<flag>`s, a medium, bodies apart from the robot, height fields, planes other than a level one at height 0",
+         " nonlinear damping, `<flag>`s, a medium, bodies apart from the robot, height fields, planes other than a"
+         " level one at height 0, wheels that are cylinders, and pairs of links beyond its filter",
          "as the finding says; MuJoCo simulates the file itself"),
 )  # fmt: skip
 """Kinds of findings about a file."""
@@ -84,7 +86,7 @@ OF_ROBOTS = (
          "sizes or angles are not those of a robot: millimetres read as metres, or degrees as radians",
          "give metres and radians, meshes in millimetres with <mesh scale='0.001 0.001 0.001'>"),
     FindingKind("no-inertia", "warning",
-         "no <inertial>, or a mass of 0: its collision shapes give mass and inertia, or without shapes it weighs"
+         "no <inertial>: its collision shapes give mass and inertia; without shapes, or with a mass of 0, it weighs"
          " 1e-6 kg",
          "add <inertial> with mass and inertia: gains in efforts cannot control a link without mass"),
     FindingKind("out-of-limits", "warning",
@@ -232,23 +234,42 @@ def _sentence(same: Sequence[Finding]) -> str:
     )
 
 
+class Notes(NamedTuple):
+    """Findings of a file that is read: ``repairs`` are what is simulated otherwise than the file
+    says, ``losses`` what is lost where MuJoCo does not simulate an MJCF file itself.
+    """
+
+    repairs: list[Finding]
+    losses: list[Finding]
+
+    def lose(self, text: str, joint: str | None = None, link: str | None = None) -> None:
+        """Add a loss."""
+        remedy = "use the engine 'mujoco', which simulates the file itself"
+        self.losses.append(Finding("engine", text, remedy, joint, link))
+
+
 class RepairWarning(UserWarning):
     """A robot's file was read with repairs."""
 
 
 def report(path: Path, repairs: Sequence[Finding], strict: bool) -> None:
-    """Warn of the ``repairs`` of the file at ``path``; if ``strict``, raise a RobotError that lists
-    them.
+    """Warn of the ``repairs`` of the file at ``path`` that change the motion; if ``strict``, raise
+    a RobotError that lists them.
     """
-    if not repairs:
+    severe = [finding for finding in repairs if finding.severity == "warning"]
+    if not severe:
         return
-    if len(repairs) == 1:
-        count = "1 repair"
-    else:
-        count = f"{len(repairs)} repairs"
+    count = "1 repair" if len(severe) == 1 else f"{len(severe)} repairs"
     if not strict:
         warn(f"{path}: {count}; robot.check() and batchpid inspect list them", RepairWarning)
         return
-    sentences = [sentence.partition(": ")[2] for sentence in summary(repairs)]
+    sentences = [sentence.partition(": ")[2] for sentence in summary(severe)]
     listed = "".join(f"\n  {sentence}" for sentence in sentences)
     raise RobotError(f"{path}: needs {count}, which strict=True refuses:{listed}")
+
+
+def report_shortfalls(path: Path, engine: str, shortfalls: Iterable[Finding]) -> None:
+    """Warn of what an engine runs otherwise than the file at ``path`` says."""
+    if count := len(list(shortfalls)):
+        text = f"engine {engine!r} runs otherwise than the file says in {count} findings"
+        warn(f"{path}: {text}; robot.check(engine={engine!r}) lists them", RepairWarning)

@@ -26,8 +26,7 @@ from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner
 from batchpid.io.files import package_versions
 from batchpid.sim.engine.physics import MujocoSolver, Physics
-from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.backend import describe
+from batchpid.sim.loop.backend import describe, native_obstacle
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import (
@@ -66,6 +65,8 @@ from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, WorkerPool
+from batchpid.stages import Stage
+from batchpid.stages.values import Command
 
 CHECKPOINT_STEPS = 8000
 """Least number of sim steps between checkpoints, from the last of which a lost worker is replayed."""
@@ -106,8 +107,8 @@ class Runner(SingleOwner):
         link ``tool``, or a :class:`batchpid.sim.Controller`; forces that are compensated.
     timestep, substeps
         Time step of simulation and control [s]; sim steps of a tick.
-    actuators, guard
-        Motors and sensors, default the robot's; limits of setpoints.
+    actuators, guard, stages
+        Motors and sensors, default the robot's; limits of setpoints; further stages of a sim step.
     engine, physics, collisions, ground, build
         Physics engine, "mujoco" or "sapien"; its solver settings; collision shapes; a ground at
         height 0; content of SAPIEN's scenes.
@@ -146,6 +147,7 @@ class Runner(SingleOwner):
         compensate: Compensation = "gravity+coriolis+friction",
         actuators: bp.Actuators | None = None,
         guard: bool | bp.Guard | None = None,
+        stages: Sequence[Stage] = (),
         engine: EngineName = DEFAULT_ENGINE,
         physics: PhysicsPreset | Physics | MujocoSolver = "accurate",
         collisions: bool = True,
@@ -176,6 +178,7 @@ class Runner(SingleOwner):
             compensate=compensate,
             actuators=actuators,
             guard=guard,
+            stages=stages,
             engine=engine,
             physics=physics,
             collisions=collisions,
@@ -234,6 +237,8 @@ class Runner(SingleOwner):
     def __repr__(self) -> str:
         options = self.options
         state = "closed" if self.closed else f"at {self.time:g} s"
+        if options.stages and (reason := native_obstacle(options)):
+            state += f", law in NumPy or JAX ({reason})"
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {options.workers} workers,"
             f" control {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
