@@ -44,6 +44,7 @@ from batchpid.sim.options.groups import (
 from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.rollout import Rollout, RunInfo
 from batchpid.sim.runner.arguments import count_ticks, read_command
 from batchpid.sim.runner.operations import (
     Operation,
@@ -61,7 +62,6 @@ from batchpid.sim.runner.operations import (
 from batchpid.sim.runner.run_warnings import RunWarnings
 from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.signals.quantities import CommandSpec, Observation, empty_observation
-from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, WorkerPool

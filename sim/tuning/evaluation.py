@@ -29,8 +29,8 @@ from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.randomization.checks import check_robot
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.rollout import Rollout
 from batchpid.sim.runner.runner import Runner
-from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.tuning.moves import (
     Moves,
     shortest_durations,
