@@ -25,8 +25,6 @@ SHORTER = {
 SHORTER_CODE = {
     # pattern in Python blocks: a smaller size
     r"\b64\b": "8",
-    r"\brange\(\d{2,}\)": "range(5)",
-    r"\((?:100|150|200), robot\.dof\)": "(10, robot.dof)",
     r"\b8(?=, robot\.dof\)|, params=params|, substeps=20\))": "2",
 }
 TWO_JOINTS = robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", "c"))

@@ -20,8 +20,13 @@ from batchpid.law.pid import init
 from batchpid.native.compiled import law_trace
 from batchpid.native.tracing import Segment
 
-GAINS = ({}, {"ki": 1.0}, {"kd": 1.0}, {"ki": 1.0, "kd": 1.0})
-"""P, PI, PD and PID: gains beside kp."""
+BESIDE_P: tuple[dict[str, float], ...] = (
+    {},
+    {"ki": 1.0},
+    {"kd": 1.0},
+    {"ki": 1.0, "kd": 1.0},
+)
+"""Gains beside kp of P, PI, PD and PID."""
 ANTI_WINDUPS = ("none", "clamp", "conditional", "back_calculation")
 FILTER_TIMES = (None, 0.01)
 
@@ -32,7 +37,7 @@ def segments() -> Iterator[Segment]:
     """
     numbers = np.zeros((1, 1))
     for gains, strategy, time, feedforward in product(
-        GAINS, ANTI_WINDUPS, FILTER_TIMES, (None, numbers)
+        BESIDE_P, ANTI_WINDUPS, FILTER_TIMES, (None, numbers)
     ):
         # What has no gain has no option.
         if (strategy != "none" and "ki" not in gains) or (time is not None and "kd" not in gains):

@@ -24,7 +24,7 @@ class Segment(NamedTuple):
 
     first: int
     """Index of the first operation."""
-    count: int
+    length: int
     code: bytes
     """Numbers of operands and results; then of each operation its code and three operands; then the
     values that are results. A value is an operand of the segment, or numbered after these.
