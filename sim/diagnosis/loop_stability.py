@@ -19,8 +19,8 @@ import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.errors import InvalidArgumentError, warn
 from batchpid.law.implicit import as_explicit
-from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.parts import DISSIPATION
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import known_joints
 
 NEAR_BOUND = 0.5
@@ -45,7 +45,7 @@ class StabilityReport(NamedTuple):
 
 
 def _loop(
-    robot: RobotDescription,
+    robot: Robot,
     params: bp.PIDParams,
     qpos: Float64,
     timestep: float,
@@ -86,7 +86,7 @@ def _loop(
         loop["mass_matrix"] = eye[None]
     else:
         # The law knows the damping, too, as part of its matrix.
-        joints = known_joints(robot)
+        joints = known_joints(robot.actuators, robot.dof)
         implicit = coupling.reduced_damping(robot.damping + joints.viscous)
         model = matrix(joints.armature) + timestep * eye * implicit
         plant = matrix(motors.armature) + timestep * eye * damping[:, None]
@@ -98,7 +98,7 @@ def _loop(
 
 
 def stability_report(
-    robot: RobotDescription,
+    robot: Robot,
     params: bp.PIDParams,
     qpos: Float64,
     timestep: float,
@@ -156,7 +156,7 @@ class StabilityCheck:
         The bound is taken at the robot's start pose with this time step [s].
     """
 
-    def __init__(self, robot: RobotDescription, timestep: float) -> None:
+    def __init__(self, robot: Robot, timestep: float) -> None:
         self._robot = robot
         self._timestep = timestep
         self._has_warned = False

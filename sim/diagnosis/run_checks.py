@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Rows
 from batchpid.errors import warn
-from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
+from batchpid.sim.robot.robot import LIMIT_TOLERANCE, Robot
 
 
 class SetpointWarning(UserWarning):
@@ -19,7 +19,7 @@ class SetpointCheck:
     joint.
     """
 
-    def __init__(self, robot: RobotDescription) -> None:
+    def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._low = robot.lower - LIMIT_TOLERANCE
         self._high = robot.upper + LIMIT_TOLERANCE

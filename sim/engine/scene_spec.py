@@ -18,10 +18,10 @@ from batchpid.arrays.array_types import Float64
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.geometry.distances import Contacts
-from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.merging import merge_links, place_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.simulated_links import BodyParts, rigid_tree, varied_bodies
 from batchpid.sim.robot.tables import Tables
 from batchpid.task_space.frames import SpatialInertia, spatial_matrix, total
@@ -68,7 +68,7 @@ class SceneSpec:
     @classmethod
     def of(
         cls,
-        robot: RobotDescription,
+        robot: Robot,
         timestep: float,
         physics: object,
         **options: Any,

@@ -204,7 +204,7 @@ def _prepared(
     free = (qpos.min(0) < robot.lower[joints]) | (qpos.max(0) > robot.upper[joints])
     # A Runner compensates the friction of the description and of the robot's motors, too.
     modelled = None
-    friction = (robot.friction + known_joints(robot).coulomb)[joints]
+    friction = (robot.friction + known_joints(robot.actuators, robot.dof).coulomb)[joints]
     if is_friction and friction.any():
         band = np.array([BAND[robot.units[joint]] for joint in joints])
         modelled = ModelledFriction(friction, band, robot.continuous[joints] / TURN)
@@ -223,7 +223,8 @@ def _prepared(
 
 def _resting(robot: Robot, start: Float64) -> Robot:
     """Return ``robot`` with the start pose ``start`` (dof,)."""
-    return replace(robot, settings=None, defaults=FileDefaults(start))
+    reading = robot.reading._replace(defaults=FileDefaults(start))
+    return replace(robot, settings=None, reading=reading)
 
 
 def _option(

@@ -367,7 +367,7 @@ def draw_motors(
         There is no such file.
     """
     count = integer("count", count, 1, 100_000)
-    nominal = load_robot_actuators(str(path), robot)
+    nominal = load_robot_actuators(str(path), robot.joints)
     try:
         region = documents.read(path)["about"][KEY]
         entries = []

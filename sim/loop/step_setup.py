@@ -115,7 +115,7 @@ def _constants(options: RunnerOptions, pack: EnginePack, params: bp.PIDParams) -
         armature = None
         damping = np.array([joint.damping for joint in scene.joints])
         if robot.actuators is not None:
-            motors = known_joints(robot)
+            motors = known_joints(robot.actuators, robot.dof)
             armature = motors.armature
             damping = damping + motors.viscous
         # Other laws leave the damping to the engine, and to the integral.
@@ -154,7 +154,7 @@ def _modelled_friction(options: RunnerOptions, pack: EnginePack) -> ModelledFric
     joints = pack.spec.joints
     share = DISSIPATION[pack.spec.dissipation].modelled
     friction = np.array([joint.friction * share for joint in joints])
-    friction = friction + known_joints(options.robot).coulomb
+    friction = friction + known_joints(options.robot.actuators, options.robot.dof).coulomb
     is_compensated = "friction" in options.compensate.split("+") and options.sets_positions
     if not (is_compensated and friction.any()):
         return None

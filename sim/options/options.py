@@ -282,7 +282,7 @@ class RunnerOptions(RunnerKeywords):
             if self.control == "drive":
                 actuators = actuators.joint_side()
         fitted: bp.Actuators | None = fit_actuators(
-            actuators, self.robot, self.num_envs, self.control
+            actuators, self.robot.joints, self.num_envs, self.control
         )
         # Actuators without effect cost time in every sim step.
         if fitted is not None and fitted.is_ideal:
@@ -325,7 +325,7 @@ class RunnerOptions(RunnerKeywords):
             **robot.describe(),
             "joints": list(robot.joint_names),
             "ignored_pairs": digest(robot.ignored_pairs),
-            "robot_actuators": digest(known_joints(robot)),
+            "robot_actuators": digest(known_joints(robot.actuators, robot.dof)),
             "command": None if command is None else list(command.names),
         }
 

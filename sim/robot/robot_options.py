@@ -14,7 +14,6 @@ from batchpid.arrays.records import frozen
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN, JOINT_SIDE
-from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import Joint
 
@@ -45,25 +44,22 @@ class KnownJoints(NamedTuple):
     """Reflected inertia of the motors [kg m^2 or kg]."""
 
 
-def known_joints(robot: RobotDescription) -> KnownJoints:
-    """Return friction, damping and armature of the robot's own actuators, which its controller
-    knows.
+def known_joints(actuators: bp.Actuators | None, dof: int) -> KnownJoints:
+    """Return friction, damping and armature of a robot's own actuators, which its controller knows,
+    for ``dof`` joints.
     """
-    if robot.actuators is None:
-        motors = bp.Actuators()
-    else:
-        motors = robot.actuators
+    motors = bp.Actuators() if actuators is None else actuators
     coulomb, viscous, armature = (
-        np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
+        np.zeros(dof) if leaf is None else leaf[0].astype(float)
         for leaf in (motors.coulomb, motors.viscous, motors.armature)
     )
     return KnownJoints(FRICTION_SHARE * coulomb, viscous, armature)
 
 
 def load_robot_actuators(
-    source: bp.Actuators | str | Path, robot: RobotDescription
+    source: bp.Actuators | str | Path, joints: Sequence[Joint]
 ) -> bp.Actuators:
-    """Return actuators of ``robot``, given or in a file.
+    """Return actuators of the degrees of freedom ``joints``, given or in a file.
 
     Raises
     ------
@@ -73,23 +69,23 @@ def load_robot_actuators(
         The file does not exist.
     """
     if isinstance(source, str | Path):
-        source, _ = bp.load_actuators(source, robot.joint_names)
-    return fit_actuators(source, robot, 1, "pid")
+        source, _ = bp.load_actuators(source, tuple(joint.name for joint in joints))
+    return fit_actuators(source, joints, 1, "pid")
 
 
 def fit_actuators(
     actuators: bp.Actuators,
-    robot: RobotDescription,
+    joints: Sequence[Joint],
     num_envs: int,
     control: object,
 ) -> bp.Actuators:
-    """Return ``actuators`` if they fit robot and control, with the robot's continuous joints.
+    """Return ``actuators`` if they fit joints and control, with the continuous ones.
 
     Followers have no motor: their bias, friction and armature are left out. Raises
     InvalidArgumentError if they do not fit.
     """
     instance("actuators", actuators, bp.Actuators, "build them with make_actuators()")
-    actuators.check(num_envs, robot.joint_names)
+    actuators.check(num_envs, tuple(joint.name for joint in joints))
     if control == "drive" and (
         actuators.measures or actuators.delivers or actuators.load_friction is not None
     ):
@@ -103,8 +99,9 @@ def fit_actuators(
         return actuators
     motors = {name: getattr(actuators, name) for name in ("bias", *JOINT_SIDE)}
     # The leader carries friction and armature of its followers.
-    motors = {name: leaf * robot.independent for name, leaf in motors.items() if leaf is not None}
-    return actuators.replace(**motors, continuous=robot.continuous)
+    independent = coupling_of(tuple(joints)).independent
+    motors = {name: leaf * independent for name, leaf in motors.items() if leaf is not None}
+    return actuators.replace(**motors, continuous=np.array([joint.continuous for joint in joints]))
 
 
 def setpoint_guard(

@@ -44,7 +44,7 @@ def load(folder, text: str) -> Robot:
 
 def fixed_links(of: Robot) -> list[str]:
     """Return the links that fixed joints hold; with wrenches measured, they are not merged."""
-    return [each.child_link for each in of.all_joints if not each.moves]
+    return [each.child_link for each in of.tables.joints if not each.moves]
 
 
 def motion(of: Robot, ticks: int = 30, **options) -> np.ndarray:
