@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Rows
 from batchpid.errors import warn
-from batchpid.sim.robot.robot import LIMIT_TOLERANCE, Robot
+from batchpid.sim.findings import LIMIT_TOLERANCE
+
+if TYPE_CHECKING:
+    from batchpid.sim.robot.robot import Robot
 
 
 class SetpointWarning(UserWarning):

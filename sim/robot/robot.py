@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -26,14 +26,15 @@ from batchpid.arrays.elementwise import read_only
 from batchpid.checks.validate import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.motors.coupling import Coupling
-from batchpid.sim.robot.findings import Finding, Findings, report
-from batchpid.sim.robot.merging import merge_links
+from batchpid.sim.findings import Finding, Findings, report
+from batchpid.sim.robot.merging import merge_links, place_links
 from batchpid.sim.robot.mimics import couple, coupling_of
 from batchpid.sim.robot.parts import (
     DISSIPATION,
     Joint,
     LinkMass,
     MjcfFile,
+    Placement,
     Reading,
     Settings,
     Srdf,
@@ -55,7 +56,6 @@ STANDING_HZ)^2.
 """
 
 
-LIMIT_TOLERANCE = 1e-6  # rad or m
 GRAVITY_MARGIN = 2.0  # of the effort that holds the joint still
 SPEED = 3.0  # [rad/s or m/s], at which the joint's damping is overcome
 ACCELERATION = 30.0  # [rad/s^2 or m/s^2] of all joints at once
@@ -122,6 +122,13 @@ class Robot:
     def links(self) -> tuple[Body, ...]:
         """Links of the file, with mass and the joint above, breadth first."""
         return self.tables.bodies
+
+    @cached_property
+    def bodies(self) -> Mapping[str, Placement]:
+        """Placement of every link, by name, in its simulated body: links joined by fixed joints are
+        one.
+        """
+        return place_links(self.tables)
 
     @property
     def dof(self) -> int:
@@ -495,7 +502,13 @@ class Robot:
 
         if params is None and self.settings is not None and control == "pid":
             params = self.params()
-        return check(self, params, qpos, setpoint, timestep, control, engine)
+        of_engine: Iterable[Finding] = ()
+        if engine is not None:
+            # The one import that leads upwards: an engine knows robots, and is asked by its name.
+            from batchpid.sim.engine.protocol import engine_findings
+
+            of_engine = engine_findings(self, engine, timestep)
+        return check(self, params, qpos, setpoint, timestep, control, of_engine)
 
     def guard(
         self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None

@@ -14,10 +14,10 @@ from lxml import etree
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.export.differences import Exported
+from batchpid.sim.findings import summary
 from batchpid.sim.geometry.inertia import MOMENTS
 from batchpid.sim.geometry.mesh_files import find_mesh
 from batchpid.sim.geometry.shapes import Shape, mesh_file
-from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.merging import link_inertias
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.tables import NO_TURN, Body
