@@ -103,7 +103,7 @@ def identify_logs(
         return result
     print(result.report())
     problem = "are explained to less than half of the error of the robot as described"
-    remedy = f"{result.advice}; --force writes the file nevertheless"
+    remedy = "--force writes the file nevertheless"
     raise InvalidArgumentError("logs", f"{problem}, and no file is written", remedy=remedy)
 
 
