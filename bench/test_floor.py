@@ -1,21 +1,25 @@
 """Robots that stand on the floor: the closed loop in MuJoCo over ``mujoco.batch`` without control,
 in the same motion.
 
-The peer steps the same compiled model from the same state, and gets the efforts that the closed
-loop applied at each sim step. Robots of the package example-robot-data are measured where it is
-installed, or where the variable EXAMPLE_ROBOT_DATA names its folder ``robots``; a quadruped of
-boxes always is. MotrixSim, where installed (``pip install motrixsim``), steps the exported MJCF
-under the same efforts. Processor time, in one process, on one thread.
+The peer steps the same compiled model with MuJoCo's default options from the same state, and gets
+the efforts that the closed loop applied at each sim step. A user of ``mujoco.batch`` can set the
+options of the closed loop, a sparse Jacobian and no islands: then the ratio is about 1.05. Robots
+of the package example-robot-data are measured where it is installed, or where the variable
+EXAMPLE_ROBOT_DATA names its folder ``robots``; a quadruped of boxes always is. MotrixSim, where
+installed (``pip install motrixsim``), steps the exported MJCF under the same efforts. Processor
+time, in one process, on one thread.
 """
 
 from __future__ import annotations
 
+import copy
 import importlib.util
 import os
 import statistics
 import time
 from pathlib import Path
 
+import mujoco
 import mujoco.batch as mujoco_batch
 import numpy as np
 import pytest
@@ -34,6 +38,8 @@ FILES = {
     "G1": "g1_description/urdf/g1_29dof_rev_1_0.urdf",
     "Solo": "solo_description/robots/solo12.urdf",
 }
+FLOORS = {"Go2": 1.4, "G1": 1.4}
+"""Least ratio over ``mujoco.batch`` without control."""
 LINK = """<link name="{name}"><inertial><origin xyz="0 0 {down}"/><mass value="{mass}"/>
   <inertia ixx="{inertia}" iyy="{inertia}" izz="{inertia}" ixy="0" ixz="0" iyz="0"/></inertial>
   <collision><origin xyz="0 0 {down}"/><geometry><box size="{size}"/></geometry></collision></link>"""
@@ -116,7 +122,10 @@ def bare_engine(
             robot.tables, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
         )
     )
-    batch = mujoco_batch.Batch(built.model, num_envs, nthread=1, persistent=True)
+    model = copy.copy(built.model)
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    batch = mujoco_batch.Batch(model, num_envs, nthread=1, persistent=True)
     qpos, applied = batch.bind("qpos"), batch.bind("qfrc_applied")
     qpos[:, :7], qpos[:, built.qpos] = start, robot.start
     began = time.process_time()
@@ -180,8 +189,9 @@ def test_standing_robots(benchmark, report, compare, most, name, tmp_path):
     report([ours for ours, _ in rows])
     ratio = statistics.median(bare / ours for ours, bare in rows)
     benchmark.extra_info["over mujoco.batch without control"] = round(ratio, 3)
-    compare(name, f"closed loop, {num_envs} envs", "mujoco.batch without control", ratio)
+    case = f"closed loop, {num_envs} envs"
+    compare(name, case, "mujoco.batch without control", ratio, FLOORS.get(name))
     if importlib.util.find_spec("motrixsim"):
         ours = statistics.median(ours for ours, _ in rows)
         theirs = motrix(robot, num_envs, start, efforts)
-        compare(name, f"closed loop, {num_envs} envs", "MotrixSim without control", theirs / ours)
+        compare(name, case, "MotrixSim without control", theirs / ours)

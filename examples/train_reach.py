@@ -7,7 +7,6 @@ The algorithm is in ``ppo.py``. The robots step in worker processes, policy and 
 one. docs/training.md explains the choices.
 """
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import ppo
 import tyro
 from matplotlib.figure import Figure
 
-from batchpid.sim import MissedContactWarning, Robot, plots
+from batchpid.sim import Robot, plots
 
 SCORES = ("success", "error")  # of the learning curve
 FINE = 0.2  # scale on which the agent sees small errors [rad or m]
@@ -44,9 +43,6 @@ def make_envs(config):
         kp=900.0, kd=60.0, ki=0.0, gain_units="mass_matrix", measurement_rate="measured"
     )
     options = {"params": params, "workers": config.workers, "collisions": False}
-    warnings.simplefilter(
-        "ignore", MissedContactWarning
-    )  # any pose within the limits may be a goal
     task = {"robot": robot, "actions": "increment", "max_episode_steps": config.episode}
     return gymnasium.make_vec(
         "batchpid.sim.gym:batchpid/Reach-v0", config.num_envs, **task, **options

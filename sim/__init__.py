@@ -11,8 +11,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
-from batchpid.sim.diagnosis.run_checks import MovingSetpointWarning, SetpointWarning
-from batchpid.sim.loop.faults import Fault, FaultWarning, MissedContact, MissedContactWarning
+from batchpid.sim.diagnosis.run_checks import SetpointWarning
+from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import Controller, Ray
 from batchpid.sim.options.options import RunnerKeywords, RunnerOptions
@@ -41,9 +41,6 @@ __all__ = [
     "FaultWarning",
     "Finding",
     "LogUniform",
-    "MissedContact",
-    "MissedContactWarning",
-    "MovingSetpointWarning",
     "MujocoSolver",
     "Normal",
     "Observation",

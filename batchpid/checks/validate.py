@@ -10,6 +10,7 @@ import difflib
 import math
 import os
 import sys
+import unicodedata
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -126,6 +127,17 @@ def instance(
     return value
 
 
+def is_name(text: str) -> bool:
+    """Return whether ``text`` can be a name: without control characters, line breaks and halves of
+    surrogate pairs.
+
+    Names of strangers' robots stand in files, messages and pictures, where these would end a line
+    or cannot be written.
+    """
+    categories = {unicodedata.category(character) for character in text}
+    return categories.isdisjoint({"Cc", "Cs", "Zl", "Zp"})
+
+
 def names(argument: str, value: Sequence[str], count: int | None = None) -> list[str]:
     """Return ``value`` as a list of different names, ``count`` of them if given."""
     # A string is a sequence of names, too, and never meant.
@@ -137,6 +149,11 @@ def names(argument: str, value: Sequence[str], count: int | None = None) -> list
     if count is not None and len(value) != count:
         problem = f"must hold {count} names"
         raise InvalidArgumentError(argument, problem, value=value, remedy="pass that many")
+    for name in value:
+        if not is_name(name):
+            problem = "has a name with a control character or a line break"
+            remedy = "use printable characters"
+            raise InvalidArgumentError(argument, problem, value=name, remedy=remedy)
     if len(set(value)) != len(value):
         remedy = "name each once"
         raise InvalidArgumentError(argument, "repeats a name", value=value, remedy=remedy)

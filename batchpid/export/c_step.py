@@ -50,6 +50,20 @@ _ACROSS = {"row_minimum": "{0}", "matrix_vector": "{0}{1}"}
 """Operations that combine the joints, and their operands."""
 
 
+def comment(name: str) -> str:
+    """Return a name as text of a comment in C, from which no compiler reads anything else.
+
+    A backslash, a question mark (of a trigraph), an asterisk and characters that are not printable
+    stand as their numbers, as in U+005C.
+    """
+    return "".join(
+        character
+        if character.isprintable() and character not in "\\?*"
+        else f"U+{ord(character):04X}"
+        for character in name
+    )
+
+
 class Dialect(NamedTuple):
     """Names and numbers of a header: the beginning of its names, the type of its numbers, the
     number of joints.

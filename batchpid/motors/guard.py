@@ -4,18 +4,22 @@ joints).
 With the setpoint r that is asked for, the guarded setpoint g and its rate v, primes for the step
 before, and limits lower, upper, V, A::
 
-    e    = min(max(r, lower), upper) - g'                                the short way round on continuous joints
-    m    = max(ceil(sqrt(1/4 + 2 |e| / (A dt^2)) - 1/2), 1)              steps of a stop within e
-    stop = |e| / (m dt) + (m - 1) A dt / 2                               e / dt without A
-    w    = min(stop, V) sgn(e)
-    v    = min(max(w, v' - A dt), v' + A dt)
-    g    = g' + dt v
+    r       <- min(max(r, lower), upper)
+    e       = r' - g'                             the rest; all differences the short way round on continuous joints
+    v       = (r - r') / dt + sgn(e) stop(|e|)    the motion of r, and a profile that stops at the end of the rest
+    v       <- min(max(v, -V), V)
+    v       <- min(max(v, -stop(g' - lower)), stop(upper - g'))
+    v       <- min(max(v, v' - A dt), v' + A dt)
+    g       = g' + dt v
+    m       = max(ceil(sqrt(1/4 + 2 d / (A dt^2)) - 1/2), 1)      steps of a stop within d
+    stop(d) = d / (m dt) + (m - 1) A dt / 2                       d / dt without A
 
-``stop`` is the rate whose m steps of deceleration A end at rest at e: m stop dt - A dt^2 m (m - 1)
-/ 2 = |e|. So g reaches a constant r in the shortest time that the limits allow, without overshoot,
-and does not leave [lower, upper] once inside: the sampled form of the nonlinear trajectory filters
-of L. Biagiotti and C. Melchiorri, Trajectory Planning for Automatic Machines and Robots (Springer,
-2008), section 4.6.
+``stop`` is the rate whose m steps of deceleration A end at rest at d: m stop dt - A dt^2 m (m - 1)
+/ 2 = d. So g reaches a constant r in the shortest time that the limits allow, without overshoot
+from rest, and does not leave [lower, upper] once inside. A setpoint that moves within the limits is
+passed unchanged, once it has been reached: then e is 0. This is the sampled form of the nonlinear
+trajectory filters of L. Biagiotti and C. Melchiorri, Trajectory Planning for Automatic Machines and
+Robots (Springer, 2008), section 4.6, for moving setpoints.
 """
 
 from __future__ import annotations
@@ -29,6 +33,9 @@ from batchpid.arrays.elementwise import TURN, clip, in_dtype_of, namespace, wrap
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.records import LeafBuilder, Record, with_fields
 from batchpid.checks.validate import check_time_step
+
+MOST_STEPS = 1e9
+"""Longest stop [steps]: a bound, so that the rate within an infinite distance is a number."""
 
 
 class _GuardFields(NamedTuple):
@@ -63,6 +70,8 @@ class GuardState(NamedTuple):
     """g [rad or m]."""
     rate: Array
     """v [rad/s or m/s]."""
+    requested: Array
+    """r within the limits of the position [rad or m]."""
 
 
 @with_fields(*FIELDS)
@@ -113,7 +122,7 @@ def init(guard: Guard, qpos: Array) -> GuardState:
     """Return the state of a guard that starts at rest at ``qpos`` (envs, joints) [rad or m]."""
     (qpos,) = in_dtype_of(guard, qpos)
     zeros = namespace(*guard, qpos).zeros_like(qpos)
-    return GuardState(zeros + qpos, zeros)
+    return GuardState(zeros + qpos, zeros, zeros + qpos)
 
 
 def advance(
@@ -132,31 +141,40 @@ def advance(
     check_time_step(dt)
     (setpoint,) = in_dtype_of(guard, setpoint)
     xp = namespace(*guard, setpoint, *state)
-    target = clip(setpoint, guard.lower, guard.upper, xp)
+    requested = clip(setpoint, guard.lower, guard.upper, xp)
     # On a continuous joint the short way round.
-    error = wrap(target - state.setpoint, guard.turns, xp)
-    arriving = rate = error / dt
+    arriving = rate = wrap(requested - state.setpoint, guard.turns, xp) / dt
     if guard.acceleration is not None:
-        rate = xp.sign(error) * _stop(guard.acceleration, xp.abs(error), dt, xp)
+        # The rest is not made up for at once, but at the rate from which the joint can still stop.
+        rest = wrap(state.requested - state.setpoint, guard.turns, xp)
+        distance = xp.abs(rest)
+        rate = rate - xp.sign(rest) * (distance / dt - _stop(guard, distance, dt, xp))
     if guard.rate is not None:
         rate = clip(rate, -guard.rate, guard.rate, xp)
     if guard.acceleration is not None:
+        # A setpoint that moves towards a limit may stop there at once, the joint not.
+        if guard.upper is not None:
+            room = xp.maximum(guard.upper - state.setpoint, 0.0)
+            rate = xp.minimum(rate, _stop(guard, room, dt, xp))
+        if guard.lower is not None:
+            room = xp.maximum(state.setpoint - guard.lower, 0.0)
+            rate = xp.maximum(rate, -_stop(guard, room, dt, xp))
         most = dt * guard.acceleration
         rate = clip(rate, state.rate - most, state.rate + most, xp)
     # A setpoint within one step is reached to the bit, not by a sum.
-    guarded = xp.where(rate == arriving, target, state.setpoint + dt * rate)
-    return GuardState(guarded, rate), guarded != setpoint
+    guarded = xp.where(rate == arriving, requested, state.setpoint + dt * rate)
+    return GuardState(guarded, rate, requested), guarded != setpoint
 
 
 def _stop(
-    acceleration: Array,
+    guard: Guard,
     distance: Array,
     dt: float,
     xp: ArrayModule,
 ) -> Array:
-    """Return the largest rate that stops within ``distance``."""
-    finite = xp.isfinite(acceleration)
-    a = xp.where(finite, acceleration, 1.0)
-    steps = xp.maximum(xp.ceil(xp.sqrt(0.25 + 2 * distance / (a * dt**2)) - 0.5), 1.0)
-    steps = xp.where(finite, steps, 1.0)
+    """Return the largest rate that stops within ``distance``; infinite where that is infinite."""
+    finite = xp.isfinite(guard.acceleration)
+    a = xp.where(finite, guard.acceleration, 1.0)
+    steps = xp.ceil(xp.sqrt(0.25 + 2 * distance / (a * dt**2)) - 0.5)
+    steps = xp.where(finite, xp.minimum(xp.maximum(steps, 1.0), MOST_STEPS), 1.0)
     return distance / (steps * dt) + (steps - 1) * (0.5 * dt * a)

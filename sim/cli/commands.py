@@ -30,8 +30,9 @@ from batchpid.sim.cli.inspect import inspect_robot
 from batchpid.sim.cli.rollout import demo, rollout
 from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.tuning.comparison import compare, default_gains, default_sets
+from batchpid.sim.tuning.comparison import compare
 from batchpid.sim.tuning.evaluation import load_randomization
+from batchpid.sim.tuning.gain_sets import default_gains, default_sets
 from batchpid.sim.tuning.search import tune
 
 PICTURES = (".png", ".svg")

@@ -16,7 +16,7 @@ from batchpid.arrays.array_types import Document, Progress
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, read_recording
-from batchpid.sim.tuning.comparison import gain_set
+from batchpid.sim.tuning.gain_sets import gain_set
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,7 +10,7 @@ import numpy as np
 from batchpid.arrays.field_tables import Field
 from batchpid.io.files import write_atomically
 from batchpid.sim import Robot
-from batchpid.sim.tuning.comparison import table
+from batchpid.sim.diagnosis.text import table
 from batchpid.trajectories import Trajectory
 
 

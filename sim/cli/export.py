@@ -132,7 +132,7 @@ def export(
 
 def _gains(robot: Robot, gains: str | None) -> bp.PIDParams:
     """Return the gains of the law by name."""
-    from batchpid.sim.tuning.comparison import gain_set
+    from batchpid.sim.tuning.gain_sets import gain_set
 
     chosen = gain_set(robot, gains)
     if chosen.control != "pid":

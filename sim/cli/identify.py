@@ -110,7 +110,7 @@ def identify_logs(
 def _gains(robot: Robot, name: str) -> bp.PIDParams:
     """Return the gains of a name or file; a params file may have only the joints of the logs."""
     import batchpid as bp
-    from batchpid.sim.tuning.comparison import gain_set
+    from batchpid.sim.tuning.gain_sets import gain_set
 
     try:
         return gain_set(robot, name).params

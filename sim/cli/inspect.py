@@ -11,10 +11,11 @@ from dataclasses import asdict, dataclass
 
 from batchpid.arrays.array_types import Document
 from batchpid.sim import Finding, Robot
+from batchpid.sim.diagnosis.text import table
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.parts import HEADERS, joint_rows
-from batchpid.sim.tuning.comparison import gain_set, table
+from batchpid.sim.tuning.gain_sets import gain_set
 
 SOURCES = {
     "inertial": "<inertial>",

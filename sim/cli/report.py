@@ -13,12 +13,7 @@ import numpy as np
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.sim import Robot, Rollout, write_recording
 from batchpid.sim.diagnosis.causes import settled_envs
-from batchpid.sim.tuning.comparison import (
-    cause_lines,
-    median_and_worst,
-    overshoot_of_settled,
-    table,
-)
+from batchpid.sim.diagnosis.text import cause_lines, median_and_worst, overshoot_of_settled, table
 from batchpid.sim.tuning.evaluation import following_error, step_response_metrics
 from batchpid.task_space.frames import pose_error
 
@@ -200,7 +195,7 @@ class RunReport:
 
         info = self.rollout.info
         title = f"{self.robot.name}, {info.engine}, control {info.control}"
-        return plots.step_responses(self.rollout, mark=0, title=title)
+        return plots.step_responses(self.rollout, title=title)
 
 
 def speed_line(

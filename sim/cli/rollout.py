@@ -21,7 +21,7 @@ from batchpid.sim.cli.flags import BOUNDS
 from batchpid.sim.cli.report import RunReport
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.tuning.comparison import gain_set
+from batchpid.sim.tuning.gain_sets import gain_set
 
 NumEnvs = Annotated[int, BOUNDS["num_envs"]]
 SECONDS = Field("simulated time, s", low=1e-6, high=1e6)

@@ -50,14 +50,11 @@ class FaultArrays(NamedTuple):
 
     Where the cause is one of :data:`batchpid.sim.loop.faults.COMMAND_CAUSES`, ``joint`` is the
     entry of the command.
-
-    ``missed_contact`` is the sim step of its first missed contact (0: none).
     """
 
     step: NDArray[np.int64]
     joint: NDArray[np.int64]
     cause: NDArray[np.int64]
-    missed_contact: NDArray[np.int64]
 
 
 class Arrays(NamedTuple):

@@ -18,7 +18,6 @@ from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.arrays.elementwise import clip
 from batchpid.arrays.trees import flatten, leaves, structure, unflatten
 from batchpid.motors import ActuatorState, advance_measurement
-from batchpid.sim.engine.missed_contacts import MissedContacts
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.custom import OwnController
@@ -79,9 +78,6 @@ class EnvGroup:
         self._faults = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._sensors = LinkSensors(options, pack.size)
         self._pushes = Pushes(options, pack.size)
-        self._contacts: MissedContacts | None = None
-        if options.misses_contacts:
-            self._contacts = MissedContacts(pack.spec, pack.size, options.robot.has_ground)
         self._episode = np.zeros(pack.size, np.int64)
         # Results of the last sim step, which outlive executors: native code writes them in each tick.
         shape = (pack.size, pack.dof)
@@ -248,7 +244,7 @@ class EnvGroup:
         """
         while True:
             if self._runs_whole:
-                self._complete(substeps)
+                self._complete()
             if self.tick == ticks:
                 return
             with np.errstate(all="ignore"):  # overflow and invalid values become faults
@@ -257,13 +253,11 @@ class EnvGroup:
             if self.tick < ticks:
                 run_ticks(self._start(), ticks, substeps)
 
-    def _complete(self, substeps: int) -> None:
+    def _complete(self) -> None:
         """Complete the ticks of a native call: they are observed, up to an event within a tick."""
         assert isinstance(self._executor, NativeExecutor)
         self._runs_whole = False
-        first = self.tick
         self.tick, self._step = self._executor.complete()
-        self._find_contacts(first, self.tick, substeps)
 
     def _run_tick(self, substeps: int) -> None:
         """Run the present tick, or the rest of it, and observe it."""
@@ -292,7 +286,6 @@ class EnvGroup:
             self._contain(before + done, executor.qpos(), None)
         self._sensors.end(self.pack, substeps, self._faults.failed)
         self.observe(rows)
-        self._find_contacts(self.tick, self.tick + 1, substeps)
 
     def _take_results(self) -> None:
         outputs = self._executor.results()
@@ -311,18 +304,6 @@ class EnvGroup:
             self.pack.push(rows, twists)
             self._executor.measure()
         pushes.counts["steps"] += substeps
-
-    def _find_contacts(self, first: int, until: int, substeps: int) -> None:
-        """Note the first missed contact of each env in the observed ticks ``first`` to ``until``,
-        in their rows too.
-        """
-        if self._contacts is None or first == until:
-            return
-        _, observation, fault = self._arrays.at(slice(first, until))
-        steps = self._steps + substeps * np.arange(first + 1, until + 1)
-        self._contacts.look(
-            observation.qpos, steps, self._faults.missed_contact, fault.missed_contact
-        )
 
     def observe(self, rows: Arrays) -> None:
         """Write observation and faults into these envs' rows."""
@@ -359,7 +340,8 @@ class EnvGroup:
 
     def _parts(self) -> Document:
         """Return the arrays outside engine and control that a snapshot holds: results of the last
-        sim step, episodes of the motors' noise, and those of faults, sensors and pushes.
+        sim step, episodes of the motors' noise, those of faults, sensors and pushes, and the
+        digests of the user's content.
         """
         last = self._last
         return {
@@ -370,6 +352,7 @@ class EnvGroup:
             "containment": self._faults.state,
             "sensors": self._sensors.values,
             "pushes": self._pushes.counts,
+            "content": {"digest": self.pack.content} if self.pack.content.size else {},
         }
 
     def write(
@@ -414,8 +397,6 @@ class EnvGroup:
             executor.write_state(with_matrix(executor.setup, state))
         else:
             self._prepare(self._setup(state.motors), state)
-        if self._contacts is not None:
-            self._contacts.place(np.ones(pack.size, bool))
 
     # -- envs that fail
 
@@ -476,8 +457,6 @@ class EnvGroup:
             last[mask] = 0
         if acting.draws is not None:
             self._pushes.begin(mask, acting.draws.episodes)
-        if self._contacts is not None:
-            self._contacts.place(mask)
         executor.measure()
         # 2: guard and motors, from the robots' state as the engine has it
         qpos = pack.read_qpos()

@@ -1,5 +1,5 @@
 """Faults of single envs: detected, reported, and contained, while the other envs are bit-identical
-to a run without; and contacts that robots without collision shapes would have had.
+to a run without.
 
 Envs that share a pack are not influenced by one whose state is NaN. So containment is to notice a
 fault in time, and to put that env into a state from which it can be simulated.
@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,9 @@ COMMAND_CAUSES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
 """Causes in an entry of the command, which need not be a joint."""
 
 LONGEST = 10_000
-"""Largest number of events in a log."""
+"""Largest number of faults in a log."""
+NO_STEP = -1
+"""Sim step of the last fault of an env that has none."""
 
 
 class Fault(NamedTuple):
@@ -81,64 +83,37 @@ class FaultWarning(UserWarning):
     """
 
 
-class MissedContactWarning(UserWarning):
-    """Robots that are simulated without collisions would have touched something."""
+class FaultLog:
+    """Last :data:`LONGEST` faults of a runner's envs. Immutable; methods return a modified copy.
 
-
-class MissedContact(NamedTuple):
-    """First contact that an env's robot would have had since its reset."""
-
-    env: int
-    time: float
-    """End of the tick in which it was found [s]."""
-    links: tuple[str, ...]
-    """Names of the two links; of one if it is with the ground."""
-
-    def __str__(self) -> str:
-        if len(self.links) == 1:
-            place = f"{self.links[0]!r} and the ground"
-        else:
-            place = " and ".join(map(repr, self.links))
-        return f"env {self.env}: {place} at {self.time:g} s"
-
-
-class EventLog:
-    """Last :data:`LONGEST` faults or missed contacts of a runner's envs. Immutable; methods return
-    a modified copy.
-
-    ``field`` of :class:`batchpid.sim.loop.arrays.FaultArrays` holds the sim step of each env's last
-    event, or ``none``. ``read`` returns the event of an env in the arrays of a tick.
+    ``read`` returns the last fault of an env in the arrays of a tick.
     """
 
-    def __init__(
-        self,
-        num_envs: int,
-        field: str,
-        none: int,
-        read: Callable[[int, Arrays], object],
-    ) -> None:
-        self.events: tuple[Any, ...] = ()
+    def __init__(self, num_envs: int, read: Callable[[int, Arrays], Fault]) -> None:
+        self.events: tuple[Fault, ...] = ()
         """Latest last."""
-        self._field = field
-        self._none = none
         self._read = read
-        self._steps: Rows = np.full(num_envs, none)
+        self._steps: Rows = np.full(num_envs, NO_STEP)
 
-    def without(self, mask: Bool) -> EventLog:
-        """Return a log in which the envs of ``mask`` (envs,), which were reset, have no last event."""
-        return self.restored(np.where(mask, self._none, self._steps))
+    def __len__(self) -> int:
+        """Return the number of envs."""
+        return len(self._steps)
 
-    def restored(self, steps: Rows) -> EventLog:
-        """Return a log with the sim steps of the envs' last events (envs,)."""
+    def without(self, mask: Bool) -> FaultLog:
+        """Return a log in which the envs of ``mask`` (envs,), which were reset, have no last fault."""
+        return self.restored(np.where(mask, NO_STEP, self._steps))
+
+    def restored(self, steps: Rows) -> FaultLog:
+        """Return a log with the sim steps of the envs' last faults (envs,)."""
         log = copy.copy(self)
         log._steps = steps.copy()
         return log
 
-    def with_events(self, arrays: Arrays) -> EventLog:
-        """Return a log with the events of ``arrays`` that this log does not have yet."""
-        steps = getattr(arrays.fault, self._field)
-        # An event is new if it has another step than the env's last one.
-        new = np.flatnonzero((steps != self._none) & (steps != self._steps)).tolist()
+    def with_events(self, arrays: Arrays) -> FaultLog:
+        """Return a log with the faults of ``arrays`` that this log does not have yet."""
+        steps = arrays.fault.step
+        # A fault is new if it has another step than the env's last one.
+        new = np.flatnonzero((steps != NO_STEP) & (steps != self._steps)).tolist()
         if not new:
             return self
         log = self.restored(steps)
@@ -161,7 +136,7 @@ class FaultContainment:
     start_base
         Pose and twist of the base (M, 13) to which each env is reset, and where it is suspended;
         unused on fixed ones.
-    step, joint, cause, missed_contact
+    step, joint, cause
         :class:`batchpid.sim.loop.arrays.FaultArrays` of the envs (M,).
     """
 
@@ -170,13 +145,13 @@ class FaultContainment:
         self.suspended, self.failed, self._unplaced = (np.zeros(size, bool) for _ in range(3))
         self.start_qpos, self.start_qvel, self.suspended_qpos = np.zeros((3, size, dof))
         self.start_base = np.tile(ORIGIN, (size, 1))
-        self.step = np.full(size, -1)
-        self.joint, self.cause, self.missed_contact = np.zeros((3, size), int)
+        self.step = np.full(size, NO_STEP)
+        self.joint, self.cause = np.zeros((2, size), int)
 
     @property
     def rows(self) -> FaultArrays:
         """The last faults."""
-        return FaultArrays(self.step, self.joint, self.cause, self.missed_contact)
+        return FaultArrays(self.step, self.joint, self.cause)
 
     def begin_tick(self) -> bool:
         """Forget the failures of the last tick; return whether no env is suspended."""
@@ -184,9 +159,9 @@ class FaultContainment:
         return not np.logical_or.reduce(self.suspended)
 
     def clear(self, mask: Bool) -> None:
-        """Clear the faults and missed contacts of the envs of ``mask`` (M,), which are reset."""
+        """Clear the faults of the envs of ``mask`` (M,), which are reset."""
         self.suspended[mask] = self.failed[mask] = False
-        self.step[mask], self.missed_contact[mask] = -1, 0
+        self.step[mask] = NO_STEP
 
     def fail(
         self,

@@ -275,7 +275,7 @@ class Loop:
         randomization = self.options.randomization
         pack = group.pack
         varies = randomization is not None and randomization.changes_robot
-        if varies or not pack.state_is_complete:
+        if varies or "complete_state" not in self.options.load_engine().capabilities:
             pack.close()
             pack = self._build(group.envs, draws)
         group.write(pack, rows, params, actuators, draws)

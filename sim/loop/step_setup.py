@@ -26,7 +26,6 @@ from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import FrictionState
-from batchpid.motors.guard import GuardState
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.control_step import REFRESH_STEPS, mass_matrix, refreshed, uses_mass_matrix
@@ -191,7 +190,7 @@ def empty_state(
         friction = FrictionState(*[rows] * len(FrictionState._fields))
         state = state._replace(friction=friction, age=np.zeros(envs, np.int64))
     if options.guard is not None:
-        state = state._replace(guard=GuardState(rows, rows))
+        state = state._replace(guard=guard_model.init(options.guard, rows))
     return state
 
 

@@ -140,9 +140,7 @@ class Scene(OptionGroup):
         ),
     ] = True
     """Robots have collision shapes; default True. False removes the shapes and the ground, for free
-    motion only. Masses, inertias and joint limits stay. A
-    :class:`batchpid.sim.MissedContactWarning` names the robots that would have touched
-    something.
+    motion only: robots then pass through themselves. Masses, inertias and joint limits stay.
     """
     ground: Annotated[
         bool | None,

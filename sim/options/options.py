@@ -145,8 +145,8 @@ class RunnerOptions(RunnerKeywords):
             lacks_force = True
         obstacle = engine.native_obstacle() or xla.obstacle()
         if obstacle:
-            problem = f"'jax' needs native code: {obstacle}"
-            remedy = "build the extensions, or use backend='numpy'"
+            problem = f"'jax' needs native code and JAX on the CPU: {obstacle}"
+            remedy = "mend that, or use backend='numpy'"
             raise InvalidArgumentError("backend", problem, remedy=remedy)
         for argument, problem, is_lacking in (
             ("control", "is 'drive'", self.control == "drive"),
@@ -184,13 +184,6 @@ class RunnerOptions(RunnerKeywords):
     def observed(self) -> dict[str, Quantity]:
         """Quantities that the loop observes."""
         return observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
-
-    @property
-    def misses_contacts(self) -> bool:
-        """True if robots have no collision shapes, and contacts that they would have had are
-        reported.
-        """
-        return not self.collisions
 
     @cached_property
     def own_command(self) -> CommandSpec | None:

@@ -23,7 +23,7 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import RecordingError
 from batchpid.sim.signals.quantities import Observation
-from batchpid.sim.signals.rollout import Redraw, RunInfo
+from batchpid.sim.signals.rollout import RunInfo
 
 if TYPE_CHECKING:
     import h5py
@@ -66,9 +66,8 @@ class Recorder(SingleOwner):
         *,
         overwrite: bool = False,
     ) -> None:
-        from batchpid.sim.runner.runner import (
-            Runner,  # loads SAPIEN, as the runner has done already
-        )
+        # It loads the engine, as the runner has done already.
+        from batchpid.sim.runner.runner import Runner
 
         if instance("runner", runner, Runner, "pass the runner to record").closed:
             raise ClosedError("this Runner is closed; record one that is not")
@@ -86,9 +85,7 @@ class Recorder(SingleOwner):
         self._rows: list[dict[str, Rows]] = []  # not written yet
         self._count = 0  # of written rows
         self._last_write = time.monotonic()
-        self._redraws: list[Redraw] = []
         self._rates = False  # whether a recorded tick had rates
-        self._params_changed = False
         self._error: Exception | None = None
         self._is_closed = False
         runner.recorder = self
@@ -105,22 +102,23 @@ class Recorder(SingleOwner):
             cause = " ".join(str(self._error).split())  # HDF5 writes several lines
             raise RecordingError(f"{self.path}: cannot be written: {cause}") from self._error
         if self._info is None:
-            self._episodes, self._params = self._runner.episodes, self._runner.params
             self._info = replace(self._runner.info, complete=False)
 
-    def append(self, time_: float, command: Command, observation: Observation) -> None:
-        """Record the state at ``time_`` [s] after a tick under ``command``. The arrays may change
-        afterwards.
+    def append(
+        self,
+        time_: float,
+        command: Command,
+        observation: Observation,
+        changes: Rows | None,
+    ) -> None:
+        """Record the state at ``time_`` [s] after a tick under ``command``, and the ``changes``
+        (envs,) before it. The arrays may change afterwards.
         """
-        episodes = self._runner.episodes
-        for env in np.flatnonzero((episodes != self._episodes).any(1)).tolist():
-            self._redraws.append(Redraw(time_, env, *episodes[env].tolist()))
-        self._episodes = episodes
-        self._params_changed |= self._runner.params is not self._params
         self._rates |= command.setpoint_rate is not None
         rows: dict[str, Rows | None] = observation._asdict()
         rows["time"] = np.array(time_)
         rows["setpoint"] = np.array(command.setpoint)
+        rows["changes"] = changes
         if command.feedforward is not None:
             rows["feedforward"] = np.array(command.feedforward)
         self._rows.append({name: row for name, row in rows.items() if row is not None})
@@ -161,13 +159,7 @@ class Recorder(SingleOwner):
         """Write the remaining rows and the events of the run, and close the file."""
         self._write()
         if self._file:  # not closed yet
-            info = replace(
-                info,
-                faults=self._runner.faults,
-                redraws=tuple(self._redraws),
-                rates=self._rates,
-                params_changed=self._params_changed,
-            )
+            info = replace(info, faults=self._runner.faults, rates=self._rates)
             self._file.attrs.update(files.attributes(info))
             self._file.close()
 
@@ -203,7 +195,7 @@ class Recorder(SingleOwner):
 def _stacked(rows: list[dict[str, Rows]]) -> dict[str, Rows]:
     """Return the arrays of successive ticks, ticks first; 0 where a tick has none."""
     arrays = {}
-    # Feedforwards may begin, and end, with any tick.
+    # Feedforwards may begin, and end, with any tick; changes are rare.
     for name in dict.fromkeys(name for row in rows for name in row):
         present = next(row[name] for row in rows if name in row)
         zeros = np.zeros_like(present)

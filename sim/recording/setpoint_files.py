@@ -14,6 +14,7 @@ here, too.
 
 from __future__ import annotations
 
+import csv
 import io
 import math
 import os
@@ -59,6 +60,11 @@ class Setpoints(NamedTuple):
     """Number of changes that count as steps of the setpoint, with rate 0."""
 
 
+def _quoted(name: str) -> str:
+    """Return a name in quotation marks, its own doubled."""
+    return '"' + name.replace('"', '""') + '"'
+
+
 def error(
     source: str,
     problem: str,
@@ -92,10 +98,13 @@ def read_csv(
             continue
         # Programs separate cells by other characters, and quote the names.
         if not header:
-            delimiter = max(",;\t", key=line.count)
-        cells = [cell.strip(" \"'") for cell in line.split(delimiter)]
+            delimiter = max(",;\t", key=re.sub('"[^"]*"', "", line).count)
+        try:
+            cells = _cells(line, delimiter)
+        except csv.Error as bad:
+            raise error(source, f"line {number}: {bad}", "correct the line") from None
         if not header:
-            header = [re.sub(r"\s*:\s*", ":", cell) for cell in cells]
+            header = [re.sub(r"\s*:\s*", ":", cell, count=1) for cell in cells]
             continue
         if len(cells) != len(header):
             problem = f"line {number} has {len(cells)} cells, the header {len(header)}"
@@ -113,6 +122,13 @@ def read_csv(
     if len(columns) < len(header):
         raise error(source, "has two columns with the same name", "rename one of them")
     return columns, numbers
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line: those in double quotes as they are, others without blanks."""
+    if '"' in line:
+        return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    return [cell.strip(" '") for cell in line.split(delimiter)]
 
 
 def _number(
@@ -165,7 +181,9 @@ def setpoint_csv(robot: Robot, motion: Trajectory) -> str:
     names = [f"{quantity}:{name}" for quantity in QUANTITIES[:2] for name in robot.joint_names]
     rows = np.column_stack([motion.time - motion.time[0], motion.position, motion.velocity])
     text = io.StringIO()
-    np.savetxt(text, rows, "%.9g", ",", header=",".join(["time", *names]), comments="")
+    # A name may hold separators and quotation marks.
+    header = [name if re.fullmatch(r"[\w.:/-]+", name) else _quoted(name) for name in names]
+    np.savetxt(text, rows, "%.9g", ",", header=",".join(["time", *header]), comments="")
     return text.getvalue()
 
 

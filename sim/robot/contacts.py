@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Bool, Float64, Rows
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.sim.robot.collision_shapes import add_geom
 from batchpid.sim.robot.tables import Shape
 from batchpid.task_space.frames import matrix_of
@@ -28,8 +28,6 @@ GROUND = ""
 """Name of the ground."""
 _ANY = 1e6
 """Distance [m] beyond that of all bodies."""
-_EXACT = 0.1
-"""Distance [m] of balls around shapes below which least distances are exact."""
 _FARTHEST = 1.0
 """Largest distance [m] between shapes that is computed."""
 
@@ -103,10 +101,6 @@ class Contacts:
         self._pairs = np.array(pairs, np.intp).reshape(-1, 2)
         names = [*(shape.owner for shape in self._shapes), GROUND]
         self._owners = [(names[a], names[b]) for a, b in pairs]
-        touching = np.sort(self._body[self._pairs], axis=1)
-        self.body_pairs, numbers = np.unique(touching, axis=0, return_inverse=True)
-        """Pairs of bodies that may touch (pairs, 2); the ground counts as the base, body -1."""
-        self._body_pair = numbers.ravel()
 
     def near(self, qpos: Rows, within: float = NEAR) -> Iterator[Near]:
         """Yield the pairs of shapes that are closer than ``within`` [m], at one pose (dof,)."""
@@ -114,46 +108,12 @@ class Contacts:
         for row in np.flatnonzero(gaps < within).tolist():
             yield Near(*self._owners[row], float(gaps[row]))
 
-    @property
-    def balls(self) -> tuple[NDArray[np.intp], Float64]:
-        """Body of the tree that has each shape (shapes,), -1 for the base, and a ball around each
-        shape (shapes, 4): center in the frame of the body, and radius [m].
-        """
-        tree = self._tree
-        at = [tree.index(self.links[link]) for link in self._link]
-        frames = tree.bodies.link_frames[at].reshape(-1, 3, 4)
-        centers = np.einsum("sij,sj->si", frames[:, :, :3], self._place) + frames[:, :, 3]
-        return self._body[:-1], np.column_stack([centers, self._radii])
-
-    def least_distances(self, qpos: Rows, needed: Bool) -> Float64:
-        """Return lower bounds of the distances [m] of :attr:`body_pairs`, at poses qpos (n, dof),
-        as (n, pairs).
-
-        Those ``needed`` (n, pairs) are exact where the bodies are near each other, up to 1 m.
-        """
-        gaps = self._gaps(qpos, _EXACT, needed[:, self._body_pair])
-        order = np.argsort(self._body_pair, kind="stable")
-        starts = np.searchsorted(self._body_pair[order], np.arange(len(self.body_pairs)))
-        least: Float64 = np.minimum.reduceat(gaps[:, order], starts, axis=1)
-        return least
-
     def in_contact(self, qpos: Rows, clearance: float = 0.0) -> NDArray[np.bool_]:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground
         (n,).
         """
         gaps = self._gaps(np.asarray(qpos), max(clearance, NEAR))
         return np.asarray((gaps < clearance).any(axis=1))
-
-    def nearest_links(self, qpos: Rows) -> tuple[str, ...]:
-        """Return the two links nearest to each other; one if the other is the ground, none if none
-        are near.
-        """
-        nearest = min(
-            self.near(qpos),
-            key=lambda pair: pair.distance,
-            default=Near("", "", np.inf),
-        )
-        return tuple(name for name in nearest[:2] if name)
 
     def height(self, qpos: Rows, base_too: bool = False) -> float:
         """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf
@@ -185,11 +145,9 @@ class Contacts:
             heights = [self._distance(index, ground, _ANY) for index in range(ground)]
         return np.array(heights), centers
 
-    def _gaps(self, qpos: Rows, within: float, needed: Bool | None = None) -> Float64:
+    def _gaps(self, qpos: Rows, within: float) -> Float64:
         """Return lower bounds of the distances [m] of the pairs of shapes, at poses qpos (n, dof),
-        as (n, pairs).
-
-        Those ``needed`` (n, pairs), by default all, are exact below ``within``.
+        as (n, pairs), which are exact below ``within``.
         """
         centers, turns = self._frames(qpos)
         first, second = self._pairs[self._pairs[:, 1] < len(self._shapes)].T
@@ -199,8 +157,6 @@ class Contacts:
         apart -= self._radii[first] + self._radii[second]
         gaps = np.hstack([apart, centers[:, above_ground, 2] - self._radii[above_ground]])
         exact = gaps < within
-        if needed is not None:
-            exact &= needed
         with self._lock:
             for row in np.flatnonzero(exact.any(axis=1)).tolist():
                 self._put(centers[row], turns[row])

@@ -1,4 +1,7 @@
-"""Findings: oddities of a robot and repairs of its files, each with the remedy."""
+"""Findings: oddities of a robot, repairs of its files, and causes for which a run does not settle.
+
+:data:`KINDS` lists every kind, and the tables in the guides are made from it.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +9,143 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from batchpid.errors import RobotError, warn
 
 SEVERITIES = ("warning", "note")  # probably an error; good to know
 
 
+class Kind(NamedTuple):
+    """Kind of findings, which its ``code`` names for programs."""
+
+    code: str
+    severity: str
+    """One of :data:`SEVERITIES`."""
+    when: str
+    """What a file has; text of findings of the preflight and of a run."""
+    done: str
+    """What is simulated instead; remedy of findings of the preflight and of a run."""
+
+
+OF_FILES = (
+    Kind("xml", "warning",
+         "text around the root, a wrong encoding, `--` in a comment, an undeclared prefix, elements of xacro",
+         "the first `<robot>`; a default namespace (`xmlns=`) is ignored. `${...}` or `$(...)` in an attribute is an"
+         " error: the file was never expanded"),
+    Kind("unknown-element", "note",
+         "elements that no URDF has; in an MJCF file sites, sensors, and keyframes other than \"home\"",
+         "without them"),
+    Kind("repeated", "warning",
+         "names used twice or missing; several `<limit>`, `<origin>`, `<inertial>`, ... of one element, or shapes of"
+         " one `<geometry>`",
+         "the first of them; joints get a name, and a robot is called after its file"),
+    Kind("loose-link", "warning",
+         "a link that joints name but nothing defines; a link that no joint names",
+         "an empty link; without the link"),
+    Kind("joint", "warning",
+         "floating, planar and unknown joints; an axis without direction",
+         "fixed joints, a floating one at the root a floating base; the x axis, the URDF's default"),
+    Kind("limits", "warning",
+         "limits that are swapped, missing, unreadable, all 0 or equal; `effort` or `velocity` of 0 or -1; in an MJCF"
+         " file effort limits that differ by direction",
+         "swapped back; no limit (equal ones stay); the smaller limit"),
+    Kind("dynamics", "warning", "friction or damping that is negative or no number", "0"),
+    Kind("mimic", "warning",
+         "a mimic of a fixed or unknown joint, of itself, in a circle, or by 0",
+         "an independent joint"),
+    Kind("inertia", "warning",
+         "an inertia tensor that no body has, or none; a mass that is no number",
+         "the nearest possible tensor, or as given, see below; no mass"),
+    Kind("collision", "warning",
+         "shapes without geometry, extent or place",
+         "without the shape"),
+    Kind("missing-mesh", "warning",
+         "a mesh that is not there or cannot be read",
+         "without the shape; `missing_meshes=\"error\"` refuses"),
+    Kind("self-collision", "warning",
+         "a pair in the .srdf that does not name two links of the robot",
+         "without the pair"),
+    Kind("actuator", "warning",
+         "an MJCF actuator other than a motor or servo of one joint: of several joints, a muscle, with a filter or"
+         " delay; a joint without actuator",
+         "a motor for each joint"),
+    Kind("option", "warning",
+         "in an MJCF file other gravity, and bodies with `gravcomp`",
+         "gravity of -9.81 m/s^2, without compensation"),
+    Kind("engine", "warning",
+         "content that an engine simulates otherwise than the file says: in SAPIEN closed loops, tendons, springs,"
+         " `<flag>`s, a medium, bodies apart from the robot, height fields, planes other than a level one at height 0",
+         "as the finding says; MuJoCo simulates the file itself"),
+)  # fmt: skip
+"""Kinds of findings about a file."""
+OF_ROBOTS = (
+    Kind("units", "warning",
+         "sizes or angles are not those of a robot: millimetres read as metres, or degrees as radians",
+         "give metres and radians, meshes in millimetres with <mesh scale='0.001 0.001 0.001'>"),
+    Kind("no-inertia", "warning",
+         "no <inertial>, or a mass of 0: its collision shapes give mass and inertia, or without shapes it weighs"
+         " 1e-6 kg",
+         "add <inertial> with mass and inertia: gains in efforts cannot control a link without mass"),
+    Kind("out-of-limits", "warning",
+         "start pose or setpoint are outside the joint limits",
+         "move them inside"),
+    Kind("touching", "warning",
+         "links touch or overlap each other, or the ground",
+         "choose another pose or path, correct the collision shapes, disable the pair in an .srdf, or use"
+         " ground=False"),
+    Kind("effort-limit", "warning",
+         "the effort limit does not suffice for gravity and friction, or for the move in its time",
+         "raise the effort limit, lighten the load, choose other poses, or give the move more time"),
+    Kind("no-effort-limit", "note",
+         "no effort limit: designed and tuned gains use limits from gravity and inertia",
+         "give <limit effort=>, or pass effort_limit= to robot.params()"),
+    Kind("continuous", "warning",
+         "the joint is continuous in the file or in params alone",
+         "use robot.params(), or give make_params the continuous= of the file"),
+    Kind("unstable", "warning",
+         "the gains are near the stability bound of the sampled PID loop, or beyond it",
+         "lower the gains, or use robot.designed()"),
+)  # fmt: skip
+"""Kinds of findings about a robot, its gains and its setpoint."""
+OF_RUNS = (
+    Kind("failed", "warning",
+         "an input was not finite, or the state diverged",
+         "correct the input or lower the gains"),
+    Kind("out-of-reach", "warning",
+         "no pose within the joint limits brings the tool to the setpoint",
+         "move it nearer"),
+    Kind("guard", "warning",
+         "the guard holds the setpoint back",
+         "move it inside the guard's limits, or give it more time"),
+    Kind("oscillates", "warning",
+         "oscillates: gains are beyond the stability bound, hardly damped, or too high for the delays",
+         "use robot.designed(), or raise kd and lower kp and ki; robot.check(params=) tells which"),
+    Kind("blocked", "warning",
+         "something outside the robot's model acts on it: an object, a payload, another force",
+         "look at the scene; for a constant load use gains with integral action"),
+    Kind("gains", "warning",
+         "rests away from the setpoint: the remaining error balances gravity or friction",
+         "raise kp, ki or integral_limit, or compensate gravity and friction"),
+    Kind("slow", "warning",
+         "still moves at the end of the run: to its setpoint, or behind a moving one",
+         "run longer, hold the last setpoint, pass setpoint_rate, or raise the gains"),
+)  # fmt: skip
+"""Kinds of findings about a run, besides those about a robot."""
+KINDS = {kind.code: kind for kind in (*OF_FILES, *OF_ROBOTS, *OF_RUNS)}
+"""Every kind of finding, by its code."""
+
+
 @dataclass(frozen=True)
 class Finding:
     """Oddity of a joint, a link or the robot, and the remedy.
 
-    ``severity`` is one of :data:`SEVERITIES`; ``code`` names the kind of finding, for programs.
-    ``text`` and ``remedy`` are the same for all joints with one cause; ``detail`` has the figures
-    of this joint or link. ``envs`` and ``time`` [s] belong to findings of a run
-    (:meth:`batchpid.sim.Rollout.findings`): the envs that have it, the first one first, and when it
-    began there.
+    ``code`` is one of :data:`KINDS`. ``text`` and ``remedy`` are the same for all joints with one
+    cause; ``detail`` has the figures of this joint or link. ``envs`` and ``time`` [s] belong to
+    findings of a run (:meth:`batchpid.sim.Rollout.findings`): the envs that have it, the first one
+    first, and when it began there.
     """
 
-    severity: str
     code: str
     text: str
     remedy: str
@@ -32,6 +154,11 @@ class Finding:
     detail: str = ""
     envs: tuple[int, ...] = ()
     time: float | None = None
+
+    @property
+    def severity(self) -> str:
+        """One of :data:`SEVERITIES`, that of the kind."""
+        return KINDS[self.code].severity
 
     @property
     def where(self) -> str:
@@ -91,7 +218,7 @@ def _sentence(same: Sequence[Finding]) -> str:
     first = same[0]
     names = list(
         dict.fromkeys(
-            f"{finding._name} ({finding.figures})" if finding.figures else finding._name
+            f"{finding._name} ({finding.figures})".strip() if finding.figures else finding._name
             for finding in same
         )
     )

@@ -19,6 +19,7 @@ import numpy as np
 
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
+from batchpid.io.packages import imported
 from batchpid.sim.robot.tables import Shape
 from batchpid.sim.robot.xml import LARGEST, LFS_POINTER, parse_bytes
 
@@ -88,7 +89,7 @@ def _ros_packages(package: str) -> Iterator[Path]:
 
 def read_mesh(path: str | Path) -> Any:
     """Return the result of ``trimesh`` for a mesh file, in metres. Raises errors of many types."""
-    from trimesh import load
+    load = imported("trimesh").load
 
     # Materials are textures to decode, of which nothing here needs any.
     mesh: Any = load(path, force="mesh", process=False, skip_materials=True)

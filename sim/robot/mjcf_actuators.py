@@ -64,7 +64,7 @@ def read_couplings(model: MjModel, robot: RobotInFile, findings: list[Finding]) 
         if not is_linear or name in couplings:
             text = f"{ALONE} an equality of the joint that is not linear in one other joint"
             remedy = "give the joint a setpoint"
-            findings.append(Finding("warning", "mimic", text, remedy, name))
+            findings.append(Finding("engine", text, remedy, name))
             continue
         rest, rest_of_leader = model.qpos0[model.jnt_qposadr[[follower, leader]]].tolist()
         offset += rest - multiplier * rest_of_leader
@@ -72,7 +72,7 @@ def read_couplings(model: MjModel, robot: RobotInFile, findings: list[Finding]) 
     if others:
         text = f"{ALONE} equality constraints other than between the robot's joints: {', '.join(others)}"
         remedy = "in SAPIEN expect closed loops to be open"
-        findings.append(Finding("warning", "equality", text, remedy))
+        findings.append(Finding("engine", text, remedy))
     return couplings
 
 
@@ -95,9 +95,7 @@ def read_motors(
             text = f"actuator {label(model.actuator(actuator))} has effects that are not simulated"
             text += ": only motors and servos of one joint are"
             remedy = "check gains and limits of the joint"
-            findings += [
-                Finding("warning", "actuator", text, remedy, name) for name in arms or [None]
-            ]
+            findings += [Finding("actuator", text, remedy, name) for name in arms or [None]]
         for name, arm in arms.items():
             _add(model, actuator, name, arm, motors, findings)
             kp, kv = _servo(model, actuator) if len(arms) == 1 else (0.0, 0.0)
@@ -107,7 +105,7 @@ def read_motors(
         if model.nu and name not in motors.effort_limit and name not in couplings:
             text = "no actuator of the file moves the joint: it is controlled like all others"
             remedy = "give it gains of 0 to let it move freely"
-            findings.append(Finding("warning", "actuator", text, remedy, name))
+            findings.append(Finding("actuator", text, remedy, name))
         # A limit of 0 counts as none.
         limit = motors.effort_limit.get(name, math.inf) or math.inf
         if model.jnt_actfrclimited[joint]:
@@ -121,7 +119,7 @@ def read_motors(
     if tendons:
         text = f"{ALONE} springs, damping, friction, armature and limits of tendons: "
         remedy = "in SAPIEN expect their joints to move freely"
-        findings.append(Finding("warning", "tendon", text + ", ".join(tendons), remedy))
+        findings.append(Finding("engine", text + ", ".join(tendons), remedy))
     return motors
 
 
@@ -233,5 +231,5 @@ def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
         text = "effort limits differ by direction: the smaller one above zero is used in both"
         detail = f"{min(ends):g} to {max(ends):g}"
         remedy = "pass effort_min= and effort_max= to robot.params()"
-        findings.append(Finding("warning", "limits", text, remedy, name, detail=detail))
+        findings.append(Finding("limits", text, remedy, name, detail=detail))
     return smaller or larger

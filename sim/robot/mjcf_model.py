@@ -90,7 +90,7 @@ def compile_file(path: Path, missing_meshes: str, findings: list[Finding]) -> Co
             raise
     text = f"collision meshes not found, simulated without: {', '.join(lean.missing)}"
     remedy = "put the files where the MJCF names them"
-    findings.append(Finding("warning", "missing-mesh", text, remedy))
+    findings.append(Finding("missing-mesh", text, remedy))
     return lean
 
 
@@ -259,7 +259,7 @@ class RobotInFile:
         for body in sorted(self._left_out - soft):
             text = f"is apart from the robot: {ALONE} it"
             remedy = "in SAPIEN add it with build="
-            findings.append(Finding("note", "loose-link", text, remedy, link=self.bodies[body]))
+            findings.append(Finding("engine", text, remedy, link=self.bodies[body]))
         if floating:
             return floating.pop()
         # The only body, if it is held at the origin, is the root in place of the world.

@@ -149,29 +149,37 @@ def _unused(model: MjModel, robot: RobotInFile) -> Iterator[Finding]:
     left_out = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
     if left_out:
         text = f"elements that the simulation does not use are left out: {left_out}"
-        yield Finding("note", "unknown-element", text, "expect no effect")
+        yield Finding("unknown-element", text, "expect no effect")
     option = model.opt
     disabled = ", ".join(
         switch.lower()
         for switch in _SWITCHES
         if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{switch}")
     )
-    # Every row: whether the file has it, and what is simulated.
-    for is_there, text in (
-        (tuple(option.gravity) != GRAVITY, f"gravity is {GRAVITY} m/s^2, not the file's"),
-        (disabled, f"{ALONE} <flag>, which disables {disabled}, but for gravity and actuation"),
-        (option.density or option.viscosity, f"{ALONE} the medium (<option density= viscosity=>)"),
-        (model.nflex, f"{ALONE} flexible bodies"),
+    # Every row: whether the file has it, the code, and what is simulated.
+    for is_there, code, text in (
+        (tuple(option.gravity) != GRAVITY, "option", f"gravity is {GRAVITY} m/s^2, not the file's"),
+        (
+            disabled,
+            "engine",
+            f"{ALONE} <flag>, which disables {disabled}, but for gravity and actuation",
+        ),
+        (
+            option.density or option.viscosity,
+            "engine",
+            f"{ALONE} the medium (<option density= viscosity=>)",
+        ),
+        (model.nflex, "engine", f"{ALONE} flexible bodies"),
     ):
         if is_there:
-            yield Finding("warning", "option", text, _ELSEWHERE)
+            yield Finding(code, text, _ELSEWHERE)
     for joint, name in robot.joints.items():
         if stiffness := model.jnt_stiffness[joint]:
             text = f"{ALONE} the spring of the joint"
             detail = f"{stiffness:g} in units of N, m and rad"
-            yield Finding("warning", "spring", text, _ELSEWHERE, name, detail=detail)
+            yield Finding("engine", text, _ELSEWHERE, name, detail=detail)
     for body in np.flatnonzero(model.body_gravcomp).tolist():
         if robot.is_of_robot(body):
             text = "gravity compensation of this body (gravcomp) is not simulated"
             remedy = "let the controller compensate"
-            yield Finding("note", "gravcomp", text, remedy, link=robot.bodies[body])
+            yield Finding("option", text, remedy, link=robot.bodies[body])

@@ -176,7 +176,7 @@ class TableReader:
                 text, detail = repair
                 remedy = "correct <inertia>"
                 self._findings.append(
-                    Finding("warning", "inertia", text, remedy, link=row.name, detail=detail)
+                    Finding("inertia", text, remedy, link=row.name, detail=detail)
                 )
             axes = model.body_iquat[body].copy()
             row = row._replace(mass=mass, center=center, inertia=inertia, inertia_wxyz=axes)
@@ -223,7 +223,7 @@ class TableReader:
         if absent:
             text = f"{ALONE} planes, height fields and shapes of the world: {', '.join(absent)}"
             remedy = "in SAPIEN add them with build= of Runner"
-            self._findings.append(Finding("warning", "collision", text, remedy))
+            self._findings.append(Finding("engine", text, remedy))
 
 
 def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair, ...]:

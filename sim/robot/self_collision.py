@@ -92,9 +92,7 @@ def read_srdf(path: Path, links: Iterable[str]) -> Srdf:
                 f"{path.name}: <{element.tag} link1={pair[0]!r} link2={pair[1]!r}> does not name"
                 " two links of the robot"
             )
-            findings.append(
-                Finding("warning", "srdf-link", text, "correct the names; now left out")
-            )
+            findings.append(Finding("self-collision", text, "correct the names; now left out"))
         elif element.tag == "enable_collisions":
             enabled.add(frozenset(pair))
         else:

@@ -15,6 +15,7 @@ import numpy as np
 from lxml import etree
 
 from batchpid.arrays.array_types import Document, Float64
+from batchpid.checks.validate import is_name
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
@@ -79,6 +80,22 @@ def read_robot(
     be read, a structure or number without repair, a bad mesh, or an MJCF file that MuJoCo does not
     compile.
     """
+    source = _read(path, fixed_base, package_dirs, missing_meshes)
+    joints = [joint.name for joint in source.tables.joints]
+    for name in (source.name, *joints, *(body.name for body in source.tables.bodies)):
+        if not is_name(name):
+            raise RobotError(
+                f"{path}: the name {name!r} has a control character or a line break; rename it"
+            )
+    return source
+
+
+def _read(
+    path: Path,
+    fixed_base: bool | None,
+    package_dirs: tuple[Path, ...],
+    missing_meshes: str,
+) -> Source:
     findings: list[Finding] = []
     root = parse_xml(path, findings)
     if not is_mjcf(root):
@@ -168,7 +185,7 @@ class _Reader:
         link: str | None = None,
         detail: str = "",
     ) -> None:
-        self._findings.append(Finding("warning", code, text, remedy, joint, link, detail))
+        self._findings.append(Finding(code, text, remedy, joint, link, detail))
 
     # -- Structure
 
@@ -188,11 +205,10 @@ class _Reader:
         if unknown:
             # A robot may lack the parts of a macro that is not expanded.
             is_xacro = any(tag.startswith("xacro:") for tag in unknown)
-            severity = "warning" if is_xacro else "note"
             listed = ", ".join(f"{count} <{tag}>" for tag, count in unknown.most_common(8))
             text = f"elements that the simulation does not use are left out: {listed}"
             remedy = _EXPAND if is_xacro else "remove them, or expect no effect"
-            self._findings.append(Finding(severity, "unknown-element", text, remedy))
+            self._findings.append(Finding("xml" if is_xacro else "unknown-element", text, remedy))
 
     def _report_repeated(self, root: etree._Element) -> None:
         """Report elements of which the first is read."""
@@ -203,7 +219,7 @@ class _Reader:
                     if count > 1 and tag != "<collision>":
                         text = f"<{parent.tag}> has several {tag}: the first is used"
                         owner = {part.tag: _text(part, "name")}
-                        self._warn("repeated-element", text, "remove the others", **owner)
+                        self._warn("repeated", text, "remove the others", **owner)
 
     def _refuse_xacro(self, root: etree._Element) -> None:
         for element in root.iter():
@@ -221,7 +237,7 @@ class _Reader:
             if not name or name in links:
                 text = "has no name, or a repeated one: left out"
                 remedy = "give every link a unique name"
-                self._warn("repeated-name", text, remedy, link=name or None)
+                self._warn("repeated", text, remedy, link=name or None)
                 continue
             links[name] = element
         return links
@@ -234,13 +250,13 @@ class _Reader:
             name = _text(element, "name")
             ends = _ends(element)
             if name in joints and _ends(joints[name]) == ends:
-                self._warn("repeated-name", "given twice: the first is kept", "remove it", name)
+                self._warn("repeated", "given twice: the first is kept", "remove it", name)
                 continue
             new = name
             if not name or name in joints:
                 new = unique(name or "{}_to_{}".format(*ends), names)
                 text = f"no name, or a repeated one: renamed {new!r}"
-                self._warn("repeated-name", text, "name it in the URDF", name or None)
+                self._warn("repeated", text, "name it in the URDF", name or None)
             joints[new] = element
         return joints
 
@@ -259,7 +275,7 @@ class _Reader:
             if name not in self._links:
                 self._links[name] = etree.Element("link")
                 text = "named by joints, but not in the file: added, without mass and shape"
-                self._warn("missing-link", text, "correct the name, or add the link", link=name)
+                self._warn("loose-link", text, "correct the name, or add the link", link=name)
         for name in [name for name in self._links if name not in joined]:
             text = "no joint holds it: left out"
             self._warn("loose-link", text, "join it, or remove it", link=name)
@@ -332,7 +348,7 @@ class _Reader:
             remedy = "use revolute, continuous or prismatic joints"
             if kind == "floating":
                 remedy = "load with fixed_base=False for a robot that is free to move"
-            self._warn("joint-type", text, remedy, name)
+            self._warn("joint", text, remedy, name)
             kind = "fixed"
         # The other elements mean nothing for a fixed joint, and their faults are none.
         if kind == "fixed":
@@ -344,7 +360,7 @@ class _Reader:
         if axis is None or math.hypot(*axis) < 1e-3:
             text = f"<axis xyz={_text(element.find('axis'), 'xyz')!r}> has no direction: the x"
             text += " axis is used, the URDF's default"
-            self._warn("axis", text, "correct the axis", name)
+            self._warn("joint", text, "correct the axis", name)
             axis = (1.0, 0.0, 0.0)
         dynamics = element.find("dynamics")
         for key in ("damping", "friction"):
@@ -373,7 +389,7 @@ class _Reader:
         if placeholders:
             text = f"<limit {' '.join(placeholders)}> is a placeholder or not within"
             text += f" +-{LARGEST:g}: no limit"
-            self._warn("placeholder", text, "give <limit effort= velocity=> of the motor", name)
+            self._warn("limits", text, "give <limit effort= velocity=> of the motor", name)
         is_unknown = all(map(math.isinf, limits.values()))
         safety = joint.find("safety_controller")
         if safety is not None:

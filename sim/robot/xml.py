@@ -51,7 +51,7 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
             ) from error
         if repairs is not None:
             text = f"not well-formed XML: {error.msg}; read as far as possible"
-            repairs.append(Finding("warning", "xml", text, "correct the file at that line"))
+            repairs.append(Finding("xml", text, "correct the file at that line"))
     except OSError as error:
         raise RobotError(
             f"{path}: cannot be read: {error}; check that it is a readable text file"

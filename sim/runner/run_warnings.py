@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import batchpid as bp
 from batchpid.errors import warn
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
-from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
-from batchpid.sim.loop.faults import EventLog, FaultWarning, MissedContactWarning
+from batchpid.sim.diagnosis.run_checks import SetpointCheck
+from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.tool_space import OperationalSpace
@@ -25,11 +24,8 @@ class RunWarnings:
         self.setpoint_limits = (
             self.limits if options.sets_positions and options.guard is None else None
         )
-        self.moving: MovingSetpointCheck | None = None
-        """Check of the setpoints of every tick; None where it can find nothing."""
         self._control = control
         self._stability = StabilityCheck(robot, timestep) if control == "pid" else None
-        self._moving = MovingSetpointCheck(robot) if control == "pid" else None
         self._issued = set[type[Warning]]()
 
     def check_controller(self) -> None:
@@ -42,24 +38,12 @@ class RunWarnings:
         if self._stability is not None:
             self._stability.check(state.params, state.actuators)
 
-    def set_params(self, params: bp.PIDParams) -> None:
-        """Watch the next ticks for what these gains may lead to."""
-        if self._moving is not None:
-            self._moving.set_params(params)
-            self.moving = self._moving if self._moving.is_watching else None
-
-    def issue(self, faults: EventLog, contacts: EventLog | None, lost: list[str]) -> None:
-        """Warn of lost workers (the messages ``lost``, which are removed), faults and missed
-        contacts.
-        """
+    def issue(self, faults: FaultLog, lost: list[str]) -> None:
+        """Warn of lost workers (the messages ``lost``, which are removed) and faults."""
         while lost:
             warn(lost.pop(), RecoveryWarning)
         if faults.events:
             self._warn_once(f"{faults.events[0]}; see runner.faults for more", FaultWarning)
-        if contacts is not None and contacts.events:
-            problem = "robots passed through links or the ground, since collisions are off"
-            remedy = "Use collisions=True, or other moves; see runner.missed_contacts for more"
-            self._warn_once(f"{problem}: {contacts.events[0]}. {remedy}", MissedContactWarning)
 
     def _warn_once(self, text: str, kind: type[Warning]) -> None:
         if kind not in self._issued:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, EventLog, Fault, MissedContact
+from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, Fault, FaultLog
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 
+ALL = slice(None)
+"""All envs."""
 Motion = tuple[Float64, Float64 | None]
 """Setpoints of joints and their rates (envs, dof); None for 0."""
 
@@ -26,9 +28,7 @@ class RunnerState(NamedTuple):
     params: bp.PIDParams
     actuators: bp.Actuators | None
     draws: Draws
-    faults: EventLog
-    contacts: EventLog | None
-    """None if contacts are not watched: the robots have collision shapes."""
+    faults: FaultLog
     motion: Motion | None
     """Setpoint of the last tick and its rate, or position and velocity after a reset. None for
     other setpoints.
@@ -37,6 +37,15 @@ class RunnerState(NamedTuple):
     steps_since_checkpoint: int = 0
     work: tuple[tuple[float, ...], int] = ((), 1)
     """Seconds of each worker in the last run, and the ticks of that run."""
+    changes: Rows | None = None
+    """Changes of each env since the last tick (envs,): :attr:`batchpid.sim.Rollout.changes`."""
+
+    def changed(self, change: int, envs: Bool | slice = ALL, **values: Any) -> RunnerState:
+        """Return a state with other ``values``, which notes a ``change`` of some envs."""
+        changes = np.zeros(len(self.faults), np.uint8) if self.changes is None else self.changes
+        changes = changes.copy()
+        changes[envs] |= change
+        return self._replace(changes=changes, **values)
 
     @classmethod
     def first(cls, options: RunnerOptions) -> RunnerState:
@@ -46,14 +55,11 @@ class RunnerState(NamedTuple):
         draws = NOTHING
         if options.randomization is not None:
             draws = options.randomization.first(robot, count, options.first_env)
-        faults = EventLog(count, "step", -1, partial(_fault, options))
-        contacts = None
-        if options.misses_contacts:
-            contacts = EventLog(count, "missed_contact", 0, partial(_missed_contact, options))
+        faults = FaultLog(count, partial(_fault, options))
         motion = None
         if options.sets_positions:
             motion = (np.tile(robot.start, (count, 1)), None)
-        return cls(options.params, options.actuators, draws, faults, contacts, motion)
+        return cls(options.params, options.actuators, draws, faults, motion)
 
 
 def _fault(options: RunnerOptions, env: int, arrays: Arrays) -> Fault:
@@ -66,10 +72,3 @@ def _fault(options: RunnerOptions, env: int, arrays: Arrays) -> Fault:
         kind, names = "entry", command.names
     joint = names[arrays.fault.joint[env]]
     return Fault(env, step, step * options.timestep, joint, cause, options.on_fault, kind)
-
-
-def _missed_contact(options: RunnerOptions, env: int, arrays: Arrays) -> MissedContact:
-    """Return the first missed contact of an env in the arrays of a tick."""
-    time = int(arrays.fault.missed_contact[env]) * options.timestep
-    contacts = options.robot.dynamics().contacts
-    return MissedContact(env, time, contacts.nearest_links(arrays.observation.qpos[env]))

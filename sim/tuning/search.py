@@ -16,9 +16,8 @@ the designed ones. For such robots the first generation consists of other design
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -31,13 +30,13 @@ from batchpid.arrays.array_types import Document, Float64, Progress
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import package_versions
-from batchpid.sim.loop.faults import MissedContactWarning
 from batchpid.sim.options.groups import EngineName
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tuning.candidates import FACTORS, Candidates, Weights
-from batchpid.sim.tuning.comparison import Comparison, GainSet, compare
+from batchpid.sim.tuning.candidates import FACTORS, Candidates
+from batchpid.sim.tuning.comparison import Comparison, compare
 from batchpid.sim.tuning.evaluation import SUBSTEPS, reseeded, tuning_engine
+from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 if TYPE_CHECKING:
@@ -116,7 +115,6 @@ def tune(
     seed: int = 0,
     seconds: float = 1.5,
     gain_units: Literal["mass_matrix", "effort"] = "mass_matrix",
-    weights: Weights | None = None,
     moves: Moves | None = None,
     randomization: Randomization | None = None,
     motors: bp.Actuators | None = None,
@@ -143,9 +141,6 @@ def tune(
         Simulated time of each move of the search [s].
     gain_units
         Gains per mass matrix (all joints respond equally fast), or as efforts (for any controller).
-    weights
-        Of the terms of the cost. Default: 1 for a second of a step's settling time and 1 for the
-        logarithm of the following error.
     moves
         Default: the tutorial's move and SEARCH_MOVES random ones, and FINAL_MOVES others in the
         final round. Given moves replace them, with contacts, since they may touch something. There
@@ -189,7 +184,6 @@ def tune(
     if motors is not None and runner_options.get("actuators") is not None:
         remedy = "leave it out: the control knows the actuators of the robot"
         raise InvalidArgumentError("actuators", "cannot be combined with motors", remedy=remedy)
-    weights = Weights() if weights is None else weights
     build = runner_options.get("build")
     engine = tuning_engine(build) if engine is None else engine
     # Options of all rollouts; the search adds fast ones where moves are free of contact.
@@ -211,7 +205,6 @@ def tune(
             gain_units,
             moves,
             seconds,
-            weights,
             headroom=headroom,
             drawn=differs and motors is None,
             motors=motors,
@@ -250,7 +243,6 @@ def tune(
         "population": population,
         "seconds": seconds,
         "gain_units": gain_units,
-        "weights": asdict(weights),
         "moves": list(moves.names),
         "randomization": None if randomization is None else randomization.to_dict(),
         "engine": engine,
@@ -290,21 +282,18 @@ def _evolve(
     points = []
     history = []
     numbers = range(generations)
-    with warnings.catch_warnings():
-        # Bad gains may leave the way of a move.
-        warnings.simplefilter("ignore", MissedContactWarning)
-        for generation in numbers if progress is None else progress(numbers):
-            samples = np.array([optimizer.ask() for _ in range(population)])
-            if generation == 0:
-                samples[: len(first)] = first
-            costs = evaluate(samples)
-            if generation == 0 and len(first) > 1:
-                # Points far outside its spread would upset CMA-ES: it starts anew at the best one.
-                optimizer = make(mean=samples[int(np.argmin(costs))])
-            else:
-                optimizer.tell(list(zip(samples, costs.tolist(), strict=True)))
-            points.append(samples)
-            history.append(tuple(costs.tolist()))
+    for generation in numbers if progress is None else progress(numbers):
+        samples = np.array([optimizer.ask() for _ in range(population)])
+        if generation == 0:
+            samples[: len(first)] = first
+        costs = evaluate(samples)
+        if generation == 0 and len(first) > 1:
+            # Points far outside its spread would upset CMA-ES: it starts anew at the best one.
+            optimizer = make(mean=samples[int(np.argmin(costs))])
+        else:
+            optimizer.tell(list(zip(samples, costs.tolist(), strict=True)))
+        points.append(samples)
+        history.append(tuple(costs.tolist()))
     return np.concatenate(points), tuple(history)
 
 

@@ -84,13 +84,7 @@ class RobotScene:
             finite &= np.isfinite(base_pose).all(1, keepdims=True)
             self._base = np.where(finite, base_pose, self._base)
         self._qpos = np.where(finite, qpos, self._qpos)
-        return self.poses(self._qpos, np.arange(len(qpos)))
-
-    def poses(self, qpos: Float64, robots: Rows) -> Float64:
-        """Return the poses of the surfaces (n, surfaces, 7) [m] of n ``robots`` at ``qpos`` (n,
-        dof) [rad or m].
-        """
-        links = ts.link_poses(self._tree, qpos)[:, self._links]
-        poses = placed(self._base[robots][:, None], links)
-        poses[..., :3] += self.positions[robots][:, None]
+        links = ts.link_poses(self._tree, self._qpos)[:, self._links]
+        poses = placed(self._base[:, None], links)
+        poses[..., :3] += self.positions[:, None]
         return poses

@@ -30,29 +30,30 @@ class ScalarGuard:
     acceleration: float = math.inf
     continuous: bool = False
     speed: float = 0.0
+    requested: float | None = None
 
     def step(self, asked: float, dt: float) -> float:
         target = asked if self.continuous else within(asked, self.lower, self.upper)
-        error = difference(target, self.setpoint, self.continuous)
-        wanted = speed = error / dt
+        last = self.setpoint if self.requested is None else self.requested
+        wanted = difference(target, self.setpoint, self.continuous) / dt
+        rest = difference(last, self.setpoint, self.continuous)
         change = self.acceleration * dt
-        if math.isfinite(change):
-            steps = 1
-            while change * dt * steps * (steps + 1) / 2 < abs(error):
-                steps += 1
-            speed = (
-                math.copysign(abs(error) / (steps * dt) + (steps - 1) * change / 2, error)
-                if error
-                else 0.0
-            )
-        speed = within(
-            within(speed, -self.rate, self.rate), self.speed - change, self.speed + change
-        )
-        self.setpoint, self.speed = (
-            (target if speed == wanted else self.setpoint + dt * speed),
-            speed,
-        )
+        late = abs(rest) / dt - self.stop(abs(rest), dt)
+        speed = within(wanted - math.copysign(late, rest), -self.rate, self.rate)
+        if not self.continuous:
+            speed = min(speed, self.stop(max(self.upper - self.setpoint, 0.0), dt))
+            speed = max(speed, -self.stop(max(self.setpoint - self.lower, 0.0), dt))
+        speed = within(speed, self.speed - change, self.speed + change)
+        self.setpoint = target if speed == wanted else self.setpoint + dt * speed
+        self.speed, self.requested = speed, target
         return self.setpoint
+
+    def stop(self, distance: float, dt: float) -> float:
+        change = self.acceleration * dt
+        steps = 1
+        while math.isfinite(distance) and change * dt * steps * (steps + 1) / 2 < distance:
+            steps += 1
+        return distance / (steps * dt) + (steps - 1) * (change / 2 if steps > 1 else 0.0)
 
 
 @dataclass

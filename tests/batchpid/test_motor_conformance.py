@@ -65,12 +65,14 @@ MOTORS = {
 
 
 class GuardCase:
-    """A guard of setpoints that jump."""
+    """A guard of setpoints that move and jump."""
 
     def __init__(self, rng, dtype):
         self.options = drawn(rng, GUARD, dtype) | {"continuous": rng.random(SHAPE) < 0.4}
         self.start = rng.uniform(-2, 2, SHAPE).astype(dtype)
-        self.inputs = [np.repeat(rng.normal(0, 2.5, (STEPS // 8, *SHAPE)), 8, axis=0).astype(dtype)]
+        jumps = np.repeat(rng.normal(0, 2.5, (STEPS // 8, *SHAPE)), 8, axis=0)
+        motion = DT * rng.normal(0, 3.0, SHAPE) * np.arange(STEPS)[:, None, None]
+        self.inputs = [(jumps + motion).astype(dtype)]
         self.model = bp.make_guard(JOINTS, **self.options, dtype=dtype)
 
     def begin(self, model, start):

@@ -45,9 +45,8 @@ RESET = np.arange(N) % 2 == 0
 ENGINES = ("sapien", "mujoco")
 pytestmark = [
     pytest.mark.usefixtures("small_groups"),
-    pytest.mark.filterwarnings(
-        "ignore::UserWarning"
-    ),  # of faults, lost workers, missed contacts and past bounds
+    # Of faults, lost workers and past bounds.
+    pytest.mark.filterwarnings("ignore::UserWarning"),
 ]
 
 
@@ -81,7 +80,9 @@ class Feature(NamedTuple):
     repeats: bool = True
     """Whether a second episode is bit-identical: not with noise."""
     exact: bool = False
-    """Whether results are bit-identical with and without native code, instead of close."""
+    """Whether results are bit-identical with and without native code, instead of close; in MuJoCo
+    without drives they differ by rounding, since native code has its own steps.
+    """
     alike: bool = True
     """Whether the engines agree on the motion: not in contact, nor under large efforts or drives at
     their limits.
@@ -339,7 +340,6 @@ class Result(NamedTuple):
     """Rollout after the snapshot."""
     end: Snapshot
     faults: Any
-    missed: Any
     poses: Any
     """Poses of the user's content."""
 
@@ -347,7 +347,7 @@ class Result(NamedTuple):
 def second_half(runner: Runner, given: dict[str, np.ndarray], rollout: Any) -> tuple[Any, ...]:
     second = rollout(runner, part(given, slice(SPLIT, None)))
     poses = None if runner.options.build is None else runner.poses()
-    return second, runner.snapshot(), runner.faults, runner.missed_contacts, poses
+    return second, runner.snapshot(), runner.faults, poses
 
 
 def program(
@@ -397,7 +397,7 @@ def check_equal(ours: Result, theirs: Result) -> None:
     """Raise AssertionError unless two results are bit-identical."""
     for name in ("first", "placed", "second"):
         assert_identical(getattr(ours, name), getattr(theirs, name))
-    for name in ("snapshot", "end", "faults", "missed", "poses"):
+    for name in ("snapshot", "end", "faults", "poses"):
         pairs = zip(leaves(getattr(ours, name)), leaves(getattr(theirs, name)), strict=True)
         for (path, mine), (other_path, other) in pairs:
             assert path == other_path
@@ -425,8 +425,12 @@ def in_python(case: tuple[str, str]) -> None:
         with make(case) as runner:
             assert "native calls into" not in runner.backend
             result = program(runner, case)
-    check = check_equal if FEATURES[case[0]].exact else functools.partial(check_close, atol=1e-6)
-    check(reference(case), result)
+    feature = FEATURES[case[0]]
+    rounds = case[1] == "mujoco" and feature.options.get("control") != "drive"
+    if feature.exact and not rounds:
+        check_equal(reference(case), result)
+    else:
+        check_close(reference(case), result, 1e-7 if feature.exact else 1e-6)
 
 
 def in_numpy(case: tuple[str, str]) -> None:

@@ -307,7 +307,6 @@ def test_a_hook_of_a_wrong_shape_is_named(hook):
     env.close()
 
 
-@pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
 def test_increments_are_followed_closely():
     """After half a second of constant increments, joints are at most 20 ms behind the setpoint."""
     rate = 0.25  # [rad/s]

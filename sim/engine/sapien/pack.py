@@ -69,8 +69,6 @@ class Pack(ModelPack):
         Whether the calls into the engine are native.
     """
 
-    state_is_complete = False  # PhysX remembers contacts
-
     def __init__(
         self,
         spec: SceneSpec,
@@ -97,6 +95,7 @@ class Pack(ModelPack):
                     SceneContent(spec, spec.build, scene, env, frames[env - first_env])
                     for env, scene in envs
                 ]
+            self.content = np.array([content.digest for content in self._contents])
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
         coupling = coupling_of(spec.joints)

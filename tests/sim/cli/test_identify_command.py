@@ -10,7 +10,6 @@ from batchpid.sim.identification import excite
 
 pytest.importorskip("scipy")
 
-pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
 
 PENDULUM = """<robot name="pendulum"><link name="base"/>
 <link name="bob"><inertial><origin xyz="0 0 -0.3"/><mass value="2"/>

@@ -379,7 +379,6 @@ def test_flags_that_contradict_a_trajectory_are_refused(
     assert (status, message in error) == (2, True), error
 
 
-@pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
 def test_a_trajectory_without_rates_is_a_log(saved, panda, tmp_path, motion):
     """It has no accelerations either, so that gains in efforts follow it."""
     path = tmp_path / "motion.csv"

@@ -8,7 +8,7 @@ from tiny_urdf import one_joint, write
 
 import batchpid as bp
 from batchpid.sim import Robot
-from batchpid.sim.tuning import random_moves
+from batchpid.sim.tuning.moves import random_moves
 
 pytest.importorskip("cmaes")
 

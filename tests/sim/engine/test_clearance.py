@@ -4,15 +4,19 @@ the same.
 
 from __future__ import annotations
 
+import copy
 import os
 
+import mujoco
 import numpy as np
 import pytest
 from identical import assert_identical
 from robots import load_bundled
 from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
-from batchpid.sim import Robot, Runner
+from batchpid.sim import MujocoSolver, Robot, Runner
+from batchpid.sim.engine.mujoco.model_builder import robot_model
+from batchpid.sim.engine.scene_spec import SceneSpec
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::batchpid.sim.StabilityWarning", "ignore::batchpid.sim.FaultWarning"
@@ -30,11 +34,11 @@ HULL = (
 )
 
 
-def shaped_tree(seed, folder, **options):
+def shaped_tree(seed, folder, links=9, **options):
     """Return a robot of random joints and shapes of every kind, loosely spread."""
     rng = np.random.default_rng(seed)
     (folder / "hull.obj").write_text(HULL)
-    parts = random_tree(rng, 9)
+    parts = random_tree(rng, links)
     for number, part in enumerate(parts):
         if part.startswith("<link"):
             place = '<origin xyz="{} {} {}" rpy="{} {} {}"/>'.format(*rng.uniform(-0.5, 0.5, 6))
@@ -50,7 +54,10 @@ def motion(of, monkeypatch, proofs, ticks=30, **options):
     between them.
     """
     rng, envs = np.random.default_rng(1), 4
-    monkeypatch.setenv("BATCHPID_NATIVE", str(int(proofs)))
+    if not proofs:
+        monkeypatch.setattr(
+            "batchpid.sim.engine.mujoco.mujoco_step.shape_tables", lambda robot: None
+        )
     starts = rng.uniform(np.maximum(of.lower, -3.0), np.minimum(of.upper, 3.0), (envs, of.dof))
     efforts = np.tile(
         rng.normal(size=(envs, of.dof)) * np.minimum(of.effort_limit, 20), (ticks, 1, 1)
@@ -87,7 +94,7 @@ CASES = [
 @pytest.mark.skipif(os.environ.get("BATCHPID_NATIVE") == "0", reason="there are no native calls")
 @pytest.mark.parametrize(("name", "fixed_base", "ground"), CASES)
 def test_a_motion_is_the_same_without_proofs(name, fixed_base, ground, tmp_path, monkeypatch):
-    """Without native code MuJoCo looks for contacts in every step."""
+    """Without proofs MuJoCo looks for contacts in every step."""
     of = (
         load_bundled(name)
         if isinstance(name, str)
@@ -117,3 +124,23 @@ def test_a_link_that_is_welded_far_out_stops_at_an_obstacle(tmp_path, monkeypatc
     ours, theirs = (motion(arm, monkeypatch, proofs, **options) for proofs in (True, False))
     for one, other in zip(ours, theirs, strict=True):
         assert_identical(one, other)
+
+
+def test_the_form_of_the_solver_changes_rounding_alone(tmp_path):
+    """A sparse Jacobian without islands, against MuJoCo's default, with contacts."""
+    of = shaped_tree(0, tmp_path, links=26, fixed_base=False)
+    parts = of.tables, of.ignored_pairs, of.joints, 1e-3, MujocoSolver()
+    ours = robot_model(SceneSpec(*parts, fixed_base=False)).model
+    theirs = copy.copy(ours)
+    theirs.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+    theirs.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    assert mujoco.mj_isSparse(ours)
+    assert not mujoco.mj_isSparse(theirs)
+    first, second = mujoco.MjData(ours), mujoco.MjData(theirs)
+    touched = 0
+    for _ in range(50):
+        mujoco.mj_step(ours, first)
+        mujoco.mj_step(theirs, second)
+        touched += first.ncon
+    assert touched
+    np.testing.assert_allclose(first.qpos, second.qpos, rtol=0, atol=1e-10)

@@ -430,7 +430,6 @@ def random_file(rng):
     )
 
 
-@pytest.mark.filterwarnings("ignore::batchpid.sim.MissedContactWarning")
 @pytest.mark.parametrize("seed", range(16))
 def test_random_files_in_contact_move_as_in_mujoco(load, monkeypatch, seed):
     rng = np.random.default_rng(seed)

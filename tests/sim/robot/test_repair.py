@@ -47,7 +47,7 @@ def test_repairs_have_the_effect_that_they_tell(tmp_path):
     assert load("joint name twice").joint_names == ("hinge", "hinge_2")
     assert [joint.mimic for joint in load("mimics in a circle").joints].count(None) == 1
     assert load("floating base").joint_names == ("hinge",)
-    assert {"placeholder", "no-effort-limit"} <= {
+    assert {"limits", "no-effort-limit"} <= {
         finding.code for finding in load("effort of 0").check()
     }
     heavy = load("no inertia").mass_matrix([0.0])[0]

@@ -8,17 +8,15 @@ import pytest
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import LogUniform, Randomization, Runner, Uniform
-from batchpid.sim.tuning import (
-    Moves,
+from batchpid.sim.tuning.evaluation import (
     arm_joints,
     evaluate_gains,
     following_error,
     load_randomization,
-    random_moves,
     run_moves,
     step_response_metrics,
-    tutorial_move,
 )
+from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 
 def hold(pose, name="hold"):
