@@ -33,6 +33,7 @@ def identify_logs(
     command_topic: str | None = None,
     prefix: str = "",
     no_payload: bool = False,
+    payload_link: str | None = None,
     extras: tuple[str, ...] = (),
     workers: Annotated[int, Field(low=0, high=1000)] = 0,
     force: bool = False,
@@ -41,7 +42,7 @@ def identify_logs(
     """Identify a robot's motors from logs of its motion, from this robot or another simulator.
 
     Finds armature, damping, friction, strength and bias of each joint, the delays of efforts and
-    setpoints and the payload at the tool, by fitting simulated motions; writes them for --actuators
+    setpoints, a lag of setpoints and a payload, by fitting simulated motions; writes them for --actuators
     of other commands. A log has a header and SI units: "time, setpoint:JOINT ..., qpos:JOINT ...",
     with the gains that drove the robot as --gains FILE, or "time, effort:JOINT ..., qpos:JOINT
     ...". The fit simulates a rigid-body model with a Runner's control and motors.
@@ -74,7 +75,10 @@ def identify_logs(
     prefix
         Prefix of the joints' names in the logs.
     no_payload
-        The tool carries no payload.
+        The robot carries no payload.
+    payload_link
+        Link that carries the payload. Default: the last one with a mass behind the last moving
+        link, or the tool, whichever explains the logs better.
     extras
         Further unknowns: load_friction, stribeck, offset, mass (of each link); with --gains also
         gain (a factor of gains that are not known), kd, saturation and slew (the limit of the
@@ -92,6 +96,7 @@ def identify_logs(
         logs,
         None if gains is None else _gains(robot, gains),
         payload=not no_payload,
+        payload_link=payload_link,
         reading=Reading(hold, degrees, topic, command_topic, prefix),
         compensate=compensate,
         timestep=timestep,

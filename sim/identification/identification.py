@@ -38,8 +38,8 @@ from batchpid.sim.identification.unknowns import (
     EXTRAS,
     KINDS,
     SENDER,
-    TOGETHER,
     Unknowns,
+    kinds_of,
 )
 from batchpid.sim.loop.step_values import ModelledFriction
 from batchpid.sim.options.groups import Compensation
@@ -355,7 +355,7 @@ def _unknowns(
         kinds += SENDER
         starts["setpoint_lag"] = np.zeros(1)
     for name in extras:
-        kinds += TOGETHER.get(name, (name,))
+        kinds += kinds_of(name)
         if KINDS[kinds[-1]].target == "law" and drive.params is None:
             problem = "is of a law, and the logs hold efforts"
             remedy = "leave it out, or give the params of the law"

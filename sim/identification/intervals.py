@@ -76,16 +76,16 @@ def certainty(problem: Problem, solution: Solution) -> Certainty:
     unknowns = problem.unknowns
     point, size, _ = solution
     prior = unknowns.spread(point)
-    residual, matrix, inverse = _information(problem, solution)
+    residual, matrix, covariance = _information(problem, solution)
     square = _mean_square(residual, len(point))
     data = matrix.T @ matrix / square
     # Stretches have independent noise.
     score = matrix * residual[:, None] / square
     sums = np.array([part.sum(0) for part in np.array_split(score, PARTS)])
-    spread = inverse @ (sums.T @ sums) @ inverse * PARTS / (PARTS - 1)
+    spread = covariance @ (sums.T @ sums) @ covariance * PARTS / (PARTS - 1)
     rows = residual.reshape(-1, len(size))
     colored = max(float((rows[1:] * rows[:-1]).sum() / (rows**2).sum()), 0.0)
-    variance = np.diagonal(inverse)
+    variance = np.diagonal(covariance)
     white = (1 - colored) * variance / np.diagonal(spread)
     common = max(1 - float(np.median(white)), colored)
     ratio = np.maximum((1 + common * (PARTS - 1)) * np.diagonal(spread), variance)
@@ -93,10 +93,10 @@ def certainty(problem: Problem, solution: Solution) -> Certainty:
     total = np.abs(unknowns.values(point) + unknowns.described)
     deviation = np.maximum(np.sqrt(ratio) * scale, LEAST_DEVIATION * total)
     # Correlations come from the information.
-    spans, axes = np.linalg.eigh(inverse)
+    spans, axes = np.linalg.eigh(covariance)
     lengths = np.minimum(deviation, scale) / np.sqrt(variance)
     root = lengths[:, None] * axes * np.sqrt(np.maximum(spans, 0.0))
-    alone = np.linalg.inv(data + FAINT_WEIGHT * np.eye(len(point)))
+    alone = inverse(data + FAINT_WEIGHT * np.eye(len(point)))
     faint = np.sqrt(np.diagonal(alone))
     alike = np.abs(alone) > ALIKE * np.outer(faint, faint)
     return Certainty(deviation, root, faint < SHOWN, alike, colored)
@@ -124,7 +124,12 @@ def _information(problem: Problem, solution: Solution) -> tuple[Float64, Float64
         axes = axes * prior
         if (np.abs(np.log(spans / before)) < SAME_LENGTH).all():
             break
-    return residual, matrix, np.linalg.inv(hessian)
+    return residual, matrix, inverse(hessian)
+
+
+def inverse(matrix: Float64) -> Float64:
+    """Return the inverse of a matrix (n, n)."""
+    return np.asarray(np.linalg.inv(matrix), float)
 
 
 def _mean_square(residual: Float64, unknowns: int) -> float:

@@ -242,7 +242,7 @@ class Identification:
             Masses are not among the unknowns (extras=["mass"]).
         """
         pairs = zip(self.unknowns.entries, self.values.tolist(), strict=True)
-        factors = {entry.link: value for entry, value in pairs if entry.kind == "mass"}
+        factors = {str(entry.link): value for entry, value in pairs if entry.kind == "mass"}
         if not factors:
             remedy = "identify with extras=['mass']"
             raise InvalidArgumentError("corrected_urdf", "no mass was found", remedy=remedy)

@@ -474,7 +474,8 @@ def simulate(
         rows = np.array([track[step][:, number::many] for step in stretch.step.tolist()])
         qpos = rows[:, 0] - stretch.before[:, None, None] * rows[:, 1]
         qpos = np.where(np.abs(qpos) < DIVERGED, qpos, np.inf)
-        positions.append(qpos.swapaxes(0, 1))
+        # Arrays from worker processes are contiguous: the same bits need the same layout here.
+        positions.append(np.ascontiguousarray(qpos.swapaxes(0, 1)))
     return positions
 
 

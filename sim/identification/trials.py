@@ -3,10 +3,11 @@ does.
 
 A start ends in a valley where the payload is sought at the wrong link, or the law's limit far from
 the error that saturates it: a short fit from each start shows the better one. What is fitted in
-addition to the motors has to lower the error at held-out rows, with free initial states: a delay or
-a lag of setpoints is left out unless its absence raises that error, and friction at rest, masses,
-offsets and load friction are added one after the other where the residuals are correlated and the
-error falls.
+addition to the motors has to lower the error at held-out rows, with free initial states of windows:
+a delay or a lag of setpoints is left out unless its absence raises that error, and friction at
+rest, masses, offsets and load friction are added, the most helpful first, where residuals are
+correlated and the error falls. One evaluation with all of them, and the linear step of each, tell
+which to try.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from batchpid.sim.identification.fit import (
     solve,
     triangle_of,
 )
-from batchpid.sim.identification.intervals import Certainty, certainty
+from batchpid.sim.identification.intervals import Certainty, certainty, inverse
 from batchpid.sim.identification.problem import Problem
-from batchpid.sim.identification.unknowns import SENDER, TOGETHER, Unknown
+from batchpid.sim.identification.unknowns import SENDER, Unknown, kinds_of
 
 TRIAL = 5
 """Evaluations of a short fit."""
@@ -38,8 +39,10 @@ KEPT = 0.95
 """Share of the held-out error that an unknown has to leave for it to be kept."""
 COLORED = 0.2
 """Correlation of the residuals from which further effects are tried."""
-EFFECTS = ("stribeck", "mass", "offset", "load_friction")
-"""Effects that are tried."""
+EFFECTS = {"stribeck": KEPT, "mass": 0.75, "offset": 0.75, "load_friction": 0.75}
+"""Effects that are tried, and the share of the held-out error that each has to leave: every motor
+has more friction at rest, but a few percent may be an error of the model that looks like a mass.
+"""
 
 Progress = Callable[[], object] | None
 
@@ -158,52 +161,48 @@ def _with_effect(
     problem, solution = result.problem, result.solution
     unknowns = problem.unknowns
     present = [entry.kind for entry in unknowns.entries]
-    kinds = [kind for kind in EFFECTS if kind not in present]
-    if not kinds:
+    effects = [effect for effect in EFFECTS if effect not in present]
+    if not effects:
         return result
     # All effects at once, at the values where they are none.
-    none = {"load_friction": np.zeros(len(unknowns.joints)), "static": np.zeros(len(unknowns.joints))}
-    names = [name for kind in kinds for name in TOGETHER.get(kind, (kind,))]
-    wider = unknowns.adding(names, none)
-    added = len(wider.entries) - len(present)
+    zero = np.zeros(len(unknowns.joints))
+    kinds = [kind for effect in effects for kind in kinds_of(effect)]
+    wider = unknowns.adding(kinds, {"load_friction": zero, "static": zero})
     wide = replace(problem, unknowns=wider)
-    point = np.append(solution.point, wider.start[-added:])
+    count = len(present)
+    point = np.append(solution.point, wider.start[count:])
     changes = FIRST_CHANGE * np.eye(len(point))
-    changes[:-added, :-added] = _axes(result)
+    changes[:count, :count] = _axes(result)
     if progress is not None:
         progress()
     triangle = triangle_of(wide, iterate(wide, point, changes), solution.size)
-    low, high = wider.bounds
-    steps = np.zeros((len(kinds), len(point)))
-    for step, kind in zip(steps, kinds, strict=True):
-        names = TOGETHER.get(kind, (kind,))
-        is_free = np.array([entry.kind in (*names, *present) for entry in wider.entries])
+    low, high = wider.bounds - point
+    names = np.array([entry.kind for entry in wider.entries])
+    steps = np.zeros((len(effects), len(point)))
+    for step, effect in zip(steps, effects, strict=True):
+        is_free = np.isin(names, [*present, *kinds_of(effect)])
         columns = triangle[:, np.append(True, is_free)]
-        step[is_free], _ = bounded_step(
-            columns, DAMPING, (low - point)[is_free], (high - point)[is_free]
-        )
-    errors = wide.errors(point, steps) / solution.size
-    left = np.linalg.norm(errors, axis=1)
-    best = int(np.argmin(left[1:]))
-    kind = kinds[best]
-    if left[1 + best] > KEPT * left[0]:
+        step[is_free], _ = bounded_step(columns, DAMPING, low[is_free], high[is_free])
+    before, *after = np.linalg.norm(wide.errors(point, steps) / solution.size, axis=1).tolist()
+    ratios = [left / EFFECTS[effect] for left, effect in zip(after, effects, strict=True)]
+    best = int(np.argmin(ratios))
+    if ratios[best] > before:
         return result
-    names = TOGETHER.get(kind, (kind,))
-    is_used = np.array([entry.kind in (*names, *present) for entry in wider.entries])
+    is_used = np.isin(names, [*present, *kinds_of(effects[best])])
     problem = replace(problem, unknowns=wider.only(is_used))
-    solution = solve(problem, (point + steps[best])[is_used], None, evaluations, progress)
-    after = np.linalg.norm(problem.errors(solution.point)[0] / result.solution.size)
-    if after > KEPT * left[0]:
+    further = solve(problem, (point + steps[best])[is_used], None, evaluations, progress)
+    share = _left(problem, further._replace(size=solution.size)) / before
+    if share > EFFECTS[effects[best]]:
         return result
-    effects = {**result.effects, kind: float(after / left[0])}
-    return Fit(problem, solution, certainty(problem, solution), result.dropped, effects)
+    added = {**result.effects, effects[best]: share}
+    return Fit(problem, further, certainty(problem, further), result.dropped, added)
 
 
 def _axes(result: Fit) -> Float64:
     """Return changes (unknowns, unknowns) along the axes of the covariance."""
     root = result.certainty.root / result.problem.unknowns.sizes[:, None]
     scale = np.maximum(np.abs(result.solution.point), 1.0)
-    axes, _ = axes_of(np.linalg.inv(root @ root.T), scale)
+    axes, _ = axes_of(inverse(root @ root.T), scale)
     return axes
 
 

@@ -73,10 +73,13 @@ EXTRAS = ("load_friction", "stribeck", "offset", "mass", "gain", "kd", "saturati
 """Kinds that a fit has on request; "stribeck" brings "static" with it."""
 SENDER = ("setpoint_delay", "setpoint_lag")
 """Kinds that every fit of setpoints has in addition."""
-TOGETHER = {"stribeck": ("static", "stribeck")}
-"""Kinds that are one effect."""
 DESCRIBED = {"damping": "damping", "friction": "friction"}
 """Kinds that add to a value of the robot's description, and the name there."""
+
+
+def kinds_of(effect: str) -> list[str]:
+    """Return the kinds of unknowns of an effect that a fit has on request."""
+    return ["static", effect] if effect == "stribeck" else [effect]
 
 
 class Unknown(NamedTuple):
@@ -201,7 +204,9 @@ class Unknowns:
     @cached_property
     def described(self) -> Float64:
         """Values of the robot's description (unknowns,), which add to those here."""
-        return np.array([-entry.least if entry.kind in DESCRIBED else 0.0 for entry in self.entries])
+        return np.array(
+            [-entry.least if entry.kind in DESCRIBED else 0.0 for entry in self.entries]
+        )
 
     def tables(self, values: Float64, *targets: str) -> dict[str, Float64]:
         """Return the ``values`` (n, unknowns) of kinds that change one of ``targets`` as tables (n,
