@@ -24,7 +24,7 @@ from batchpid.motors.actuators import FIELDS as ACTUATORS
 from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.options.options import GROUPS, OPTIONS, RunnerKeywords
 from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
-from batchpid.sim.robot.findings import OF_FILES, OF_ROBOTS, Kind
+from batchpid.sim.robot.findings import OF_FILES, OF_ROBOTS, FindingKind
 
 DOCS = Path(__file__).parent
 
@@ -86,7 +86,7 @@ def options() -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
-def findings(kinds: tuple[Kind, ...], when: str, done: str) -> str:
+def findings(kinds: tuple[FindingKind, ...], when: str, done: str) -> str:
     """Return the table of kinds of findings, with the headers of two of its columns."""
     rows = [("code", when, done), ("---",) * 3]
     rows += [(f"`{kind.code}`", _escaped(kind.when), _escaped(kind.done)) for kind in kinds]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.array_types import Rows
 from batchpid.sim import Robot, Rollout, write_recording
 from batchpid.sim.diagnosis.causes import settled_envs
 from batchpid.sim.diagnosis.text import cause_lines, median_and_worst, overshoot_of_settled, table
@@ -164,26 +164,6 @@ class RunReport:
             elif not failed.size:
                 lines.append(f"Every joint of every env settled {within} its move.")
         return lines + list(cause_lines(rollout.findings(self.robot)))
-
-    def document(self) -> Document:
-        """Return the figures, lists by env."""
-        names, units, figures = self.columns
-        info = self.rollout.info
-        joints = {}
-        for joint, (name, unit) in enumerate(zip(names, units, strict=True)):
-            columns = {column: values[:, joint] for column, values in figures.items()}
-            joints[name] = {"unit": unit, **columns}
-        return {
-            "robot": info.robot,
-            "control": info.control,
-            "tool": info.tool,
-            "engine": info.engine,
-            "physics": info.physics,
-            "num_envs": self.rollout.num_envs,
-            "seconds": self.seconds,
-            "failed": np.flatnonzero(~self.rollout.ok.all(0)),
-            "joints": joints,
-        }
 
     def save(self, path: Path) -> None:
         """Write the recording."""

@@ -1,8 +1,7 @@
 """Preflight: oddities of a robot, its gains and its setpoint, reported before the first step.
 
 ``Robot.load`` raises an error if no engine can run the file. A :class:`batchpid.sim.Finding`
-reports a robot that runs, but differently than the file or the user intends. :data:`RULES` is the
-table of the oddities.
+reports a robot that runs, but differently than the file or the user intends: :data:`ODDITIES`.
 """
 
 from __future__ import annotations
@@ -23,9 +22,13 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
+from batchpid.sim.engine.protocol import load_engine
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.geometry.inertia import triangle_excess
+from batchpid.sim.geometry.shapes import hull_share
 from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import KINDS, SEVERITIES, Finding, Findings
-from batchpid.sim.robot.inertia import triangle_excess
+from batchpid.sim.robot.tables import LEAST_MASS
 from batchpid.sim.robot.urdf import GIVE_RANGE
 
 LEAST_EXCESS = 0.01
@@ -38,6 +41,8 @@ extreme ratios of the bundled robots and of example-robot-data 6.0.0 are 3.2 and
 """
 SHORTEST_CHAIN = 0.3
 """Least length of the chain [m] that is assumed, e.g. for robots with all joints at one point."""
+LARGEST_HULL = 1.2
+"""Volume of a mesh's hull over that of the mesh, from which it is reported."""
 MOST_RADIANS, PLACEHOLDER = 4 * np.pi, 1000.0
 """Bounds between which limits of a hinge are taken for degrees [rad]; larger ones mean "no
 limit".
@@ -51,6 +56,7 @@ def check(
     setpoint: ArrayLike | None,
     timestep: float,
     control: str,
+    engine: str | None,
 ) -> Findings:
     """Return the findings, most severe first; :meth:`batchpid.sim.Robot.check` describes the
     arguments.
@@ -74,13 +80,18 @@ def check(
         params = params if control == "pid" else None
     plan = _Plan(robot, start, goal, params, timestep)
     findings = [*robot.repairs, *robot.srdf.findings]
-    for rule in RULES:
-        kind = KINDS[rule.code]
-        for place in rule.places(plan):
+    for oddity in ODDITIES:
+        kind = KINDS[oddity.code]
+        for place in oddity.places(plan):
             text = place.text or kind.when
             remedy = place.remedy or kind.done
             where = place.joint, place.link, place.detail
             findings.append(Finding(kind.code, text, remedy, *where))
+    if engine is not None:
+        chosen = load_engine(engine)
+        ground = {"ground": robot.has_ground, "mjcf": robot.mjcf}
+        scene = SceneSpec.of(robot, timestep, chosen.physics["accurate"], **ground)
+        findings += [*chosen.refusals(scene), *chosen.shortfalls(scene)]
     return Findings(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
@@ -96,7 +107,7 @@ class Place(NamedTuple):
     remedy: str = ""
 
 
-class Rule(NamedTuple):
+class Oddity(NamedTuple):
     """Kind of finding, and the places that have it."""
 
     code: str
@@ -185,7 +196,7 @@ def _massless(plan: _Plan) -> Iterator[Place]:
     bodies = {name: place.link for name, place in robot.bodies.items()}
     root = bodies[robot.all_joints[0].parent_link]
     masses = robot.link_masses
-    loaded = {bodies[name] for name, mass in masses.items() if mass.mass}
+    loaded = {bodies[name] for name, mass in masses.items() if mass.mass > LEAST_MASS}
     # Bodies with mass in them, or in the links that they carry.
     for joint in reversed(robot.all_joints):
         if bodies[joint.child_link] in loaded:
@@ -197,6 +208,15 @@ def _massless(plan: _Plan) -> Iterator[Place]:
             yield Place(link=name, detail=f"{mass.mass:.3g} kg")
         elif name == bodies[name] and name not in loaded:
             yield Place(link=name, detail="1e-6 kg")
+
+
+def _changed_meshes(plan: _Plan) -> Iterator[Place]:
+    """Yield links with a mesh that is much smaller than the hull that collides in its place."""
+    for shape in plan.robot.tables.shapes:
+        if (share := hull_share(shape)) > LARGEST_HULL:
+            text = "a collision mesh is not convex, and collides as its convex hull"
+            detail = f"{share:.3g} times its volume"
+            yield Place(None, shape.owner, detail, text, "divide the mesh into convex parts")
 
 
 def _touching(plan: _Plan) -> Iterator[Place]:
@@ -290,17 +310,18 @@ def _unstable(plan: _Plan) -> Iterator[Place]:
     yield Place(joint, detail=detail, remedy=report.remedy)
 
 
-RULES = (
-    Rule("units", _odd_sizes),
-    Rule("units", _odd_angles),
-    Rule("inertia", _odd_inertia),
-    Rule("no-inertia", _massless),
-    Rule("touching", _touching),
-    Rule("out-of-limits", _outside),
-    Rule("limits", _without_range),
-    Rule("effort-limit", _weak),
-    Rule("no-effort-limit", _without_effort_limit),
-    Rule("continuous", _wrong_turns),
-    Rule("unstable", _unstable),
+ODDITIES = (
+    Oddity("units", _odd_sizes),
+    Oddity("units", _odd_angles),
+    Oddity("inertia", _odd_inertia),
+    Oddity("no-inertia", _massless),
+    Oddity("collision", _changed_meshes),
+    Oddity("touching", _touching),
+    Oddity("out-of-limits", _outside),
+    Oddity("limits", _without_range),
+    Oddity("effort-limit", _weak),
+    Oddity("no-effort-limit", _without_effort_limit),
+    Oddity("continuous", _wrong_turns),
+    Oddity("unstable", _unstable),
 )
 """Every oddity, in the order in which they are listed."""

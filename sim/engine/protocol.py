@@ -10,7 +10,7 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from sys import modules
@@ -23,6 +23,7 @@ from batchpid.io.packages import imported
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.robot.findings import Finding
 from batchpid.task_space.rigid_tree import RigidTree
 
 Capability = Literal["build", "partial_force", "base_state", "complete_state", "sapien_dissipation"]
@@ -37,9 +38,7 @@ Capability = Literal["build", "partial_force", "base_state", "complete_state", "
 
 
 class CompiledStep(Protocol):
-    """Sim step of a pack as one native call, also from XLA
-    (:func:`batchpid.sim.engine.native.xla.sim_step`).
-    """
+    """Sim step of a pack as one native call."""
 
     def prepare(self) -> int:
         """Return the address of the native group for the next steps."""
@@ -242,7 +241,7 @@ class EnginePack(Protocol):
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
 
-    # Sim steps in native code and in programs of XLA, where they are native.
+    # Sim steps in native code, where they are native.
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether a compiled step reads this part of the passive force; otherwise call
@@ -283,6 +282,11 @@ class EnginePack(Protocol):
         """Free the envs. The pack cannot be used afterwards."""
 
 
+def _nothing(spec: SceneSpec) -> Iterator[Finding]:
+    """Yield the limits of an engine that has none: nothing."""
+    return iter(())
+
+
 @dataclass
 class Engine:
     """Physics engine: it makes packs of robots."""
@@ -311,6 +315,10 @@ class Engine:
     """
     native_obstacle: Callable[[], str]
     """Reason for which native code cannot call the engine, in a sentence; "" if it can."""
+    refusals: Callable[[SceneSpec], Iterator[Finding]] = _nothing
+    """Yields what of a scene it cannot run at all."""
+    shortfalls: Callable[[SceneSpec], Iterator[Finding]] = _nothing
+    """Yields what of a scene it runs otherwise than the robot's file says."""
 
     def is_physics(self, settings: object) -> bool:
         """Return whether ``settings`` are settings of its solver."""

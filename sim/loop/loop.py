@@ -18,15 +18,14 @@ import batchpid as bp
 from batchpid.arrays.array_types import Rows
 from batchpid.errors import BatchPIDError, ControllerError, WorkerError
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.backend import native_obstacle
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_group import EnvGroup
 from batchpid.sim.loop.env_parts import make_pack
+from batchpid.sim.loop.jax_executor import ROWS
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks
 from batchpid.sim.loop.snapshot import Snapshot, join_rows
-from batchpid.sim.loop.xla_executor import ROWS
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 
@@ -125,18 +124,9 @@ class Loop:
         envs: slice,
         arrays: Arrays,
     ) -> None:
-        robot = options.robot
         self.options, self.arrays = options, arrays
         self._first_env = envs.start
-        self._scene = SceneSpec(
-            tables=robot.tables,
-            ignored=robot.ignored_pairs,
-            joints=robot.joints,
-            dissipation=robot.dissipation,
-            fixed_base=robot.fixed_base,
-            mjcf=options.mjcf,
-            **options.values_for("scene"),
-        )
+        self._scene = options.scene
         self._steps = 0
         self._given: tuple[bool, ...] = ()
         self._workspace: dict[object, object] = {}
@@ -301,7 +291,7 @@ def group_size(options: RunnerOptions) -> int:
     """Return the number of envs of a group, which changes no result."""
     engine = options.load_engine()
     obstacle = engine.native_obstacle() or native_obstacle(options)
-    # Calls of NumPy and XLA have an overhead, which more envs share.
+    # Calls of NumPy and JAX have an overhead, which more envs share.
     if obstacle or options.backend != "numpy":
         return max(engine.group_size, ROWS)
     return engine.group_size

@@ -7,23 +7,24 @@ Ctrl-C held back.
 
 from __future__ import annotations
 
+import io
 import os
 import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from batchpid.arrays.array_types import Rows
 from batchpid.checks.validate import flag, instance
 from batchpid.errors import ClosedError, InvalidArgumentError, SingleOwner
-from batchpid.sim.loop.arrays import Command
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import RecordingError
 from batchpid.sim.signals.quantities import Observation
 from batchpid.sim.signals.rollout import RunInfo
+from batchpid.stages.values import Command
 
 if TYPE_CHECKING:
     import h5py
@@ -75,9 +76,9 @@ class Recorder(SingleOwner):
             problem = f"is being recorded already, to {runner.recorder.path}"
             raise InvalidArgumentError("runner", problem, remedy="close that Recorder first")
         if flag("overwrite", overwrite):
-            self._mode = "w"
+            self._mode = "w+"
         else:
-            self._mode = "x"
+            self._mode = "x+"
         self.path: Path = files.check_path(path, overwrite=overwrite)
         self._runner = runner
         self._info: RunInfo | None = None  # at the first tick
@@ -99,7 +100,10 @@ class Recorder(SingleOwner):
             An earlier tick could not be written.
         """
         if self._error is not None:
-            cause = " ".join(str(self._error).split())  # HDF5 writes several lines
+            # HDF5 writes several lines.
+            cause = " ".join(str(self._error).split())
+            if isinstance(self._error, FileExistsError):
+                cause = "it exists since the recorder was made; pass overwrite=True"
             raise RecordingError(f"{self.path}: cannot be written: {cause}") from self._error
         if self._info is None:
             self._info = replace(self._runner.info, complete=False)
@@ -161,7 +165,12 @@ class Recorder(SingleOwner):
         if self._file:  # not closed yet
             info = replace(info, faults=self._runner.faults, rates=self._rates)
             self._file.attrs.update(files.attributes(info))
+            self._close_file()
+
+    def _close_file(self) -> None:
+        if self._file:
             self._file.close()
+            self._output.close()
 
     def _write(self) -> None:
         """Write the rows that are not written yet, into a new file at first. Raises
@@ -176,20 +185,38 @@ class Recorder(SingleOwner):
                 assert self._info is not None
                 tick = runner.timestep * runner.substeps
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                self._file = h5py.File(self.path, self._mode, libver=files.LIBVER, locking=False)
+                self._output = _Output(self.path, self._mode)
+                self._file = h5py.File(self._output, "w", libver=files.LIBVER)
                 self._datasets = files.create_datasets(
                     self._file, self._info, runner.num_envs, tick
                 )
             if rows:
                 files.write_rows(self._datasets, self._count, _stacked(rows))
+            if self._output.error is not None:
+                raise self._output.error
         except (OSError, RuntimeError) as error:
             self._error = error
-            if self._file is not None:
-                _abandon(self._file)
+            self._close_file()
             self.prepare()  # raises
         self._count += len(rows)
         self._rows = []
         self._last_write = time.monotonic()
+
+
+class _Output(io.FileIO):
+    """File that HDF5 writes. It keeps the first error, of which HDF5 learns nothing: after one it
+    would crash the process at its end.
+    """
+
+    error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        try:
+            if self.error is None:
+                super().write(data)
+        except OSError as error:
+            self.error = error
+        return len(data)
 
 
 def _stacked(rows: list[dict[str, Rows]]) -> dict[str, Rows]:
@@ -201,14 +228,3 @@ def _stacked(rows: list[dict[str, Rows]]) -> dict[str, Rows]:
         zeros = np.zeros_like(present)
         arrays[name] = np.array([row.get(name, zeros) for row in rows])
     return arrays
-
-
-def _abandon(file: h5py.File) -> None:
-    """Close a file that cannot be written, without another write: HDF5 would crash the process at
-    its end.
-    """
-    memory = os.memfd_create("batchpid-recording", os.MFD_CLOEXEC)
-    os.dup2(memory, file.id.get_vfd_handle(), inheritable=False)
-    os.close(memory)
-    with suppress(OSError, RuntimeError):
-        file.close()

@@ -16,7 +16,7 @@ from batchpid.errors import RobotError, warn
 SEVERITIES = ("warning", "note")  # probably an error; good to know
 
 
-class Kind(NamedTuple):
+class FindingKind(NamedTuple):
     """Kind of findings, which its ``code`` names for programs."""
 
     code: str
@@ -29,105 +29,107 @@ class Kind(NamedTuple):
 
 
 OF_FILES = (
-    Kind("xml", "warning",
+    FindingKind("xml", "warning",
          "text around the root, a wrong encoding, `--` in a comment, an undeclared prefix, elements of xacro",
          "the first `<robot>`; a default namespace (`xmlns=`) is ignored. `${...}` or `$(...)` in an attribute is an"
          " error: the file was never expanded"),
-    Kind("unknown-element", "note",
-         "elements that no URDF has; in an MJCF file sites, sensors, and keyframes other than \"home\"",
+    FindingKind("unknown-element", "note",
+         "elements and attributes that no URDF has, or that have no effect here; in an MJCF file sites, sensors,"
+         " cameras, sleep, and keyframes other than \"home\"",
          "without them"),
-    Kind("repeated", "warning",
+    FindingKind("repeated", "warning",
          "names used twice or missing; several `<limit>`, `<origin>`, `<inertial>`, ... of one element, or shapes of"
          " one `<geometry>`",
          "the first of them; joints get a name, and a robot is called after its file"),
-    Kind("loose-link", "warning",
+    FindingKind("loose-link", "warning",
          "a link that joints name but nothing defines; a link that no joint names",
          "an empty link; without the link"),
-    Kind("joint", "warning",
+    FindingKind("joint", "warning",
          "floating, planar and unknown joints; an axis without direction",
          "fixed joints, a floating one at the root a floating base; the x axis, the URDF's default"),
-    Kind("limits", "warning",
+    FindingKind("limits", "warning",
          "limits that are swapped, missing, unreadable, all 0 or equal; `effort` or `velocity` of 0 or -1; in an MJCF"
-         " file effort limits that differ by direction",
-         "swapped back; no limit (equal ones stay); the smaller limit"),
-    Kind("dynamics", "warning", "friction or damping that is negative or no number", "0"),
-    Kind("mimic", "warning",
+         " file effort limits that differ by direction, and limits of a servo's setpoints",
+         "swapped back; no limit (equal ones stay); the smaller limit; `guard=True` keeps to those of setpoints"),
+    FindingKind("dynamics", "warning", "friction or damping that is negative or no number", "0"),
+    FindingKind("mimic", "warning",
          "a mimic of a fixed or unknown joint, of itself, in a circle, or by 0",
          "an independent joint"),
-    Kind("inertia", "warning",
+    FindingKind("inertia", "warning",
          "an inertia tensor that no body has, or none; a mass that is no number",
          "the nearest possible tensor, or as given, see below; no mass"),
-    Kind("collision", "warning",
-         "shapes without geometry, extent or place",
-         "without the shape"),
-    Kind("missing-mesh", "warning",
+    FindingKind("collision", "warning",
+         "shapes without geometry, extent or place; meshes of a URDF that are not convex",
+         "without the shape; the convex hull of the mesh collides"),
+    FindingKind("missing-mesh", "warning",
          "a mesh that is not there or cannot be read",
          "without the shape; `missing_meshes=\"error\"` refuses"),
-    Kind("self-collision", "warning",
+    FindingKind("self-collision", "warning",
          "a pair in the .srdf that does not name two links of the robot",
          "without the pair"),
-    Kind("actuator", "warning",
+    FindingKind("actuator", "warning",
          "an MJCF actuator other than a motor or servo of one joint: of several joints, a muscle, with a filter or"
          " delay; a joint without actuator",
          "a motor for each joint"),
-    Kind("option", "warning",
+    FindingKind("option", "warning",
          "in an MJCF file other gravity, and bodies with `gravcomp`",
          "gravity of -9.81 m/s^2, without compensation"),
-    Kind("engine", "warning",
+    FindingKind("engine", "warning",
          "content that an engine simulates otherwise than the file says: in SAPIEN closed loops, tendons, springs,"
-         " `<flag>`s, a medium, bodies apart from the robot, height fields, planes other than a level one at height 0",
+         " nonlinear damping, `<flag>`s, a medium, bodies apart from the robot, height fields, planes other than a"
+         " level one at height 0, wheels that are cylinders, and pairs of links beyond its filter",
          "as the finding says; MuJoCo simulates the file itself"),
 )  # fmt: skip
 """Kinds of findings about a file."""
 OF_ROBOTS = (
-    Kind("units", "warning",
+    FindingKind("units", "warning",
          "sizes or angles are not those of a robot: millimetres read as metres, or degrees as radians",
          "give metres and radians, meshes in millimetres with <mesh scale='0.001 0.001 0.001'>"),
-    Kind("no-inertia", "warning",
-         "no <inertial>, or a mass of 0: its collision shapes give mass and inertia, or without shapes it weighs"
+    FindingKind("no-inertia", "warning",
+         "no <inertial>: its collision shapes give mass and inertia; without shapes, or with a mass of 0, it weighs"
          " 1e-6 kg",
          "add <inertial> with mass and inertia: gains in efforts cannot control a link without mass"),
-    Kind("out-of-limits", "warning",
-         "start pose or setpoint are outside the joint limits",
-         "move them inside"),
-    Kind("touching", "warning",
+    FindingKind("out-of-limits", "warning",
+         "the setpoint or the start pose is outside the joint limits",
+         "move it inside"),
+    FindingKind("touching", "warning",
          "links touch or overlap each other, or the ground",
          "choose another pose or path, correct the collision shapes, disable the pair in an .srdf, or use"
          " ground=False"),
-    Kind("effort-limit", "warning",
+    FindingKind("effort-limit", "warning",
          "the effort limit does not suffice for gravity and friction, or for the move in its time",
          "raise the effort limit, lighten the load, choose other poses, or give the move more time"),
-    Kind("no-effort-limit", "note",
+    FindingKind("no-effort-limit", "note",
          "no effort limit: designed and tuned gains use limits from gravity and inertia",
          "give <limit effort=>, or pass effort_limit= to robot.params()"),
-    Kind("continuous", "warning",
+    FindingKind("continuous", "warning",
          "the joint is continuous in the file or in params alone",
          "use robot.params(), or give make_params the continuous= of the file"),
-    Kind("unstable", "warning",
+    FindingKind("unstable", "warning",
          "the gains are near the stability bound of the sampled PID loop, or beyond it",
          "lower the gains, or use robot.designed()"),
 )  # fmt: skip
 """Kinds of findings about a robot, its gains and its setpoint."""
 OF_RUNS = (
-    Kind("failed", "warning",
+    FindingKind("failed", "warning",
          "an input was not finite, or the state diverged",
          "correct the input or lower the gains"),
-    Kind("out-of-reach", "warning",
+    FindingKind("out-of-reach", "warning",
          "no pose within the joint limits brings the tool to the setpoint",
          "move it nearer"),
-    Kind("guard", "warning",
+    FindingKind("guard", "warning",
          "the guard holds the setpoint back",
          "move it inside the guard's limits, or give it more time"),
-    Kind("oscillates", "warning",
+    FindingKind("oscillates", "warning",
          "oscillates: gains are beyond the stability bound, hardly damped, or too high for the delays",
          "use robot.designed(), or raise kd and lower kp and ki; robot.check(params=) tells which"),
-    Kind("blocked", "warning",
+    FindingKind("blocked", "warning",
          "something outside the robot's model acts on it: an object, a payload, another force",
          "look at the scene; for a constant load use gains with integral action"),
-    Kind("gains", "warning",
+    FindingKind("gains", "warning",
          "rests away from the setpoint: the remaining error balances gravity or friction",
          "raise kp, ki or integral_limit, or compensate gravity and friction"),
-    Kind("slow", "warning",
+    FindingKind("slow", "warning",
          "still moves at the end of the run: to its setpoint, or behind a moving one",
          "run longer, hold the last setpoint, pass setpoint_rate, or raise the gains"),
 )  # fmt: skip
@@ -232,23 +234,42 @@ def _sentence(same: Sequence[Finding]) -> str:
     )
 
 
+class Notes(NamedTuple):
+    """Findings of a file that is read: ``repairs`` are what is simulated otherwise than the file
+    says, ``losses`` what is lost where MuJoCo does not simulate an MJCF file itself.
+    """
+
+    repairs: list[Finding]
+    losses: list[Finding]
+
+    def lose(self, text: str, joint: str | None = None, link: str | None = None) -> None:
+        """Add a loss."""
+        remedy = "use the engine 'mujoco', which simulates the file itself"
+        self.losses.append(Finding("engine", text, remedy, joint, link))
+
+
 class RepairWarning(UserWarning):
     """A robot's file was read with repairs."""
 
 
 def report(path: Path, repairs: Sequence[Finding], strict: bool) -> None:
-    """Warn of the ``repairs`` of the file at ``path``; if ``strict``, raise a RobotError that lists
-    them.
+    """Warn of the ``repairs`` of the file at ``path`` that change the motion; if ``strict``, raise
+    a RobotError that lists them.
     """
-    if not repairs:
+    severe = [finding for finding in repairs if finding.severity == "warning"]
+    if not severe:
         return
-    if len(repairs) == 1:
-        count = "1 repair"
-    else:
-        count = f"{len(repairs)} repairs"
+    count = "1 repair" if len(severe) == 1 else f"{len(severe)} repairs"
     if not strict:
         warn(f"{path}: {count}; robot.check() and batchpid inspect list them", RepairWarning)
         return
-    sentences = [sentence.partition(": ")[2] for sentence in summary(repairs)]
+    sentences = [sentence.partition(": ")[2] for sentence in summary(severe)]
     listed = "".join(f"\n  {sentence}" for sentence in sentences)
     raise RobotError(f"{path}: needs {count}, which strict=True refuses:{listed}")
+
+
+def report_shortfalls(path: Path, engine: str, shortfalls: Iterable[Finding]) -> None:
+    """Warn of what an engine runs otherwise than the file at ``path`` says."""
+    if count := len(list(shortfalls)):
+        text = f"engine {engine!r} runs otherwise than the file says in {count} findings"
+        warn(f"{path}: {text}; robot.check(engine={engine!r}) lists them", RepairWarning)

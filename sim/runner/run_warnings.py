@@ -7,6 +7,7 @@ from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.robot.findings import report_shortfalls
 from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.pool import RecoveryWarning
@@ -17,6 +18,8 @@ class RunWarnings:
 
     def __init__(self, options: RunnerOptions) -> None:
         robot = options.robot
+        shortfalls = options.load_engine().shortfalls(options.scene)
+        report_shortfalls(robot.path, options.engine, shortfalls)
         timestep = options.timestep
         control = options.control
         self.limits = SetpointCheck(robot)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from batchpid.arrays.array_types import Document, Progress
-from batchpid.arrays.field_tables import Field
 from batchpid.motors import DRIVEN
 from batchpid.sim.diagnosis.text import cause_lines, median_and_worst, overshoot_of_settled, table
 from batchpid.sim.engine.protocol import load_engine
@@ -135,9 +134,9 @@ class Comparison:
 def compare(
     robot: Robot,
     gains: tuple[str, ...] | Sequence[GainSet] = (),
-    moves: Annotated[int, Field(low=1, high=100_000)] = 20,
-    seed: Annotated[int, Field(high=2**31 - 1)] = 0,
-    seconds: Annotated[float, Field("simulated time, s", low=1e-6, high=1e6)] = 2.0,
+    moves: int = 20,
+    seed: int = 0,
+    seconds: float = 2.0,
     engine: tuple[EngineName, ...] | EngineName | None = None,
     randomization: Randomization | None = None,
     workers: int | None = None,

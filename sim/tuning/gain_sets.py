@@ -6,8 +6,11 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.diagnosis.text import table
 from batchpid.sim.options.groups import ControlMode
 from batchpid.sim.robot.robot import Robot
 
@@ -76,3 +79,22 @@ def default_sets(robot: Robot) -> tuple[str, ...]:
     if robot.settings:
         return ("tuned", "sapien-tutorial", "drive")
     return ("designed", "drive")
+
+
+def gain_table(robot: Robot, params: bp.PIDParams) -> str:
+    """Return a table of the gains as efforts per error at the robot's start pose, of the first
+    env.
+
+    Gains of accelerations are multiplied by the inertia of each joint.
+    """
+    inertia = np.ones(robot.dof)
+    if params.gain_units is not None:
+        inertia = np.diagonal(robot.mass_matrix(robot.start)[0])
+    rows = []
+    for index, joint in enumerate(robot.joints):
+        cells = [f"{joint.name} [{joint.effort_unit}/{joint.unit}]"]
+        for gains in (params.kp, params.ki, params.kd):
+            gain = 0.0 if gains is None else inertia[index] * np.asarray(gains)[0, index]
+            cells.append(f"{gain:.3g}")
+        rows.append(cells)
+    return table(rows, ("gains at the start pose", "kp", "ki, per s", "kd, s"), "lrrr")

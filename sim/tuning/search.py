@@ -36,7 +36,7 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.candidates import FACTORS, Candidates
 from batchpid.sim.tuning.comparison import Comparison, compare
 from batchpid.sim.tuning.evaluation import SUBSTEPS, reseeded, tuning_engine
-from batchpid.sim.tuning.gain_sets import GainSet
+from batchpid.sim.tuning.gain_sets import GainSet, gain_table
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class Tuning:
     rejected: str | None
     """Why the designed gains are the result; None if a candidate was best."""
     scene: Document
-    """Options of the comparison with the designed gains."""
+    """Options of the comparison with the designed gains, and its progress."""
 
     @cached_property
     def comparison(self) -> Comparison:
@@ -93,7 +93,8 @@ class Tuning:
         ]
         if self.rejected is not None:
             lines.append(f"The designed gains are the result: {self.rejected}.")
-        return "\n".join([*lines, self.comparison.report()])
+        lines += [self.comparison.report(), "", gain_table(self.robot, self.params)]
+        return "\n".join(lines)
 
     def save(self, path: str | Path) -> None:
         """Write the params and the settings of the search."""
@@ -120,7 +121,7 @@ def tune(
     motors: bp.Actuators | None = None,
     engine: EngineName | None = None,
     workers: int | None = None,
-    progress: Progress[int] | None = None,
+    progress: Progress[Any] | None = None,
     **runner_options: Any,
 ) -> Tuning:
     """Tune the gains of any robot: design them from its inertia, then search by CMA-ES on simulated
@@ -158,7 +159,7 @@ def tune(
     workers
         Processes that step the scenes; 0: this one. Default: one per available core.
     progress
-        Wraps the range of generations, e.g. ``tqdm.tqdm``.
+        Wraps the range of generations, and the sets of the comparison, e.g. ``tqdm.tqdm``.
     runner_options
         More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``, for the final round.
         In the search, robots with a fixed base and without a ``build`` have no collision shapes and
@@ -258,7 +259,7 @@ def tune(
         history=history,
         settings=settings,
         rejected=f"no candidate beats the designed gains in the {stage}" if best == 0 else None,
-        scene=scene | {"engine": (engine,), "randomization": randomization},
+        scene=scene | {"engine": (engine,), "randomization": randomization, "progress": progress},
     )
 
 

@@ -10,7 +10,7 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.shapes import surfaces
+from batchpid.sim.view.surfaces import surfaces
 from batchpid.task_space.frames import placed
 
 MAX_ROBOTS = 64

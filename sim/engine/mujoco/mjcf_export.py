@@ -24,8 +24,8 @@ from batchpid.sim.engine.mujoco.actuator_export import FAR, MjcfActuators, numbe
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
+from batchpid.sim.geometry.inertia import nearest_physical
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.inertia import nearest_physical
 from batchpid.sim.robot.robot_model import base_start
 from batchpid.task_space.frames import SpatialInertia
 
@@ -84,16 +84,7 @@ def to_mjcf(
         params = make_params(robot.dof, 0.0, measurement_rate="measured")
     law = export_law(params, robot.joint_names, dt, inertia, actuators, guard, has_law)
     sentences = differences(law, "mjcf", robot.independent)
-    spec = SceneSpec(
-        robot.tables,
-        robot.ignored_pairs,
-        robot.joints,
-        law.dt,
-        SOLVERS["accurate"],
-        dissipation=robot.dissipation,
-        ground=robot.has_ground,
-        fixed_base=robot.fixed_base,
-    )
+    spec = SceneSpec.of(robot, law.dt, SOLVERS["accurate"], ground=robot.has_ground)
     # The bodies are those that the engine simulates; inertias and efforts are then written with all
     # their digits.
     scene, names = robot_spec(spec)

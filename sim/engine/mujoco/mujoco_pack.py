@@ -6,7 +6,8 @@ Longer than 350 lines because that is the whole interface between loop and engin
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -134,8 +135,9 @@ class MujocoPack(ModelPack):
     def _evaluate(self, rows: Iterable[int]) -> None:
         """Compute all that follows from the states of robots ``rows``."""
         data = self.data
-        for row in rows:
-            mujoco.mj_step1(self.models[row], data[row])
+        with _without_warnings():
+            for row in rows:
+                mujoco.mj_step1(self.models[row], data[row])
 
     def _own_model(self, row: int) -> Any:
         """Return the model of robot ``row`` alone, which may be changed."""
@@ -186,11 +188,7 @@ class MujocoPack(ModelPack):
         effort = self.qf
         if self._constraint is not None:
             effort = self._constraint.apply(self.qf, self.read_qpos(), self.read_qvel())
-        handler = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(
-            lambda message: None
-        )  # the loop finds states that are not finite
-        try:
+        with _without_warnings():
             everyone = self.data
             for row in np.flatnonzero(~self._suspended):
                 model = self.models[row]
@@ -200,8 +198,6 @@ class MujocoPack(ModelPack):
                 self._sensed[row] += data.sensordata
                 if (np.abs(data.qpos[self._at]) <= FARTHEST).all():
                     mujoco.mj_step1(model, data)
-        finally:
-            mujoco.set_mju_user_warning(handler)
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         return gravity and coriolis and self._is_model
@@ -544,6 +540,17 @@ class MujocoPack(ModelPack):
         self._own_step = None
         for name in ("_scratch", "_rubbing"):
             self.__dict__.pop(name, None)
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Silence MuJoCo's warnings of states that are not finite: the loop finds and reports them."""
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
 
 
 ENGINE = Engine(

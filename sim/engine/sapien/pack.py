@@ -43,6 +43,7 @@ from batchpid.sim.engine.sapien.calls import (
     SapienStep,
     obstacle,
 )
+from batchpid.sim.engine.sapien.limits import refusals, shortfalls
 from batchpid.sim.engine.sapien.sapien_sensors import SapienLinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
@@ -486,4 +487,6 @@ ENGINE = Engine(
     group_size=4,
     make_pack=Pack,
     native_obstacle=obstacle,
+    refusals=refusals,
+    shortfalls=shortfalls,
 )

@@ -168,7 +168,8 @@ def _describe(part: object) -> Document:
     properties: Document = {"type": type(part).__name__}
     for name in dir(part):
         is_state = name in _STATE and not isinstance(part, PhysxRigidStaticComponent)
-        if name.startswith("_") or is_state or "gpu" in name:
+        # ``pose`` is the deprecated name of ``entity_pose``.
+        if name.startswith("_") or is_state or "gpu" in name or name == "pose":
             continue
         try:
             value = getattr(part, name)

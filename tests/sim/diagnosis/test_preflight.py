@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+import trimesh
 from faulty_urdfs import REPAIRED
 from robots import load_bundled
 from test_unsettled import CASES as RUNS
@@ -35,7 +36,7 @@ def mjcf(inner: str = '<joint name="j"/>', rest: str = "") -> str:
 
 
 ODDITIES = {
-    # a file, options of loading, the code of its finding, and what that says
+    # a file, options of loading and of the check, the code of its finding, and what that says
     "an actuator with a filter": (
         mjcf(rest='<actuator><position joint="j" timeconst=".1"/></actuator>'),
         {},
@@ -45,9 +46,24 @@ ODDITIES = {
     "other gravity": (mjcf(rest='<option gravity="0 0 0"/>'), {}, "option", "gravity is"),
     "a closed loop": (
         mjcf(rest='<equality><weld body1="b"/></equality>'),
-        {},
+        {"engine": "sapien"},
         "engine",
         "equality",
+    ),
+    "unknown elements": (
+        robot(link("base"), link("arm"), joint("hinge", "base", "arm"), "<plugin/><plugin/>"),
+        {},
+        "unknown-element",
+        "note: .*left out: 2 <plugin>",
+    ),
+    "a mesh that is not convex": (
+        one_joint(
+            arm=INERTIAL
+            + BOX.format(0.1).replace('box size="0.1 0.1 0.1"', 'mesh filename="u.stl"')
+        ),
+        {},
+        "collision",
+        r"'arm' \(1.34 times its volume\): .*not convex",
     ),
     "shapes in millimetres": (
         one_joint(arm=INERTIAL + BOX.format(100)),
@@ -84,7 +100,7 @@ ODDITIES = {
         one_joint(arm=INERTIAL.replace('mass value="1"', 'mass value="0"')),
         {},
         "no-inertia",
-        "'arm'.* or a mass of 0",
+        "'arm'.* with a mass of 0",
     ),
     "links that overlap": (
         BESIDE,
@@ -143,8 +159,13 @@ def test_each_oddity_of_a_file_has_its_finding(name, tmp_path):
         write(tmp_path, srdf, "test.srdf")
     suffix = "xml" if text.startswith("<mujoco") else "urdf"
     path = write(tmp_path, text, f"test.{suffix}")
-    loading = {key: value for key, value in options.items() if key != "srdf"}
-    findings = [each for each in Robot.load(path, **loading).check() if each.code == code]
+    notch = [trimesh.creation.box(size) for size in ([3, 1, 1], [1, 1, 3], [1, 1, 3])]
+    for part, place in zip(notch[1:], ([-1, 0, 2.01], [1, 0, 2.01]), strict=True):
+        part.apply_translation(place)
+    trimesh.util.concatenate(notch).export(tmp_path / "u.stl")
+    loading = {key: value for key, value in options.items() if key == "self_collision"}
+    checked = Robot.load(path, **loading).check(engine=options.get("engine"))
+    findings = [each for each in checked if each.code == code]
     assert re.search(message, str(findings[0])), findings
     assert all(each.remedy for each in findings)
 

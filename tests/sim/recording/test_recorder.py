@@ -17,7 +17,7 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import ClosedError, InvalidArgumentError
-from batchpid.sim import FaultWarning, Recorder, Runner, read_recording
+from batchpid.sim import FaultWarning, Recorder, RecordingError, Runner, read_recording
 from batchpid.sim.cli import main
 from batchpid.sim.recording import recorder as recorder_module
 from batchpid.sim.signals.rollout import ACTUATORS, PARAMS, RESET, RESTORE
@@ -156,6 +156,12 @@ def test_an_existing_file_is_replaced_only_when_asked(tmp_path):
             Recorder(path, runner)
         recorder = Recorder(path, runner, overwrite=True)
         assert path.read_text() == "precious"
+        with make() as other:
+            late = Recorder(tmp_path / "late.h5", other)
+            (tmp_path / "late.h5").write_text("since then")
+            other.step(ROBOT.start)
+            with pytest.raises(RecordingError, match="pass overwrite=True"):
+                late.close()
         runner.step(ROBOT.start)
         recorder.close()
         recorder.close()
@@ -222,7 +228,7 @@ with Runner(robot, 3, params=robot.params(), workers=0, substeps=2) as runner:
     with pytest.raises(RecordingError):
         recorder.close()
     assert runner.step(robot.start).ok.all()
-os._exit(0)  # HDF5 would crash
+
 """
 
 

@@ -128,16 +128,18 @@ def test_the_pairs_of_a_robot_travel_with_it(tmp_path):
     assert vars(pickle.loads(pickle.dumps(loaded)))["self_contact"] == pairs
 
 
-def test_pairs_that_the_filter_cannot_hold_go_on_colliding_and_are_told(tmp_path):
+def test_pairs_that_physx_cannot_hold_collide_in_sapien_alone(tmp_path):
     rng, count = np.random.default_rng(0), 60
     path = write(tmp_path, sliders(*(0.0 for _ in range(count))))
     pairs = [(a, b) for a, b in combinations(range(count), 2) if rng.random() < 0.5]
     lines = (f'<disable_collisions link1="l{a}" link2="l{b}"/>' for a, b in pairs)
     write(tmp_path, robot(*lines), "test.srdf")
     loaded = Robot.load(path, self_collision="urdf")
-    contact = loaded.self_contact
-    assert len(contact.pairs) + len(contact.left_over) == len(pairs)
-    assert len(contact.left_over) > 0
+    assert len(loaded.ignored_pairs) == len(pairs)
+    assert loaded.check(engine="mujoco") == loaded.check()
+    left = [found for found in loaded.check(engine="sapien") if found.code == "engine"]
+    assert 0 < len(left) < len(pairs)
+    assert all("filter of pairs is full" in found.text for found in left)
 
 
 def test_a_base_that_is_fixed_too_low_has_no_ground(tmp_path):

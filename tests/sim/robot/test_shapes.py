@@ -14,7 +14,7 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import RobotError
 from batchpid.sim import Robot
-from batchpid.sim.robot.shapes import FEWEST, MOST, segments_of, surfaces
+from batchpid.sim.view.surfaces import FEWEST, MOST, segments_of, surfaces
 
 RED = '<material name="red"><color rgba="1 0 0 0.5"/></material>'
 BOX = '<box size="0.1 0.2 0.4"/>'

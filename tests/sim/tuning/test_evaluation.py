@@ -102,11 +102,12 @@ def test_payload_outside_the_model_pulls_the_hand_down_and_the_integral_lifts_it
 def test_randomization_is_a_file(panda, tmp_path):
     path = tmp_path / "drawn.yaml"
     path.write_text(
-        "payload: {uniform: [0, 0.3]}\nparams: {kp: {log_uniform: [0.5, 2], operation: scale}}\n"
+        "seed: 4\npayload: {uniform: [0, 0.3]}\nparams: {kp: {log_uniform: [0.5, 2], operation: scale}}\n"
     )
-    loaded = load_randomization(path, panda, seed=4)
+    loaded = load_randomization(path, panda)
     kp = LogUniform(0.5, 2, operation="scale")
     assert loaded == Randomization(seed=4, payload=Uniform(0, 0.3), params={"kp": kp})
+    assert load_randomization(None, panda) is None
     path.write_text("payload: {uniform: [-1, 0]}")
     with pytest.raises(InvalidArgumentError, match=r"payload, entry 'payload': must be .*got -1"):
         load_randomization(path, panda)

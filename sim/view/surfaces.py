@@ -17,11 +17,10 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from batchpid.io.packages import imported
-from batchpid.sim.robot.collision_shapes import convex_hull
+from batchpid.sim.geometry.mesh_files import find_mesh, read_mesh
+from batchpid.sim.geometry.shapes import Shape, convex_hull
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.meshes import find_mesh, read_mesh
-from batchpid.sim.robot.tables import Shape
 from batchpid.sim.robot.urdf import SHAPES, is_mjcf, read_origin, read_shape
 from batchpid.sim.robot.xml import parse_xml, read_numbers
 from batchpid.task_space.frames import matrix_of, rotate
@@ -202,11 +201,10 @@ def _mesh(shape: Shape | None, robot: RobotDescription, deviation: float) -> Any
     creation = imported("trimesh.creation")
     if shape.kind == "mesh":
         if shape.vertices is not None:
-            surface = convex_hull(shape.vertices)
+            surface: Any = convex_hull(shape.vertices)
         else:
-            loaded = _read_mesh(shape.file, robot)
-            surface = loaded.vertices, loaded.faces
-        mesh: Any = trimesh.Trimesh(*surface, process=False)
+            surface = _read_mesh(shape.file, robot)
+        mesh: Any = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
         mesh.apply_scale(shape.scale)
     elif shape.kind == "box":
         mesh = creation.box([2 * side for side in shape.size])
