@@ -24,7 +24,7 @@ from batchpid.checks.validate import file_path, integer, number
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import replacing
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.rollout import Rollout
+from batchpid.sim.rollout import Rollout
 from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
 from batchpid.sim.view.surfaces import Surface
 from batchpid.sim.view.view_data import Playback, rows_at
