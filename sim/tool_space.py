@@ -122,7 +122,7 @@ class OperationalSpace:
         self._friction: tuple[Array, Array] | None = None
         # Damping and friction that the robot is known to have: the law acts against them.
         modelled = DISSIPATION[robot.dissipation].modelled
-        motors = known_joints(robot.actuators, robot.dof)
+        motors = known_joints(robot)
         damping = motors.viscous + np.array([joint.damping * modelled for joint in robot.joints])
         self._damping = damping[None] if damping.any() else None
         coulomb = motors.coulomb + robot.friction * modelled

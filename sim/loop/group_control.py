@@ -98,7 +98,7 @@ def control_of(
     engine and law know.
     """
     compensated = options.compensate.split("+")
-    known = known_joints(options.robot.actuators, options.robot.dof)
+    known = known_joints(options.robot)
     turns = np.array([joint.continuous / TURN for joint in joints])
     modelled = np.array([joint.friction * share for joint in joints]) + known.coulomb
     has_modelled = "friction" in compensated and options.sets_positions and modelled.any()

@@ -458,7 +458,7 @@ class Robot:
         motors = source.actuators if actuators is None else actuators
         if motors is None:
             return robot
-        return replace(robot, actuators=load_robot_actuators(motors, joints))
+        return replace(robot, actuators=load_robot_actuators(motors, robot))
 
     @staticmethod
     def bundled() -> tuple[str, ...]:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.records import frozen
-from batchpid.checks.validate import instance
+from batchpid.checks.validate import entries, instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN, JOINT_SIDE
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import Joint
+
+if TYPE_CHECKING:
+    from batchpid.sim.robot.robot import Robot
 
 BAND = {"rad": 1e-4, "m": 2e-5}
 """Half width, by the joint's unit, of the band in which the compensation of friction is less than
@@ -44,22 +47,23 @@ class KnownJoints(NamedTuple):
     """Reflected inertia of the motors [kg m^2 or kg]."""
 
 
-def known_joints(actuators: bp.Actuators | None, dof: int) -> KnownJoints:
-    """Return friction, damping and armature of a robot's own actuators, which its controller knows,
-    for ``dof`` joints.
+def known_joints(robot: Robot) -> KnownJoints:
+    """Return friction, damping and armature of the robot's own actuators, which its controller
+    knows.
     """
-    motors = bp.Actuators() if actuators is None else actuators
+    if robot.actuators is None:
+        motors = bp.Actuators()
+    else:
+        motors = robot.actuators
     coulomb, viscous, armature = (
-        np.zeros(dof) if leaf is None else leaf[0].astype(float)
+        np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
         for leaf in (motors.coulomb, motors.viscous, motors.armature)
     )
     return KnownJoints(FRICTION_SHARE * coulomb, viscous, armature)
 
 
-def load_robot_actuators(
-    source: bp.Actuators | str | Path, joints: Sequence[Joint]
-) -> bp.Actuators:
-    """Return actuators of the degrees of freedom ``joints``, given or in a file.
+def load_robot_actuators(source: bp.Actuators | str | Path, robot: Robot) -> bp.Actuators:
+    """Return actuators of ``robot``, given or in a file.
 
     Raises
     ------
@@ -69,23 +73,23 @@ def load_robot_actuators(
         The file does not exist.
     """
     if isinstance(source, str | Path):
-        source, _ = bp.load_actuators(source, tuple(joint.name for joint in joints))
-    return fit_actuators(source, joints, 1, "pid")
+        source, _ = bp.load_actuators(source, robot.joint_names)
+    return fit_actuators(source, robot, 1, "pid")
 
 
 def fit_actuators(
     actuators: bp.Actuators,
-    joints: Sequence[Joint],
+    robot: Robot,
     num_envs: int,
     control: object,
 ) -> bp.Actuators:
-    """Return ``actuators`` if they fit joints and control, with the continuous ones.
+    """Return ``actuators`` if they fit robot and control, with the robot's continuous joints.
 
     Followers have no motor: their bias, friction and armature are left out. Raises
     InvalidArgumentError if they do not fit.
     """
     instance("actuators", actuators, bp.Actuators, "build them with make_actuators()")
-    actuators.check(num_envs, tuple(joint.name for joint in joints))
+    actuators.check(num_envs, robot.joint_names)
     if control == "drive" and (
         actuators.measures or actuators.delivers or actuators.load_friction is not None
     ):
@@ -99,9 +103,16 @@ def fit_actuators(
         return actuators
     motors = {name: getattr(actuators, name) for name in ("bias", *JOINT_SIDE)}
     # The leader carries friction and armature of its followers.
-    independent = coupling_of(tuple(joints)).independent
-    motors = {name: leaf * independent for name, leaf in motors.items() if leaf is not None}
-    return actuators.replace(**motors, continuous=np.array([joint.continuous for joint in joints]))
+    motors = {name: leaf * robot.independent for name, leaf in motors.items() if leaf is not None}
+    described = {"coulomb": robot.friction, "static": robot.friction, "viscous": robot.damping}
+    for name, least in described.items():
+        if name in motors:
+            problem = "is less than none, together with the description's"
+            remedy = "give at least minus the friction or damping of the robot's file"
+            # Of a float32 the sum may be zero but for its rounding.
+            good = motors[name] >= -(1 + 1e-6) * least
+            entries(name, motors[name], good, problem, robot.joint_names, remedy=remedy)
+    return actuators.replace(**motors, continuous=robot.continuous)
 
 
 def setpoint_guard(
