@@ -108,6 +108,7 @@ OPERATIONS = (
     "push",
     "take",
     "gather",
+    "take_row",
 )
 """Operations of programs, as Code in program.h."""
 MASKS = frozenset(OPERATIONS[6:15]) | {"isfinite"}
