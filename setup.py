@@ -80,7 +80,21 @@ class Build(build_ext):
             sys.exit(f"batchpid: the extension {ext.name} cannot be built: {error}; {remedy}")
 
 
+def write_passes():
+    """Write fused.h, the passes of the commonest laws, from the traces of the law."""
+    sys.path.insert(0, str(ROOT))
+    from batchpid.native.fused import header
+
+    file = ROOT / "batchpid" / "native" / "fused.h"
+    text = header()
+    # An older file would be compiled again.
+    if not file.is_file() or file.read_text() != text:
+        file.write_text(text)
+
+
 modules = [load(name) for name in MODULES] if os.environ.get("BATCHPID_NATIVE") != "0" else []
+if modules:
+    write_passes()
 extensions = [extension for module in modules for extension in module.EXTENSIONS.values()]
 setup(
     cmdclass={"build_ext": Build},

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 
+from batchpid.errors import BatchPIDError
+
 
 def main() -> int:
     """Run the command line as a program."""
@@ -15,6 +17,9 @@ def main() -> int:
     except KeyboardInterrupt:  # in an import, or at the end
         print("batchpid: interrupted", file=sys.stderr)
         return 130
+    except BatchPIDError as error:  # in an import
+        print(f"batchpid: {error}", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document
-from batchpid.arrays.jax_settings import own_settings, require_jax
+from batchpid.arrays.jax_settings import precision, require_jax
 from batchpid.law import pid
 from batchpid.law.coefficients import discretise
 from batchpid.law.params import PIDParams
@@ -137,7 +137,7 @@ class JAXBackend:
         jnp = self.jax.numpy
         leaves, tree = self.jax.tree.flatten(params)
         is_shared = tuple(leaf.shape[0] == 1 for leaf in leaves)
-        with own_settings(self.dtype):
+        with precision(self.dtype):
             shared = [np.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if one]
             separate = [
                 jnp.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if not one
@@ -152,14 +152,13 @@ class JAXBackend:
             return np.asarray(value, dtype=self.dtype)
         if value.dtype == self.dtype:
             return value
-        with own_settings():
-            return np.asarray(value, dtype=self.dtype)
+        return np.asarray(value, dtype=self.dtype)
 
     def call(self, function: Callable[..., PIDState], *inputs: Array, **named: Array) -> PIDState:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
         if function not in self._compiled:
             self._compiled[function] = self._compile(function)
-        with own_settings(self.dtype):
+        with precision(self.dtype):
             state: PIDState = self._compiled[function](*self.packed, *inputs, **named)
             return state
 
@@ -174,5 +173,5 @@ class JAXBackend:
         """Return the new state, the effort, the terms if they are kept, and no fast call; ``out``
         is None.
         """
-        with own_settings(self.dtype):
+        with precision(self.dtype):
             return *self._step(*self.packed, state, r, y, *rates), declined

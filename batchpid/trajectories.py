@@ -170,6 +170,15 @@ def straight_line(
     return Trajectory(s.time, position, s.velocity * move, s.acceleration * move)
 
 
+def _check_sampling(frequency: float, dt: float) -> None:
+    """Raise InvalidArgumentError for a frequency [Hz] of which ticks of ``dt`` [s] show another."""
+    half = 0.5 / positive("dt", dt, "s")
+    if positive("frequency", frequency, "Hz") >= half:
+        problem = f"must be below {half:g} Hz, half the rate of the ticks"
+        remedy = "lower it, or use a smaller dt"
+        raise InvalidArgumentError("frequency", problem, value=frequency, remedy=remedy)
+
+
 def sine(
     center: ArrayLike,
     amplitude: ArrayLike,
@@ -191,14 +200,15 @@ def sine(
     dt, duration
         Time of a tick and of the trajectory [s].
     frequency
-        f [Hz].
+        f [Hz], below half the rate of the ticks.
     """
     low, move = _move(center, np.add(center, amplitude))
     time = _ticks(dt, np.array(positive("duration", duration, "s")))
     growth = minimum_jerk([0.0], [1.0], dt, duration=positive("fade", fade, "s"))
     growth = growth.hold(duration)
     a, rate, change = (part[: len(time), 0] for part in growth[1:])
-    w = 2 * np.pi * positive("frequency", frequency, "Hz")
+    _check_sampling(frequency, dt)
+    w = 2 * np.pi * frequency
     sin = np.sin(w * time)
     cos = np.cos(w * time)
     # Products of the growth and the wave, and their derivatives.

@@ -22,7 +22,8 @@ from tabulate import tabulate
 
 from batchpid.errors import BatchPIDError
 from batchpid.sim import Robot
-from batchpid.sim.tuning import evaluate_gains, random_moves
+from batchpid.sim.tuning.evaluation import evaluate_gains
+from batchpid.sim.tuning.moves import random_moves
 
 HEADERS = (
     "robot",

@@ -1,20 +1,13 @@
-"""Speed of the law alone, for 1 to 2^20 envs of 9 joints, against other kernels and the machine's
-bandwidth.
+"""Speed of the law alone, for 1 to 2^20 envs of 9 joints, against other kernels.
 
-The law has P, I, filtered D, feedforward, effort limits and back-calculation, in float32. The
-necessary bytes of a step are each input read once and each output written once: setpoint,
-measurement, feedforward, integral, last measurement and filtered rate in; effort, integral,
-measurement and filtered rate out; 10 arrays of envs x joints. Bandwidth is their size over the best
-time of a step. ``of triad`` is its share of the bandwidth of a[i] = b[i] + s c[i] over arrays of
-the same size, counted as 3 arrays and measured in the same test on all cores (numba), or of a copy
-on the GPU where JAX has one. Compilation is never timed. "native", "numpy" and "jax" are
-:class:`batchpid.BatchPID`, the first two with and without the extension; efforts of "native" are
-written into kept arrays (``out=``).
+The law has P, I, filtered D, feedforward, effort limits and back-calculation, in float32.
+Compilation is never timed. "native", "numpy" and "jax" are :class:`batchpid.BatchPID`, the first
+two with and without the extension; efforts of "native" are written into kept arrays (``out=``). The
+bound is "fused by hand": this law alone, with its gains, as one pass over the arrays (numba).
 """
 
 import os
 import time
-from functools import cache
 from unittest import mock
 
 import jax
@@ -40,7 +33,6 @@ PARAMS = bp.make_params(
     anti_windup="back_calculation",
     dtype=np.float32,
 )
-ARRAYS = 10
 SIZES = [1, 64, 4096, 2**16, 2**20]
 
 
@@ -75,47 +67,22 @@ def best(most):
     return best
 
 
-@numba.njit(parallel=True, fastmath=True)
-def _triad(a, b, c, s):
-    for i in numba.prange(a.size):
-        a[i] = b[i] + s * c[i]
-
-
-@pytest.fixture(scope="module")
-def machine_bandwidth(best):
-    """Function that returns bytes per second of the triad (CPU, all cores) or of a copy (GPU),
-    cached by size.
-    """
-
-    @cache
-    def machine_bandwidth(num_envs):
-        size = num_envs * JOINTS
-        if jax.default_backend() != "cpu":
-            copy, source = jax.jit(lambda x: x + 1, donate_argnums=0), [jnp.ones(size, jnp.float32)]
-
-            def call():
-                source[0] = copy(source[0])
-                source[0].block_until_ready()
-
-            return 2 * 4 * size / best(call)
-        a, b, c = np.ones((3, size), np.float32)
-        return 3 * 4 * size / best(lambda: _triad(a, b, c, np.float32(2)))
-
-    return machine_bandwidth
+ROWS = 16
+"""Rows of a block of the fused law, which repeats its gains for each."""
 
 
 @numba.njit(parallel=True)
-def _by_hand(
-    kp, ki, kd, low, high, decay, intake, per_dt, dt, back, r, y, ff, integral, last, rate, effort
-):
-    for i in numba.prange(r.shape[0]):
-        for j in range(r.shape[1]):
-            e = r[i, j] - y[i, j]
-            v = decay[j] * rate[i, j] + intake[j] * (last[i, j] - y[i, j]) * per_dt
-            u = kp[j] * e + integral[i, j] + kd[j] * v + ff[i, j]
-            s = min(max(u, low[j]), high[j])
-            integral[i, j] += ki[j] * dt * e + back[j] * (s - u)
-            last[i, j], rate[i, j], effort[i, j] = y[i, j], v, s
+def _fused(kp, ki_dt, kd, low, high, decay, intake, back, r, y, ff, integral, last, rate, effort):
+    """Step blocks of ``kp.size`` numbers."""
+    for block in numba.prange((r.size + kp.size - 1) // kp.size):
+        at = block * kp.size
+        for i in range(min(kp.size, r.size - at)):
+            e = r[at + i] - y[at + i]
+            v = decay[i] * rate[at + i] + intake[i] * (last[at + i] - y[at + i])
+            u = kp[i] * e + integral[at + i] + kd[i] * v + ff[at + i]
+            s = min(max(u, low[i]), high[i])
+            integral[at + i] += ki_dt[i] * e + back[i] * (s - u)
+            last[at + i], rate[at + i], effort[at + i] = y[at + i], v, s
 
 
 def native_step(num_envs, dtype=np.float32, threads=None):
@@ -160,24 +127,18 @@ def jax_step(num_envs):
     return call
 
 
-def numba_step(num_envs):
-    r, y0, y1, ff = inputs(num_envs)
-    k = bp.discretise(PARAMS, DT)
-    rows = [
-        np.asarray(x, np.float32).ravel()
-        for x in (k.kp, PARAMS.ki, k.kd, k.effort_min, k.effort_max, k.decay, k.intake)
-    ]
-    scalars, back = (
-        (np.float32(k.per_dt), np.float32(DT)),
-        np.asarray(k.tracking, np.float32).ravel(),
-    )
+def fused_step(num_envs, dtype=np.float32):
+    r, y0, y1, ff = (array.ravel() for array in inputs(num_envs, dtype))
+    k = bp.discretise(PARAMS.replace(dtype=dtype), DT)
+    gains = (k.kp, k.ki_dt, k.kd, k.effort_min, k.effort_max, k.decay, k.intake * k.per_dt)
+    rows = [np.tile(np.asarray(x, dtype).ravel(), ROWS) for x in (*gains, k.tracking)]
     state = [np.zeros_like(r), y1.copy(), np.zeros_like(r)]
     effort, turn = np.empty_like(r), [y0, y1]
 
     def call():
         turn.reverse()
-        _by_hand(*rows, *scalars, back, r, turn[0], ff, *state, effort)
-        return effort
+        _fused(*rows, r, turn[0], ff, *state, effort)
+        return effort.reshape(num_envs, JOINTS)
 
     return call
 
@@ -217,7 +178,7 @@ KERNELS = {
     "native": native_step,
     "numpy": numpy_step,
     "jax": jax_step,
-    "numba by hand": numba_step,
+    "fused by hand": fused_step,
 }
 SCALARS = {"tutorial": scalar_step(tutorial), "simple-pid": scalar_step(simple)}
 
@@ -230,7 +191,7 @@ def found():
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("num_envs", SIZES)
-def test_step(benchmark, compare, most, best, machine_bandwidth, found, kernel, num_envs):
+def test_step(benchmark, compare, most, best, found, kernel, num_envs):
     num_envs = min(num_envs, most.rows)
     call = KERNELS[kernel](num_envs)
     first = np.array(call())
@@ -238,15 +199,10 @@ def test_step(benchmark, compare, most, best, machine_bandwidth, found, kernel, 
     assert not np.array_equal(first, call()), "the efforts follow the measurements"
     rounds = max(5, min(5000, int(0.3 / best(call, 0.1))))
     benchmark.pedantic(call, rounds=min(rounds, most.rounds), warmup_rounds=2)
-    bandwidth, least = machine_bandwidth(num_envs), benchmark.stats.stats.min
-    moved = ARRAYS * 4 * num_envs * JOINTS
+    least = benchmark.stats.stats.min
     benchmark.extra_info |= {
         "us per step": round(1e6 * least, 2),
         "ns per env": round(1e9 * least / num_envs, 2),
-        "necessary MB": round(moved / 1e6, 3),
-        "GB/s": round(moved / least / 1e9, 2),
-        "of triad": round(moved / least / bandwidth, 3),
-        "triad GB/s": round(bandwidth / 1e9, 1),
         "device": str(jax.devices()[0]) if kernel.startswith("jax") else f"{os.cpu_count()} CPUs",
     }
     others = {
@@ -262,16 +218,15 @@ def test_step(benchmark, compare, most, best, machine_bandwidth, found, kernel, 
 
 @pytest.mark.parametrize(("num_envs", "threads"), [(64, 1), (4096, 1), (2**20, 1), (2**20, 2)])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_native_against_numpy_and_memory(benchmark, compare, most, dtype, num_envs, threads):
-    """Least times of rounds in turn: the law by the extension and by NumPy, and the triad on as
+def test_native_against_numpy_and_a_fused_pass(benchmark, compare, most, dtype, num_envs, threads):
+    """Least times of rounds in turn: the law by the extension and by NumPy, and fused by hand on as
     many threads.
     """
     num_envs, threads = min(num_envs, most.rows), min(threads, numba.config.NUMBA_NUM_THREADS)
-    a, b, c = np.ones((3, num_envs * JOINTS), dtype)
     calls = {
         "native": native_step(num_envs, dtype, threads),
         "numpy": numpy_step(num_envs, dtype),
-        "triad": lambda: _triad(a, b, c, dtype(2)),
+        "fused": fused_step(num_envs, dtype),
     }
     times = {name: [] for name in calls}
     repeat = max(1, min(most.ticks, 2**17 // num_envs))
@@ -294,13 +249,12 @@ def test_native_against_numpy_and_memory(benchmark, compare, most, dtype, num_en
         numba.set_num_threads(before)
     assert calls["native"]().tobytes() == calls["numpy"]().tobytes()
     least = {name: min(each) for name, each in times.items()}
-    bound = ARRAYS / 3 * least["triad"]
     benchmark.extra_info |= {
         f"us, {name}": round(1e6 * seconds, 2) for name, seconds in least.items()
     }
     setup = f"law, {num_envs} envs, {np.dtype(dtype)}, {threads} threads"
     compare(setup, "native", "numpy", least["numpy"] / least["native"])
-    compare(setup, "native", "bound by the triad's memory traffic", bound / least["native"])
+    compare(setup, "native", "fused by hand", least["fused"] / least["native"])
 
 
 @pytest.mark.parametrize("kernel", SCALARS)

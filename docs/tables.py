@@ -24,6 +24,7 @@ from batchpid.motors.actuators import FIELDS as ACTUATORS
 from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.options.options import GROUPS, OPTIONS, RunnerKeywords
 from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
+from batchpid.sim.robot.findings import OF_FILES, OF_ROBOTS, FindingKind
 
 DOCS = Path(__file__).parent
 
@@ -85,6 +86,18 @@ def options() -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
+def findings(kinds: tuple[FindingKind, ...], when: str, done: str) -> str:
+    """Return the table of kinds of findings, with the headers of two of its columns."""
+    rows = [("code", when, done), ("---",) * 3]
+    rows += [(f"`{kind.code}`", _escaped(kind.when), _escaped(kind.done)) for kind in kinds]
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _escaped(text: str) -> str:
+    """Return a sentence in Markdown: tags stand in code."""
+    return re.sub(r"(?<!`)(<[^`>]*>)", r"`\1`", text)
+
+
 def bound(field: Field) -> str:
     """Return the bounds of a field."""
     if math.isfinite(field.high):
@@ -120,6 +133,8 @@ def tables() -> dict[tuple[str, str], str]:
             attributes(Randomization), PHYSICAL | START | EVENTS, ("seed", "per"), off=False
         ),
         ("runner.md", "options"): options(),
+        ("robots.md", "files"): findings(OF_FILES, "the file has", "what is simulated"),
+        ("robots.md", "preflight"): findings(OF_ROBOTS, "what it says", "remedy"),
     }
 
 
@@ -128,10 +143,9 @@ def pages() -> dict[Path, str]:
     texts: dict[Path, str] = {}
     for (page, name), rows in tables().items():
         path = DOCS / page
+        text = texts.get(path) or path.read_text()
         marked = re.compile(rf"(<!-- {name}: made by docs/tables.py -->\n).*?(<!-- end -->)", re.S)
-        text, count = marked.subn(
-            lambda match, rows=rows: f"{match[1]}{rows}\n{match[2]}", path.read_text()
-        )
+        text, count = marked.subn(lambda match, rows=rows: f"{match[1]}{rows}\n{match[2]}", text)
         assert count == 1, (page, name)
         texts[path] = text
     return texts

@@ -11,7 +11,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
-from batchpid.sim.diagnosis.run_checks import MovingSetpointWarning, SetpointWarning
+from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import Controller, Ray
@@ -41,7 +41,6 @@ __all__ = [
     "FaultWarning",
     "Finding",
     "LogUniform",
-    "MovingSetpointWarning",
     "MujocoSolver",
     "Normal",
     "Observation",

@@ -16,17 +16,15 @@ BLOCK = re.compile(
 )
 SHORTER = {
     # command: flags that make it short
-    "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
+    "demo": ["--num-envs", "2", "--seconds", "0.1"],
     "rollout": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
     "excite": ["--seconds", "1"],
-    "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1", "--engine", "mujoco"],
+    "compare": ["--moves", "1", "--engine", "mujoco"],
     "view": ["--num-envs", "2", "--workers", "0", "--time-limit", "0.1", "--port", "8765"],
 }
 SHORTER_CODE = {
     # pattern in Python blocks: a smaller size
     r"\b64\b": "8",
-    r"\brange\(\d{2,}\)": "range(5)",
-    r"\((?:100|150|200), robot\.dof\)": "(10, robot.dof)",
     r"\b8(?=, robot\.dof\)|, params=params|, substeps=20\))": "2",
 }
 TWO_JOINTS = robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", "c"))

@@ -23,7 +23,7 @@ MODULES = {"pycollada": "collada", "imageio-ffmpeg": "imageio_ffmpeg"}
 """Name of a package's module, where it is another than the package's."""
 NEEDED = {"tune": "tune", "identify": "tune", "view": "view"}
 """Commands of the two pages that need an extra."""
-SIZES = SHORTER | {"compare": ["--moves", "1", "--seconds", "0.1", "--workers", "0"]}
+SIZES = SHORTER | {"compare": ["--moves", "1"]}
 PROGRAM = """
 import contextlib, io, json, sys, warnings
 from importlib.machinery import PathFinder
@@ -80,7 +80,6 @@ def test_each_command_and_program_runs_or_names_its_extra(tmp_path: Path):
     ]
     sizes = [[] if "--trajectory" in words else SIZES.get(words[0], []) for words in lines]
     commands = [[*words, *size] for words, size in zip(lines, sizes, strict=True)]
-    commands.append(["rollout", "panda", "--backend", "jax", "--out", "jax.h5"])
     (tmp_path / "robots").mkdir()
     write(tmp_path / "robots", TWO_JOINTS, "two.urdf")
     programs = [match["code"] for page in (README, INDEX) for match in blocks(page, "python")]

@@ -18,6 +18,8 @@ from batchpid.arrays.choices import CHOICE_TYPES
 T = TypeVar("T", bound=tuple[Any, ...])
 V = TypeVar("V")
 TURN = 2 * math.pi
+NAMED_TUPLES: list[type] = [*CHOICE_TYPES]
+"""Types of records and choices, as ``jax.export`` writes them into files."""
 _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
 
 
@@ -29,8 +31,19 @@ def namespace(*leaves: Array) -> ArrayModule:
         for leaf in leaves:
             if not isinstance(leaf, np.ndarray) and hasattr(leaf, "__array_namespace__"):
                 module: ArrayModule = leaf.__array_namespace__()
+                if getattr(module, "__name__", "") == "jax.numpy":
+                    _register_in_jax()
                 return module
     return np
+
+
+@cache
+def _register_in_jax() -> None:
+    """Let ``jax.export`` serialize functions of records; for all else JAX knows named tuples."""
+    from jax.export import register_namedtuple_serialization
+
+    for kind in NAMED_TUPLES:
+        register_namedtuple_serialization(kind, serialized_name=f"batchpid.{kind.__name__}")
 
 
 def in_dtype_of(params: Iterable[Array], *arrays: Array) -> list[Array]:
@@ -140,7 +153,7 @@ def replace_envs(state: T, fresh: T, mask: Array) -> T:
         if old is None:
             return None
         return xp.where(
-            chosen.reshape(-1, *[1] * (old.ndim - 1)),
+            chosen.reshape(*chosen.shape, *[1] * (old.ndim - chosen.ndim)),
             new,
             old,
         )

@@ -23,7 +23,7 @@ from typing import Any, ClassVar, ParamSpec, TypeVar
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document, DType, Rows
-from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.elementwise import NAMED_TUPLES, namespace
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.trees import mapped, parts
 from batchpid.checks.validate import check_keywords, entries, integer, is_traced, names, read_array
@@ -50,6 +50,9 @@ class Record(tuple[Any, ...]):
     WHOLE: ClassVar[tuple[str, ...]] = ()
     """Leaves with one value for all joints."""
 
+    def __init_subclass__(cls) -> None:
+        NAMED_TUPLES.append(cls)
+
     def options(self) -> Document:
         """Return the options that are on, as arguments of the constructor that build this record
         again.
@@ -67,13 +70,13 @@ class Record(tuple[Any, ...]):
         """Number of joints; 0 where all fields are off."""
         shapes = [leaf.shape for name, leaf in self.leaves().items() if name not in self.WHOLE]
         if shapes:
-            return int(shapes[0][1])
+            return int(shapes[0][-1])
         return 0
 
     @property
     def num_envs(self) -> int:
         """Number of envs with separate values; 1 where all envs share them."""
-        return max((leaf.shape[0] for leaf in self.leaves().values()), default=1)
+        return max((leaf.shape[0] for leaf in self.leaves().values() if leaf.ndim > 1), default=1)
 
     @property
     def dtype(self) -> DType:
@@ -84,6 +87,17 @@ class Record(tuple[Any, ...]):
     def for_envs(self: R, envs: slice | Rows | Sequence[int]) -> R:
         """Return the part of some envs (a slice or an index array); shared rows stay shared."""
         part: R = mapped(lambda leaf: leaf if leaf.shape[0] == 1 else leaf[envs], self)
+        return part
+
+    def for_rank(self: R, ndim: int) -> R:
+        """Return the record for arrays of ``ndim`` axes: for one robot's (joints,), such as under
+        jax.vmap, shared rows (1, joints) lose their axis of envs.
+        """
+        if ndim != 1:
+            return self
+        part: R = mapped(
+            lambda leaf: leaf[0] if leaf.ndim == 2 and leaf.shape[0] == 1 else leaf, self
+        )
         return part
 
     def for_joints(self: R, joints: Rows | Sequence[int] | slice) -> R:

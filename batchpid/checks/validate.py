@@ -102,6 +102,9 @@ def choice(argument: str, value: object, known: Collection[S]) -> S:
         if isinstance(value, str) and option == value:
             return option
     remedy = f"use one of {', '.join(map(repr, known))}"
+    near = difflib.get_close_matches(str(value), known, 1)
+    if near:
+        remedy = f"did you mean {near[0]!r}? Else {remedy}"
     raise InvalidArgumentError(argument, "unknown option", value=value, remedy=remedy)
 
 

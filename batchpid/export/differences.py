@@ -1,24 +1,62 @@
-"""Results of exports, and the differences between the law and a target, with the figures of this
-law.
+"""Results of exports, and the tables of differences between the law and its targets.
+
+A target's file holds the law in effort units (:class:`Law`); :func:`differences` compares it with
+the target's own law. C is in no table: its header is this law, bit for bit.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Array, Bool, Document, Float64
+from batchpid.arrays.array_types import Bool, Document, Float64
 from batchpid.checks.validate import array, at_least, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.anti_windup import named
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.implicit import as_explicit
+from batchpid.law.params import FIELDS as LAW_FIELDS
 from batchpid.law.params import PIDParams
 from batchpid.motors.actuators import FIELDS, Actuators
+from batchpid.motors.guard import FIELDS as GUARD_FIELDS
+from batchpid.motors.guard import Guard
+
+SAME = {
+    "effort_rate_limit": "the change of the effort is not limited",
+    "setpoint_weight": "P acts on the whole setpoint (b = 1), so steps overshoot more",
+    "derivative_filter_time": "no filter",
+}
+OPTIONS = {
+    "ros2_control": SAME
+    | {
+        "deadband": "stops the integral alone, and P acts on the whole error",
+        "continuous": "taken from the type of the joint in robot_description",
+        "non_finite": "the effort is NaN, or not written, after an input that is not finite",
+    },
+    "mjcf": SAME
+    | {
+        "deadband": "none: P acts on the whole error",
+        "continuous": "errors are not taken the short way round",
+        "non_finite": "inputs are not checked",
+    },
+}
+"""Options of the law without an equal in a target, and what it does instead."""
+QUOTIENT = "measurement_rate: the derivative is the measured velocity, not a difference"
+WRITTEN = {"armature", "viscous", "coulomb", "command_delay", "lag"}
+WRITTEN |= {"effort_limit", "saturation_effort", "no_load_speed"}
+"""Effects of motors in an MJCF beside the law; without one there are strength and bias, too."""
+
+
+NEUTRAL = {
+    name: float(field.neutral)
+    for fields in (LAW_FIELDS, FIELDS, GUARD_FIELDS)
+    for name, field in fields.items()
+    if name != "anti_windup"
+}
+"""Value of each option with which it is off."""
 
 
 def check_one_env(params: PIDParams) -> None:
@@ -39,236 +77,206 @@ class Exported(NamedTuple):
     """One sentence each; empty where the target computes the same law."""
 
 
-class Differences(list[str]):
-    """Sentences ``"option: difference"`` about params in effort units, for a target.
+class Law(NamedTuple):
+    """Explicit law of one env in effort units, with its motors and the guard of its setpoints."""
 
-    ``params`` are those given, of one env, converted to efforts at ``inertia`` if they were per
-    unit of it, and to the explicit law at ``dt`` if they were implicit; ``joints`` their names;
-    ``dt`` the time step [s].
+    joints: list[str]
+    dt: float
+    """Time step [s]."""
+    params: PIDParams
+    actuators: Actuators
+    guard: Guard
+    conversions: tuple[str, ...]
+    """Differences by the conversion to this law."""
+    is_law: bool
+    """False for motors without a law."""
+
+    def column(self, option: str) -> Float64:
+        """Return an option of the law, its motors or its guard (joints,), neutral where it is off;
+        1 for a choice that is on.
+        """
+        records = (self.params, self.actuators, self.guard)
+        record = next(record for record in records if option in record._fields)
+        leaf = getattr(record, option)
+        if leaf is None:
+            return np.full(len(self.joints), NEUTRAL.get(option, 0.0))
+        if isinstance(leaf, tuple):
+            return np.ones(len(self.joints))
+        return np.asarray(leaf[0], np.float64)
+
+    def has(self, option: str) -> Bool:
+        """Return the mask of the joints at which an option is on."""
+        mask: Bool = self.column(option) != NEUTRAL.get(option, 0.0)
+        return mask
+
+    @property
+    def strategies(self) -> list[str]:
+        """Strategy of anti-windup of each joint, by the names of make_params."""
+        params = self.params
+        rows = named(params.num_joints, params.tracking_time, params.conditional)
+        return [str(strategy) for strategy in rows[0]]
+
+    @property
+    def begins_outside(self) -> Bool:
+        """Mask of the joints whose integral begins at a limit, since the limits exclude 0."""
+        return (self.column("integral_min") > 0) | (self.column("integral_max") < 0)
+
+    @property
+    def effort_range(self) -> Float64:
+        """Limits of the efforts, of law and motor (2, joints) [N m or N]."""
+        limit = self.column("effort_limit")
+        low = np.maximum(self.column("effort_min"), -limit)
+        return np.array([low, np.minimum(self.column("effort_max"), limit)])
+
+    @property
+    def has_line(self) -> Bool:
+        """Mask of the motors with a torque-speed line; one without strength has no effort."""
+        return np.isfinite(self.column("saturation_effort")) & (self.column("strength") > 0)
+
+    @property
+    def is_dcmotor(self) -> Bool:
+        """Mask of the joints whose motor is MuJoCo's ``<dcmotor>``: its PID has neither a line nor
+        a lag.
+        """
+        return self.has_line | (self.is_law & (self.column("lag") > 0))
+
+
+def export_law(
+    params: PIDParams,
+    joint_names: Sequence[str],
+    dt: float,
+    inertia: ArrayLike | None,
+    actuators: Actuators | None = None,
+    guard: Guard | None = None,
+    is_law: bool = True,
+) -> Law:
+    """Return the law that targets are given: gains converted to efforts at ``inertia`` (joints,)
+    [kg m^2 or kg] if they are per unit of it, and to the explicit law at ``dt`` [s] if implicit.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Params or actuators of several envs or of other joints, or gains per mass matrix without
+        ``inertia``.
     """
-
-    def __init__(
-        self,
-        params: PIDParams,
-        joint_names: Sequence[str],
-        dt: float,
-        inertia: ArrayLike | None,
-    ) -> None:
-        super().__init__()
-        check_one_env(params)
-        self.joints = names("joint_names", joint_names, params.num_joints)
-        self.dt = time_step("dt", dt)
-        params.check(1, self.joints)
-        check_gain_units(params)
-        self.params = self._in_efforts(self._explicit(params), inertia)
-
-    def _explicit(self, params: PIDParams) -> PIDParams:
-        """Return the params of the explicit law at this time step."""
-        # No target has the implicit law, but all can have its gains at one time step.
-        explicit = as_explicit(params, self.dt)
-        if explicit is not params:
-            text = f"gains of the explicit law at dt = {self.dt:g} s only"
-            if params.ki is not None and np.any(params.ki > 0):
-                text += "; the integral leads by dt times the rate of the setpoint"
-            self.append(f"discretization: {text}")
-        return explicit
-
-    def _in_efforts(self, params: PIDParams, inertia: ArrayLike | None) -> PIDParams:
-        """Return the params with gains in effort units."""
-        if inertia is not None:
-            inertia = _inertia(inertia, self.joints)
-        if params.gain_units is None:
-            return params
+    check_one_env(params)
+    joints = names("joint_names", joint_names, params.num_joints)
+    dt = time_step("dt", dt)
+    params.check(1, joints)
+    check_gain_units(params)
+    motors = Actuators() if actuators is None else actuators
+    instance("actuators", motors, Actuators, "build them with make_actuators()")
+    motors.check(1, joints)
+    conversions = []
+    # No target has the implicit law, but all can have its gains at one time step.
+    explicit = as_explicit(params, dt)
+    if explicit is not params:
+        text = f"gains of the explicit law at dt = {dt:g} s only"
+        if np.any(explicit.ki):
+            text += "; the integral leads by dt times the rate of the setpoint"
+        conversions.append(f"discretization: {text}")
+    if inertia is not None:
+        inertia = array("inertia", inertia, (len(joints),), joints)
+        inertia = at_least("inertia", inertia, np.finfo(float).tiny, joints)
+    if explicit.gain_units is not None:
         if inertia is None:
             problem = "is missing for gains per mass_matrix"
             remedy = "pass inertia=, the diagonal of the mass matrix, or gains in effort units"
             raise InvalidArgumentError("inertia", problem, remedy=remedy)
-        text = f"gains in efforts, for one inertia: {self.listed(inertia)} kg m^2"
-        self.append(f"gain_units: {text} or kg; joints disturb each other")
+        conversions.append(
+            "gain_units: gains in efforts, for one inertia; joints disturb each other"
+        )
         scaled: Document = {"gain_units": None}
-        for name, leaf in params.leaves().items():
+        for name, leaf in explicit.leaves().items():
             if name in ("kp", "ki", "kd", "integral_min", "integral_max"):
-                scaled[name] = (leaf * inertia).astype(params.dtype)
-        return params._replace(**scaled)
-
-    def value(self, option: str, off: float = 0.0) -> Float64:
-        """Return an option of the params (joints,), ``off`` where it is off."""
-        return joint_values(getattr(self.params, option), len(self.joints), off)
-
-    def ends(self, limit: str) -> tuple[Float64, Float64]:
-        """Return the lower and the upper limit (joints,) of the "effort" or the "integral"."""
-        return self.value(f"{limit}_min", -math.inf), self.value(f"{limit}_max", math.inf)
-
-    @property
-    def limited(self) -> Bool:
-        """Mask of the joints with an effort limit."""
-        low, high = self.ends("effort")
-        return np.isfinite(low) | np.isfinite(high)
-
-    def listed(self, values: ArrayLike, where: ArrayLike = True) -> str:
-        """Return one value for each joint of the mask ``where``, as text: one figure where all are
-        the same.
-        """
-        chosen = np.broadcast_to(where, len(self.joints))
-        texts = [f"{value:.4g}" for value in np.asarray(values)]
-        if chosen.all() and len(set(texts)) == 1:
-            return texts[0]
-        named = [f"{joint} {text}" for joint, text in zip(self.joints, texts, strict=True)]
-        return ", ".join(np.array(named)[chosen])
-
-    def add(
-        self,
-        option: str,
-        problem: str,
-        where: ArrayLike,
-        values: ArrayLike | None = None,
-        unit: str = "",
-    ) -> None:
-        """Add a difference of ``option``, if any joint is in the mask ``where``, with this law's
-        ``values`` there.
-        """
-        if np.any(where):
-            figures = ""
-            if values is not None:
-                figures = f"; here {self.listed(values, where)} {unit}".rstrip()
-            self.append(f"{option}: {problem}{figures}")
-
-    def lack(
-        self,
-        option: str,
-        problem: str,
-        off: float,
-        unit: str = "",
-    ) -> None:
-        """Add an option that the target lacks, where it is on."""
-        values = self.value(option, off)
-        self.add(option, problem, values != off, values, unit)
-
-    def lack_weights(self) -> None:
-        """Add the limit of the effort's rate and the weight of the setpoint in P."""
-        text = "the change of the effort is not limited"
-        self.lack("effort_rate_limit", text, math.inf, "N m/s or N/s")
-        text = "P acts on the whole setpoint (b = 1), so steps overshoot more"
-        self.lack("setpoint_weight", text, 1.0)
-
-    def opening(self, title: str) -> str:
-        """Return the comments that open a file: its title, and the differences."""
-        lines = [f"# {title}, generated by batchpid.\n"]
-        lines += [f"# differs: {' '.join(sentence.split())}\n" for sentence in self]
-        return "".join(lines)
+                scaled[name] = (leaf * inertia).astype(explicit.dtype)
+        explicit = explicit._replace(**scaled)
+    guard = Guard() if guard is None else guard
+    return Law(joints, dt, explicit, motors, guard, tuple(conversions), is_law)
 
 
-def joint_values(leaf: Array, joints: int, off: float) -> Float64:
-    """Return a leaf of one env (joints,), ``off`` where it is None."""
-    if leaf is None:
-        return np.full(joints, off)
-    return np.asarray(leaf[0], np.float64)
+def differences(
+    law: Law, target: Literal["ros2_control", "mjcf"], driven: ArrayLike = True
+) -> list[str]:
+    """Return sentences ``"option: difference"`` on the target's law, each with its joints unless it
+    concerns all.
 
-
-def strategies(params: PIDParams) -> list[str]:
-    """Return the anti-windup strategy of each joint of params of one env, by the names of
-    make_params.
+    The mask ``driven`` has the joints that the target drives.
     """
-    names = named(params.num_joints, params.tracking_time, params.conditional)
-    return [str(name) for name in names[0]]
+    rows = _mjcf(law) if target == "mjcf" else _ros2_control(law)
+    for option, text in OPTIONS[target].items():
+        rows[f"{option}: {text}"] = law.has(option)
+    sentences = list(law.conversions)
+    for sentence, mask in rows.items():
+        joints = np.array(law.joints)[mask & np.asarray(driven)]
+        if len(joints) == len(law.joints):
+            sentences.append(sentence)
+        elif len(joints):
+            sentences.append(f"{sentence}; here {', '.join(joints)}")
+    return sentences
 
 
-def _inertia(inertia: ArrayLike, joints: list[str]) -> Float64:
-    """Return inertias (joints,) > 0."""
-    row = array("inertia", inertia, (len(joints),), joints)
-    return at_least("inertia", row, np.finfo(float).tiny, joints)
+def _ros2_control(law: Law) -> dict[str, Bool]:
+    """Return differences by several options, and the joints that have them."""
+    params = law.params
+    integrates = law.has("ki")
+    limited = law.has("effort_min") | law.has("effort_max")
+    weighs = law.has("kd") & (params.setpoint_weight_derivative is not None)
+    differentiates = law.has("kd") & (params.measurement_rate is None)
+    excludes = (law.column("effort_min") > 0) | (law.column("effort_max") < 0)
+    strategy = np.array(law.strategies)
+    misled = (strategy == "conditional") & excludes
+    tracks = strategy == "back_calculation"
+    early = tracks & (law.column("tracking_time") < law.dt)
+    weight = (
+        "a feedforward of the desired velocity, after u_clamp; setpoints are not differentiated"
+    )
+    clamp = "u_clamp limits the PID alone, not its sum with a feedforward such as gravity"
+    left_out = tracks & integrates & limited
+    return {
+        f"setpoint_weight_derivative: {weight}": weighs,
+        QUOTIENT: differentiates,
+        f"effort_limit: {clamp} compensation": limited,
+        "integral_limit: limits contain 0 in the target": law.begins_outside,
+        "anti_windup: conditional integration is wrong where limits exclude 0": misled,
+        "anti_windup: without ki the integral does not track": tracks & ~integrates,
+        "anti_windup: back-calculation is left out at an error of exactly 0": left_out,
+        "tracking_time: below dt the integral over-corrects": early,
+    }
 
 
-EFFECTS = {
-    name: field for name, field in FIELDS.items() if name not in ("no_load_speed", "effort_limit")
-}
-"""Effects of actuators that a target may lack."""
-_PROBLEMS = {
-    "saturation_effort": "no torque-speed line",
-    "static": "friction at rest as in motion",
-    "load_friction": "friction does not grow with the effort",
-}
-
-
-class Drive(Differences):
-    """Gains of a drive on the measured velocity, and its motors, with their differences."""
-
-    def __init__(
-        self,
-        params: PIDParams,
-        joint_names: Sequence[str],
-        dt: float,
-        inertia: ArrayLike | None,
-        actuators: Actuators | None,
-    ) -> None:
-        super().__init__(params, joint_names, dt, inertia)
-        motors = Actuators() if actuators is None else actuators
-        self.actuators = instance(
-            "actuators", motors, Actuators, "build them with make_actuators()"
-        )
-        if motors.num_envs > 1 or motors.num_joints not in (0, len(self.joints)):
-            problem = f"are for {motors.num_envs} envs and {motors.num_joints} joints"
-            remedy = f"give them for one env and {len(self.joints)} joints"
-            raise InvalidArgumentError("actuators", problem, remedy=remedy)
-        self._compare()
-
-    def motor(self, effect: str, off: float = 0.0) -> Float64:
-        """Return an effect of the actuators (joints,), ``off`` where it is off."""
-        return joint_values(getattr(self.actuators, effect), len(self.joints), off)
-
-    @property
-    def integral_limit(self) -> Float64:
-        """Symmetric limit of the integral (joints,) [N m or N]; infinite without a limit."""
-        low, high = self.ends("integral")
-        return np.maximum(np.minimum(-low, high), 0.0)
-
-    def lack_motors(self, has: Collection[str]) -> None:
-        """Add the effects of the actuators that are on and not in ``has``."""
-        for effect, field in EFFECTS.items():
-            values = self.motor(effect, field.neutral)
-            off = field.neutral
-            if effect not in has:
-                text = _PROBLEMS.get(effect, "none in the target")
-                self.add(effect, text, values != off, values, field.unit.removeprefix("1"))
-
-    def compare_integral(self, clamps: ArrayLike) -> None:
-        """Add the differences of a target that limits its integral alone, symmetrically.
-
-        The target passes the limit by up to one step, except at the joints of the mask ``clamps``.
-        """
-        # A joint without ki has no integral that could differ.
-        integrates = self.value("ki") > 0
-        limits = self.integral_limit
-        low, high = self.ends("integral")
-        passes = np.isfinite(limits) & ~np.asarray(clamps)
-        motors = [self.motor(effect, math.inf) for effect in ("effort_limit", "saturation_effort")]
-        winds = self.limited | np.isfinite(motors).any(0)
-        winds &= np.array(strategies(self.params)) != "none"
-        rows = (
-            ("anti_windup", "the integral grows during saturation, up to its limit", winds),
-            ("integral_limit", "the same in both directions", (-low != high) & clamps),
-            ("integral_limit", "exceeded by up to one step, ki dt |e|", passes),
-        )
-        for option, text, where in rows:
-            self.add(option, text, integrates & where, limits, "N m or N")
-
-    def _compare(self) -> None:
-        # Options of the derivative matter where there is one, and come last.
-        params = self.params
-        low, high = self.ends("integral")
-        excluded = ((low > 0) | (high < 0)) & (params.ki is not None)
-        self.add("integral_limit", "the integral begins at 0, outside its limits", excluded)
-        self.lack_weights()
-        self.lack("deadband", "none: P acts on the whole error", 0.0, "rad or m")
-        turns = params.continuous is not None
-        self.add("continuous", "errors are not taken the short way round", turns)
-        self.add("non_finite", "inputs are not checked", params.non_finite is not None)
-        if params.kd is None:
-            return
-        weight = self.value("setpoint_weight_derivative")
-        has_weight = params.setpoint_weight_derivative is not None
-        text = "acts on the target's velocity alone (c = 1)"
-        self.add("setpoint_weight_derivative", text, has_weight, weight)
-        self.lack("derivative_filter_time", "no filter", 0.0, "s")
-        text = "the derivative is the simulator's velocity, not a difference"
-        self.add("measurement_rate", text, params.measurement_rate is None)
+def _mjcf(law: Law) -> dict[str, Bool]:
+    """Return differences by several options or of motors, and the joints that have them."""
+    params = law.params
+    derives = law.has("kd")
+    integrates = law.has("ki")
+    bounded = law.has("integral_min") | law.has("integral_max")
+    line, is_dcmotor = law.has_line, law.is_dcmotor
+    one_sided = -law.column("integral_min") != law.column("integral_max")
+    clamps = integrates & bounded & (~is_dcmotor | one_sided)
+    weighs = derives & (params.setpoint_weight_derivative is not None)
+    late = law.is_law & law.has("command_delay")
+    saturates = np.isfinite(law.effort_range).any(0) | line
+    winds = saturates & (np.array(law.strategies) != "none")
+    weak = np.abs(law.effort_range).min(0) < law.column("effort_limit")
+    places = law.has("lower") | law.has("upper")
+    guarded = derives & (places | law.has("rate"))
+    turns = np.zeros(len(law.joints)) if law.guard.turns is None else law.guard.turns[0]
+    written = WRITTEN if law.is_law else WRITTEN | {"strength", "bias"}
+    lacking = [effect for effect in FIELDS if effect not in written]
+    return {
+        "setpoint_weight_derivative: acts on the target's velocity alone (c = 1)": weighs,
+        QUOTIENT: derives & (params.measurement_rate is None),
+        "integral_limit: the integral begins at 0, outside its limits": law.begins_outside,
+        "integral_limit: symmetric, and in a <pid> exceeded by up to one step": clamps,
+        "anti_windup: the integral grows during saturation, up to its limit": integrates & winds,
+        "command_delay: delays the inputs, 0 at first, and not the effort": late,
+        "bias: none in a dcmotor": (not law.is_law) & is_dcmotor & law.has("bias"),
+        "saturation_effort: none without strength": law.has("saturation_effort") & ~line,
+        "saturation_effort: beyond its line a motor brakes within the law's limits": line & weak,
+        "lag: acts before the limits of the effort, not after them": law.has("lag") & saturates,
+        "guard: the acceleration of the setpoint is not limited": law.has("acceleration"),
+        "guard: a dcmotor has no limits of the position alone": is_dcmotor & places,
+        "guard: setpoints do not go the short way round": law.has("rate") & (turns > 0),
+        "guard: limits the position input, not the velocity input": guarded,
+    } | {f"{effect}: none in the target": law.has(effect) for effect in lacking}

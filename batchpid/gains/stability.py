@@ -31,8 +31,8 @@ multivariable root loci", Int. J. Control 25, 1977). The phase has to fall throu
 there; if it begins below, no gains are stable and the ratio is infinite. A delay between two steps
 is interpolated, as :mod:`batchpid.motors.delay` does.
 
-The integral, which is slow, is not in the ratio; :func:`spectral_radius` and :func:`oscillation`
-include it. E. I. Jury, Theory and Application of the z-Transform Method (Wiley, 1964).
+The integral, which is slow, is not in the ratio; :func:`spectral_radius` includes it. E. I. Jury,
+Theory and Application of the z-Transform Method (Wiley, 1964).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.checks.validate import at_least, broadcast, positive, read_array, time_step
+from batchpid.checks.validate import at_least, broadcast, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 
 _FREQUENCIES = 100
@@ -52,6 +52,8 @@ between two of them the loci are interpolated.
 """
 _SLOWEST = 0.01
 """Lowest of them, over 1 / (delay + lag)."""
+_LATEST_STEPS = 1e9
+"""Time steps of the longest delay and lag that the bound tells from longer ones."""
 
 
 class StabilityBound(NamedTuple):
@@ -65,19 +67,6 @@ class StabilityBound(NamedTuple):
     """(..., joints): share of each joint in the least stable mode (with delay or lag: in its kinetic
     energy); sums to 1.
     """
-
-
-class Oscillation(NamedTuple):
-    """Least damped oscillation of the sampled loop among those that last; of a loop without any the
-    ratio is 1.
-    """
-
-    damping_ratio: Float64
-    """(...): zeta; after a period exp(-2 pi zeta / sqrt(1 - zeta^2)) of the amplitude is left."""
-    frequency: Float64
-    """(...) [Hz]; 0 without oscillation."""
-    participation: Float64
-    """(..., joints): share of each joint in it; sums to 1."""
 
 
 def stability_bound(
@@ -154,6 +143,8 @@ def _late_bound(
     participation = np.zeros(m.shape[:-1])
     for at in np.ndindex(*m.shape[:-2]):
         local = [column[at] for column in columns]
+        # With later efforts z would round to 1 at the lowest frequency.
+        local[-2:] = [np.minimum(late, _LATEST_STEPS * dt) for late in local[-2:]]
         # Frequencies are spaced by ratio where loci bend, and evenly up to the highest.
         slowest = _SLOWEST / (1 + float(np.max(local[-2] + local[-1])) / dt)
         slow = np.geomspace(slowest, np.pi / 4, _FREQUENCIES)
@@ -242,46 +233,6 @@ def spectral_radius(
     values = np.linalg.eigvals(_one_step(mass_matrix, dt, kp, ki, kd, filter_time, damping))
     radius: Float64 = np.abs(values).max(-1)
     return radius
-
-
-def oscillation(
-    mass_matrix: ArrayLike,
-    kp: ArrayLike,
-    ki: ArrayLike,
-    kd: ArrayLike,
-    dt: float,
-    *,
-    filter_time: ArrayLike = 0.0,
-    damping: ArrayLike = 0.0,
-    lasting: float = 1.0,
-) -> Oscillation:
-    """Return the least damped oscillation of the sampled PID loop that takes ``lasting`` [s] or
-    longer to fall to 2 %.
-
-    Modes that decay faster are not seen in a motion. The other arguments are as in
-    :func:`spectral_radius`. With the eigenvalue z of a mode, its continuous one is s = log(z) / dt,
-    zeta = -Re s / |s|, and its frequency |Im s| / 2 pi.
-    """
-    values, vectors = np.linalg.eig(_one_step(mass_matrix, dt, kp, ki, kd, filter_time, damping))
-    joints = values.shape[-1] // 4
-    turns = np.abs(values.imag) > 1e-9
-    s = np.log(np.where(turns, values, 1j)) / dt
-    lasts = turns & (-s.real * positive("lasting", lasting, "s") < -np.log(0.02))
-    ratio = np.where(lasts, -s.real / np.abs(s), 1.0)
-    worst = ratio.argmin(-1)[..., None]
-    results = np.take_along_axis(lasts, worst, -1)
-    shape = np.take_along_axis(vectors, worst[..., None], -1)[..., :joints, 0]
-    # Kinetic energy, apart from the coupling of joints.
-    energy = np.abs(shape) ** 2 * np.diagonal(
-        read_array("mass_matrix", mass_matrix), axis1=-2, axis2=-1
-    )
-    energy = np.where(results, energy, 1.0)
-    frequency = np.abs(np.take_along_axis(s, worst, -1).imag) / (2 * np.pi)
-    return Oscillation(
-        damping_ratio=np.take_along_axis(ratio, worst, -1)[..., 0],
-        frequency=np.where(results, frequency, 0.0)[..., 0],
-        participation=energy / energy.sum(-1, keepdims=True),
-    )
 
 
 def _one_step(mass_matrix: ArrayLike, dt: float, *gains: ArrayLike) -> Float64:

@@ -61,6 +61,7 @@ def track(
     if dt is None and params.discretization is not None:
         problem = "is needed where the params have discretization 'implicit'"
         raise InvalidArgumentError("dt", problem, remedy="give dt in seconds")
+    params = params.for_rank(measurement.ndim)
     xp = namespace(*params, *state, setpoint, measurement, effort)
     k = discretise(params, 1.0 if dt is None else dt)
     # The terms of the next step, on the same inputs, with the derivative settled.

@@ -54,7 +54,8 @@ def checked_inputs(
     shapes |= {name: [array.shape] for name, array in arrays.items() if array is not None}
     (whole,) = shapes["measurement"]
     joints = params.num_joints
-    usual = {whole, (1, joints)}  # a look saves most of the time
+    # One look saves most of the time.
+    usual = {whole, (1, joints)}
     if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*shapes.values())):
         _check_shapes(np.broadcast_shapes(*of_params), joints, shapes)
     return in_dtype_of(params, *arrays.values())
@@ -150,10 +151,11 @@ def checked_state(state: PIDState, needed: PIDState) -> PIDState:
 
 
 def checked_mask(mask: Array, state: PIDState) -> Array:
-    """Return ``mask`` as bools, one for each env of ``state``."""
+    """Return ``mask`` as bools, one for each env of ``state``; () for one robot."""
     array = _as_array("mask", mask, "b")
-    envs = np.broadcast_shapes(*(leaf.shape for leaf in state if leaf is not None))[:1]
-    if array.dtype.kind != "b" or array.ndim != 1 or (envs and array.shape != envs):
+    shape = np.broadcast_shapes(*(leaf.shape for leaf in state if leaf is not None))
+    envs = shape[:-1]
+    if array.dtype.kind != "b" or array.ndim > 1 or (shape and array.shape != envs):
         problem = f"is {array.dtype} {array.shape}, not bool {envs}"
         raise InvalidArgumentError("mask", problem, remedy="give one bool per env")
     return array

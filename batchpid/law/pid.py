@@ -57,12 +57,14 @@ def init(params: PIDParams, measurement: Array) -> PIDState:
     """Return the state before the first step.
 
     Derivative and setpoint weighting start from ``measurement`` (envs, joints) [rad or m]: the
-    first step has no kick.
+    first step has no kick. All functions of the law take arrays of one robot (joints,), too, and
+    return such arrays, so that a function of one robot works under ``jax.vmap``.
 
     Raises InvalidArgumentError if the measurement has another number of joints than the params.
     """
     # A state holds what the options need, and nothing else.
     (measurement,) = checked_inputs(params, PIDState(), measurement)
+    params = params.for_rank(measurement.ndim)
     xp = namespace(*params, measurement)
     y = xp.zeros_like(measurement) + measurement
     # No two leaves share a buffer: JAX donates each of them.
@@ -92,8 +94,8 @@ def step(
 ) -> tuple[PIDState, Array]:
     """Advance the law by ``dt`` seconds; return the state and the effort.
 
-    Arrays are (envs, joints), or (1, joints) for all envs, and taken in the params' dtype, which
-    state and effort have; none is written to.
+    Arrays are (envs, joints), (1, joints) for all envs, or (joints,) for one robot, and taken in
+    the params' dtype, which state and effort have; none is written to.
 
     Parameters
     ----------
@@ -151,7 +153,7 @@ def _step(
 ) -> tuple[PIDState, Terms]:
     """Check the arguments of a step and advance the law."""
     r, y, inputs = _checked(params, state, setpoint, measurement, inputs)
-    return advance(discretise(params, dt), state, r, y, **inputs)
+    return advance(discretise(params.for_rank(y.ndim), dt), state, r, y, **inputs)
 
 
 def _checked(
@@ -389,7 +391,7 @@ def drive_target(
     """
     r, y, inputs = _checked(params, state, setpoint, measurement, inputs)
     check_drive(params)
-    return advance_drive(discretise(params, dt), state, r, y, **inputs)
+    return advance_drive(discretise(params.for_rank(y.ndim), dt), state, r, y, **inputs)
 
 
 def advance_drive(

@@ -85,7 +85,7 @@ class ArrayProgram:
                 *prepared
             )
             prepared += [entry.astype(dtype) for entry in result]
-        tables = trace.operations, trace.results, trace.registers
+        tables = trace.operations, trace.results, trace.segments, trace.registers
         self.arguments = (*tables, inputs, tuple(prepared), *shape, self.dtype == np.float32)
         """Arguments of ``make_program`` in make_program.h."""
         self._program = interpreter().program(*self.arguments)

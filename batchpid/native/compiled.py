@@ -21,7 +21,9 @@ _MEASUREMENT = 1
 
 
 @lru_cache(maxsize=256)
-def _trace(structures: tuple[Any, ...], terms: bool, dtype: DType) -> tuple[Trace, tuple[int, ...]]:
+def law_trace(
+    structures: tuple[Any, ...], terms: bool, dtype: DType
+) -> tuple[Trace, tuple[int, ...]]:
     """Return the law's trace, and the indices of the state leaves that it returns before its other
     results.
 
@@ -65,7 +67,7 @@ class CompiledLaw:
         key = tuple([leaf is None for leaf in (*state, *inputs)])
         if key not in self._programs:
             dtype = self._k.kp.dtype
-            traced, lasting = _trace(structure((self._k, state, inputs)), self._terms, dtype)
+            traced, lasting = law_trace(structure((self._k, state, inputs)), self._terms, dtype)
             program = ArrayProgram(
                 traced, leaves(self._k), key.count(False), self._shape, dtype, self._threads
             )

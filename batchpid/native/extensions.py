@@ -111,6 +111,10 @@ OPERATIONS = (
     "take_row",
 )
 """Operations of programs, as Code in program.h."""
+ROW_WISE = ("row_minimum", "matrix_vector", "push", "take", "gather")
+"""Operations whose result at a number depends on other numbers of its row, or on a table."""
+MOST_OPERANDS = 48
+"""Largest number of operands, and of results, of a fused segment; as in program.h."""
 MASKS = frozenset(OPERATIONS[6:15]) | {"isfinite"}
 """Operations whose results are masks."""
 MOST_SUMMED = 128
@@ -120,8 +124,12 @@ MOST_SUMMED = 128
 _FILES = ("make_program.h", "extension.h", "program.h", "extensions.py")
 PROGRAMS = tuple(f"batchpid/native/{name}" for name in _FILES)
 """Headers and tables of programs, for extensions that include them."""
+PASSES_VECTORIZED = "-fno-tree-pre"
+"""Flag without which GCC does not vectorize a pass with two limits (fused.h)."""
 PROGRAM = Extension(
-    "batchpid.native._program", ("batchpid/native/program.cpp", *PROGRAMS), (*ROUNDED, "-pthread")
+    "batchpid.native._program",
+    ("batchpid/native/program.cpp", "batchpid/native/fused.h", *PROGRAMS),
+    (*ROUNDED, PASSES_VECTORIZED, "-pthread"),
 )
 
 KINEMATICS = ("qpos", "qvel", "tool", "pose", "jacobian", "jacobian_rate", "mass_matrix", "bias")

@@ -45,9 +45,12 @@ struct alignas(WIDTH * sizeof(double)) Lanes {  // GCC aligns its vectors otherw
     return (q.of < low.of) | (q.of > high.of) ? Packed{} : a.of;
   }
   friend Lanes where_positive(Lanes mask, Lanes a, Lanes b) { return mask.of > 0.0 ? a.of : b.of; }
+  friend double largest(Lanes a) { return std::max(std::max(a.of[0], a.of[1]), std::max(a.of[2], a.of[3])); }
   friend bool any_positive(Lanes a) { return (a.of[0] > 0) | (a.of[1] > 0) | (a.of[2] > 0) | (a.of[3] > 0); }
   // 1.0 where a >= b, else 0.0, also for nan.
   friend Lanes at_least_mask(Lanes a, Lanes b) { return a.of >= b.of ? Packed{} + 1.0 : Packed{}; }
+  // 1.0 where a < b, else 0.0, also for nan.
+  friend Lanes below_mask(Lanes a, Lanes b) { return a.of < b.of ? Packed{} + 1.0 : Packed{}; }
   // 1.0 where a and b differ, or are nan, else 0.0.
   friend Lanes differs_mask(Lanes a, Lanes b) { return a.of != b.of ? Packed{} + 1.0 : Packed{}; }
   friend Lanes absolute(Lanes a) { return a.of < 0.0 ? -a.of : a.of; }

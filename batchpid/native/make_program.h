@@ -36,22 +36,48 @@ bool add_constant(Program &program, Py_buffer const &view) {
   return true;
 }
 
-// Arguments: operations, results (bytes of int32), registers, inputs, constants (a tuple of contiguous arrays), rows,
+// Read the segments whose code has a pass in a table.
+inline bool read_segments(Program &program, PyObject *segments, Fused const *table, std::size_t size) {
+  for (Py_ssize_t i = 0, count = PyTuple_Size(segments); i < count; ++i) {
+    Segment segment{};
+    char const *code, *operands, *results;
+    Py_ssize_t code_size, operands_size, results_size;
+    if (!PyArg_ParseTuple(PyTuple_GetItem(segments, i), "nny#y#y#", &segment.first, &segment.count, &code, &code_size,
+                          &operands, &operands_size, &results, &results_size)) {
+      return false;
+    }
+    auto const wanted = values_of<std::int32_t>(code, code_size);
+    auto const *fused = std::find_if(table, table + size, [&](Fused const &each) {
+      return std::equal(wanted.begin(), wanted.end(), each.code, each.code + each.size);
+    });
+    if (fused == table + size) continue;
+    segment.operands = values_of<std::int32_t>(operands, operands_size);
+    segment.results = values_of<std::int32_t>(results, results_size);
+    segment.single = fused->single;
+    segment.pass = fused->pass;
+    program.segments.push_back(std::move(segment));
+  }
+  return true;
+}
+
+// Arguments: operations, results (bytes of int32), segments, registers, inputs, constants (a tuple of contiguous arrays), rows,
 // columns, single. Return null with a Python exception if they do not fit.
-inline std::unique_ptr<Program> make_program(PyObject *arguments) {
+inline std::unique_ptr<Program> make_program(PyObject *arguments, Fused const *table = nullptr,
+                                             std::size_t size = 0) {
   char const *operations, *results;
   Py_ssize_t operations_size, results_size;
-  PyObject *constants;
+  PyObject *constants, *segments;
   int single;
   auto program = std::make_unique<Program>();
-  if (!PyArg_ParseTuple(arguments, "y#y#nnO!nnp", &operations, &operations_size, &results, &results_size,
-                        &program->registers, &program->inputs, &PyTuple_Type, &constants, &program->rows,
+  if (!PyArg_ParseTuple(arguments, "y#y#O!nnO!nnp", &operations, &operations_size, &results, &results_size,
+                        &PyTuple_Type, &segments, &program->registers, &program->inputs, &PyTuple_Type, &constants, &program->rows,
                         &program->columns, &single)) {
     return nullptr;
   }
   program->operations = values_of<Operation>(operations, operations_size);
   program->results = values_of<std::int32_t>(results, results_size);
   program->single = single != 0;
+  if (!read_segments(*program, segments, table, size)) return nullptr;
   if (program->rows < 1 || program->columns < 1) return misfit();
   // A multiple of 8 numbers (whole SIMD vectors), unless the rows are long.
   program->chunk = program->columns;
@@ -73,6 +99,11 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments) {
            std::all_of(each.operands, each.operands + 3, known);
   }
   fits = fits && std::all_of(program->results.begin(), program->results.end(), known);
+  for (Segment const &each : program->segments) {
+    fits = fits && each.first >= 0 && each.first + each.count <= static_cast<Index>(program->operations.size()) &&
+           std::all_of(each.operands.begin(), each.operands.end(), known) &&
+           std::all_of(each.results.begin(), each.results.end(), known);
+  }
   if (!fits) return misfit();
   auto const made_by = [&](std::int32_t number) {
     Index found = -1;
@@ -81,9 +112,16 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments) {
     }
     return found;
   };
+  // A segment writes its results after it has read all its operands.
+  auto const written = [&](Index operation) {
+    for (Segment const &each : program->segments) {
+      if (operation >= each.first && operation < each.first + each.count) return each.first + each.count - 1;
+    }
+    return operation;
+  };
   for (std::size_t i = 0; i < program->results.size(); ++i) {
     auto const begin = program->results.begin(), self = begin + static_cast<Index>(i);
-    program->made.push_back(std::find(begin, self, *self) == self ? made_by(*self) : -1);
+    program->made.push_back(std::find(begin, self, *self) == self ? written(made_by(*self)) : -1);
   }
   auto const all = static_cast<Index>(program->operations.size());
   for (Index number = count; number < given; ++number) {

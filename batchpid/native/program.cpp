@@ -1,5 +1,6 @@
 // Programs of operations on arrays (program.h) as a module of Python.
 
+#include "fused.h"
 #include "make_program.h"
 
 #include <atomic>
@@ -166,7 +167,7 @@ void run_all(Program const &program, Input const *inputs, Output const *outputs,
 
 // program(...): see make_program.h.
 PyObject *make(PyObject *, PyObject *arguments) {
-  auto program = make_program(arguments);
+  auto program = make_program(arguments, FUSED, std::size(FUSED));
   if (program == nullptr) return nullptr;
   return capsule_of(std::move(program));
 }
@@ -204,9 +205,13 @@ PyObject *run_arrays(PyObject *, PyObject *arguments) {
 struct Bound {
   static constexpr char CAPSULE[] = "batchpid.bound_program";
 
-  ~Bound() { Py_XDECREF(kept); }
+  ~Bound() {
+    Py_XDECREF(kept);
+    for (PyObject *output : latest) Py_XDECREF(output);
+  }
 
   PyObject *kept = nullptr;  // arguments of bind, among them the program and the arrays
+  PyObject *latest[2] = {};  // last outputs made by calls, if they are large
   PyObject *output;  // arguments of numpy.empty
   Program const *program;
   Index rows;
@@ -216,6 +221,25 @@ struct Bound {
   std::vector<Output> outputs;
 };
 constexpr std::size_t MOST = 32;  // inputs, outputs
+// Least bytes of an output that is kept to be written again: the page faults of a new one cost a fifth of a step.
+constexpr Index LARGE_OUTPUT = 1 << 20;
+
+// Return a new output, or one of the latest if nobody else holds it; views of an array hold it, too. In a loop
+// `effort = pid(...)` the caller holds the last output during a call, so there are two.
+PyObject *make_output(Bound &bound) {
+  for (PyObject *output : bound.latest) {
+    if (output == nullptr || Py_REFCNT(output) != 1) continue;
+    Py_INCREF(output);
+    return output;
+  }
+  PyObject *output = PyObject_Call(make_empty, bound.output, nullptr);
+  if (output == nullptr || bound.rows * bound.program->columns * bound.program->itemsize() < LARGE_OUTPUT) return output;
+  Py_XDECREF(bound.latest[0]);
+  bound.latest[0] = bound.latest[1];
+  bound.latest[1] = output;
+  Py_INCREF(output);
+  return output;
+}
 
 // bind(program, rows, inputs, outputs, given, full, output, threads): fix the first inputs and outputs. Bits of `given`
 // mark further inputs that are arrays (not None), bits of `full` those that must be (rows, columns). `output` holds the
@@ -279,7 +303,7 @@ PyObject *call(PyObject *, PyObject *const *arguments, Py_ssize_t count) {
   if (!is_new) {
     Py_INCREF(out);
   } else {
-    out = PyObject_Call(make_empty, bound->output, nullptr);
+    out = make_output(*bound);
     if (out == nullptr) return nullptr;
     if (!read_output(program, bound->rows, out, outputs[written])) return Py_DECREF(out), misfit();
   }

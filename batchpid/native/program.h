@@ -65,6 +65,33 @@ struct Output {
 constexpr Index CHUNK = 128;
 constexpr Index BLOCK = 8192;  // bytes of a register in a block
 
+template <class T>
+struct Operand {
+  T const *data;
+  Index step;  // numbers to the next chunk, 0 if all chunks are the same; to the next row of a table
+};
+
+// One pass over n numbers of a block, in chunks, in place of one pass for each of some consecutive operations.
+template <class T>
+using Pass = void (*)(Operand<T> const *operands, T *const *results, Index n, Index chunk);
+
+struct Fused {
+  std::size_t size;
+  std::int32_t const *code;  // of a segment: Segment in tracing.py
+  Pass<float> single;
+  Pass<double> pass;
+};
+
+constexpr std::size_t MOST_OPERANDS = 48;  // of a segment, and of its results
+
+// Consecutive elementwise operations that are one pass. Segment in tracing.py.
+struct Segment {
+  Index first, count;                           // of its operations
+  std::vector<std::int32_t> operands, results;  // registers
+  Pass<float> single;
+  Pass<double> pass;
+};
+
 // Registers are numbered: constants, inputs, temporaries. A Program is immutable, so any number of threads may run it.
 struct Program {
   static constexpr char CAPSULE[] = "batchpid.program";
@@ -73,6 +100,7 @@ struct Program {
   Index columns = 0, chunk = 0, inputs = 0, registers = 0;
   Index rows = 0;  // of constants (rows, columns)
   std::vector<Operation> operations;
+  std::vector<Segment> segments;               // those that have a pass
   std::vector<std::int32_t> results;           // register of each output
   std::vector<Index> made;                     // operation that makes each result; negative: an operand, or twice
   std::vector<Index> last_use;                 // number of the last operation that reads each input
@@ -83,12 +111,6 @@ struct Program {
 };
 
 namespace detail {
-
-template <class T>
-struct Operand {
-  T const *data;
-  Index step;  // numbers to the next chunk, 0 if all chunks are the same; to the next row of a table
-};
 
 // 0 plus the sum of n products, in NumPy's order for n <= 128: sequential below eight terms, else eight partial sums.
 template <class T>
@@ -107,55 +129,67 @@ BATCHPID_INLINE T sum_of_products(T const *a, T const *b, Index n) {
   return T(0) + sum;
 }
 
+// Result of an elementwise operation on one number of each operand.
+template <Code code, class T>
+BATCHPID_INLINE T result_of(T a, T b, T c) {
+  auto const larger = [](T x, T y) { return (x > y) | (x != x) ? x : y; };
+  auto const smaller = [](T x, T y) { return (x < y) | (x != x) ? x : y; };
+  switch (code) {
+    case ADD: return a + b;
+    case SUBTRACT: return a - b;
+    case MULTIPLY: case AND: return a * b;
+    case DIVIDE: return a / b;
+    case MAXIMUM: case OR: return larger(a, b);
+    case MINIMUM: return smaller(a, b);
+    case GREATER: return a > b ? 1 : 0;
+    case GREATER_EQUAL: return a >= b ? 1 : 0;
+    case LESS: return a < b ? 1 : 0;
+    case LESS_EQUAL: return a <= b ? 1 : 0;
+    case EQUAL: return a == b ? 1 : 0;
+    case NOT_EQUAL: return a != b ? 1 : 0;
+    case NOT: return 1 - a;
+    case NEGATIVE: return -a;
+    case ABSOLUTE: return std::fabs(a);
+    case RINT: return std::nearbyint(a);
+    case CEIL: return std::ceil(a);
+    case FLOOR: return std::floor(a);
+    case SQRT: return std::sqrt(a);
+    case SIGN: return a > 0 ? 1 : a < 0 ? -1 : a == 0 ? 0 : a;
+    case FINITE: return a - a == 0 ? 1 : 0;
+    case WHERE: return a != 0 ? b : c;
+    case MULTIPLY_ADD: return a * b + c;
+    case ADD_SUBTRACT: return a + b - c;
+    case SUBTRACT_MULTIPLY: return (a - b) * c;
+    case CLIP: return smaller(larger(a, b), c);
+    default: return a;
+  }
+}
+
 // Apply an operation to n numbers, whole rows, from number `first` of the arrays on. A table begins with row 0.
 template <class T>
 BATCHPID_INLINE void apply(Program const &program, Code code, Index first, Index n, T *out, Operand<T> x, Operand<T> y,
                            Operand<T> z) {
   Index const columns = program.columns, chunk = x.step && y.step && z.step ? n : program.chunk;
-#define EACH(expression)                                                             \
-  for (Index start = 0; start < n; start += chunk) {                                 \
-    T const *a = x.data, *b = y.data, *c = z.data;                                   \
-    T *o = out + start;                                                              \
-    Index const count = std::min(chunk, n - start);                                  \
-    _Pragma("GCC ivdep") for (Index i = 0; i < count; ++i) o[i] = T(expression);     \
-    static_cast<void>(a), static_cast<void>(b), static_cast<void>(c);                \
-    x.data += x.step, y.data += y.step, z.data += z.step;                            \
-  }                                                                                  \
-  break
-#define MAX(a, b) ((a) > (b) || (a) != (a) ? (a) : (b))
-#define MIN(a, b) ((a) < (b) || (a) != (a) ? (a) : (b))
+#define EACH(code)                                                                             \
+  case code:                                                                                   \
+    for (Index start = 0; start < n; start += chunk) {                                         \
+      T const *a = x.data, *b = y.data, *c = z.data;                                           \
+      T *o = out + start;                                                                      \
+      Index const count = std::min(chunk, n - start);                                          \
+      _Pragma("GCC ivdep") for (Index i = 0; i < count; ++i) o[i] = result_of<code>(a[i], b[i], c[i]); \
+      x.data += x.step, y.data += y.step, z.data += z.step;                                    \
+    }                                                                                          \
+    break;
   switch (code) {
-    case ADD: EACH(a[i] + b[i]);
-    case SUBTRACT: EACH(a[i] - b[i]);
-    case MULTIPLY: case AND: EACH(a[i] * b[i]);
-    case DIVIDE: EACH(a[i] / b[i]);
-    case MAXIMUM: case OR: EACH(MAX(a[i], b[i]));
-    case MINIMUM: EACH(MIN(a[i], b[i]));
-    case GREATER: EACH(a[i] > b[i] ? 1 : 0);
-    case GREATER_EQUAL: EACH(a[i] >= b[i] ? 1 : 0);
-    case LESS: EACH(a[i] < b[i] ? 1 : 0);
-    case LESS_EQUAL: EACH(a[i] <= b[i] ? 1 : 0);
-    case EQUAL: EACH(a[i] == b[i] ? 1 : 0);
-    case NOT_EQUAL: EACH(a[i] != b[i] ? 1 : 0);
-    case NOT: EACH(1 - a[i]);
-    case NEGATIVE: EACH(-a[i]);
-    case ABSOLUTE: EACH(std::fabs(a[i]));
-    case RINT: EACH(std::nearbyint(a[i]));
-    case CEIL: EACH(std::ceil(a[i]));
-    case FLOOR: EACH(std::floor(a[i]));
-    case SQRT: EACH(std::sqrt(a[i]));
-    case SIGN: EACH(a[i] > 0 ? 1 : a[i] < 0 ? -1 : a[i] == 0 ? 0 : a[i]);
-    case FINITE: EACH(a[i] - a[i] == 0 ? 1 : 0);
-    case WHERE: EACH(a[i] != 0 ? b[i] : c[i]);
-    case MULTIPLY_ADD: EACH(a[i] * b[i] + c[i]);
-    case ADD_SUBTRACT: EACH(a[i] + b[i] - c[i]);
-    case SUBTRACT_MULTIPLY: EACH((a[i] - b[i]) * c[i]);
-    case CLIP: EACH(MIN(MAX(a[i], b[i]), c[i]));
+    EACH(ADD) EACH(SUBTRACT) EACH(MULTIPLY) EACH(DIVIDE) EACH(MAXIMUM) EACH(MINIMUM) EACH(GREATER) EACH(GREATER_EQUAL)
+    EACH(LESS) EACH(LESS_EQUAL) EACH(EQUAL) EACH(NOT_EQUAL) EACH(AND) EACH(OR) EACH(NOT) EACH(NEGATIVE) EACH(ABSOLUTE)
+    EACH(RINT) EACH(CEIL) EACH(FLOOR) EACH(SQRT) EACH(SIGN) EACH(FINITE) EACH(WHERE) EACH(MULTIPLY_ADD)
+    EACH(ADD_SUBTRACT) EACH(SUBTRACT_MULTIPLY) EACH(CLIP)
     case ROW_MINIMUM:
       for (Index row = 0; row < n; row += columns) {
         T const *a = x.data + (x.step ? row : row % program.chunk);
         T least = a[0];
-        for (Index i = 1; i < columns; ++i) least = MIN(least, a[i]);
+        for (Index i = 1; i < columns; ++i) least = result_of<MINIMUM>(least, a[i], T(0));
         std::fill_n(out + row, columns, least);
       }
       break;
@@ -193,8 +227,6 @@ BATCHPID_INLINE void apply(Program const &program, Code code, Index first, Index
       break;
   }
 #undef EACH
-#undef MAX
-#undef MIN
 }
 
 // Write n numbers of a register.
@@ -235,6 +267,20 @@ inline bool is_made_in_place(Program const &program, Input const *inputs, Output
     if (inputs[i].data == outputs[result].data && program.last_use[static_cast<std::size_t>(i)] > made) return false;
   }
   return true;
+}
+
+// Run a segment on n numbers of the registers `at`.
+template <class T>
+BATCHPID_INLINE void run_segment(Segment const &segment, Operand<T> const *at, Index n, Index chunk) {
+  Operand<T> operands[MOST_OPERANDS];
+  T *results[MOST_OPERANDS];
+  for (std::size_t i = 0; i < segment.operands.size(); ++i) operands[i] = at[segment.operands[i]];
+  for (std::size_t i = 0; i < segment.results.size(); ++i) results[i] = const_cast<T *>(at[segment.results[i]].data);
+  if constexpr (sizeof(T) == sizeof(float)) {
+    segment.single(operands, results, n, chunk);
+  } else {
+    segment.pass(operands, results, n, chunk);
+  }
 }
 
 template <class T>
@@ -278,7 +324,15 @@ BATCHPID_INLINE void run_rows(Program const &program, Input const *inputs, Outpu
     for (std::size_t i = 0; i < program.results.size(); ++i) {
       if (i < 64 && in_place >> i & 1) at[program.results[i]] = {static_cast<T *>(outputs[i].data) + start, chunk};
     }
-    for (Operation const &each : program.operations) {
+    auto segment = program.segments.begin();
+    for (Index k = 0; k < static_cast<Index>(program.operations.size()); ++k) {
+      if (segment != program.segments.end() && segment->first == k) {
+        run_segment(*segment, at, n, chunk);
+        k += segment->count - 1;
+        ++segment;
+        continue;
+      }
+      Operation const &each = program.operations[static_cast<std::size_t>(k)];
       auto const *operands = each.operands;
       apply(program, static_cast<Code>(each.code), start, n, const_cast<T *>(at[each.out].data), at[operands[0]],
             at[operands[1]], at[operands[2]]);

@@ -145,10 +145,10 @@ void weigh_bodies(std::int64_t dof, BodyRow<T> const *rows, BodyState<N> *body) 
   for (std::int64_t j = 0; j < dof; ++j) weigh(rows[j].inertia, body[j]);
 }
 
-// Write the mass matrix (dof, dof) of the bodies; each then has the inertia of all that its joint moves.
-template <class N>
-void composite_mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyState<N> *body, N *matrix) {
-  for (std::int64_t at = 0; at < dof * dof; ++at) matrix[at] = N{};
+// Write the entries (i, j) of the mass matrix of the bodies for each joint j and those above it, i <= j, by a function;
+// each body then has the inertia of all that its joint moves.
+template <class N, class Write>
+void composite_mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyState<N> *body, Write write) {
   for (std::int64_t j = dof - 1; j >= 0; --j) {
     Inertia<N> const &moved = body[j].inertia;
     if (tree[2 * j] >= 0) body[tree[2 * j]].inertia.add(moved);
@@ -157,9 +157,18 @@ void composite_mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyState
     for (std::int64_t i = j; i >= 0; i = tree[2 * i]) {
       N product = dot(body[i].moving, linear);
       if (!tree[2 * i + 1]) product += dot(body[i].axes[0], angular);
-      matrix[i * dof + j] = matrix[j * dof + i] = product;
+      write(i, j, product);
     }
   }
+}
+
+// Write the mass matrix (dof, dof) of the bodies.
+template <class N>
+void composite_mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyState<N> *body, N *matrix) {
+  for (std::int64_t at = 0; at < dof * dof; ++at) matrix[at] = N{};
+  composite_mass_matrix(dof, tree, body, [&](std::int64_t i, std::int64_t j, N product) {
+    matrix[i * dof + j] = matrix[j * dof + i] = product;
+  });
 }
 
 // Velocity and acceleration of a body, and the wrench on it, about the origin.

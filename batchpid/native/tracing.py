@@ -5,17 +5,34 @@ function.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, DType, Pytree
 from batchpid.arrays.trees import filled, leaves
-from batchpid.native.extensions import OPERATIONS
+from batchpid.native.extensions import MOST_OPERANDS, OPERATIONS, ROW_WISE
 from batchpid.native.symbols import Namespace, Symbol
 
 _Operation = tuple[str, tuple[Symbol, ...], Symbol]
+
+
+class Segment(NamedTuple):
+    """Consecutive elementwise operations of a trace, as one function of their operands."""
+
+    first: int
+    """Index of the first operation."""
+    length: int
+    code: bytes
+    """Numbers of operands and results; then of each operation its code and three operands; then the
+    values that are results. A value is an operand of the segment, or numbered after these.
+    """
+    operands: bytes
+    """Register of each operand."""
+    results: bytes
+    """Register of each result."""
 
 
 class Trace(NamedTuple):
@@ -24,6 +41,7 @@ class Trace(NamedTuple):
     operations: bytes
     results: bytes
     """Register of each result."""
+    segments: tuple[Segment, ...]
     masks: tuple[bool, ...]
     """Whether each result is a mask."""
     registers: int
@@ -175,7 +193,50 @@ def _assembled(
         rows.append([OPERATIONS.index(name), places[result], *numbers, *(2 * numbers[:1])][:5])
         # Freed last: a result must not use the register of an operand.
         free += {places[one] for one in operands if last_use[one] == at and one not in lasting}
-    table = np.array(rows, np.int32)
-    ends = np.array([places[result] for result in results], np.int32)
     masks = tuple(result.is_mask for result in results)
-    return Trace(table.tobytes(), ends.tobytes(), masks, registers, literals, prelude)
+    segments = tuple(_segments(operations, places, results))
+    ends = _packed(places[result] for result in results)
+    return Trace(_packed(rows), ends, segments, masks, registers, literals, prelude)
+
+
+def _segments(
+    operations: list[_Operation], places: Mapping[Symbol, int], results: list[Symbol]
+) -> Iterator[Segment]:
+    """Yield the longest runs of at least two elementwise operations."""
+    last_use = {
+        operand: at for at, (_, operands, _) in enumerate(operations) for operand in operands
+    }
+    last_use |= dict.fromkeys(results, len(operations))
+    for is_elementwise, run in groupby(
+        enumerate(operations), lambda entry: entry[1][0] not in ROW_WISE
+    ):
+        if not is_elementwise:
+            continue
+        numbered = list(run)
+        first, end = numbered[0][0], numbered[-1][0] + 1
+        inside = [operation for _, operation in numbered]
+        made = dict.fromkeys(result for _, _, result in inside)
+        read = dict.fromkeys(
+            operand for _, operands, _ in inside for operand in operands if operand not in made
+        )
+        numbers = {symbol: number for number, symbol in enumerate([*read, *made])}
+        kept = [symbol for symbol in made if last_use.get(symbol, -1) >= end]
+        if len(inside) < 2 or len(read) > MOST_OPERANDS or len(kept) > MOST_OPERANDS:
+            continue
+        code = [len(read), len(kept)]
+        for name, operands, _ in inside:
+            entries = [numbers[operand] for operand in operands]
+            code += [OPERATIONS.index(name), *entries, *(2 * entries[:1])][:4]
+        code += [numbers[symbol] for symbol in kept]
+        yield Segment(
+            first,
+            end - first,
+            _packed(code),
+            _packed(places[symbol] for symbol in read),
+            _packed(places[symbol] for symbol in kept),
+        )
+
+
+def _packed(numbers: Iterable[Any]) -> bytes:
+    """Return numbers as bytes of int32."""
+    return np.array(list(numbers), np.int32).tobytes()

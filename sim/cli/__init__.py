@@ -1,9 +1,9 @@
-"""The command line: each command is a function, whose signature is the flags and whose docstring is
-the help.
+"""The command line: each command is a function, whose annotations are the flags and whose docstring
+is the help.
 
-The result writes itself. ``report()`` is printed, and the output files come from ``save(path)``,
-``figure()`` and ``document()``; ``status`` is the exit status (without it: 0). To add a command,
-write such a function and list it in :data:`COMMANDS`.
+The result writes itself. ``report()`` is printed, and the output files come from ``save(path)`` and
+``figure()``; ``status`` is the exit status (without it: 0). To add a command, write such a function
+and list it in :data:`COMMANDS`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 import tyro
 
 import batchpid
+from batchpid.checks.validate import choice
 from batchpid.errors import BatchPIDError
 from batchpid.sim.cli.commands import COMMANDS, execute
 from batchpid.sim.cli.flags import check
@@ -67,8 +68,9 @@ def parse(arguments: Sequence[str]) -> tuple[str, object]:
         tyro.conf.arg(help="`batchpid COMMAND --help` lists the flags of a command."),
     )
     # A command is parsed alone, so that a message names its help.
-    if arguments and arguments[0] in COMMANDS:
+    if arguments and not arguments[0].startswith("-"):
         name, *words = arguments
+        choice("command", name, COMMANDS)
         record = COMMANDS[name].record()
         return name, tyro.cli(record, prog=f"batchpid {name}", args=words, config=config)
     app = tyro.extras.SubcommandApp()

@@ -6,12 +6,11 @@ No file is replaced without ``--force``, and no input at all.
 from __future__ import annotations
 
 import inspect
-import json
-import math
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterable, Iterator, Sized
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,24 +24,22 @@ from batchpid.sim.cli import flags
 from batchpid.sim.cli.drawing import plot, view
 from batchpid.sim.cli.excite import excite_joints
 from batchpid.sim.cli.export import ENDINGS, export
+from batchpid.sim.cli.gains import compare, tune
 from batchpid.sim.cli.identify import identify_logs
 from batchpid.sim.cli.inspect import inspect_robot
 from batchpid.sim.cli.rollout import demo, rollout
 from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.tuning.comparison import compare, default_gains, default_sets
-from batchpid.sim.tuning.evaluation import load_randomization
-from batchpid.sim.tuning.search import tune
+from batchpid.sim.tuning.gain_sets import default_gains
 
 PICTURES = (".png", ".svg")
 DOCUMENTS = (".yaml", ".yml", ".json")
 DEFAULT_ROBOT = "panda"
 FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
-SWITCH: dict[str | None, bool] = {"on": True, "off": False, "fixed": True, "free": False}
-"""Values of flags with two words."""
-COUNTS = {"num_envs": "robots", "moves": "random moves", "population": "candidates at once"}
-"""Flags that are counts, with nouns for the first line."""
+LINE_SECONDS = 10.0
+"""Time between lines about the progress of a command [s]."""
+FIXED: dict[str | None, bool] = {"fixed": True, "free": False}
+"""Values of the flag ``--base``."""
 
 
 class Output(NamedTuple):
@@ -71,7 +68,7 @@ class CommandFunction(NamedTuple):
     outputs: dict[str, Output]
     options: tuple[str, ...] = ()
     """Options of a Runner that are flags."""
-    loading: tuple[str, ...] = ("base",)
+    loading: tuple[str, ...] = ()
     """Options of :meth:`Robot.load` that are flags."""
 
     def record(self) -> type:
@@ -80,18 +77,18 @@ class CommandFunction(NamedTuple):
         return flags.record_of(self.function, self.options, self.loading, outputs)
 
 
-FIGURES = Output("Figures", (".json",))
 PICTURE = Output("Picture", PICTURES)
 COMMANDS = {
     "demo": CommandFunction(
         demo,
         {"picture": PICTURE._replace(default="out/{ROBOT}-demo.png")},
-        ("engine", "workers"),
+        ("engine",),
+        (),
     ),
     "rollout": CommandFunction(
         rollout,
-        {"out": Output("Recording", (".h5",)), "picture": PICTURE, "json": FIGURES},
-        ("engine", "workers", "backend", "compensate", "ground"),
+        {"out": Output("Recording", (".h5",)), "picture": PICTURE},
+        ("engine", "workers"),
         ("base", "actuators"),
     ),
     "tune": CommandFunction(
@@ -102,9 +99,7 @@ COMMANDS = {
         },
         loading=("base", "actuators"),
     ),
-    "compare": CommandFunction(
-        compare, {"picture": PICTURE, "json": FIGURES}, loading=("base", "actuators")
-    ),
+    "compare": CommandFunction(compare, {"picture": PICTURE}, loading=("base", "actuators")),
     "excite": CommandFunction(
         excite_joints, {"out": Output("Setpoints", (".csv",), "out/{ROBOT}.excite.csv")}
     ),
@@ -113,16 +108,16 @@ COMMANDS = {
         {
             "out": Output("Actuators file", DOCUMENTS, "out/{ROBOT}.actuators.yaml"),
             "picture": PICTURE._replace(default="{NAME}-fit.png"),
-            "json": FIGURES,
             "corrected_urdf": Output("URDF with the identified masses", (".urdf",)),
         },
+        loading=("base",),
     ),
     "export": CommandFunction(
         export,
         {"out": Output("File", (".h", ".yaml", ".xml", ".urdf"), "out/{ROBOT}-{ENDING}")},
-        loading=("base", "actuators"),
+        loading=("actuators",),
     ),
-    "inspect": CommandFunction(inspect_robot, {"json": FIGURES}),
+    "inspect": CommandFunction(inspect_robot, {}, loading=("base",)),
     "plot": CommandFunction(
         plot,
         {
@@ -132,7 +127,6 @@ COMMANDS = {
                 "{NAME}-{KIND}.png",
             )
         },
-        loading=(),
     ),
     "view": CommandFunction(view, {}, ("engine", "workers"), ("base", "actuators")),
 }
@@ -171,7 +165,7 @@ def _output_paths(command: CommandFunction, values: Document) -> dict[str, Path]
             path = _default_path(output.default, values | paths)
         if path is not None:
             file_path(name, path, output.suffixes)
-            check_output(name, path, inputs, paths.values(), values["force"])
+            check_output(name, path, inputs, values["force"])
             paths[name] = path
     return paths
 
@@ -194,26 +188,18 @@ def _arguments(command: CommandFunction, values: Document) -> Document:
     accepted = inspect.signature(command.function).parameters
     # Output files and --force are for execute(), but identify also takes --force.
     arguments = {name: value for name, value in values.items() if name in accepted}
-    for name in command.options:
-        # On and off are switches; one that is left out is left to the Runner.
-        if values[name] is not None:
-            arguments[name] = SWITCH.get(values[name], values[name])
+    arguments |= {name: values[name] for name in command.options}
     # A recording has a robot already.
     is_recorded = values.get("recording", values.get("play")) is not None
     if "robot" in values and (values["robot"] or not is_recorded):
         robot = Robot.load(
             values["robot"] or DEFAULT_ROBOT,
-            fixed_base=SWITCH.get(values.get("base")),
+            fixed_base=FIXED.get(values.get("base")),
             actuators=values.get("actuators"),
         )
         arguments["robot"] = robot
-        # Distributions are checked against the joints and links of the robot.
-        if values.get("randomize") is not None:
-            arguments["randomization"] = load_randomization(values["randomize"], robot)
         if not is_recorded:
             print(f"{robot.name}: {', '.join(_settings(robot, values))}", flush=True)
-        if values.get("engine") == "sapien":
-            print("MuJoCo is several times as fast, with other contacts: --engine mujoco")
     if "progress" in accepted:
         arguments["progress"] = bar(command.function.__name__)
     return arguments
@@ -224,36 +210,28 @@ def _settings(robot: Robot, values: Document) -> Iterator[str]:
     if not robot.fixed_base:
         yield "free base"
     yield f"{robot.dof} dof"
-    if "engine" in values:
-        # A comparison may have two engines.
-        engines = values["engine"] or ("mujoco",)
-        names = (engines,) if isinstance(engines, str) else engines
-        yield " and ".join(load_engine(name).title for name in names)
-    gains = values.get("gains")
-    if gains:
-        yield f"gains {gains if isinstance(gains, str) else ', '.join(gains)}"
+    engines = values.get("engine") or ()
+    # A comparison may have two engines.
+    for name in (engines,) if isinstance(engines, str) else engines:
+        yield load_engine(name).title
     # Drives and tools have other gains.
-    elif values.get("control", "pid") != "pid":
+    if values.get("control", "pid") != "pid":
         yield f"control {values['control']}"
-    elif "moves" in values:
-        yield f"gains {', '.join(default_sets(robot))}"
-    # Logs have the gains that drove their robot.
-    elif "gains" in values and "logs" not in values:
+    elif values.get("gains"):
+        gains = values["gains"]
+        yield f"gains {gains if isinstance(gains, str) else ', '.join(gains)}"
+    elif "num_envs" in values:
         yield f"gains {default_gains(robot)}"
-    timestep = values.get("timestep", RunnerOptions.timestep if "engine" in values else None)
-    if timestep is not None:
-        yield f"{1 / timestep:g} Hz"
-    for name, noun in COUNTS.items():
-        if name in values:
-            yield f"{values[name]} {noun}"
+    if values.get("timestep") is not None:
+        yield f"{1 / values['timestep']:g} Hz"
+    if "num_envs" in values:
+        yield f"{values['num_envs']} robots"
 
 
 def _write(name: str, result: Any, path: Path) -> None:
     """Write an output file of a result."""
     if name == "out":
         result.save(path)
-    elif name == "json":
-        write_figures(path, result.document())
     elif name == "corrected_urdf":
         write_atomically(path, result.corrected_urdf())
     elif path.suffix in PICTURES:
@@ -268,21 +246,17 @@ def check_output(
     argument: str,
     path: Path,
     inputs: Iterable[Path],
-    outputs: Iterable[Path],
     force: bool,
 ) -> None:
     """Check that a file may be written at ``path``.
 
-    Raises InvalidArgumentError if the command reads it (one of ``inputs``) or writes it as another
-    one of its ``outputs``, its folder neither exists nor is :data:`FOLDER`, or it exists and may
-    not be replaced by ``force``.
+    Raises InvalidArgumentError if the command reads it (one of ``inputs``), its folder neither
+    exists nor is :data:`FOLDER`, or it exists and may not be replaced by ``force``.
     """
     remedy = "choose another file"
     # Links count as the file that they lead to, so that none is read and replaced at once.
     if path.exists() and any(path.samefile(source) for source in inputs):
         problem = "is a file to read"
-    elif path.resolve() in [other.resolve() for other in outputs]:
-        problem = "is another output of this run"
     elif not path.parent.exists() and path.parent != FOLDER:
         problem = f"has no folder {str(path.parent)!r}"
         remedy = f"make it: mkdir -p {shlex.quote(str(path.parent))}"
@@ -294,35 +268,25 @@ def check_output(
     raise InvalidArgumentError(argument, problem, value=str(path), remedy=remedy)
 
 
-def write_figures(path: Path, figures: object) -> None:
-    """Write figures as JSON: arrays as lists, named tuples and mappings as objects, null for NaN
-    and infinity.
+def bar(label: str, unit: str = "it") -> Progress[Any]:
+    """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; where stderr
+    is no terminal, with a line every :data:`LINE_SECONDS`.
     """
-    write_atomically(path, json.dumps(_plain(figures), indent=1, allow_nan=False) + "\n")
-
-
-def _plain(value: Any) -> Any:
-    # Named tuples keep their names; JSON has no NaN.
-    if hasattr(value, "_asdict"):
-        value = value._asdict()
-    elif hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {name: _plain(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def bar(label: str, **options: object) -> Progress[T]:
-    """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; ``options``
-    go to tqdm.
-
-    A file as stderr gets no bar.
-    """
+    if not sys.stderr.isatty():
+        return partial(_lines, label, unit)
     from tqdm import tqdm
 
-    shown = {"delay": 1.0, "leave": False, "dynamic_ncols": True, **options}
-    return partial(tqdm, desc=label, disable=not sys.stderr.isatty(), **shown)
+    return partial(tqdm, desc=label, unit=unit, delay=1.0, leave=False, dynamic_ncols=True)
+
+
+def _lines(label: str, unit: str, items: Iterable[T]) -> Iterator[T]:
+    """Yield ``items``, with lines about how many are done."""
+    began = told = time.monotonic()
+    total = f" of {len(items)}" if isinstance(items, Sized) else ""
+    for count, item in enumerate(items):
+        now = time.monotonic()
+        if now - told >= LINE_SECONDS:
+            told = now
+            text = f"{label}: {count}{total} {unit}, {now - began:.0f} s"
+            print(f"batchpid: {text}", file=sys.stderr, flush=True)
+        yield item

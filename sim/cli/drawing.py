@@ -16,7 +16,8 @@ from batchpid.arrays.array_types import Document, Progress
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, read_recording
-from batchpid.sim.tuning.comparison import gain_set
+from batchpid.sim.cli.flags import Gains, flag
+from batchpid.sim.tuning.gain_sets import gain_set
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,21 +60,21 @@ class Recording:
 
 
 def plot(
-    recording: tyro.conf.Positional[Path],
+    recording: Annotated[
+        Path,
+        tyro.conf.Positional,
+        flag("File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote, .h5."),
+    ],
     robot: Robot | None = None,
-    kind: Literal["responses", "efforts", "following"] = "responses",
+    kind: Annotated[
+        Literal["responses", "efforts", "following"],
+        flag("Step responses, efforts against their limits, or errors of following."),
+    ] = "responses",
 ) -> Recording:
     """Draw a recorded run, or film it.
 
     The recording may be complete, cut short by a kill, or still being written. A film draws
     the robot of the recording, or the one that is named.
-
-    Parameters
-    ----------
-    recording
-        File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote, .h5.
-    kind
-        Step responses, efforts against their limits, or errors of following.
     """
     return Recording(recording, _read(recording), robot, kind)
 
@@ -95,30 +96,21 @@ def recording_line(path: Path, rollout: Rollout) -> str:
 
 def view(
     robot: Robot | None = None,
-    num_envs: Annotated[int, Field(low=1, high=64)] = 16,
-    gains: str | None = None,
-    play: Path | None = None,
-    port: Annotated[int, Field(low=1, high=65535)] = 8080,
-    time_limit: Annotated[float | None, Field("s")] = None,
+    num_envs: Annotated[int, Field(low=1, high=64), flag("Number of robots; 64 at most.")] = 16,
+    gains: Gains = None,
+    play: Annotated[Path | None, flag("Recorded run to show, .h5.", "FILE")] = None,
+    port: Annotated[
+        int, Field(low=1, high=65535), flag("Port, or a free one if it is taken.")
+    ] = 8080,
+    time_limit: Annotated[
+        float | None, Field("s"), flag("Stop after this wall-clock time [s]. Default: none.")
+    ] = None,
     **options: Any,
 ) -> None:
     """Show moving robots in the browser: sliders for setpoints and gains, and charts.
 
     The page is served on localhost only; from another machine, use ``ssh -L``. With ``--play`` it
     shows a recorded run, of the robot in the recording, or of the one that is named.
-
-    Parameters
-    ----------
-    num_envs
-        Number of robots; 64 at most.
-    gains
-        Gains, as for `batchpid rollout`.
-    play
-        Recorded run to show, .h5.
-    port
-        Port, or a free one if it is taken.
-    time_limit
-        Stop after this wall-clock time [s]. Default: none.
     """
     from batchpid.sim.view import View
 

@@ -10,7 +10,8 @@ import numpy as np
 from batchpid.arrays.field_tables import Field
 from batchpid.io.files import write_atomically
 from batchpid.sim import Robot
-from batchpid.sim.tuning.comparison import table
+from batchpid.sim.cli.flags import flag
+from batchpid.sim.diagnosis.text import table
 from batchpid.trajectories import Trajectory
 
 
@@ -54,11 +55,9 @@ class Excitation(NamedTuple):
 
 def excite_joints(
     robot: Robot,
-    seconds: Annotated[float, Field("s", low=1.0, high=3600.0)] = 10.0,
-    rate: Annotated[float, Field("Hz", low=20.0, high=10_000.0)] = 500.0,
-    lowest: Annotated[float, Field("Hz", low=0.01, high=50.0)] = 0.15,
-    highest: Annotated[float, Field("Hz", low=0.01, high=1000.0)] = 3.0,
-    seed: Annotated[int, Field(high=2**31 - 1)] = 0,
+    seconds: Annotated[
+        float, Field("s", low=1.0, high=3600.0), flag("Duration of the motion [s].")
+    ] = 10.0,
 ) -> Excitation:
     """Make the motion to record for identification: a chirp of every joint.
 
@@ -66,21 +65,7 @@ def excite_joints(
     and their rates as CSV with the header "time, setpoint:JOINT, ..., setpoint_rate:JOINT, ...",
     which `batchpid rollout --trajectory` follows. Move the robot to the first row before it starts,
     and add the measured positions to the log as qpos:JOINT.
-
-    Parameters
-    ----------
-    seconds
-        Duration of the motion [s].
-    rate
-        Rows per second [Hz].
-    lowest
-        Lowest frequency of the chirp [Hz].
-    highest
-        Highest frequency [Hz].
-    seed
-        Seed of the phases.
     """
     from batchpid.sim.identification.excitation import excite
 
-    motion = excite(robot, seconds, rate=rate, lowest=lowest, highest=highest, seed=seed)
-    return Excitation(robot, motion)
+    return Excitation(robot, excite(robot, seconds))

@@ -14,6 +14,7 @@ from batchpid.arrays.field_tables import Field
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
+from batchpid.sim.cli.flags import Gains, flag
 
 if TYPE_CHECKING:
     import batchpid as bp
@@ -29,7 +30,7 @@ ENDINGS = {
 USED = {
     "c": ("gains", "limits", "dynamics", "plan"),
     "ros2_control": ("gains", "limits"),
-    "mjcf": ("gains", "limits", "motors"),
+    "mjcf": ("gains", "limits"),
     "urdf": (),
 }
 """Flags that have an effect for each target, of those that only some have."""
@@ -70,14 +71,28 @@ class ExportedFile:
 
 def export(
     robot: Robot,
-    to: Literal["c", "ros2_control", "mjcf", "urdf"] = "c",
-    gains: str | None = None,
-    timestep: Annotated[float, Field("seconds, not a rate: 1/1000", low=1e-6, high=1.0)] = 1 / 1000,
-    limits: bool = False,
-    prefix: str = "batchpid",
-    dynamics: bool = False,
-    motors: bool = False,
-    plan: Path | None = None,
+    to: Annotated[Literal["c", "ros2_control", "mjcf", "urdf"], flag("Target.")] = "c",
+    gains: Gains = None,
+    timestep: Annotated[
+        float,
+        Field("seconds, not a rate: 1/1000", low=1e-6, high=1.0),
+        flag("Time step of the control on the robot, or of the physics [s]."),
+    ] = 1 / 1000,
+    limits: Annotated[
+        bool,
+        flag("Limit setpoints to the robot's joint limits and speeds before they reach the law."),
+    ] = False,
+    prefix: Annotated[
+        str,
+        flag("Beginning of every name in the file; in ros2_control the name of the controller."),
+    ] = "batchpid",
+    dynamics: Annotated[
+        bool, flag("In C, add the robot's mass matrix, gravity and bias as functions.")
+    ] = False,
+    plan: Annotated[
+        Path | None,
+        flag("In C, add a plan for chunks of a policy, from a file of `batchpid.save_plan`."),
+    ] = None,
 ) -> ExportedFile:
     """Write a robot's gains, or the robot itself, as a file for another program.
 
@@ -85,63 +100,32 @@ def export(
     batchpid's. "ros2_control" is the YAML of a controller. "mjcf" is the robot with the law in
     MuJoCo's own actuators, "urdf" the robot with its repairs. Differences between the file and
     batchpid's law or the robot's file are printed, one line each.
-
-    Parameters
-    ----------
-    to
-        Target.
-    gains
-        Gains, as for `batchpid rollout`.
-    timestep
-        Time step of the control on the robot, or of the physics [s].
-    limits
-        Limit setpoints to the robot's joint limits and speeds before they reach the law.
-    prefix
-        Beginning of every name in the file; in ros2_control the name of the controller.
-    dynamics
-        In C, add the robot's mass matrix, gravity and bias as functions.
-    motors
-        In MJCF, write the motors without the law: their inputs are the efforts asked for.
-    plan
-        In C, add a plan for chunks of a policy, from a file of `batchpid.save_plan`.
     """
     # A flag without effect is refused by name.
-    chosen = {
-        "gains": gains,
-        "limits": limits,
-        "dynamics": dynamics,
-        "motors": motors,
-        "plan": plan,
-    }
+    chosen = {"gains": gains, "limits": limits, "dynamics": dynamics, "plan": plan}
     unused = [name for name, value in chosen.items() if value and name not in USED[to]]
     if unused:
         raise InvalidArgumentError(
             unused[0], f"has no effect with --to {to}", remedy="leave it out"
         )
-    # The robot alone, its motors, or the law.
+    # The robot alone, or the law.
     if to == "urdf":
         from batchpid.sim.robot.urdf_export import to_urdf
 
         return ExportedFile(to, partial(to_urdf, robot))
-    if motors:
-        if gains is not None or limits:
-            remedy = "leave out --gains and --limits"
-            raise InvalidArgumentError("motors", "exclude gains and limits", remedy=remedy)
-        exported = _mjcf(robot, None, timestep, False)
+    params = _gains(robot, gains)
+    if to == "mjcf":
+        exported = _mjcf(robot, params, timestep, limits)
+    elif to == "c":
+        exported = _c_header(robot, params, timestep, limits, prefix, dynamics, plan)
     else:
-        params = _gains(robot, gains)
-        if to == "mjcf":
-            exported = _mjcf(robot, params, timestep, limits)
-        elif to == "c":
-            exported = _c_header(robot, params, timestep, limits, prefix, dynamics, plan)
-        else:
-            exported = _controllers(robot, params, timestep, limits, prefix)
+        exported = _controllers(robot, params, timestep, limits, prefix)
     return ExportedFile(to, lambda folder: exported)
 
 
 def _gains(robot: Robot, gains: str | None) -> bp.PIDParams:
     """Return the gains of the law by name."""
-    from batchpid.sim.tuning.comparison import gain_set
+    from batchpid.sim.tuning.gain_sets import gain_set
 
     chosen = gain_set(robot, gains)
     if chosen.control != "pid":
@@ -211,7 +195,7 @@ def _with_followers(robot: Robot, exported: Exported, place: str) -> Exported:
 
 def _mjcf(
     robot: Robot,
-    params: bp.PIDParams | None,
+    params: bp.PIDParams,
     dt: float,
     limits: bool,
 ) -> Exported:

@@ -11,6 +11,7 @@ import tyro
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
+from batchpid.sim.cli.flags import flag
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.options.groups import Compensation
 
@@ -23,18 +24,74 @@ EVALUATIONS = 45
 
 def identify_logs(
     robot: Robot,
-    logs: tyro.conf.Positional[tuple[Path, ...]] = (),
-    gains: str | None = None,
-    compensate: Compensation | None = None,
-    timestep: Annotated[float | None, Field("s", low=1e-5, high=0.01)] = None,
-    hold: bool = False,
-    degrees: bool = False,
-    topic: str = "/joint_states",
-    command_topic: str | None = None,
-    prefix: str = "",
-    no_payload: bool = False,
-    extras: tuple[str, ...] = (),
-    workers: Annotated[int, Field(low=0, high=1000)] = 0,
+    logs: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        flag("Logs: .csv, ROS bags (.bag, .mcap, folders) or recordings (.h5)."),
+    ] = (),
+    gains: Annotated[
+        str | None,
+        flag(
+            "Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or"
+            " file as for --gains of other commands. Without it a recording's own, or the logs'"
+            " efforts. Gains that are found are written beside the actuators, as NAME-gains.yaml.",
+            "NAME|FILE",
+        ),
+    ] = None,
+    compensate: Annotated[
+        Compensation | None,
+        flag(
+            "Forces that the robot compensates: gravity+coriolis+friction, gravity+coriolis, gravity"
+            " or none. Default: as the recordings say, else gravity+coriolis+friction."
+        ),
+    ] = None,
+    timestep: Annotated[
+        float | None,
+        Field("s", low=1e-5, high=0.01),
+        flag(
+            "Time step of the control that drove the robot [s]. Default: as the recordings say, else"
+            " 1/2000."
+        ),
+    ] = None,
+    hold: Annotated[
+        bool,
+        flag(
+            "Commands hold from row to row of a log; otherwise they are interpolated. Recordings are"
+            " always held."
+        ),
+    ] = False,
+    degrees: Annotated[
+        bool, flag("Positions and setpoints of revolute joints are in degrees.")
+    ] = False,
+    topic: Annotated[
+        str,
+        flag(
+            "Topic of the measurements in a ROS bag (sensor_msgs/JointState), whose efforts count as"
+            " measured."
+        ),
+    ] = "/joint_states",
+    command_topic: Annotated[
+        str | None,
+        flag(
+            "Topic of the commands in a ROS bag: positions are setpoints, efforts are efforts."
+            " Default: measured efforts."
+        ),
+    ] = None,
+    prefix: Annotated[str, flag("Prefix of the joints' names in the logs.")] = "",
+    no_payload: Annotated[bool, flag("The tool carries no payload.")] = False,
+    extras: Annotated[
+        tuple[str, ...],
+        flag(
+            "Further unknowns: load_friction, stribeck, offset, mass (of each link); with --gains"
+            " also gain (a factor of gains that are not known), kd, saturation and slew (the limit"
+            " of the goal's rate)."
+        ),
+    ] = (),
+    workers: Annotated[
+        int,
+        Field(low=0, high=1000),
+        flag("Number of processes, 0 for none besides this one. The result does not depend on it."),
+    ] = 0,
     force: bool = False,
     progress: Callable[[Any], Any] | None = None,
 ) -> Identification:
@@ -45,42 +102,6 @@ def identify_logs(
     of other commands. A log has a header and SI units: "time, setpoint:JOINT ..., qpos:JOINT ...",
     with the gains that drove the robot as --gains FILE, or "time, effort:JOINT ..., qpos:JOINT
     ...". The fit simulates a rigid-body model with a Runner's control and motors.
-
-    Parameters
-    ----------
-    logs
-        Logs: .csv, ROS bags (.bag, .mcap, folders) or recordings (.h5).
-    gains
-        Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file
-        as for --gains of other commands. Without it a recording's own, or the logs' efforts. Gains
-        that are found are written beside the actuators, as NAME-gains.yaml.
-    compensate
-        Forces that the robot compensates: gravity+coriolis+friction, gravity+coriolis, gravity or
-        none. Default: as the recordings say, else gravity+coriolis+friction.
-    timestep
-        Time step of the control that drove the robot [s]. Default: as the recordings say, else
-        1/2000.
-    hold
-        Commands hold from row to row of a log; otherwise they are interpolated. Recordings are
-        always held.
-    degrees
-        Positions and setpoints of revolute joints are in degrees.
-    topic
-        Topic of the measurements in a ROS bag (sensor_msgs/JointState), whose efforts count as
-        measured.
-    command_topic
-        Topic of the commands in a ROS bag: positions are setpoints, efforts are efforts. Default:
-        measured efforts.
-    prefix
-        Prefix of the joints' names in the logs.
-    no_payload
-        The tool carries no payload.
-    extras
-        Further unknowns: load_friction, stribeck, offset, mass (of each link); with --gains also
-        gain (a factor of gains that are not known), kd, saturation and slew (the limit of the
-        goal's rate).
-    workers
-        Number of processes, 0 for none besides this one. The result does not depend on it.
     """
     from batchpid.sim.identification.identification import identify
     from batchpid.sim.identification.logs import Reading
@@ -110,7 +131,7 @@ def identify_logs(
 def _gains(robot: Robot, name: str) -> bp.PIDParams:
     """Return the gains of a name or file; a params file may have only the joints of the logs."""
     import batchpid as bp
-    from batchpid.sim.tuning.comparison import gain_set
+    from batchpid.sim.tuning.gain_sets import gain_set
 
     try:
         return gain_set(robot, name).params

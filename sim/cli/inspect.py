@@ -7,14 +7,16 @@ from __future__ import annotations
 import textwrap
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from typing import Annotated
 
-from batchpid.arrays.array_types import Document
 from batchpid.sim import Finding, Robot
+from batchpid.sim.cli.flags import Gains, flag
+from batchpid.sim.diagnosis.text import table
+from batchpid.sim.geometry.inertia import DENSITY
 from batchpid.sim.robot.findings import summary
-from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.parts import HEADERS, joint_rows
-from batchpid.sim.tuning.comparison import gain_set, table
+from batchpid.sim.tuning.gain_sets import GainSet, gain_set, gain_table
 
 SOURCES = {
     "inertial": "<inertial>",
@@ -35,8 +37,8 @@ class Inspection:
 
     robot: Robot
     findings: list[Finding]
-    gains: str | None
-    """Name of the gains, if any are checked."""
+    gains: GainSet | None
+    """Gains that are checked, if any."""
     of_gains: list[Finding]
     """Findings about the gains."""
     all: bool
@@ -53,8 +55,9 @@ class Inspection:
         ]
         if self.gains is not None:
             lines += [
-                f"\nUnder gains {self.gains}:",
+                f"\nUnder gains {self.gains.name}:",
                 *(sentences(self.of_gains) or ["Nothing odd."]),
+                "\n" + gain_table(robot, self.gains.params),
             ]
 
         # Joints in the order of qpos, then links by mass: the data sheet has both.
@@ -93,33 +96,16 @@ class Inspection:
                 lines.append(f"Do not collide, {reason!r}: {', '.join(names)}")
         return [_fill(line) for line in lines]
 
-    def document(self) -> Document:
-        """Return findings, joints and links."""
-        masses = self.robot.link_masses
-        joints = {joint.name: {"unit": joint.unit} | asdict(joint) for joint in self.robot.joints}
-        return {
-            "robot": self.robot.name,
-            "mass": sum(link.mass for link in masses.values()),
-            "findings": [asdict(finding) for finding in self.findings + self.of_gains],
-            "joints": joints,
-            "links": masses,
-        }
-
 
 def inspect_robot(
     robot: Robot,
-    gains: str | None = None,
-    all: bool = False,
+    gains: Gains = None,
+    all: Annotated[
+        bool, flag("List fixed joints and pairs of links that do not collide, too.")
+    ] = False,
 ) -> Inspection:
     """List findings about a robot and gains, its joints in the order of qpos, and the masses of its
     links.
-
-    Parameters
-    ----------
-    gains
-        Gains to check, as for `batchpid rollout`. Default: tuned where the robot has them.
-    all
-        List fixed joints and pairs of links that do not collide, too.
     """
     findings = robot.check(setpoint=robot.target, control="drive")  # without gains
     if gains is None and not robot.has_tuned:
@@ -128,7 +114,7 @@ def inspect_robot(
     chosen = gain_set(robot, gains)
     checked = robot.check(params=chosen.params, setpoint=robot.target, control=chosen.control)
     of_gains = [finding for finding in checked if finding not in findings]
-    return Inspection(robot, findings, chosen.name, of_gains, all)
+    return Inspection(robot, findings, chosen, of_gains, all)
 
 
 def limbs(robot: Robot) -> int:

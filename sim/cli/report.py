@@ -10,15 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.array_types import Rows
 from batchpid.sim import Robot, Rollout, write_recording
 from batchpid.sim.diagnosis.causes import settled_envs
-from batchpid.sim.tuning.comparison import (
-    cause_lines,
-    median_and_worst,
-    overshoot_of_settled,
-    table,
-)
+from batchpid.sim.diagnosis.text import cause_lines, median_and_worst, overshoot_of_settled, table
 from batchpid.sim.tuning.evaluation import following_error, step_response_metrics
 from batchpid.task_space.frames import pose_error
 
@@ -170,26 +165,6 @@ class RunReport:
                 lines.append(f"Every joint of every env settled {within} its move.")
         return lines + list(cause_lines(rollout.findings(self.robot)))
 
-    def document(self) -> Document:
-        """Return the figures, lists by env."""
-        names, units, figures = self.columns
-        info = self.rollout.info
-        joints = {}
-        for joint, (name, unit) in enumerate(zip(names, units, strict=True)):
-            columns = {column: values[:, joint] for column, values in figures.items()}
-            joints[name] = {"unit": unit, **columns}
-        return {
-            "robot": info.robot,
-            "control": info.control,
-            "tool": info.tool,
-            "engine": info.engine,
-            "physics": info.physics,
-            "num_envs": self.rollout.num_envs,
-            "seconds": self.seconds,
-            "failed": np.flatnonzero(~self.rollout.ok.all(0)),
-            "joints": joints,
-        }
-
     def save(self, path: Path) -> None:
         """Write the recording."""
         write_recording(self.rollout, path, overwrite=True)
@@ -200,7 +175,7 @@ class RunReport:
 
         info = self.rollout.info
         title = f"{self.robot.name}, {info.engine}, control {info.control}"
-        return plots.step_responses(self.rollout, mark=0, title=title)
+        return plots.step_responses(self.rollout, title=title)
 
 
 def speed_line(

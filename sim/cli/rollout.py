@@ -17,21 +17,27 @@ from batchpid.arrays.field_tables import Field
 from batchpid.checks.validate import array
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Robot
-from batchpid.sim.cli.flags import BOUNDS
+from batchpid.sim.cli.flags import BOUNDS, Gains, NumEnvs, Randomize, flag
 from batchpid.sim.cli.report import RunReport
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
-from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.tuning.comparison import gain_set
+from batchpid.sim.tuning.evaluation import load_randomization
+from batchpid.sim.tuning.gain_sets import gain_set
 
-NumEnvs = Annotated[int, BOUNDS["num_envs"]]
-SECONDS = Field("simulated time, s", low=1e-6, high=1e6)
+SUBSTEPS = 20
+"""Sim steps of a tick, from one sample to the next, to a setpoint."""
+SPREAD = 0.3
+"""Largest distance of a start pose from the first one [rad or m]."""
+Seconds = Annotated[
+    float | None,
+    Field("simulated time, s", low=1e-6, high=1e6),
+    flag("Simulated time [s]. Default: 2, or as long as the trajectory."),
+]
 
 
 def demo(
     robot: Robot,
     num_envs: NumEnvs = 64,
-    gains: str | None = None,
-    seconds: Annotated[float, SECONDS] = 2.0,
+    seconds: Seconds = None,
     progress: Progress[int] | None = None,
     **options: Any,
 ) -> RunReport:
@@ -39,87 +45,63 @@ def demo(
 
     PID and passive force are computed at each of the 2000 sim steps of a second. Env 0 starts where
     SAPIEN's tutorial does, the others at seeded poses near it.
-
-    Parameters
-    ----------
-    num_envs
-        Number of robots, one in each scene.
-    gains
-        Gains, as for `batchpid rollout`.
-    seconds
-        Simulated time [s].
     """
-    return rollout(
-        robot, num_envs, gains, seconds=seconds, substeps=10, progress=progress, **options
-    )
+    return rollout(robot, num_envs, seconds=seconds, progress=progress, **options)
 
 
 def rollout(
     robot: Robot,
     num_envs: NumEnvs = 64,
-    gains: str | None = None,
-    control: Literal["pid", "drive", "osc"] = "pid",
-    tool: str | None = None,
-    setpoint: tuple[float, ...] | None = None,
-    trajectory: Path | None = None,
-    rates: bool = True,
-    seconds: Annotated[float | None, SECONDS] = None,
-    timestep: Annotated[float, BOUNDS["timestep"]] = 1 / 2000,
-    substeps: Annotated[int | None, BOUNDS["substeps"]] = None,
-    seed: Annotated[int, Field(high=2**31 - 1)] = 0,
-    spread: Annotated[float, Field("rad or m", high=10.0)] = 0.3,
-    randomization: Randomization | None = None,
+    gains: Gains = None,
+    control: Annotated[
+        Literal["pid", "drive", "osc"],
+        flag("Batch PID, the engine's internal drive, or operational-space control of the tool."),
+    ] = "pid",
+    setpoint: Annotated[
+        tuple[float, ...] | None,
+        flag(
+            "One position per joint [rad or m]; with --control osc x y z qw qx qy qz of the tool."
+            " Default: robot.target, the bundled robot's or, of another robot, a quarter of the way"
+            " from the start pose to the farther limit of each joint, at most 0.5; with --control"
+            " osc the pose of the tool there.",
+            "FLOAT [FLOAT ...]",
+        ),
+    ] = None,
+    trajectory: Annotated[
+        Path | None,
+        flag(
+            "Setpoints to follow instead: a CSV file with the columns time, setpoint:JOINT ..., and,"
+            " where they are known, setpoint_rate:JOINT ... and setpoint_acceleration:JOINT ... A"
+            " row holds at its time, and rows are equally spaced: by a tick. The first is at 0, with"
+            " the start pose, or at the end of the first tick. All robots start there.",
+            "FILE",
+        ),
+    ] = None,
+    rates: Annotated[
+        bool,
+        flag(
+            "Give robots no rates of the setpoints (--no-rates), for a recording that `batchpid"
+            " identify` reads."
+        ),
+    ] = True,
+    seconds: Seconds = None,
+    timestep: Annotated[
+        float, BOUNDS["timestep"], flag("Time step of simulation and control [s].")
+    ] = 1 / 2000,
+    randomize: Randomize = None,
     progress: Progress[int] | None = None,
     **options: Any,
 ) -> RunReport:
     """Move N of any robot to a setpoint or along a trajectory; print a table.
 
-    Robots start from seeded poses. The recording holds time (ticks,), setpoint, qpos, qvel, effort
-    and saturated (ticks, envs, joints), ok (ticks, envs), with --control osc tool_pose (ticks,
-    envs, 7), and the robot's joint names, units and limits. The exit status is 3 if no robot
-    settles at its setpoint; the report says why.
-
-    Parameters
-    ----------
-    num_envs
-        Number of robots, one in each scene.
-    gains
-        Gains: tuned, designed, sapien-tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file
-        (.yaml or .json) that `batchpid tune` or batchpid.save_params wrote. Default: tuned where
-        the robot has them, else designed.
-    control
-        Batch PID, the engine's internal drive, or operational-space control of a tool.
-    tool
-        With --control osc: link to move. Default: the last one of the longest chain.
-    setpoint
-        One position per joint [rad or m]; with --control osc x y z qw qx qy qz of the tool.
-        Default: the bundled robot's target, else the start pose; with --control osc the pose of the
-        tool there.
-    trajectory
-        Setpoints to follow instead: a CSV file with the columns time, setpoint:JOINT ..., and,
-        where they are known, setpoint_rate:JOINT ... and setpoint_acceleration:JOINT ... A row
-        holds at its time, and rows are equally spaced: by a tick. The first is at 0, with the start
-        pose of env 0, or at the end of the first tick.
-    rates
-        --no-rates: give robots no rates of the setpoints, for a recording that `batchpid identify`
-        reads.
-    seconds
-        Simulated time [s]. Default: 2, or as long as the trajectory.
-    timestep
-        Time step of simulation and control [s].
-    substeps
-        Sim steps of a tick, from one sample to the next. Default: 20, or as the trajectory's rows.
-    seed
-        Seed of the start poses.
-    spread
-        Largest distance of a start pose from the robot's own, with --control osc from its target,
-        with --trajectory from its first row at time 0 [rad or m]; env 0 starts at that itself.
-    randomization
-        Draw the robot of each env: a YAML file (docs/randomization.md), e.g. `payload: {uniform:
-        [0, 0.5]}`.
+    To a setpoint robots start from seeded poses. The recording holds time (ticks,), setpoint, qpos,
+    qvel, effort and saturated (ticks, envs, joints), ok (ticks, envs), with --control osc tool_pose
+    (ticks, envs, 7), and the robot's joint names, units and limits. The exit status is 3 if no
+    robot settles at its setpoint; the report says why.
     """
     from batchpid.sim.runner.runner import Runner
 
+    randomization = load_randomization(randomize, robot)
     options |= {"timestep": timestep, "randomization": randomization, "control": control}
     # Gains, or the controller of a tool.
     center: Rows = robot.start
@@ -128,13 +110,12 @@ def rollout(
     if control == "osc":
         _refuse("gains", gains, "are for the control of joints")
         _refuse("trajectory", trajectory, "has joint setpoints, and excludes --control osc")
-        operational = OperationalSpace(robot, tool or robot.rigid_tree.tool, posture=robot.target)
+        operational = OperationalSpace(robot, robot.rigid_tree.tool, posture=robot.target)
         options["control"] = operational
         columns = operational.command.names
         goal = operational.tool_pose(robot.target)
         center = robot.target
     else:
-        _refuse("tool", tool, "is for control 'osc'")
         # Without gains the Runner has its own default, which knows the loops of an MJCF file.
         if gains is not None:
             chosen = gain_set(robot, gains)
@@ -148,8 +129,8 @@ def rollout(
     if trajectory is not None:
         from batchpid.sim.recording.setpoint_files import read_setpoints
 
-        for name, value in {"setpoint": setpoint, "seconds": seconds, "substeps": substeps}.items():
-            _refuse(name, value, "is given by the trajectory")
+        _refuse("setpoint", setpoint, "is given by the trajectory")
+        _refuse("seconds", seconds, "is given by the trajectory")
         motion = read_setpoints(robot, trajectory, timestep)
         setpoints = motion.position
         options["substeps"] = motion.substeps
@@ -168,9 +149,9 @@ def rollout(
     else:
         goal = goal if setpoint is None else setpoint
         row = array("setpoint", goal, (1, len(columns)), columns, kind="entry")[0]
-        options["substeps"] = substeps = 20 if substeps is None else substeps
+        options["substeps"] = SUBSTEPS
         # The metrics of a step need two ticks.
-        ticks = max(2, round((seconds or 2.0) / (timestep * substeps)))
+        ticks = max(2, round((seconds or 2.0) / (timestep * SUBSTEPS)))
         setpoints = np.tile(row, (ticks, 1))
         if robot.settings is not None and setpoint is None:
             notes += robot.settings.notes
@@ -179,7 +160,8 @@ def rollout(
         warnings.simplefilter("ignore", SetpointWarning)  # the report has the finding
         # The speed is that of the run alone, without the start of processes.
         began = time.perf_counter()
-        start = start_poses(robot, num_envs, spread, seed, center)
+        # A start off the trajectory would count as an error of following.
+        start = start_poses(robot, num_envs, SPREAD if trajectory is None else 0.0, center)
         runner.reset(start, seed=None if randomization is None else 0)
         result = runner.rollout(setpoints, progress=progress, **further)
         wall = time.perf_counter() - began
@@ -191,7 +173,6 @@ def start_poses(
     robot: Robot,
     num_envs: int,
     spread: float,
-    seed: int,
     center: Rows,
 ) -> Float64:
     """Return poses (envs, dof) [rad or m] around ``center``, inside the limits; env 0 is that pose
@@ -200,7 +181,7 @@ def start_poses(
     Uniform within ``spread`` [rad or m], and within a quarter of the joint's range where that is
     less. Row k is the same for any ``num_envs``.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     reach = np.minimum(spread, (robot.upper - robot.lower) / 4)
     poses = center + reach * random.uniform(-1.0, 1.0, (num_envs, robot.dof))
     poses[0] = center

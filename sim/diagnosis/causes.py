@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +18,9 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.diagnosis.preflight import touching_links
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
-from batchpid.sim.robot.findings import Finding, Findings
+from batchpid.sim.robot.findings import KINDS, Finding, Findings
 from batchpid.sim.signals.rollout import Rollout
 
 BAND = 0.02  # half width of the settling band, as a share of the move
@@ -99,7 +99,8 @@ def _finding(
             detail = f"{fault.joint}: {fault.cause}"
     numbers = tuple(envs[rows].tolist())
     time = times.min()
-    return Finding("warning", rule.code, rule.text, rule.remedy, name, None, detail, numbers, time)
+    kind = KINDS[rule.code]
+    return Finding(kind.code, kind.when, kind.done, name, None, detail, numbers, time)
 
 
 class _Run:
@@ -212,37 +213,33 @@ class _Run:
         times: Float64 = self.rollout.time[ticks]
         return times
 
-    def _distances(self, qpos: Float64) -> dict[str, float]:
-        """Return the distances [m] below TOUCH of links to each other and to the ground."""
-        # A floating base stands on its ground.
-        ground = bool(self.info.ground and self.robot.fixed_base)
-        near = self.robot.dynamics(ground).contacts.near(qpos, TOUCH)
-        # Of two links with several shapes the nearest, which is last.
-        pairs = sorted(near, key=itemgetter(2), reverse=True)
-        return {f"{link} on {other or 'the ground'}": distance for link, other, distance in pairs}
-
     @cached_property
     def pressed(self) -> list[str]:
-        """Nearest links at the end, per env, that a step of the unsettled joints brings nearer
-        still; "" if there are none.
+        """Nearest links at the end, per env, that a step of the unsettled joints towards their
+        setpoints brings nearer still; "" if there are none.
         """
         links = [""] * len(self.failed)
         most = 20 * absolute_band(self.robot)
         steps = np.clip(self.error[-1], -most, most) * self.unsettled
+        # A floating base stands on its ground.
+        ground = bool(self.info.ground and self.robot.fixed_base)
         for env in np.flatnonzero(~self.failed & (self.info.collisions is not False)):
-            before = self._distances(self.qpos[-1, env])
-            after = self._distances(self.robot.coupled(self.qpos[-1, env] + steps[env]))
-            pressed = [pair for pair in before if after.get(pair, TOUCH) < before[pair] - 1e-4]
+            end = self.qpos[-1, env]
+            before = touching_links(self.robot, end, ground, TOUCH)
+            # Links that slide along each other are pressed by single joints, not by all at once.
+            moves = [steps[env], *np.diag(steps[env])] if before else []
+            pressed = set[str]()
+            for move in moves:
+                after = touching_links(self.robot, self.robot.coupled(end + move), ground, TOUCH)
+                pressed |= {pair for pair in before if after.get(pair, TOUCH) < before[pair] - 1e-4}
             links[env] = min(pressed, key=before.__getitem__, default="")
         return links
 
 
 class Rule(NamedTuple):
-    """Cause for which joints do not settle, in a sentence, with the remedy."""
+    """Cause for which joints do not settle, a kind of finding."""
 
     code: str
-    text: str
-    remedy: str
     test: Callable[[_Run], Bool]  # the joints that have it (envs, dof), or the envs (envs, 1)
     names_joint: bool = True  # False for a cause of whole envs
 
@@ -285,25 +282,15 @@ def _is_blocked(run: _Run) -> Bool:
 # moment. A force that the model does not explain comes before gains that are small, which would
 # explain any error at rest.
 RULES: tuple[Rule, ...] = (
-    Rule("failed", "an input was not finite, or the state diverged", "correct the input or lower the gains",
-         lambda run: run.failed, names_joint=False),
-    Rule("setpoint-limits", "the setpoint is outside the joint limits", "move it inside", _is_beyond_limits),
-    Rule("out-of-reach", "no pose within the joint limits brings the tool to the setpoint", "move it nearer",
-         lambda run: run.out_of_reach, names_joint=False),
-    Rule("guard", "the guard holds the setpoint back", "move it inside the guard's limits, or give it more time",
-         lambda run: run.rollout.guarded[-1]),
-    Rule("touching", "links are pressed together, or against the ground",
-         "choose another start, setpoint or path, disable the pair in an .srdf, or use ground=False",
-         lambda run: np.array(run.pressed)[:, None] != "", names_joint=False),
-    Rule("effort-limit", "the effort is at its limit: gravity and friction need more, or the move more time",
-         "raise the effort limit, lighten the load, or run longer", _is_too_weak),
-    Rule("oscillates", "oscillates: gains are beyond the stability bound, hardly damped, or too high for the delays",
-         "use robot.designed(), or raise kd and lower kp and ki; robot.check(params=) tells which", _oscillates),
-    Rule("blocked", "something outside the robot's model acts on it: an object, a payload, another force",
-         "look at the scene; for a constant load use gains with integral action", _is_blocked),
-    Rule("gains", "rests away from the setpoint: the remaining error balances gravity or friction",
-         "raise kp, ki or integral_limit, or compensate gravity and friction", lambda run: run.is_at_rest),
-    Rule("slow", "still moves at the end of the run: to its setpoint, or behind a moving one",
-         "run longer, hold the last setpoint, pass setpoint_rate, or raise the gains", lambda run: run.unsettled),
-)  # fmt: skip
+    Rule("failed", lambda run: run.failed, names_joint=False),
+    Rule("out-of-limits", _is_beyond_limits),
+    Rule("out-of-reach", lambda run: run.out_of_reach, names_joint=False),
+    Rule("guard", lambda run: run.rollout.guarded[-1]),
+    Rule("touching", lambda run: np.array(run.pressed)[:, None] != "", names_joint=False),
+    Rule("effort-limit", _is_too_weak),
+    Rule("oscillates", _oscillates),
+    Rule("blocked", _is_blocked),
+    Rule("gains", lambda run: run.is_at_rest),
+    Rule("slow", lambda run: run.unsettled),
+)
 """Every cause, in the order in which they are tested and listed."""

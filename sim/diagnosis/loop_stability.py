@@ -18,11 +18,13 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.errors import InvalidArgumentError, warn
-from batchpid.gains.stability import Oscillation, oscillation
 from batchpid.law.implicit import as_explicit
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot_options import known_joints
+
+NEAR_BOUND = 0.5
+"""Share of the stability range from which gains are reported: other poses may have less inertia."""
 
 
 class StabilityReport(NamedTuple):
@@ -49,8 +51,7 @@ def _loop(
     timestep: float,
     actuators: bp.Actuators | None,
 ) -> Document:
-    """Return plant and gains at ``qpos`` (dof,), by the names of :func:`batchpid.stability_bound`,
-    and "ki".
+    """Return plant and gains at ``qpos`` (dof,), by the names of :func:`batchpid.stability_bound`.
 
     Arrays are (1 or envs, n, ...) of the independent joints. Strength of the motors is part of the
     gains, or of the model.
@@ -73,7 +74,7 @@ def _loop(
         inertia: Float64 = coupling.reduced(robot.mass_matrix(qpos) + added)
         return inertia
 
-    loop: Document = {name: column(getattr(params, name)) for name in ("kp", "ki", "kd")}
+    loop: Document = {name: column(getattr(params, name)) for name in ("kp", "kd")}
     eye = np.eye(loop["kp"].shape[1])
     strength = column(motors.strength, 1.0)
     viscous = robot.damping + table(motors.viscous)
@@ -110,7 +111,6 @@ def stability_report(
     friction count; rows are envs, as of the params.
     """
     loop = _loop(robot, params, qpos, timestep, actuators)
-    del loop["ki"]
     rows = max(len(leaf) for leaf in loop.values())
     mass_matrix = np.broadcast_to(loop.pop("mass_matrix"), (rows, *loop["kp"].shape[1:] * 2))
     bound = bp.stability_bound(mass_matrix, dt=timestep, **loop)
@@ -129,22 +129,6 @@ def stability_report(
         remedy += ", discretization='implicit'"
     shares = robot.coupling.of_all(bound.participation[worst])
     return StabilityReport(ratio, shares, worst, effect, f"{remedy}, or robot.designed()")
-
-
-def slow_oscillation(
-    robot: RobotDescription,
-    params: bp.PIDParams,
-    qpos: Float64,
-    timestep: float,
-    env: int,
-) -> Oscillation:
-    """Return the least damped oscillation that lasts, of one env's ``params`` at ``qpos`` (dof,),
-    with ideal motors.
-    """
-    loop = _loop(robot, params.for_envs(slice(env, env + 1)), qpos, timestep, None)
-    loop = {name: leaf[0] for name, leaf in loop.items() if name not in ("delay", "lag")}
-    slowest = oscillation(dt=timestep, **loop)
-    return slowest._replace(participation=robot.coupling.of_all(slowest.participation))
 
 
 class StabilityWarning(UserWarning):

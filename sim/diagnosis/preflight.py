@@ -1,14 +1,18 @@
 """Preflight: oddities of a robot, its gains and its setpoint, reported before the first step.
 
-SAPIEN silently accepts most of these oddities. ``Robot.load`` raises an error if SAPIEN cannot run
-the file at all. A :class:`batchpid.sim.Finding` reports a robot that runs, but differently than the
-URDF or the user intends.
+``Robot.load`` raises an error if no engine can run the file. A :class:`batchpid.sim.Finding`
+reports a robot that runs, but differently than the file or the user intends: :data:`ODDITIES`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from operator import itemgetter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,20 +21,32 @@ import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.diagnosis.loop_stability import slow_oscillation, stability_report
+from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
+from batchpid.sim.engine.protocol import load_engine
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.geometry.inertia import triangle_excess
+from batchpid.sim.geometry.shapes import hull_share
 from batchpid.sim.robot.description import POSES, RobotDescription
-from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
-from batchpid.sim.robot.inertia import DENSITY, triangle_excess
-from batchpid.sim.robot.parts import Joint
-from batchpid.sim.robot.plausibility import implausible_figures
+from batchpid.sim.robot.findings import KINDS, SEVERITIES, Finding, Findings
+from batchpid.sim.robot.tables import LEAST_MASS
 from batchpid.sim.robot.urdf import GIVE_RANGE
 
-# of the triangle inequality of principal moments, above which it is reported; less is rounding
-EXCESS = 0.01
-# damping ratio below which gains are reported: more than a quarter is left after each period
-RINGING = 0.2
-# share of the stability range above which gains are reported: other poses may have less inertia
-NEAR_BOUND = 0.5
+LEAST_EXCESS = 0.01
+"""Excess over the triangle inequality of principal moments from which it is reported; less is
+rounding.
+"""
+LARGEST_SHAPES, SMALLEST_SHAPES = 20.0, 1 / 200
+"""Bounds of the ratio of the shapes' size to the length of the longest chain of joints. The most
+extreme ratios of the bundled robots and of example-robot-data 6.0.0 are 3.2 and 1/5.
+"""
+SHORTEST_CHAIN = 0.3
+"""Least length of the chain [m] that is assumed, e.g. for robots with all joints at one point."""
+LARGEST_HULL = 1.2
+"""Volume of a mesh's hull over that of the mesh, from which it is reported."""
+MOST_RADIANS, PLACEHOLDER = 4 * np.pi, 1000.0
+"""Bounds between which limits of a hinge are taken for degrees [rad]; larger ones mean "no
+limit".
+"""
 
 
 def check(
@@ -40,6 +56,7 @@ def check(
     setpoint: ArrayLike | None,
     timestep: float,
     control: str,
+    engine: str | None,
 ) -> Findings:
     """Return the findings, most severe first; :meth:`batchpid.sim.Robot.check` describes the
     arguments.
@@ -50,259 +67,261 @@ def check(
     start = robot.start
     if qpos is not None:
         start = within("qpos", array("qpos", qpos, (1, robot.dof), names), 1e6, names)[0]
-    # The robot first, then what this run adds to it.
-    preflight = _Preflight(robot)
-    preflight.check_robot(start)
+    goal = None
     if setpoint is not None:
         goal = array("setpoint", setpoint, (1, robot.dof), names)[0]
-        preflight.check_pose("setpoint", goal)
     if params is not None:
         instance("params", params, bp.PIDParams, "use robot.params()")
         if params.num_joints != robot.dof:
             problem = f"must have {robot.dof} joints"
             remedy = "build them with robot.params()"
             raise InvalidArgumentError("params", problem, value=params.num_joints, remedy=remedy)
-        preflight.check_params(params, control)
-        if control == "pid":
-            preflight.check_stability(params, start, timestep)
-    return Findings(sorted(preflight.findings, key=lambda it: SEVERITIES.index(it.severity)))
+        # Gains of a drive are not sampled, and its errors do not wrap.
+        params = params if control == "pid" else None
+    plan = _Plan(robot, start, goal, params, timestep)
+    findings = [*robot.repairs, *robot.srdf.findings]
+    for oddity in ODDITIES:
+        kind = KINDS[oddity.code]
+        for place in oddity.places(plan):
+            text = place.text or kind.when
+            remedy = place.remedy or kind.done
+            where = place.joint, place.link, place.detail
+            findings.append(Finding(kind.code, text, remedy, *where))
+    if engine is not None:
+        chosen = load_engine(engine)
+        ground = {"ground": robot.has_ground, "mjcf": robot.mjcf}
+        scene = SceneSpec.of(robot, timestep, chosen.physics["accurate"], **ground)
+        findings += [*chosen.refusals(scene), *chosen.shortfalls(scene)]
+    return Findings(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
-class _Preflight:
-    """Findings about one robot, in the order in which they are made."""
+class Place(NamedTuple):
+    """Joint or link of a finding, and its figures; text and remedy where they are not those of the
+    kind.
+    """
 
-    def __init__(self, robot: RobotDescription) -> None:
-        self.robot = robot
-        self.findings = [*implausible_figures(robot), *robot.repairs, *robot.srdf.findings]
+    joint: str | None = None
+    link: str | None = None
+    detail: str = ""
+    text: str = ""
+    remedy: str = ""
 
-    def _note(
-        self,
-        code: str,
-        text: str,
-        remedy: str,
-        joint: str | None = None,
-        link: str | None = None,
-        detail: str = "",
-    ) -> None:
-        self.findings.append(Finding("note", code, text, remedy, joint, link, detail))
 
-    def _warn(self, *parts: str, **where: str) -> None:
-        self._note(*parts, **where)
-        self.findings[-1] = replace(self.findings[-1], severity="warning")
+class Oddity(NamedTuple):
+    """Kind of finding, and the places that have it."""
 
-    def check_robot(self, start: Float64) -> None:
-        """Check links, contacts, the ``start`` (dof,), and joints."""
-        self._check_links()
-        self._check_contacts(start)
-        self.check_pose("start pose", start)
-        # Repairs of joints without a range are findings already.
-        ranged = {repair.joint for repair in self.robot.repairs if repair.remedy == GIVE_RANGE}
-        limits = self.robot.design_effort_limit
-        for joint, friction, suggested in zip(
-            self.robot.joints, self.robot.friction, limits, strict=True
-        ):
-            self._check_joint(joint, friction, suggested, joint.name in ranged)
-        self._check_strength()
+    code: str
+    places: Callable[[_Plan], Iterator[Place]]
 
-    def _check_links(self) -> None:
-        """Report the links with an odd inertia tensor, or without mass or inertia of their own."""
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """Robot, and what it is to do."""
+
+    robot: RobotDescription
+    start: Float64
+    goal: Float64 | None
+    params: bp.PIDParams | None
+    timestep: float
+
+    @cached_property
+    def chain(self) -> float:
+        """Length [m] of the longest chain of joints, slides extended."""
         robot = self.robot
-        bodies = {name: place.link for name, place in robot.bodies.items()}
-        root = bodies[robot.all_joints[0].parent_link]
-        shaped = {shape.owner for shape in robot.tables.shapes}
-        solid = {bodies[link.name] for link in robot.links if link.mass or link.name in shaped}
-        loaded = set(solid)  # bodies with mass in them or in the links that they carry
-        for joint in reversed(robot.all_joints):
-            if bodies[joint.child_link] in loaded:
-                loaded.add(bodies[joint.parent_link])
-        for link in robot.links:
-            body = bodies[link.name]
-            if link.mass:
-                excess = triangle_excess(link.inertia)
-            else:
-                excess = 0.0
-            if excess > EXCESS:
-                self._note(
-                    "inertia",
-                    "no body has such an inertia tensor, a moment above the sum of the others:"
-                    " simulated as given",
-                    "correct <inertia>",
-                    link=link.name,
-                    detail=f"by {100 * excess:.0f} %",
-                )
-            is_held = robot.fixed_base and body == root
-            adds_nothing = link.name not in shaped and (link.name != body or body in solid)
-            if not (link.mass or is_held or adds_nothing):
-                self._report_mass(link.name, link.name == body, body in loaded)
+        length: dict[str, float] = defaultdict(float)
+        for joint, link in zip(robot.all_joints, robot.links[1:], strict=True):  # parents first
+            ends = (joint.lower, joint.upper) if joint.type == "prismatic" else ()
+            travel = max((abs(end) for end in ends if np.isfinite(end)), default=0.0)
+            offset = float(np.linalg.norm(link.position)) + travel
+            length[joint.child_link] = length[joint.parent_link] + offset
+        return max(length.values(), default=0.0)
 
-    def _report_mass(self, link: str, is_body: bool, is_loaded: bool) -> None:
-        """Report a link without ``<inertial>``."""
-        mass = self.robot.link_masses[link]
-        report = self._warn if is_body else self._note
-        effect = (
-            "it becomes a link of 1e-6 kg that carries nothing: gains in efforts cannot control it"
-        )
-        detail = ""
+
+def touching_links(
+    robot: RobotDescription,
+    qpos: Float64,
+    ground: bool,
+    distance: float,
+) -> dict[str, float]:
+    """Return pairs of links, or of a link and the ground, that are nearer than ``distance`` [m] at
+    ``qpos`` (dof,), with their distances, the nearest last.
+    """
+    near = robot.dynamics(ground).contacts.near(qpos, distance)
+    # Of two links with several shapes the nearest, which is last.
+    pairs = sorted(near, key=itemgetter(2), reverse=True)
+    return {f"{link} on {other or 'the ground'}": gap for link, other, gap in pairs}
+
+
+def _odd_sizes(plan: _Plan) -> Iterator[Place]:
+    """Yield links whose shapes are larger than the robot, or the robot if all are tiny."""
+    masses = plan.robot.link_masses
+    sizes = {name: mass.size for name, mass in masses.items() if mass.size > 0}
+    of_chain = f"the robot's chain of joints is {plan.chain:.3g} m long"
+    for name, size in sizes.items():
+        if size > LARGEST_SHAPES * max(plan.chain, SHORTEST_CHAIN):
+            yield Place(link=name, detail=f"shapes of {size:.3g} m; {of_chain}")
+    # A single small link is common, such as a sensor.
+    largest = max(sizes.values(), default=math.inf)
+    if largest < SMALLEST_SHAPES * plan.chain:
+        yield Place(detail=f"shapes of at most {largest:.2g} m; {of_chain}")
+
+
+def _odd_angles(plan: _Plan) -> Iterator[Place]:
+    """Yield hinges with limits or mimic offsets of many turns."""
+    for joint in plan.robot.all_joints:
+        offset = 0.0 if joint.mimic is None else joint.mimic.offset
+        angles = {"lower": joint.lower, "upper": joint.upper, "mimic offset": offset}
+        large = [
+            f"{name} {angle:g} rad"
+            for name, angle in angles.items()
+            if MOST_RADIANS < abs(angle) <= PLACEHOLDER
+        ]
+        if large and joint.unit == "rad":
+            yield Place(joint.name, detail=", ".join(large))
+
+
+def _odd_inertia(plan: _Plan) -> Iterator[Place]:
+    """Yield links with a principal moment above the sum of the others."""
+    for link in plan.robot.links:
+        excess = triangle_excess(link.inertia) if link.mass else 0.0
+        if excess > LEAST_EXCESS:
+            text = "no body has such an inertia tensor, a moment above the sum of the others"
+            detail = f"by {100 * excess:.0f} %"
+            yield Place(None, link.name, detail, f"{text}: simulated as given", "correct <inertia>")
+
+
+def _massless(plan: _Plan) -> Iterator[Place]:
+    """Yield links whose mass is that of their shapes, and bodies that carry no mass at all."""
+    robot = plan.robot
+    bodies = {name: place.link for name, place in robot.bodies.items()}
+    root = bodies[robot.all_joints[0].parent_link]
+    masses = robot.link_masses
+    loaded = {bodies[name] for name, mass in masses.items() if mass.mass > LEAST_MASS}
+    # Bodies with mass in them, or in the links that they carry.
+    for joint in reversed(robot.all_joints):
+        if bodies[joint.child_link] in loaded:
+            loaded.add(bodies[joint.parent_link])
+    for name, mass in masses.items():
+        if robot.fixed_base and bodies[name] == root:
+            continue
         if mass.source == "shapes":
-            effect = f"mass and inertia are those of the collision shapes, at {DENSITY:g} kg/m^3"
-            detail = f"{mass.mass:.3g} kg"
-        elif is_loaded:
-            report = self._note
-            effect = "it becomes a link of 1e-6 kg; only the links that it carries have mass"
-        remedy = "add <inertial> with mass and inertia"
-        report("no-inertia", f"no <inertial>: {effect}", remedy, link=link, detail=detail)
+            yield Place(link=name, detail=f"{mass.mass:.3g} kg")
+        elif name == bodies[name] and name not in loaded:
+            yield Place(link=name, detail="1e-6 kg")
 
-    def _check_contacts(self, start: Float64) -> None:
-        """Report pairs that PhysX's filter does not hold, and contacts at the start pose."""
-        robot = self.robot
-        if left_over := robot.self_contact.left_over:
-            text = f"{len(left_over)} pairs should not collide, but PhysX's filter cannot hold them"
-            self._note("pairs-left-over", text, "disable fewer pairs in the .srdf")
-        for pair in robot.self_contact.pairs:
-            if pair.reason == "Default" and pair not in robot.srdf.disabled:
-                text = (
-                    "links that touch or overlap at the start pose do not collide with each other"
-                )
-                remedy = "move their shapes 1 mm apart, or enable the pair in an .srdf"
-                other = f"with {pair.second!r}"
-                self._note("pairs-left-out", text, remedy, link=pair.first, detail=other)
-        # A floating base starts on its ground, which is no fault.
-        model = robot.dynamics(ground=robot.fixed_base and robot.has_ground)
-        if model.in_contact(start[None])[0]:
-            self._warn(
-                "touching",
-                "links overlap each other or the ground at the start pose: they are pushed apart",
-                "use another start pose, correct the collision shapes, or load with"
-                " self_collision='auto'",
-            )
 
-    def check_pose(self, name: str, qpos: Float64) -> None:
-        """Report positions (dof,) outside the limits."""
-        for _, index, value in self.robot.limit_violations(qpos):
-            joint = self.robot.joints[index]
-            detail = f"{value:g} {joint.unit}, limits [{joint.lower:g}, {joint.upper:g}]"
-            text = f"{name} outside the limits"
-            self._warn("out-of-limits", text, "move it inside", joint.name, detail=detail)
+def _changed_meshes(plan: _Plan) -> Iterator[Place]:
+    """Yield links with a mesh that is much smaller than the hull that collides in its place."""
+    for shape in plan.robot.tables.shapes:
+        if (share := hull_share(shape)) > LARGEST_HULL:
+            text = "a collision mesh is not convex, and collides as its convex hull"
+            detail = f"{share:.3g} times its volume"
+            yield Place(None, shape.owner, detail, text, "divide the mesh into convex parts")
 
-    def _check_joint(
-        self,
-        joint: Joint,
-        friction: float,
-        suggested: float,
-        ranged: bool,
-    ) -> None:
-        """Report oddities of a joint; ``suggested`` is the effort limit of designed gains."""
-        name = joint.name
-        if friction >= joint.effort_limit > 0:
-            text = "friction reaches the effort limit: no motion"
-            detail = f"{friction:g} {joint.effort_unit}, limit {joint.effort_limit:g}"
-            self._warn("friction", text, "correct one of them", name, detail=detail)
-        if joint.mimic is not None:
-            text = "mimics another joint: its own setpoints and gains have no effect"
-            detail = f"{joint.mimic.multiplier:g} x {joint.mimic.joint!r}"
-            self._note("mimic", text, "command the leader", name, detail=detail)
-        elif math.isinf(joint.effort_limit):
-            text = "no effort limit: designed and tuned gains use limits from gravity and inertia"
-            remedy = "give <limit effort=>, or pass effort_limit= to robot.params()"
-            detail = f"{suggested:.3g} {joint.effort_unit}"
-            self._note("no-effort-limit", text, remedy, name, detail=detail)
-        if joint.continuous:
-            text = "position wraps: qpos jumps by whole turns"
-            remedy = "build params with robot.params(), which takes errors the short way round"
-            self._note("continuous", text, remedy, name)
-        elif joint.lower == joint.upper:
-            remedy = "give <limit lower= upper=>, or make it fixed"
+
+def _touching(plan: _Plan) -> Iterator[Place]:
+    """Yield the robot if links touch at the start pose or at the setpoint."""
+    robot = plan.robot
+    # A floating base starts on its ground, which is no fault.
+    ground = robot.fixed_base and robot.has_ground
+    goal = robot.target if plan.goal is None else robot.coupled(plan.goal)
+    for name, qpos in (("start pose", plan.start), ("setpoint", goal)):
+        pairs = touching_links(robot, qpos, ground, 0.0)
+        if pairs:
+            *_, nearest = pairs
+            yield Place(detail=f"{name}: {nearest}")
+
+
+def _outside(plan: _Plan) -> Iterator[Place]:
+    """Yield joints whose start position or setpoint is outside the limits."""
+    for name, qpos in (("start pose", plan.start), ("setpoint", plan.goal)):
+        if qpos is not None:
+            for _, index, value in plan.robot.limit_violations(qpos):
+                joint = plan.robot.joints[index]
+                limits = f"limits [{joint.lower:g}, {joint.upper:g}]"
+                yield Place(joint.name, detail=f"{name} {value:g} {joint.unit}, {limits}")
+
+
+def _without_range(plan: _Plan) -> Iterator[Place]:
+    """Yield joints that cannot move, apart from those of which a repair says so."""
+    reported = {repair.joint for repair in plan.robot.repairs if repair.remedy == GIVE_RANGE}
+    for joint in plan.robot.joints:
+        if joint.lower == joint.upper and not joint.continuous and joint.name not in reported:
+            text = "lower and upper limit are equal: no motion"
             limits = f"[{joint.lower:g}, {joint.upper:g}]"
-            self._warn(
-                "no-range",
-                "lower and upper limit are equal: no motion",
-                remedy,
-                name,
-                detail=limits,
-            )
-        elif math.isinf(joint.upper - joint.lower) and not ranged:
-            remedy = f"{GIVE_RANGE}, so that setpoints can be checked"
-            self._note("no-limits", "no position limits", remedy, name)
+            remedy = "give <limit lower= upper=>, or make it fixed"
+            yield Place(joint.name, None, limits, text, remedy)
 
-    def _check_strength(self) -> None:
-        """Report joints whose effort limit does not overcome gravity and friction in every pose."""
-        robot = self.robot
-        limits = robot.effort_limit
-        load = np.abs(robot.holding_efforts(robot.sample(POSES, seed=0)))
-        share = (load + robot.friction >= limits).mean(0)
-        for index in np.flatnonzero((share > 0) & (limits > robot.friction)):
-            joint = robot.joints[index]
-            self._warn(
-                "weak",
-                "effort limit does not overcome gravity and friction in every pose: some cannot be"
-                " held or left",
-                "expect no moves there, or correct <limit effort=>",
-                joint.name,
-                detail=f"{joint.effort_limit:g} {joint.effort_unit}, gravity up to"
-                f" {load[:, index].max():.3g}, friction {joint.friction:g},"
-                f" {100 * share[index]:.0f} % of poses",
-            )
 
-    def check_stability(self, params: bp.PIDParams, start: Float64, timestep: float) -> None:
-        """Report gains near or beyond the stability bound, and gains that ring."""
-        robot = self.robot
-        report = stability_report(robot, params, start, timestep, robot.actuators)
-        ratio = report.robot_ratio
-        if ratio < 1:
-            self._check_ringing(params, start, timestep, report.env)
-        if ratio >= NEAR_BOUND and params.discretization is not None:
-            text = (
-                f"the implicit law diverges if the model's inertia is {1 / ratio:.3g} times the"
-                " robot's, or more"
-            )
-            remedy = "lower kp and kd if the model may be that wrong"
-            self._note("near-unstable", text, remedy)
-        elif ratio >= NEAR_BOUND:
-            joint = robot.joint_names[int(np.argmax(report.participation))]
-            text = (
-                f"the sampled PID loop is at {ratio:.3g} times its stability bound, mostly of joint"
-                f" {joint!r}, at the start pose"
-            )
-            if ratio >= 1:
-                self._warn("unstable", f"{text}: {report.effect}", report.remedy)
-            else:
-                text = f"{text}: it may diverge in other poses"
-                self._note("near-unstable", text, report.remedy)
-
-    def _check_ringing(
-        self,
-        params: bp.PIDParams,
-        start: Float64,
-        timestep: float,
-        env: int,
-    ) -> None:
-        slow = slow_oscillation(self.robot, params, start, timestep, env)
-        zeta = float(slow.damping_ratio)
-        if zeta >= RINGING:
-            return
-        rest = math.exp(-2 * math.pi * zeta / math.sqrt(1 - zeta**2))
-        text = (
-            f"the PID loop rings at {slow.frequency:.2g} Hz with a damping ratio of {zeta:.2g} at"
-            f" the start pose: after each period {100 * rest:.0f} % of the amplitude remains"
+def _weak(plan: _Plan) -> Iterator[Place]:
+    """Yield joints that cannot be held, or not be moved, in some poses."""
+    robot = plan.robot
+    limits = robot.effort_limit
+    load = np.abs(robot.holding_efforts(robot.sample(POSES, seed=0)))
+    share = (load + robot.friction >= limits).mean(0)
+    for index in np.flatnonzero((share > 0) & (limits > 0)):
+        joint = robot.joints[index]
+        yield Place(
+            joint.name,
+            detail=f"{joint.effort_limit:g} {joint.effort_unit}, gravity up to"
+            f" {load[:, index].max():.3g}, friction {joint.friction:g},"
+            f" {100 * share[index]:.0f} % of poses",
         )
-        joint = self.robot.joint_names[int(np.argmax(slow.participation))]
-        report = self._note if zeta > 0 else self._warn
-        remedy = "raise its kd, lower its ki, or use robot.designed()"
-        report("ringing", text, remedy, joint)
 
-    def check_params(self, params: bp.PIDParams, control: str) -> None:
-        """Report params that disagree with the joints, or have no effect under ``control``."""
-        wraps = np.zeros(self.robot.dof, bool)
-        if params.continuous is not None:
-            wraps |= np.asarray(params.continuous).any(axis=0)
-        for index, joint in enumerate(self.robot.joints):
-            if joint.continuous and not wraps[index] and control == "pid":
-                text = "continuous in the URDF, not in params: the error jumps where qpos wraps"
-                remedy = "pass continuous= to make_params, or use robot.params()"
-                self._warn("continuous", text, remedy, joint.name)
-            if wraps[index] and not joint.continuous:
-                text = (
-                    "continuous in params, not in the URDF: the short way round may exceed limits"
-                )
-                remedy = "leave it out of continuous="
-                self._warn("continuous", text, remedy, joint.name)
+
+def _without_effort_limit(plan: _Plan) -> Iterator[Place]:
+    """Yield joints without an effort limit, with the one of their designed gains."""
+    robot = plan.robot
+    for joint, limit in zip(robot.joints, robot.design_effort_limit, strict=True):
+        if math.isinf(joint.effort_limit) and joint.mimic is None:
+            yield Place(joint.name, detail=f"{limit:.3g} {joint.effort_unit}")
+
+
+def _wrong_turns(plan: _Plan) -> Iterator[Place]:
+    """Yield joints whose errors wrap in the params, but not in the file, and the reverse."""
+    if plan.params is None:
+        return
+    wraps = np.zeros(plan.robot.dof, bool)
+    if plan.params.continuous is not None:
+        wraps |= np.asarray(plan.params.continuous).any(axis=0)
+    for joint, is_wrapped in zip(plan.robot.joints, wraps, strict=True):
+        if joint.continuous and not is_wrapped:
+            yield Place(joint.name, detail="in the file: the error jumps where qpos wraps")
+        if is_wrapped and not joint.continuous:
+            yield Place(joint.name, detail="in params: the short way round may exceed limits")
+
+
+def _unstable(plan: _Plan) -> Iterator[Place]:
+    """Yield the joint that is the first to become unstable."""
+    if plan.params is None:
+        return
+    robot = plan.robot
+    report = stability_report(robot, plan.params, plan.start, plan.timestep, robot.actuators)
+    ratio = report.robot_ratio
+    if ratio < NEAR_BOUND:
+        return
+    effect = "it may diverge in other poses"
+    if plan.params.discretization is not None:
+        effect = f"it diverges if the robot has {1 / ratio:.3g} times the model's inertia, or less"
+    elif ratio >= 1:
+        effect = report.effect
+    joint = robot.joint_names[int(np.argmax(report.participation))]
+    detail = f"{ratio:.3g} times the bound at the start pose: {effect}"
+    yield Place(joint, detail=detail, remedy=report.remedy)
+
+
+ODDITIES = (
+    Oddity("units", _odd_sizes),
+    Oddity("units", _odd_angles),
+    Oddity("inertia", _odd_inertia),
+    Oddity("no-inertia", _massless),
+    Oddity("collision", _changed_meshes),
+    Oddity("touching", _touching),
+    Oddity("out-of-limits", _outside),
+    Oddity("limits", _without_range),
+    Oddity("effort-limit", _weak),
+    Oddity("no-effort-limit", _without_effort_limit),
+    Oddity("continuous", _wrong_turns),
+    Oddity("unstable", _unstable),
+)
+"""Every oddity, in the order in which they are listed."""

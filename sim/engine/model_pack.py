@@ -57,6 +57,7 @@ class ModelPack(EnginePack, SingleOwner):
         self.dof, self._variation = len(spec.joints), variation or Variation()
         self._masses = VariedMasses(spec, size, self._variation)
         self._suspended: Bool = np.zeros(size, bool)
+        self.content = np.zeros(0, np.int64)
         self.friction = own_friction(spec, self._variation)
         armature = self._variation.armature  # vary() changes its rows
         self.armature = self._motors = np.zeros((1, self.dof)) if armature is None else armature

@@ -10,9 +10,8 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from importlib.util import find_spec
 from sys import modules
 from typing import Any, Literal, Protocol
@@ -20,16 +19,20 @@ from typing import Any, Literal, Protocol
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.io.packages import imported
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.robot.findings import Finding
 from batchpid.task_space.rigid_tree import RigidTree
 
-Capability = Literal["build", "partial_force", "base_state", "sapien_dissipation"]
+Capability = Literal["build", "partial_force", "base_state", "complete_state", "sapien_dissipation"]
 """
 - ``"build"``: the user's function ``build`` adds content to scenes;
 - ``"partial_force"``: compiled steps read gravity or Coriolis forces alone;
 - ``"base_state"``: compiled steps read state and passive force of robots on a floating base;
+- ``"complete_state"``: :meth:`EnginePack.read_state` holds everything that later steps depend on, so
+  that a pack in use can be restored, and a snapshot changes no bit;
 - ``"sapien_dissipation"``: SAPIEN's own friction and damping in place of the URDF's.
 """
 
@@ -87,9 +90,8 @@ class EnginePack(Protocol):
         :meth:`joint_mass_matrix`.
     steps_natively
         Whether native code does the sim steps, by :meth:`compiled_step`.
-    state_is_complete
-        Whether :meth:`read_state` holds everything that later steps depend on, so that a pack in
-        use can be restored.
+    content
+        Digest of the content that the user's ``build`` added to each env (M,); empty without one.
     """
 
     spec: SceneSpec
@@ -97,7 +99,7 @@ class EnginePack(Protocol):
     dof: int
     first_env: int
     qf: Rows
-    state_is_complete: bool
+    content: Rows
     friction: Friction
     armature: Float64
     steps_natively: bool
@@ -282,6 +284,11 @@ class EnginePack(Protocol):
         """Free the envs. The pack cannot be used afterwards."""
 
 
+def _nothing(spec: SceneSpec) -> Iterator[Finding]:
+    """Yield the limits of an engine that has none: nothing."""
+    return iter(())
+
+
 @dataclass
 class Engine:
     """Physics engine: it makes packs of robots."""
@@ -310,6 +317,10 @@ class Engine:
     """
     native_obstacle: Callable[[], str]
     """Reason for which native code cannot call the engine, in a sentence; "" if it can."""
+    refusals: Callable[[SceneSpec], Iterator[Finding]] = _nothing
+    """Yields what of a scene it cannot run at all."""
+    shortfalls: Callable[[SceneSpec], Iterator[Finding]] = _nothing
+    """Yields what of a scene it runs otherwise than the robot's file says."""
 
     def is_physics(self, settings: object) -> bool:
         """Return whether ``settings`` are settings of its solver."""
@@ -349,13 +360,13 @@ def load_engine(name: str = "sapien") -> Engine:
     if name == "sapien" and module not in modules and find_spec("sapien") is None:
         problem = "is not installed: SAPIEN is for Linux on x86-64"
         raise InvalidArgumentError("engine", problem, value=name, remedy="use 'mujoco'")
-    engine: Engine = import_module(module).ENGINE
+    engine: Engine = imported(module).ENGINE
     return engine
 
 
 def _require_mujoco() -> None:
     try:
         # A module that came with the oldest version that has all that is used here.
-        import_module("mujoco.batch")
+        imported("mujoco.batch")
     except ImportError as error:
         raise MissingDependencyError("mujoco>=3.17", "the engine 'mujoco'") from error

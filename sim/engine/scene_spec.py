@@ -16,7 +16,8 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
-from batchpid.sim.robot.contacts import Contacts
+from batchpid.sim.geometry.distances import Contacts
+from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.merging import merge_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
@@ -62,6 +63,26 @@ class SceneSpec:
     mjcf: MjcfFile | None = None
     carrier: str = ""
     varied_links: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        robot: RobotDescription,
+        timestep: float,
+        physics: object,
+        **options: Any,
+    ) -> SceneSpec:
+        """Return the description of scenes of ``robot``; ``options`` are further fields."""
+        return cls(
+            robot.tables,
+            robot.ignored_pairs,
+            robot.joints,
+            timestep,
+            physics,
+            dissipation=robot.dissipation,
+            fixed_base=robot.fixed_base,
+            **options,
+        )
 
     @property
     def simulated(self) -> Tables:

@@ -7,6 +7,8 @@ task Reach.
 step: ``jax.dlpack.from_dlpack`` and ``torch.from_dlpack`` take them without a copy.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from batchpid.errors import MissingDependencyError
 
 try:
@@ -18,7 +20,20 @@ from batchpid.sim.gym.reach import ReachEnv, ReachVectorEnv
 from batchpid.sim.gym.robot_env import RobotEnv
 from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
 
-__all__ = ["ReachEnv", "ReachVectorEnv", "RobotEnv", "RobotVectorEnv"]
+if TYPE_CHECKING:
+    from batchpid.sim.gym.stable_baselines import SB3VecEnv
+
+__all__ = ["ReachEnv", "ReachVectorEnv", "RobotEnv", "RobotVectorEnv", "SB3VecEnv"]
+
+
+def __getattr__(name: str) -> Any:
+    # Stable-Baselines3 imports PyTorch, which takes seconds.
+    if name == "SB3VecEnv":
+        from batchpid.sim.gym.stable_baselines import SB3VecEnv
+
+        return SB3VecEnv
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
 
 gymnasium.register(
     "batchpid/Reach-v0",

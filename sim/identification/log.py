@@ -6,6 +6,7 @@ and setpoints of revolute joints that were logged modulo 2 pi become continuous.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, SupportsIndex
@@ -128,8 +129,9 @@ def interpolated(time: Float64, known: Rows, table: Rows) -> Float64:
     return np.stack([np.interp(time, known, column) for column in table.T], axis=1)
 
 
-def checked(robot: Robot, log: Log) -> list[Log]:
-    """Return the stretches of ``log`` between gaps in time, with continuous positions.
+def checked(robot: Robot, log: Log, resets: Sequence[int] = ()) -> list[Log]:
+    """Return the stretches of ``log`` between gaps in time, with continuous positions; ``resets``
+    are rows before which the robot was placed elsewhere.
 
     Raises
     ------
@@ -146,7 +148,8 @@ def checked(robot: Robot, log: Log) -> list[Log]:
     if period > LONGEST:
         problem = f"has one row per {period:.3g} s, too few to see friction and delay"
         raise log.error(problem, f"record at 100 Hz or more; {units}")
-    cuts = np.flatnonzero(np.diff(log.time) > max(GAP, PERIODS * period)) + 1
+    gaps = np.flatnonzero(np.diff(log.time) > max(GAP, PERIODS * period)) + 1
+    cuts = np.union1d(gaps, resets).astype(int)
     parts = list[Log]()
     short = list[str]()
     for begin, end in pairwise([0, *cuts.tolist(), len(log.time)]):
@@ -160,7 +163,9 @@ def checked(robot: Robot, log: Log) -> list[Log]:
         remedy = f"record {MIN_ROWS} rows and {MIN_SECONDS} s without a gap; {units}"
         raise log.error(problem, remedy)
     if short:
-        log.warn(f"stretches between gaps in time are too short, left out: {short[0]} ...")
+        log.warn(
+            f"stretches between gaps in time or resets are too short, left out: {short[0]} ..."
+        )
     return parts
 
 

@@ -27,7 +27,7 @@ from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checke
 from batchpid.sim.recording.recording_files import read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.rollout import Rollout
+from batchpid.sim.signals.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
 
 QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
@@ -111,15 +111,19 @@ def logs_of_rollout(
     kind: CommandKind | None = None,
     source: str = "rollout",
 ) -> list[Log]:
-    """Return one log for each env of ``rollout``, whose setpoints are efforts under control
-    "effort".
+    """Return a log for each env of ``rollout`` and each stretch between its resets. Setpoints are
+    efforts under control "effort".
 
     Raises InvalidArgumentError if the simulation of a fit lacks an effect of the run.
     """
     info = rollout.info
     recorded: CommandKind = "effort" if info.control == "effort" else "setpoint"
     follows = recorded == "setpoint"
-    changes = np.abs(np.diff(rollout.time) - rollout.tick)
+    lengths = np.abs(np.diff(rollout.time) - rollout.tick)
+    # Changes before the first row are before the log.
+    within = np.zeros((0, rollout.num_envs), np.uint8)
+    if rollout.changes is not None:
+        within = rollout.changes[1:]
     obstacles = {
         f"is of the joints {', '.join(info.joint_names)}": info.joint_names != robot.joint_names,
         "was made with setpoints that are not of joints": info.own_command is not None,
@@ -129,8 +133,10 @@ def logs_of_rollout(
         "was made with a feedforward": rollout.feedforward is not None,
         "has setpoints that a guard changed": bool(np.any(rollout.guarded)),
         "was made with a randomization": bool(info.randomization),
-        "has params that were changed": info.params_changed and follows,
-        "has ticks of varied length": bool((changes > 1e-9 + 1e-6 * rollout.tick).any()),
+        "has params that were changed": bool((within & PARAMS).any()) and follows,
+        "has actuators that were changed": bool((within & ACTUATORS).any()),
+        "has a snapshot that was restored": bool((within & RESTORE).any()),
+        "has ticks of varied length": bool((lengths > 1e-9 + 1e-6 * rollout.tick).any()),
         "has failed": not rollout.ok.all(),
     }
     for problem, holds in obstacles.items():
@@ -156,7 +162,8 @@ def logs_of_rollout(
             compensate=info.compensate,
             params=params,
         )
-        logs += checked(robot, log)
+        resets = np.flatnonzero(within[:, env] & RESET) + 1
+        logs += checked(robot, log, resets.tolist())
     return logs
 
 

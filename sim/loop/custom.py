@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64, Pytree, Rows
 from batchpid.arrays.elementwise import read_only
-from batchpid.arrays.jax_settings import own_settings
+from batchpid.arrays.jax_settings import precision
 from batchpid.arrays.trees import flatten, unflatten
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions
@@ -149,8 +149,10 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
         arguments = arguments[:2]
     if options.backend != "jax":
         return init(*arguments)
-    with own_settings("float64"):  # its arrays have this dtype, not JAX's default in this process
-        return unflatten(state := init(*arguments), flatten(state))
+    # Its arrays have this dtype, not JAX's default in this process.
+    with precision("float64"):
+        state = init(*arguments)
+        return unflatten(state, flatten(state))
 
 
 def _like(before: Document, leaves: Document) -> Document:

@@ -340,7 +340,8 @@ class EnvGroup:
 
     def _parts(self) -> Document:
         """Return the arrays outside engine and control that a snapshot holds: results of the last
-        sim step, episodes of the motors' noise, and those of faults, sensors and pushes.
+        sim step, episodes of the motors' noise, those of faults, sensors and pushes, and the
+        digests of the user's content.
         """
         last = self._last
         return {
@@ -351,6 +352,7 @@ class EnvGroup:
             "containment": self._faults.state,
             "sensors": self._sensors.values,
             "pushes": self._pushes.counts,
+            "content": {"digest": self.pack.content} if self.pack.content.size else {},
         }
 
     def write(

@@ -95,6 +95,10 @@ class FaultLog:
         self._read = read
         self._steps: Rows = np.full(num_envs, NO_STEP)
 
+    def __len__(self) -> int:
+        """Return the number of envs."""
+        return len(self._steps)
+
     def without(self, mask: Bool) -> FaultLog:
         """Return a log in which the envs of ``mask`` (envs,), which were reset, have no last fault."""
         return self.restored(np.where(mask, NO_STEP, self._steps))

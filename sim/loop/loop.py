@@ -18,7 +18,6 @@ import batchpid as bp
 from batchpid.arrays.array_types import Rows
 from batchpid.errors import BatchPIDError, ControllerError, WorkerError
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.backend import native_obstacle
 from batchpid.sim.loop.custom import OwnController
@@ -125,18 +124,9 @@ class Loop:
         envs: slice,
         arrays: Arrays,
     ) -> None:
-        robot = options.robot
         self.options, self.arrays = options, arrays
         self._first_env = envs.start
-        self._scene = SceneSpec(
-            tables=robot.tables,
-            ignored=robot.ignored_pairs,
-            joints=robot.joints,
-            dissipation=robot.dissipation,
-            fixed_base=robot.fixed_base,
-            mjcf=options.mjcf,
-            **options.values_for("scene"),
-        )
+        self._scene = options.scene
         self._steps = 0
         self._given: tuple[bool, ...] = ()
         self._workspace: dict[object, object] = {}
@@ -275,7 +265,7 @@ class Loop:
         randomization = self.options.randomization
         pack = group.pack
         varies = randomization is not None and randomization.changes_robot
-        if varies or not pack.state_is_complete:
+        if varies or "complete_state" not in self.options.load_engine().capabilities:
             pack.close()
             pack = self._build(group.envs, draws)
         group.write(pack, rows, params, actuators, draws)

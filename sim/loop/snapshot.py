@@ -27,6 +27,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 
 _FORMAT = 17
+_SAME_CONTENT = "take one with the same build=, and keep each env's number where it depends on it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,23 +74,30 @@ class Snapshot:
         for name in ours | theirs:
             kind, other = theirs.get(name), ours.get(name)
             _expect(kind == other, f"has {kind} for {name}, not {other}")
+        # An env of a fork may have come from one for which build made something else.
+        content = self.rows.get("content/digest")
+        if content is not None:
+            is_same = np.array_equal(content, own["content/digest"])
+            _expect(is_same, "is of envs for which build made other content", _SAME_CONTENT)
         # The engine's values of an env end where NaN begin.
         lengths = np.isnan(self.rows["engine"]) == np.isnan(own["engine"])
-        _expect(lengths.all(), "holds other content than this runner's build makes")
+        _expect(lengths.all(), "holds other content than this runner's build makes", _SAME_CONTENT)
 
     def episodes(self, num_envs: int) -> NDArray[np.int64]:
         """Return the checked stream and episode of each of ``num_envs`` envs."""
         episodes = self.rows.get("episodes", np.zeros(0))
         is_table = episodes.shape == (num_envs, 2) and episodes.dtype == np.int64
-        _expect(is_table and (episodes >= 0).all(), "has no valid episode numbers")
+        is_valid = is_table and (episodes >= 0).all()
+        _expect(is_valid, "has no valid episode numbers", "take another: this one is damaged")
         return episodes
 
     def for_envs(self, envs: slice | Sequence[int] | Rows) -> Snapshot:
         """Return a snapshot of the envs with these numbers, in this order, and repeatedly where a
         number repeats.
 
-        A runner of as many envs restores it. An env continues bit by bit as the original would,
-        with the noise of the original's sensors, until it is reset.
+        A runner of as many envs restores it, if its ``build`` makes the same content for each as
+        for the original. An env continues bit by bit as the original would, with the noise of the
+        original's sensors, until it is reset.
 
         Raises
         ------
@@ -191,7 +199,7 @@ def _widened(table: Rows, width: int) -> Rows:
     return np.pad(table, ((0, 0), (0, missing)), constant_values=np.nan)
 
 
-def _expect(holds: Any, problem: str) -> None:
+def _expect(holds: Any, problem: str, remedy: str = "take one with the same options") -> None:
     """Raise InvalidArgumentError with a ``problem`` of a snapshot unless something ``holds``."""
     if not holds:
-        raise InvalidArgumentError("snapshot", problem, remedy="take one with the same build=")
+        raise InvalidArgumentError("snapshot", problem, remedy=remedy)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Float64, Pytree, Rows
-from batchpid.arrays.jax_settings import own_settings
+from batchpid.arrays.jax_settings import precision
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine.native import xla
 from batchpid.sim.loop.arrays import Command
@@ -92,7 +92,7 @@ class XLAExecutor:
             limits=(None, None) if layout.law is not None else spread(constants.limits),
             friction=spread(constants.friction),
         )
-        with own_settings("float64"):
+        with precision("float64"):
             self._constants = put(arrays)
             if uses_bodies:
                 self._bodies = put(pack.rigid_tree.tables)
@@ -103,7 +103,7 @@ class XLAExecutor:
 
     def measure(self) -> None:
         """Read the robots, after a change of their states between sim steps."""
-        with own_settings("float64"):
+        with precision("float64"):
             self._measured = put(mapped(padded, self._engine.measure()))
 
     def qpos(self) -> Float64:
@@ -131,7 +131,7 @@ class XLAExecutor:
         else:
             # The program's integers have 32 bits, as those of a tick's span.
             age = state.age.astype(np.int32)
-        with own_settings("float64"):
+        with precision("float64"):
             self._state = put(jax.tree.map(padded, state._replace(age=age)))
 
     def results(self) -> Outputs:
@@ -153,7 +153,7 @@ class XLAExecutor:
         controller = setup.controller
         layout = setup.layout._replace(model=Model(), moves=moves)
         traced = None if controller is None else controller.traced
-        with own_settings("float64"):
+        with precision("float64"):
             # An address has two parts: without 64-bit integers JAX would cut it.
             steps = np.array([begin, end, 0, 0], np.int32)
             steps[2:].view(np.uint64)[0] = step.prepare()

@@ -148,10 +148,6 @@ class Scene(OptionGroup):
             "snapshot",
             "recording",
             "scene",
-            flag=(
-                "Ground at height 0. Default: on, unless links of a fixed robot reach it at the"
-                " start pose."
-            ),
         ),
     ] = None
     """Add a ground plane at height 0 to every scene. Default :attr:`Robot.has_ground`: True, unless
@@ -374,7 +370,7 @@ class Control(OptionGroup):
     """Link that control "osc" moves; default the last link of the robot's longest chain."""
     backend: Annotated[
         Backend,
-        option("snapshot", flag="Array library: NumPy, or JAX, which compiles law and sim steps."),
+        option("snapshot"),
     ] = "numpy"
     """Library of the law: ``"numpy"``, the default, or ``"jax"``, which compiles law and sim steps
     of a tick, and a :class:`Controller`, into one XLA program for the CPU (docs/performance.md). It
@@ -384,11 +380,7 @@ class Control(OptionGroup):
     """
     compensate: Annotated[
         Compensation,
-        option(
-            "snapshot",
-            "recording",
-            flag="Efforts added in every sim step against these forces.",
-        ),
+        option("snapshot", "recording"),
     ] = "gravity+coriolis+friction"
     """Compensation added to the effort at every sim step: the passive force (gravity, Coriolis and
     centrifugal forces) and the known Coulomb friction in the direction of the setpoint.

@@ -23,13 +23,13 @@ from batchpid.arrays.field_tables import Field, declared, plain
 from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.records import frozen
 from batchpid.checks.validate import AxisKind, instance
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.native import xla
-from batchpid.sim.engine.scene_spec import added_friction
+from batchpid.sim.engine.scene_spec import SceneSpec, added_friction
 from batchpid.sim.options.groups import (
     Control,
     Controller,
@@ -130,6 +130,14 @@ class RunnerOptions(RunnerKeywords):
         if self.params is None:
             values["params"] = default_params(robot, self.control, self.loops)
         values["params"] = self.check_params(self.params)
+        if refusals := list(self.load_engine().refusals(self.scene)):
+            raise RobotError(f"{robot.path}: {'; '.join(map(str, refusals))}")
+
+    @cached_property
+    def scene(self) -> SceneSpec:
+        """Description of the scenes, for the engine."""
+        options = self.values_for("scene")
+        return SceneSpec.of(self.robot, mjcf=self.mjcf, **options)
 
     def _check_program(self) -> None:
         """Raise InvalidArgumentError for an option that the program of backend "jax" does not
@@ -145,8 +153,8 @@ class RunnerOptions(RunnerKeywords):
             lacks_force = True
         obstacle = engine.native_obstacle() or xla.obstacle()
         if obstacle:
-            problem = f"'jax' needs native code: {obstacle}"
-            remedy = "build the extensions, or use backend='numpy'"
+            problem = f"'jax' needs native code and JAX on the CPU: {obstacle}"
+            remedy = "mend that, or use backend='numpy'"
             raise InvalidArgumentError("backend", problem, remedy=remedy)
         for argument, problem, is_lacking in (
             ("control", "is 'drive'", self.control == "drive"),

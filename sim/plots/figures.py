@@ -33,14 +33,11 @@ FORMATS = (".png", ".svg")
 """Suffixes of the files that :func:`save` writes."""
 ENV = "#4c78a8"
 MEDIAN = "#16324f"
-MARKED = "#f28e2b"
 SECOND = "#e45756"
 SETPOINT = "#2f8f4e"
 LIMIT = "#b23a48"
 SMALL = 7.0
 """Font size of ticks and units."""
-BAND = 0.02
-"""Half width of the settling band around the last setpoint, as a fraction of the median move."""
 
 
 class Picture(Figure):
@@ -56,7 +53,6 @@ def step_responses(
     rollout: Rollout,
     *,
     joints: Sequence[str] = (),
-    mark: int | None = None,
     title: str = "",
 ) -> Figure:
     """Draw, for each joint, positions against setpoint and limits above efforts against their
@@ -70,8 +66,6 @@ def step_responses(
     ----------
     joints
         Names; default all.
-    mark
-        An env to draw in a colour apart.
 
     Raises
     ------
@@ -87,10 +81,10 @@ def step_responses(
     # Joints come first, entries of another command after them.
     for joint, (above, below) in zip(chosen, blocks, strict=False):
         _draw_limits(above, run.info.lower[joint], run.info.upper[joint])
-        _draw_setpoint(above, run, joint)
-        _draw_fan(above, run.time, run.qpos[..., joint], mark)
+        _draw_line(above, run.time, run.setpoint[..., joint])
+        _draw_fan(above, run.time, run.qpos[..., joint])
         _show_positions(above, [run], joint)
-        _draw_efforts(below, run, joint, mark)
+        _draw_efforts(below, run, joint)
     pose = run.tool_pose
     if pose is not None:
         # Of the two quaternions of an orientation, the one that is nearer to the setpoint's.
@@ -104,7 +98,7 @@ def step_responses(
     for entry, (above, below) in enumerate(blocks[len(chosen) :]):
         _draw_line(above, run.time, rollout.setpoint[..., entry])
         if pose is not None and entry < pose.shape[-1]:
-            _draw_fan(above, run.time, pose[..., entry], mark)
+            _draw_fan(above, run.time, pose[..., entry])
         below.remove()
     _add_legend(figure)
     return figure
@@ -115,7 +109,7 @@ def efforts(rollout: Rollout) -> Figure:
     run = _blank_failed(rollout)
     figure, chosen, blocks = _joint_axes([run], (), 1)
     for joint, (axes,) in zip(chosen, blocks, strict=True):
-        _draw_efforts(axes, run, joint, None)
+        _draw_efforts(axes, run, joint)
     _add_legend(figure)
     return figure
 
@@ -128,7 +122,7 @@ def following_errors(rollout: Rollout) -> Figure:
     figure, chosen, blocks = _joint_axes([run], (), 1)
     for joint, (axes,) in zip(chosen, blocks, strict=True):
         error = run.qpos[..., joint] - run.setpoint[..., joint]
-        _draw_fan(axes, run.time, error, None)
+        _draw_fan(axes, run.time, error)
         _show(axes, error, run.info.units[joint])
     _add_legend(figure)
     return figure
@@ -294,15 +288,8 @@ def _add_legend(figure: Figure) -> None:
     )
 
 
-def _draw_fan(
-    axes: Axes,
-    time: Rows,
-    values: Rows,
-    mark: int | None,
-) -> None:
-    """Draw each env of ``values`` (ticks, envs) as a thin line, their median as a bold one, env
-    ``mark`` in colour.
-    """
+def _draw_fan(axes: Axes, time: Rows, values: Rows) -> None:
+    """Draw each env of ``values`` (ticks, envs) as a thin line, their median as a bold one."""
     lines = [np.stack([time, value], axis=1) for value in values.T]
     # As one bitmap: an SVG of 64 envs by 9 joints would hold half a million points.
     fan = LineCollection(
@@ -316,14 +303,6 @@ def _draw_fan(
     axes.add_collection(fan, autolim=False)
     (median,) = _quantiles(values, 0.5)
     axes.plot(time, median, color=MEDIAN, lw=1.5, label="median")
-    if mark is not None:
-        axes.plot(
-            time,
-            values[:, mark],
-            color=MARKED,
-            lw=1.1,
-            label=f"env {mark}",
-        )
 
 
 def _draw_band(
@@ -337,27 +316,6 @@ def _draw_band(
     low, median, high = _quantiles(values, 0.1, 0.5, 0.9)
     axes.fill_between(time, low, high, color=colour, alpha=0.2, lw=0)
     axes.plot(time, median, color=colour, lw=1.4, label=f"{label}: median, 10 to 90 %")
-
-
-def _draw_setpoint(axes: Axes, run: Rollout, joint: int) -> None:
-    """Draw the setpoint of a joint, and the settling band around its last value."""
-    setpoint = run.setpoint[..., joint]
-    _draw_line(axes, run.time, setpoint)
-    last = setpoint[-1]
-    move = np.abs(last - run.qpos[0, :, joint])
-    move = move[np.isfinite(move)]
-    # Envs with different setpoints have no common band.
-    if move.size and np.ptp(last) == 0:
-        half = BAND * float(np.median(move))
-        label = f"settling band, {BAND:.0%} of the move"
-        axes.axhspan(
-            last[0] - half,
-            last[0] + half,
-            color=SETPOINT,
-            alpha=0.2,
-            lw=0,
-            label=label,
-        )
 
 
 def _draw_line(axes: Axes, time: Rows, values: Rows) -> None:
@@ -377,17 +335,12 @@ def _draw_limits(axes: Axes, low: float, high: float) -> None:
             axes.axhline(limit, color=LIMIT, lw=0.9, zorder=2, label="limit")
 
 
-def _draw_efforts(
-    axes: Axes,
-    run: Rollout,
-    joint: int,
-    mark: int | None,
-) -> None:
+def _draw_efforts(axes: Axes, run: Rollout, joint: int) -> None:
     """Draw the efforts against their limit, with their peak and the share of saturated samples."""
     values = run.effort[..., joint]
     limit = float(run.info.effort_limit[joint])
     _draw_limits(axes, -limit, limit)
-    _draw_fan(axes, run.time, values, mark)
+    _draw_fan(axes, run.time, values)
     _show_efforts(axes, [run], joint)
     peak = np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
     share = run.saturated[..., joint].mean()
@@ -449,7 +402,10 @@ def _quantiles(values: Rows, *at: float) -> Rows:
 def _blank_failed(rollout: Rollout) -> Rollout:
     """Return the rollout with NaN where an env has failed, and for setpoints that are not
     positions.
+
+    Raises InvalidArgumentError for one without ticks.
     """
+    rollout.check_ticks()
     alive = rollout.ok[..., None]
     blank = {}
     for name in ("qpos", "effort", "tool_pose"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from batchpid.sim.randomization.randomization import EVENTS, FIELDS, Randomizati
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 
-_HUGE = 1e300
 _ZERO = ("payload", "center_of_mass", *EVENTS)
 """Fields whose nominal value is 0, which no draw can scale."""
 
@@ -39,7 +38,7 @@ def check_robot(randomization: Randomization, robot: Robot, mjcf: MjcfFile | Non
             if name in _ZERO and part.operation == "scale":
                 problem = "is 0, which cannot be scaled"
                 raise InvalidArgumentError(name, problem, remedy="use operation 'add'")
-        for rows in _extremes(name, field, columns, nominal_values(name, robot, mjcf)[None]):
+        for rows in _outermost(name, field, columns, nominal_values(name, robot, mjcf)[None]):
             FIELDS[name].checked(name, rows[0], columns, kind="entry")
     if randomization.damping is not None and robot.dissipation != "urdf":
         problem = "cannot be drawn: the engine sets it with this dissipation"
@@ -62,21 +61,22 @@ def _check_events(randomization: Randomization, robot: Robot) -> None:
         raise InvalidArgumentError("push", problem, remedy=remedy)
 
 
-def _extremes(
+def _outermost(
     name: str,
     field: Field,
     columns: Sequence[str],
     nominal: Rows,
-) -> Iterator[Rows]:
-    """Yield ``nominal`` (rows, elements, ...) with the least and with the largest draw of each part
-    of a field.
+) -> tuple[Rows, Rows]:
+    """Return ``nominal`` (rows, elements, ...) with the least, and with the largest draws of a
+    field: all operations are monotonic.
     """
-    # A draw at an end of its range is the worst, since all operations are monotonic.
+    least = np.array(nominal)
+    largest = np.array(nominal)
     for _, chosen, distribution in parts(name, field, columns):
-        for end in np.clip(distribution.support, -_HUGE, _HUGE):
-            rows = np.array(nominal)
-            rows[:, chosen] = distribution.apply(rows[:, chosen], end)
-            yield rows
+        low, high = distribution.support
+        least[:, chosen] = distribution.apply(least[:, chosen], low)
+        largest[:, chosen] = distribution.apply(largest[:, chosen], high)
+    return least, largest
 
 
 def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robot) -> None:
@@ -90,7 +90,7 @@ def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robo
             problem = "is off in the params, or not a number"
             remedy = f"draw one of {', '.join(leaves)}"
             raise InvalidArgumentError(f"params.{name}", problem, remedy=remedy)
-        for rows in _extremes(f"params.{name}", field, robot.joint_names, leaves[name]):
+        for rows in _outermost(f"params.{name}", field, robot.joint_names, leaves[name]):
             drawn: Document = {name: rows}
             params._replace(**drawn).check(params.num_envs, robot.joint_names)
 
@@ -129,7 +129,7 @@ def prepared_actuators(
             raise InvalidArgumentError(argument, problem, remedy=remedy)
         if leaf is None:
             leaf = np.full((1, robot.dof), declared.neutral)
-        for rows in _extremes(argument, field, robot.joint_names, leaf):
+        for rows in _outermost(argument, field, robot.joint_names, leaf):
             declared.checked(name, rows, robot.joint_names)
             if name in DELAYS:
                 delay = max(delay, float(rows.max()))

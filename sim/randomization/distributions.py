@@ -8,7 +8,7 @@ import hashlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -26,8 +26,12 @@ Episodes = NDArray[np.int64]
 Operation = Literal["add", "scale", "abs"]
 _UNIT = "in the unit of the field"
 _TINY = float(np.finfo(float).tiny)
-LEAST_SHARE = 0.01
-"""Least share of a normal distribution within its bounds."""
+FARTHEST_SPREAD = 4.0
+"""Largest distance of a normal draw from the mean, over the standard deviation: 1 in 16,000 draws
+is farther.
+"""
+LARGEST_MEAN = 1e300
+"""Largest mean and standard deviation, of which no draw is infinite."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +58,9 @@ class Distribution(ABC):
         flag("shared", self.shared)
 
     @property
+    @abstractmethod
     def support(self) -> tuple[float, float]:
         """Smallest and largest value that can be drawn."""
-        return self.low, self.high  # type: ignore[attr-defined]
 
     @abstractmethod
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
@@ -101,6 +105,11 @@ class Uniform(Distribution):
         # The class is frozen; its __dict__ is not.
         vars(self).update(low=low, high=high)
 
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that can be drawn."""
+        return self.low, self.high
+
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
         return generator.uniform(self.low, self.high, size)
@@ -121,34 +130,27 @@ class LogUniform(Uniform):
 
 @dataclass(frozen=True)
 class Normal(Distribution):
-    """Normal distribution, truncated to [low, high]: draws outside are repeated."""
+    """Normal distribution; a draw further than :data:`FARTHEST_SPREAD` from the mean becomes that."""
 
     mean: float
     std: float
-    low: float = field(default=-math.inf, kw_only=True)
-    high: float = field(default=math.inf, kw_only=True)
     kind = "normal"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        mean = number("mean", self.mean, -math.inf, math.inf, _UNIT)
-        std = number("std", self.std, _TINY, math.inf, _UNIT)
-        low, high = read_array("low", [self.low, self.high]).tolist()
-        # Draws outside are repeated, which a tail would do for long.
-        below, above = (math.erf((end - mean) / (math.sqrt(2.0) * std)) for end in (low, high))
-        share = 0.5 * (above - below)
-        if not share >= LEAST_SHARE:
-            problem = f"the range to high holds {share:.2g} of the draws"
-            remedy = "use a uniform distribution for a tail"
-            raise InvalidArgumentError("low", problem, value=low, remedy=remedy)
-        vars(self).update(mean=mean, std=std, low=low, high=high)
+        mean = number("mean", self.mean, -LARGEST_MEAN, LARGEST_MEAN, _UNIT)
+        std = number("std", self.std, _TINY, LARGEST_MEAN, _UNIT)
+        vars(self).update(mean=mean, std=std)
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that can be drawn."""
+        reach = FARTHEST_SPREAD * self.std
+        return self.mean - reach, self.mean + reach
 
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
-        drawn = generator.normal(self.mean, self.std, size)
-        while (outside := (drawn < self.low) | (drawn > self.high)).any():
-            drawn[outside] = generator.normal(self.mean, self.std, int(outside.sum()))
-        return drawn
+        return np.clip(generator.normal(self.mean, self.std, size), *self.support)
 
 
 @dataclass(frozen=True)

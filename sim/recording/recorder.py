@@ -7,12 +7,13 @@ Ctrl-C held back.
 
 from __future__ import annotations
 
+import io
 import os
 import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import RecordingError
 from batchpid.sim.signals.quantities import Observation
-from batchpid.sim.signals.rollout import Redraw, RunInfo
+from batchpid.sim.signals.rollout import RunInfo
 
 if TYPE_CHECKING:
     import h5py
@@ -66,9 +67,8 @@ class Recorder(SingleOwner):
         *,
         overwrite: bool = False,
     ) -> None:
-        from batchpid.sim.runner.runner import (
-            Runner,  # loads SAPIEN, as the runner has done already
-        )
+        # It loads the engine, as the runner has done already.
+        from batchpid.sim.runner.runner import Runner
 
         if instance("runner", runner, Runner, "pass the runner to record").closed:
             raise ClosedError("this Runner is closed; record one that is not")
@@ -76,9 +76,9 @@ class Recorder(SingleOwner):
             problem = f"is being recorded already, to {runner.recorder.path}"
             raise InvalidArgumentError("runner", problem, remedy="close that Recorder first")
         if flag("overwrite", overwrite):
-            self._mode = "w"
+            self._mode = "w+"
         else:
-            self._mode = "x"
+            self._mode = "x+"
         self.path: Path = files.check_path(path, overwrite=overwrite)
         self._runner = runner
         self._info: RunInfo | None = None  # at the first tick
@@ -86,9 +86,7 @@ class Recorder(SingleOwner):
         self._rows: list[dict[str, Rows]] = []  # not written yet
         self._count = 0  # of written rows
         self._last_write = time.monotonic()
-        self._redraws: list[Redraw] = []
         self._rates = False  # whether a recorded tick had rates
-        self._params_changed = False
         self._error: Exception | None = None
         self._is_closed = False
         runner.recorder = self
@@ -102,25 +100,29 @@ class Recorder(SingleOwner):
             An earlier tick could not be written.
         """
         if self._error is not None:
-            cause = " ".join(str(self._error).split())  # HDF5 writes several lines
+            # HDF5 writes several lines.
+            cause = " ".join(str(self._error).split())
+            if isinstance(self._error, FileExistsError):
+                cause = "it exists since the recorder was made; pass overwrite=True"
             raise RecordingError(f"{self.path}: cannot be written: {cause}") from self._error
         if self._info is None:
-            self._episodes, self._params = self._runner.episodes, self._runner.params
             self._info = replace(self._runner.info, complete=False)
 
-    def append(self, time_: float, command: Command, observation: Observation) -> None:
-        """Record the state at ``time_`` [s] after a tick under ``command``. The arrays may change
-        afterwards.
+    def append(
+        self,
+        time_: float,
+        command: Command,
+        observation: Observation,
+        changes: Rows | None,
+    ) -> None:
+        """Record the state at ``time_`` [s] after a tick under ``command``, and the ``changes``
+        (envs,) before it. The arrays may change afterwards.
         """
-        episodes = self._runner.episodes
-        for env in np.flatnonzero((episodes != self._episodes).any(1)).tolist():
-            self._redraws.append(Redraw(time_, env, *episodes[env].tolist()))
-        self._episodes = episodes
-        self._params_changed |= self._runner.params is not self._params
         self._rates |= command.setpoint_rate is not None
         rows: dict[str, Rows | None] = observation._asdict()
         rows["time"] = np.array(time_)
         rows["setpoint"] = np.array(command.setpoint)
+        rows["changes"] = changes
         if command.feedforward is not None:
             rows["feedforward"] = np.array(command.feedforward)
         self._rows.append({name: row for name, row in rows.items() if row is not None})
@@ -161,15 +163,14 @@ class Recorder(SingleOwner):
         """Write the remaining rows and the events of the run, and close the file."""
         self._write()
         if self._file:  # not closed yet
-            info = replace(
-                info,
-                faults=self._runner.faults,
-                redraws=tuple(self._redraws),
-                rates=self._rates,
-                params_changed=self._params_changed,
-            )
+            info = replace(info, faults=self._runner.faults, rates=self._rates)
             self._file.attrs.update(files.attributes(info))
+            self._close_file()
+
+    def _close_file(self) -> None:
+        if self._file:
             self._file.close()
+            self._output.close()
 
     def _write(self) -> None:
         """Write the rows that are not written yet, into a new file at first. Raises
@@ -184,39 +185,46 @@ class Recorder(SingleOwner):
                 assert self._info is not None
                 tick = runner.timestep * runner.substeps
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                self._file = h5py.File(self.path, self._mode, libver=files.LIBVER, locking=False)
+                self._output = _Output(self.path, self._mode)
+                self._file = h5py.File(self._output, "w", libver=files.LIBVER)
                 self._datasets = files.create_datasets(
                     self._file, self._info, runner.num_envs, tick
                 )
             if rows:
                 files.write_rows(self._datasets, self._count, _stacked(rows))
+            if self._output.error is not None:
+                raise self._output.error
         except (OSError, RuntimeError) as error:
             self._error = error
-            if self._file is not None:
-                _abandon(self._file)
+            self._close_file()
             self.prepare()  # raises
         self._count += len(rows)
         self._rows = []
         self._last_write = time.monotonic()
 
 
+class _Output(io.FileIO):
+    """File that HDF5 writes. It keeps the first error, of which HDF5 learns nothing: after one it
+    would crash the process at its end.
+    """
+
+    error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        try:
+            if self.error is None:
+                super().write(data)
+        except OSError as error:
+            self.error = error
+        return len(data)
+
+
 def _stacked(rows: list[dict[str, Rows]]) -> dict[str, Rows]:
     """Return the arrays of successive ticks, ticks first; 0 where a tick has none."""
     arrays = {}
-    # Feedforwards may begin, and end, with any tick.
+    # Feedforwards may begin, and end, with any tick; changes are rare.
     for name in dict.fromkeys(name for row in rows for name in row):
         present = next(row[name] for row in rows if name in row)
         zeros = np.zeros_like(present)
         arrays[name] = np.array([row.get(name, zeros) for row in rows])
     return arrays
-
-
-def _abandon(file: h5py.File) -> None:
-    """Close a file that cannot be written, without another write: HDF5 would crash the process at
-    its end.
-    """
-    memory = os.memfd_create("batchpid-recording", os.MFD_CLOEXEC)
-    os.dup2(memory, file.id.get_vfd_handle(), inheritable=False)
-    os.close(memory)
-    with suppress(OSError, RuntimeError):
-        file.close()

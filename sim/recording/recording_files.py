@@ -2,8 +2,8 @@
 ticks first.
 
 Each field of its :class:`batchpid.sim.RunInfo` is an attribute of the file: a number, a text, an
-array of them, or JSON (:data:`READERS`). Two more are ``num_envs`` and ``tick`` [s]. The dataset
-``feedforward`` is empty where none was given.
+array of them, or JSON (:data:`READERS`). Two more are ``num_envs`` and ``tick`` [s]. The datasets
+``feedforward`` and ``changes`` are empty where there are none.
 
 A row is valid if its ``time`` is a number: times are written last, and only after the other arrays
 are on the disk. So any reader of HDF5 can read the file after a kill, up to the last row that has a
@@ -30,12 +30,12 @@ from batchpid.errors import BatchPIDError, InvalidArgumentError, RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.signals.quantities import CommandSpec, Observation
-from batchpid.sim.signals.rollout import Redraw, Rollout, RunInfo
+from batchpid.sim.signals.rollout import OPTIONAL, Rollout, RunInfo, merged_changes
 
 if TYPE_CHECKING:
     import h5py  # functions load it, since commands that record nothing start sooner without it
 
-FORMAT = "batchpid-recording-2"
+FORMAT = "batchpid-recording-3"
 HDF5 = (".h5", ".hdf5")
 LIBVER = ("v108", "v108")
 """Versions of HDF5's format. Later ones mark a file that was not closed, and HDF5 then refuses to
@@ -118,6 +118,7 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
                 raise ValueError(f"its format is not {FORMAT}")
             info = read_info(file.attrs)
             num_envs = int(file.attrs["num_envs"])
+            _check_info(info, num_envs)
             tick = float(file.attrs["tick"])
             time = file["time"][:]
             # The rows of a run that still goes on, or was killed, end at the first without a time.
@@ -125,19 +126,35 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
             rows = slice(0, count, every)
             arrays = {"time": time[rows]}
             for name, quantity in info.recorded.items():
-                array = file[name][rows]
+                if name == "changes":
+                    ticks = np.arange(count)[::every]
+                    array = merged_changes(file[name][:count], ticks)
+                else:
+                    array = file[name][rows]
                 shape = (len(arrays["time"]), *info.row_shape(name, num_envs))
                 if array.shape != shape:
                     raise ValueError(f"its {name} has shape {array.shape}, not {shape}")
                 arrays[name] = array.astype(quantity.dtype, casting="same_kind", copy=False)
-            if not file["feedforward"].id.get_storage_size():
-                arrays["feedforward"] = None
+            for name in OPTIONAL:
+                if not file[name].id.get_storage_size():
+                    arrays[name] = None
     except Exception as error:  # a damaged file can make HDF5 raise anything
         raise RecordingError(
             f"{path}: cannot be read as a recording: {error or type(error).__name__}"
         ) from error
-    inputs = {name: arrays.pop(name) for name in ("time", "setpoint", "feedforward")}
+    inputs = {name: arrays.pop(name) for name in ("time", "setpoint", *OPTIONAL)}
     return Rollout(**inputs, observation=Observation(**arrays), tick=tick * every, info=info)
+
+
+def _check_info(info: RunInfo, num_envs: int) -> None:
+    """Raise ValueError for an array of a file whose shape is not that of its field."""
+    joints: tuple[int, ...] = (len(info.joint_names),)
+    shapes = dict.fromkeys(("units", "lower", "upper", "effort_limit"), joints)
+    shapes |= {"start": (num_envs, *joints), "episodes": (num_envs, 2)}
+    for name, shape in shapes.items():
+        value = getattr(info, name)
+        if value is not None and np.shape(value) != shape:
+            raise ValueError(f"its {name} has shape {np.shape(value)}, not {shape}")
 
 
 def check_path(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
@@ -220,7 +237,6 @@ def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Documen
 READERS: dict[str, Callable[[Any], Any]] = {
     "own_command": lambda entries: CommandSpec(*entries),
     "faults": lambda faults: tuple([Fault(*fault) for fault in faults]),
-    "redraws": lambda redraws: tuple([Redraw(*redraw) for redraw in redraws]),
     "draws": lambda draws: {name: np.array(rows, np.float64) for name, rows in draws.items()},
     "versions": dict,
     "randomization": dict,

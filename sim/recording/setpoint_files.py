@@ -302,6 +302,9 @@ def _substeps(
         row = int(late.argmax())
         problem = f"line {lines[row]}: time is {time[row]:.9g} s, and not {expected[row]:.9g} s"
         remedy = f"begin at 0 or {dt:g} s, with rows whole sim steps of {timestep:g} s apart"
+        # Rows of 30 Hz are no whole number of the default steps.
+        if abs(period - dt) > 1e-6 * timestep:
+            remedy += f", or use --timestep {period / substeps:.9g} (timestep=)"
         raise error(source, problem, remedy)
     if first + len(time) == 1:
         problem = f"line {lines[0]}: the only row is at 0 s"

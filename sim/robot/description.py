@@ -20,7 +20,6 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.merging import merge_links, place_links
-from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import (
     DISSIPATION,
@@ -362,7 +361,8 @@ class RobotDescription:
     @cached_property
     def digest(self) -> str:
         """Digest of bodies, joints and shapes, with the content of mesh files in place of paths."""
-        return digest(self.tables.bodies, content_of(self.tables.shapes), self.joints)
+        shapes = [shape._replace(file="") for shape in self.tables.shapes]
+        return digest(self.tables.bodies, shapes, self.joints)
 
     def limit_violations(self, qpos: ArrayLike) -> list[tuple[int, int, float]]:
         """Return the entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env,

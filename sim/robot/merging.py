@@ -19,9 +19,9 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import read_only
-from batchpid.sim.robot.collision_shapes import inertia_of
+from batchpid.sim.geometry.shapes import inertia_of
 from batchpid.sim.robot.parts import Joint, Placement
-from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Tables
+from batchpid.sim.robot.tables import LEAST_MASS, NO_TURN, ORIGIN, Body, Tables
 from batchpid.task_space.frames import SpatialInertia, compose, matrix_of, rotate, total
 
 Separate = tuple[str, ...]
@@ -55,7 +55,7 @@ def merge_links(tables: Tables, separate: Separate = ()) -> Tables:
             joint = replace(body.joint, parent_link=at.link)
             body = body._replace(joint=joint, position=position, wxyz=wxyz)
         # A link alone keeps the axes of its tensor, by which SAPIEN orders the principal ones.
-        if members[body.name] > 1 or not body.mass:
+        if members[body.name] > 1 or body.mass <= LEAST_MASS:
             body = _with_inertia(body, parts[body.name])
         bodies.append(body)
     shapes = []
@@ -112,9 +112,11 @@ def link_inertias(tables: Tables) -> dict[str, SpatialInertia]:
 
 
 def _with_inertia(body: Body, parts: Sequence[SpatialInertia]) -> Body:
-    """Return ``body`` with the sum of inertias in its frame; without any, with NO_MASS."""
+    """Return ``body`` with the sum of inertias in its frame; without mass, with NO_MASS."""
     nothing = SpatialInertia(NO_MASS, np.zeros(3), NO_MASS * np.eye(3))
-    mass, center, tensor = total(parts) if parts else nothing
+    if sum(part.mass for part in parts) <= LEAST_MASS * len(parts):
+        parts = [nothing]
+    mass, center, tensor = total(parts)
     return body._replace(mass=float(mass), center=center, inertia=tensor, inertia_wxyz=NO_TURN)
 
 

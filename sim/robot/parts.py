@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Float64
+from batchpid.sim.robot.findings import Finding
 from batchpid.task_space.frames import SpatialInertia
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
-"""URDF joint types that SAPIEN turns into degrees of freedom."""
+"""URDF joint types that are degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Joint:
     upper: float = math.inf
     effort_limit: float = math.inf
     velocity_limit: float = math.inf
+    acceleration_limit: float = math.inf
     soft_lower: float = -math.inf
     soft_upper: float = math.inf
     damping: float = 0.0
@@ -135,13 +137,15 @@ class Settings:
 
 @dataclass(frozen=True)
 class FileDefaults:
-    """Start pose (dof,) [rad or m] of an MJCF file, and the gains (dof,) of its servos; None
-    without servos.
+    """Start pose (dof,) [rad or m] of an MJCF file, and the gains (dof,) of its servos with the
+    limits of their integrals [N m or N]; None without servos.
     """
 
     start: Float64
     kp: Float64 | None = None
-    kv: Float64 | None = None
+    ki: Float64 | None = None
+    kd: Float64 | None = None
+    integral_limit: Float64 | None = None
 
 
 @dataclass(frozen=True)
@@ -149,10 +153,11 @@ class MjcfFile:
     """MJCF file that MuJoCo simulates itself, with everything in it besides the robot.
 
     ``is_whole`` says whether all of it is compiled
-    (:func:`batchpid.sim.robot.mjcf_model.compile_scene`), and ``content`` is the digest of the
+    (:func:`batchpid.sim.robot.mjcf.model.compile_scene`), and ``content`` is the digest of the
     model. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
     other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
-    links. ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of
+    links. ``losses`` are findings of what is lost in an engine that does not simulate the file.
+    ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of
     the world can collide, unless the root is fixed to the origin in place of its free joint.
     ``friction`` is the coefficient of its ground, the first of these planes.
     """
@@ -163,6 +168,7 @@ class MjcfFile:
     bodies: tuple[str, ...]
     falling: tuple[str, ...] = ()
     loops: tuple[str, ...] = ()
+    losses: tuple[Finding, ...] = ()
     is_alone: bool = True
     has_floor: bool = False
     friction: float = 1.0

@@ -27,7 +27,6 @@ from batchpid.sim.robot.urdf import read_robot
 from batchpid.task_space.rigid_tree import RigidTree
 
 _ASSETS = Path(assets.__file__).parent
-MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
 DESIGN_HZ = 1.7
 """Bandwidth of :meth:`Robot.designed` with the mass matrix."""
 STANDING_HZ = 3.0
@@ -82,8 +81,8 @@ class Robot(RobotDescription):
             :class:`batchpid.Actuators` of one row, or a file of :func:`batchpid.save_actuators`, in
             which joints are matched by name. None: ideal ones, with the armature of an MJCF file.
         strict
-            True to refuse a file that needs repairs, which are otherwise made, with a warning, and
-            listed by :meth:`check`.
+            True to refuse a file that needs repairs that change the motion, which are otherwise
+            made, with a warning, and listed by :meth:`check`.
 
         Raises
         ------
@@ -133,13 +132,6 @@ class Robot(RobotDescription):
             package_dirs=folders,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
         )
-        # From here on links mean bodies: those that fixed joints hold together are one.
-        count = len(source.tables.bodies)
-        if count > MAX_LINKS:
-            count = len({at.link for at in robot.bodies.values()})
-        if count > MAX_LINKS:
-            problem = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
-            raise RobotError(f"{path}: {problem}; split the robot")
         motors = source.actuators if actuators is None else actuators
         if motors is None:
             return robot
@@ -158,6 +150,7 @@ class Robot(RobotDescription):
         setpoint: ArrayLike | None = None,
         timestep: float = 1 / 2000,
         control: str = "pid",
+        engine: str | None = None,
     ) -> Findings:
         """Return the findings of the preflight, most severe first: oddities of this robot and of
         running it this way.
@@ -173,6 +166,9 @@ class Robot(RobotDescription):
             Time step of control and simulation [s].
         control
             ``"pid"``, ``"drive"`` or ``"effort"``, as in :class:`batchpid.sim.Runner`.
+        engine
+            ``"mujoco"`` or ``"sapien"``: add what this engine cannot run, and what it runs
+            otherwise than the file says. None: findings that hold in every engine.
 
         Raises
         ------
@@ -183,7 +179,7 @@ class Robot(RobotDescription):
 
         if params is None and self.settings is not None and control == "pid":
             params = self.params()
-        return check(self, params, qpos, setpoint, timestep, control)
+        return check(self, params, qpos, setpoint, timestep, control, engine)
 
     def guard(
         self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None
@@ -198,7 +194,8 @@ class Robot(RobotDescription):
         rate
             Largest rate, scalar or (dof,) [rad/s or m/s]; default the URDF's velocity limits.
         acceleration
-            Largest acceleration, scalar or (dof,) [rad/s^2 or m/s^2]; default none.
+            Largest acceleration, scalar or (dof,) [rad/s^2 or m/s^2]; default the URDF's limits of
+            acceleration and deceleration (URDF 1.2), the smaller of both.
 
         Raises
         ------
@@ -298,11 +295,12 @@ class Robot(RobotDescription):
         return bp.load_params(self.path.with_suffix(".tuned.yaml"), self.joint_names)[0]
 
     def mjcf_gains(self) -> bp.PIDParams:
-        """Return params with the gains of the servos of an MJCF file: kp and, on the measurement
-        alone, kd.
+        """Return params with the gains of the servos of an MJCF file: kp, ki and kd, on the
+        measured velocity, and the limits of their integrals.
 
         Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of
-        the servo's control; a velocity servo has kd alone.
+        the servo's control; a velocity servo has kd alone. :meth:`guard` has the limits of their
+        setpoints.
 
         Raises
         ------
@@ -310,13 +308,15 @@ class Robot(RobotDescription):
             The robot is not from an MJCF file, or that has no servos.
         """
         defaults = self.defaults
-        if defaults is None or defaults.kp is None or defaults.kv is None:
+        if defaults is None or defaults.kp is None:
             problem = (
                 f"{self.name!r} has no servos of an MJCF file (<position>, or <general> with an"
                 " affine bias)"
             )
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
-        return self.params(kp=defaults.kp, ki=0.0, kd=defaults.kv, measurement_rate="measured")
+        gains = {name: getattr(defaults, name) for name in ("kp", "ki", "kd", "integral_limit")}
+        # MuJoCo's integral grows during saturation, up to its limit.
+        return self.params(**gains, anti_windup="none", measurement_rate="measured")
 
 
 def _find(name_or_path: str | Path) -> Path:

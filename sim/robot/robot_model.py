@@ -15,7 +15,7 @@ import numpy as np
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.motors.coupling import Coupling
-from batchpid.sim.robot.contacts import Contacts
+from batchpid.sim.geometry.distances import Contacts
 from batchpid.sim.robot.tables import Tables
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree

@@ -95,7 +95,7 @@ def fit_actuators(
     ):
         raise InvalidArgumentError(
             "actuators",
-            "change efforts or measurements, or use the effort, which PhysX's drives bypass",
+            "change efforts or measurements, or use the effort, which the engines' drives bypass",
             remedy=f"use control 'pid', or leave only {', '.join(DRIVEN)}",
         )
     # Ideal ones have no leaf that a joint could change.
@@ -117,12 +117,13 @@ def setpoint_guard(
 
     Raises InvalidArgumentError if a follower of a continuous joint has position limits.
     """
+    accelerations = [joint.acceleration_limit for joint in joints]
     limits = bp.make_guard(
         len(joints),
         lower=[max(joint.lower, joint.soft_lower) for joint in joints],
         upper=[min(joint.upper, joint.soft_upper) for joint in joints],
         rate=[joint.velocity_limit for joint in joints] if rate is None else rate,
-        acceleration=acceleration,
+        acceleration=accelerations if acceleration is None else acceleration,
         continuous=[joint.continuous for joint in joints],
         joint_names=[joint.name for joint in joints],
     )

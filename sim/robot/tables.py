@@ -1,7 +1,7 @@
 """Record of a robot: bodies with their joints, and collision shapes, as rows of arrays and names.
 
 A :class:`Tables` is made once, by the reader of a URDF (:mod:`batchpid.sim.robot.urdf`) or of an
-MJCF file (:mod:`batchpid.sim.robot.mjcf_reader`). Everything else reads it: engines, rigid
+MJCF file (:mod:`batchpid.sim.robot.mjcf.reader`). Everything else reads it: engines, rigid
 trees, distances and exports.
 
 :func:`batchpid.sim.robot.merging.merge_links` makes the tables that engines simulate, with one body
@@ -19,7 +19,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.motors import Actuators
+from batchpid.sim.geometry.shapes import Shape
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.parts import DisabledPair, FileDefaults, Joint, MjcfFile, Placement
 from batchpid.task_space.frames import SpatialInertia, matrix_of
@@ -34,9 +35,8 @@ from batchpid.task_space.frames import SpatialInertia, matrix_of
 ORIGIN = read_only(np.zeros(3))
 NO_TURN = read_only(np.array([1.0, 0.0, 0.0, 0.0]))
 NO_INERTIA = read_only(np.zeros((3, 3)))
-
-
-ShapeKind = Literal["sphere", "box", "capsule", "cylinder", "mesh"]
+LEAST_MASS = 1e-9
+"""Mass [kg] of a row without mass: 0 stands for a mass that the file does not give."""
 
 
 class Body(NamedTuple):
@@ -66,35 +66,6 @@ class Body(NamedTuple):
         """Inertia of the body in its frame."""
         turn = matrix_of(self.inertia_wxyz)
         return SpatialInertia(self.mass, self.center, read_only(turn @ self.inertia @ turn.T))
-
-
-class Shape(NamedTuple):
-    """Convex collision shape."""
-
-    body: str
-    """Body that has the shape."""
-    owner: str
-    """Link of the file that has the shape; another than ``body`` after a merge."""
-    kind: ShapeKind
-    size: tuple[float, ...]
-    """Radius; half lengths of a box's sides; radius and half length, without the ends of a capsule
-    [m]; () for a mesh. Capsules and cylinders lie along the z axis of the shape.
-    """
-    position: Float64
-    """Place of the shape in the frame of the body (3,) [m]."""
-    wxyz: Float64
-    """Orientation of the shape in the frame of the body (4,)."""
-    file: str = ""
-    """Absolute path of a mesh, which counts as its convex hull; "" for other shapes."""
-    scale: tuple[float, ...] = (1.0, 1.0, 1.0)
-    """Factors of the vertices of the file; an odd number of negative ones mirrors the mesh."""
-    vertices: Float64 | None = None
-    """Vertices (n, 3) [m] of a mesh without a file, in the frame of the shape."""
-
-    @property
-    def is_mirrored(self) -> bool:
-        """Whether a factor of a mesh is negative: SAPIEN builds such shapes last."""
-        return min(self.scale) < 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +107,12 @@ class Tables:
     def joints(self) -> tuple[Joint, ...]:
         """Joints of all bodies but the base, in their order."""
         return tuple(body.joint for body in self.bodies if body.joint is not None)
+
+
+def without_mass(body: Body) -> Body:
+    """Return ``body`` with next to no mass, in place of that of its shapes."""
+    tensor = 1e-3 * LEAST_MASS * np.eye(3)
+    return body._replace(mass=LEAST_MASS, center=ORIGIN, inertia=tensor, inertia_wxyz=NO_TURN)
 
 
 def breadth_first(bodies: Iterable[Body], shapes: Iterable[Shape]) -> Tables:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -17,29 +18,30 @@ from lxml import etree
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import is_name
 from batchpid.errors import RobotError
+from batchpid.sim.geometry.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
+from batchpid.sim.geometry.mesh_files import LARGEST, check_mesh, find_mesh
+from batchpid.sim.geometry.shapes import Shape
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
-from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
-from batchpid.sim.robot.mjcf_model import unique
-from batchpid.sim.robot.mjcf_reader import read_mjcf
+from batchpid.sim.robot.mjcf.model import unique
+from batchpid.sim.robot.mjcf.reader import read_mjcf
 from batchpid.sim.robot.parts import MOVING_TYPES, Joint, Mimic
 from batchpid.sim.robot.tables import (
     NO_TURN,
     ORIGIN,
     Body,
-    Shape,
     Source,
     Tables,
     breadth_first,
+    without_mass,
 )
-from batchpid.sim.robot.xml import LARGEST, fault, numbers, parse_xml, read_numbers
+from batchpid.sim.robot.xml import fault, numbers, parse_xml, read_numbers
 from batchpid.task_space.frames import from_rpy
 
 MOST_READ = 4096  # links and joints of a file
 GIVE_RANGE = "give <limit lower= upper=>"
 """Remedy for position limits that are missing or unreadable."""
 SMALLEST_SIZE, LARGEST_SIZE = 1e-6, 1e6
-"""Bounds of the sizes of shapes [m] and scales of meshes, by PhysX's limits of the latter."""
+"""Bounds of the sizes of shapes [m] and scales of meshes: engines hold no others."""
 SHAPES = {
     "box": {"size": "0 0 0"},
     "sphere": {"radius": "0"},
@@ -50,8 +52,8 @@ SHAPES = {
 """Attributes of each shape, with as many numbers as each has."""
 UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
 """Elements of a URDF that have no effect here."""
-_READ = {
-    "robot": {"link", "joint"},
+_ELEMENTS = {
+    "robot": {"link", "joint", "transmission"},
     "link": {"inertial", "collision"},
     "joint": {
         "origin",
@@ -63,8 +65,26 @@ _READ = {
         "mimic",
         "safety_controller",
     },
+    "transmission": {"type", "joint", "actuator"},
+    "actuator": {"hardwareInterface", "mechanicalReduction"},
 }
-"""Elements that are read, by parent."""
+"""Elements that are read, or say how motors are connected and nothing about the motion, by
+parent.
+"""
+_ATTRIBUTES = {
+    "limit": {"lower", "upper", "effort", "velocity", "acceleration", "deceleration"},
+    "dynamics": {"damping", "friction"},
+    "mimic": {"joint", "multiplier", "offset"},
+    "mass": {"value"},
+    "inertia": {*MOMENTS},
+    "safety_controller": {
+        "soft_lower_limit",
+        "soft_upper_limit",
+        "k_position",
+        "k_velocity",
+    },
+}
+"""Attributes of the same kind, of the elements that have numbers of the motion."""
 _EXPAND = "expand it first: xacro FILE.xacro > FILE.urdf"
 
 
@@ -185,31 +205,36 @@ class _Reader:
         link: str | None = None,
         detail: str = "",
     ) -> None:
-        self._findings.append(Finding("warning", code, text, remedy, joint, link, detail))
+        self._findings.append(Finding(code, text, remedy, joint, link, detail))
 
     # -- Structure
 
     def _drop_unused(self, root: etree._Element) -> None:
-        """Remove elements that are not read, visuals above all."""
+        """Remove elements that are not read, visuals above all; report them, and attributes."""
         unknown: Counter[str] = Counter()
-        for parent in (root, *root.findall("link"), *root.findall("joint")):
+        motors = root.iterfind("transmission"), root.iterfind("transmission/actuator")
+        for parent in (root, *root.findall("link"), *root.findall("joint"), *chain(*motors)):
             for child in list(parent):
-                if child.tag in _READ[parent.tag]:
+                if child.tag in _ELEMENTS[parent.tag]:
                     continue
                 name = etree.QName(child)
                 if "xacro" in (name.namespace or ""):
-                    unknown[f"xacro:{name.localname}"] += 1
+                    unknown[f"<xacro:{name.localname}>"] += 1
                 elif name.localname not in UNUSED:
-                    unknown[name.localname] += 1
+                    unknown[f"<{name.localname}>"] += 1
                 parent.remove(child)
+        for element in root.iter(*_ATTRIBUTES):
+            for key in {*element.attrib} - _ATTRIBUTES[element.tag]:
+                unknown[f"{key} of <{element.tag}>"] += 1
+        for transmission in root.findall("transmission"):
+            root.remove(transmission)
         if unknown:
             # A robot may lack the parts of a macro that is not expanded.
-            is_xacro = any(tag.startswith("xacro:") for tag in unknown)
-            severity = "warning" if is_xacro else "note"
-            listed = ", ".join(f"{count} <{tag}>" for tag, count in unknown.most_common(8))
+            is_xacro = any(name.startswith("<xacro:") for name in unknown)
+            listed = ", ".join(f"{count} {name}" for name, count in unknown.most_common(8))
             text = f"elements that the simulation does not use are left out: {listed}"
             remedy = _EXPAND if is_xacro else "remove them, or expect no effect"
-            self._findings.append(Finding(severity, "unknown-element", text, remedy))
+            self._findings.append(Finding("xml" if is_xacro else "unknown-element", text, remedy))
 
     def _report_repeated(self, root: etree._Element) -> None:
         """Report elements of which the first is read."""
@@ -220,7 +245,7 @@ class _Reader:
                     if count > 1 and tag != "<collision>":
                         text = f"<{parent.tag}> has several {tag}: the first is used"
                         owner = {part.tag: _text(part, "name")}
-                        self._warn("repeated-element", text, "remove the others", **owner)
+                        self._warn("repeated", text, "remove the others", **owner)
 
     def _refuse_xacro(self, root: etree._Element) -> None:
         for element in root.iter():
@@ -238,7 +263,7 @@ class _Reader:
             if not name or name in links:
                 text = "has no name, or a repeated one: left out"
                 remedy = "give every link a unique name"
-                self._warn("repeated-name", text, remedy, link=name or None)
+                self._warn("repeated", text, remedy, link=name or None)
                 continue
             links[name] = element
         return links
@@ -251,13 +276,13 @@ class _Reader:
             name = _text(element, "name")
             ends = _ends(element)
             if name in joints and _ends(joints[name]) == ends:
-                self._warn("repeated-name", "given twice: the first is kept", "remove it", name)
+                self._warn("repeated", "given twice: the first is kept", "remove it", name)
                 continue
             new = name
             if not name or name in joints:
                 new = unique(name or "{}_to_{}".format(*ends), names)
                 text = f"no name, or a repeated one: renamed {new!r}"
-                self._warn("repeated-name", text, "name it in the URDF", name or None)
+                self._warn("repeated", text, "name it in the URDF", name or None)
             joints[new] = element
         return joints
 
@@ -276,7 +301,7 @@ class _Reader:
             if name not in self._links:
                 self._links[name] = etree.Element("link")
                 text = "named by joints, but not in the file: added, without mass and shape"
-                self._warn("missing-link", text, "correct the name, or add the link", link=name)
+                self._warn("loose-link", text, "correct the name, or add the link", link=name)
         for name in [name for name in self._links if name not in joined]:
             text = "no joint holds it: left out"
             self._warn("loose-link", text, "join it, or remove it", link=name)
@@ -345,11 +370,11 @@ class _Reader:
         parent, child = _ends(element)
         kind = element.get("type", "").strip().lower()
         if kind not in (*MOVING_TYPES, "fixed"):
-            text = f"joints of type {kind!r} cannot be simulated by SAPIEN: fixed instead"
+            text = f"joints of type {kind!r} are not simulated: fixed instead"
             remedy = "use revolute, continuous or prismatic joints"
             if kind == "floating":
                 remedy = "load with fixed_base=False for a robot that is free to move"
-            self._warn("joint-type", text, remedy, name)
+            self._warn("joint", text, remedy, name)
             kind = "fixed"
         # The other elements mean nothing for a fixed joint, and their faults are none.
         if kind == "fixed":
@@ -361,7 +386,7 @@ class _Reader:
         if axis is None or math.hypot(*axis) < 1e-3:
             text = f"<axis xyz={_text(element.find('axis'), 'xyz')!r}> has no direction: the x"
             text += " axis is used, the URDF's default"
-            self._warn("axis", text, "correct the axis", name)
+            self._warn("joint", text, "correct the axis", name)
             axis = (1.0, 0.0, 0.0)
         dynamics = element.find("dynamics")
         for key in ("damping", "friction"):
@@ -380,7 +405,7 @@ class _Reader:
         limit = joint.find("limit")
         limits: Document = {}
         placeholders = []
-        for key in ("effort", "velocity"):
+        for key in ("effort", "velocity", "acceleration", "deceleration"):
             values = numbers(limit, key, "inf", limit=True)
             # Exporters write 0 or -1 for "not set".
             if values is None or values[0] <= 0:
@@ -390,7 +415,10 @@ class _Reader:
         if placeholders:
             text = f"<limit {' '.join(placeholders)}> is a placeholder or not within"
             text += f" +-{LARGEST:g}: no limit"
-            self._warn("placeholder", text, "give <limit effort= velocity=> of the motor", name)
+            self._warn("limits", text, "give <limit effort= velocity=> of the motor", name)
+        # A guard has one limit for both.
+        braking = limits.pop("deceleration_limit")
+        limits["acceleration_limit"] = min(limits["acceleration_limit"], braking)
         is_unknown = all(map(math.isinf, limits.values()))
         safety = joint.find("safety_controller")
         if safety is not None:
@@ -447,11 +475,11 @@ class _Reader:
             elif not leader.moves:
                 problem = "does not move"
             # A chain of leaders that comes back to the joint is cut there.
-            chain = set[str]()
-            while leader is not None and leader.mimic is not None and leader.name not in chain:
-                chain.add(leader.name)
+            leaders = set[str]()
+            while leader is not None and leader.mimic is not None and leader.name not in leaders:
+                leaders.add(leader.name)
                 leader = joints.get(leader.mimic.joint)
-            if name in chain:
+            if name in leaders:
                 problem = "mimics it in turn"
             if problem is not None:
                 self._report_mimic(name, self._joints[name].find("mimic"), problem)
@@ -480,12 +508,14 @@ class _Reader:
             center, turn = read_origin(inertial, "")
         value = numbers(mass, "value", "0")
         if value is None or value[0] < 0 or 0 < value[0] < SMALLEST:
-            text = f"<mass value={_text(mass, 'value')!r}> is a mass that PhysX cannot hold"
+            text = (
+                f"<mass value={_text(mass, 'value')!r}> is no mass from {SMALLEST:g} to {LARGEST:g}"
+            )
             text += ": it counts as missing"
             self._warn("inertia", text, "give a mass > 0 [kg]", link=body.name)
             return body
         if value[0] == 0:
-            return body
+            return without_mass(body)
         # One unreadable entry makes the whole tensor unknown.
         entries = [numbers(inertia, key, "0") for key in MOMENTS]
         tensor = np.zeros((3, 3))
@@ -501,7 +531,7 @@ class _Reader:
         return body._replace(mass=value[0], center=center, inertia=tensor, inertia_wxyz=turn)
 
     def _read_collision(self, link: str, collision: etree._Element) -> Shape | None:
-        """Return a collision shape, None if PhysX cannot hold it or its mesh is missing."""
+        """Return a collision shape, None if it has no size or its mesh is missing."""
         geometry = next(
             (part for part in collision.iterfind("geometry/*") if part.tag in SHAPES), None
         )
@@ -527,13 +557,14 @@ class _Reader:
         if shape.kind != "mesh":
             return shape
         file = find_mesh(shape.file, self._path, self._package_dirs)
-        problem = None if file is None else mesh_problem(file)
-        if file is None or problem is not None:
-            self._missing.append(shape.file if problem is None else f"{shape.file} ({problem})")
+        if file is None:
+            self._missing.append(shape.file)
             return None
-        # SAPIEN would simulate the file that it read before.
-        check_unchanged(file)
-        return shape._replace(file=str(file))
+        content, problem = check_mesh(file)
+        if problem is not None:
+            self._missing.append(f"{shape.file} ({problem})")
+            return None
+        return shape._replace(file=str(file), content=content)
 
     def report_missing(self, missing_meshes: str) -> None:
         """Report meshes that are missing or cannot be read, or raise RobotError if that is

@@ -15,12 +15,11 @@ from pathlib import Path
 from lxml import etree
 
 from batchpid.errors import RobotError
+from batchpid.sim.geometry.mesh_files import LARGEST, LFS_POINTER, parse_bytes
 from batchpid.sim.robot.findings import Finding
 
 SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
-LFS_POINTER = b"version https://git-lfs"  # beginning of git-lfs's file in place of another
 MOST_PREFIXES = 100  # of namespaces that nobody declared
-LARGEST = 1e18  # magnitude of a number whose square fits in PhysX's single precision
 
 
 def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Element:
@@ -51,7 +50,7 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
             ) from error
         if repairs is not None:
             text = f"not well-formed XML: {error.msg}; read as far as possible"
-            repairs.append(Finding("warning", "xml", text, "correct the file at that line"))
+            repairs.append(Finding("xml", text, "correct the file at that line"))
     except OSError as error:
         raise RobotError(
             f"{path}: cannot be read: {error}; check that it is a readable text file"
@@ -76,12 +75,6 @@ def _drop_default_namespace(root: etree._Element) -> None:
         element.tag = etree.QName(element).localname
     if elements:
         etree.cleanup_namespaces(root)
-
-
-def parse_bytes(data: bytes, **options: bool) -> etree._Element:
-    """Return the root element of untrusted XML; ``options`` are more of those of lxml's parser."""
-    safe = {"resolve_entities": False, "no_network": True, "load_dtd": False}
-    return etree.fromstring(data, etree.XMLParser(**safe, **options))
 
 
 def _parse(data: bytes) -> etree._Element:
@@ -154,7 +147,7 @@ def fault(element: etree._Element | None, key: str, default: str) -> str | None:
         return None
     count = len(default.split())
     need = f"{count} finite number" + "s" * (count > 1)
-    within = f"within +-{LARGEST:g}, which PhysX can hold"
+    within = f"within +-{LARGEST:g}"
     return f"<{element.tag} {key}={element.get(key)!r}> needs {need} {within}"
 
 

@@ -32,6 +32,7 @@ from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.runner.arguments import base_rows, joint_rows
 from batchpid.sim.runner.runner_state import RunnerState
+from batchpid.sim.signals.rollout import ACTUATORS, PARAMS, RESET, RESTORE
 from batchpid.sim.workers.pool import Outcome
 from batchpid.sim.workers.requests import Request
 
@@ -58,6 +59,10 @@ class Reset(Operation):
     draws: Draws
     base: Float64 | None
     ticks = 1
+
+    @property
+    def placed(self) -> Bool:
+        return self.mask
 
     @classmethod
     def read(
@@ -104,7 +109,7 @@ class Reset(Operation):
             rate = np.where(chosen, self.qvel, 0.0 if rate is None else rate)
             motion = np.where(chosen, self.qpos, setpoint), rate
         faults = state.faults.without(self.mask).with_events(outcome.at(0))
-        return state._replace(faults=faults, draws=self.draws, motion=motion)
+        return state.changed(RESET, self.mask, faults=faults, draws=self.draws, motion=motion)
 
 
 @dataclass(frozen=True)
@@ -155,7 +160,8 @@ class Run(Operation):
         else:
             work = (tuple(outcome.results), count)
         since = state.steps_since_checkpoint + steps
-        values = faults, motion, state.steps + steps, since, work
+        changes = None if count else state.changes
+        values = faults, motion, state.steps + steps, since, work, changes
         # Not _replace(), which is a call of Python in the path of a tick.
         return tuple.__new__(RunnerState, (state.params, state.actuators, state.draws, *values))
 
@@ -170,7 +176,7 @@ class SetParams(Operation):
         loop.set_params(self.params)
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        return state._replace(params=self.params)
+        return state.changed(PARAMS, params=self.params)
 
 
 @dataclass(frozen=True)
@@ -183,7 +189,7 @@ class SetActuators(Operation):
         loop.set_actuators(self.actuators)
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        return state._replace(actuators=self.actuators)
+        return state.changed(ACTUATORS, actuators=self.actuators)
 
 
 @dataclass(frozen=True)
@@ -229,7 +235,8 @@ class Restore(Operation):
         if motion is not None:
             setpoint, rate = snapshot.rows["motion"].swapaxes(0, 1)
             motion = setpoint, rate
-        return state._replace(
+        return state.changed(
+            RESTORE,
             params=snapshot.params,
             actuators=snapshot.actuators,
             draws=self.draws,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import batchpid as bp
 from batchpid.errors import warn
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
-from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
+from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.robot.findings import report_shortfalls
 from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.pool import RecoveryWarning
@@ -18,6 +18,8 @@ class RunWarnings:
 
     def __init__(self, options: RunnerOptions) -> None:
         robot = options.robot
+        shortfalls = options.load_engine().shortfalls(options.scene)
+        report_shortfalls(robot.path, options.engine, shortfalls)
         timestep = options.timestep
         control = options.control
         self.limits = SetpointCheck(robot)
@@ -25,11 +27,8 @@ class RunWarnings:
         self.setpoint_limits = (
             self.limits if options.sets_positions and options.guard is None else None
         )
-        self.moving: MovingSetpointCheck | None = None
-        """Check of the setpoints of every tick; None where it can find nothing."""
         self._control = control
         self._stability = StabilityCheck(robot, timestep) if control == "pid" else None
-        self._moving = MovingSetpointCheck(robot) if control == "pid" else None
         self._issued = set[type[Warning]]()
 
     def check_controller(self) -> None:
@@ -41,12 +40,6 @@ class RunWarnings:
         """Warn of gains beyond the stability bound of the sampled loop."""
         if self._stability is not None:
             self._stability.check(state.params, state.actuators)
-
-    def set_params(self, params: bp.PIDParams) -> None:
-        """Watch the next ticks for what these gains may lead to."""
-        if self._moving is not None:
-            self._moving.set_params(params)
-            self.moving = self._moving if self._moving.is_watching else None
 
     def issue(self, faults: FaultLog, lost: list[str]) -> None:
         """Warn of lost workers (the messages ``lost``, which are removed) and faults."""

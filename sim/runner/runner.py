@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Progress
+from batchpid.arrays.array_types import Progress, Rows
 from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
@@ -55,7 +55,7 @@ from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, WorkerPool
 
 CHECKPOINT_STEPS = 8000
-"""Sim steps between checkpoints, from the last of which a lost worker is replayed."""
+"""Least number of sim steps between checkpoints, from the last of which a lost worker is replayed."""
 
 
 class TickRecorder(Protocol):
@@ -66,9 +66,15 @@ class TickRecorder(Protocol):
     def prepare(self) -> None:
         """Prepare for the next tick; raise if it cannot be recorded."""
 
-    def append(self, time_: float, command: Command, observation: Observation) -> None:
+    def append(
+        self,
+        time_: float,
+        command: Command,
+        observation: Observation,
+        changes: Rows | None,
+    ) -> None:
         """Record the state at ``time_`` [s] after a tick under ``command`` (envs, ...), which may
-        change afterwards.
+        change afterwards, and the ``changes`` (envs,) before it.
 
         It must return soon, and without an error: Ctrl-C waits for it.
         """
@@ -135,7 +141,6 @@ class Runner(SingleOwner):
             self._call.end()
         self._execute(start)
         checks.check_stability(self._state)
-        checks.set_params(options.params)
         checks.check_controller()
 
     def __repr__(self) -> str:
@@ -329,6 +334,10 @@ class Runner(SingleOwner):
         seen = empty_observation(ticks, self.num_envs, options.robot.dof, observed=options.observed)
         info = self.info
         steps = self._state.steps + options.substeps * np.arange(1.0, ticks + 1)
+        changes = None
+        if self._state.changes is not None:
+            changes = np.zeros((ticks, self.num_envs), np.uint8)
+            changes[:1] = self._state.changes
         done = 0
         shown = iter(range(ticks) if progress is None else progress(range(ticks)))
         for number in range(ticks):  # not over ``shown``, which may yield anything
@@ -347,7 +356,7 @@ class Runner(SingleOwner):
         rated = command.setpoint_rate is not None
         info = replace(info, rates=rated, faults=self._state.faults.events)
         times = steps * options.timestep
-        return Rollout(times, command.setpoint, seen, seconds, info, command.feedforward)
+        return Rollout(times, command.setpoint, seen, seconds, info, command.feedforward, changes)
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
@@ -403,7 +412,6 @@ class Runner(SingleOwner):
         checked = self.options.check_params(params)
         self._execute(SetParams(checked))
         self._warnings.check_stability(self._state)
-        self._warnings.set_params(checked)
 
     @property
     def actuators(self) -> bp.Actuators | None:
@@ -452,8 +460,7 @@ class Runner(SingleOwner):
         snapshot.check_options(self.options.described)
         restore = restored(self.options, snapshot, self._present)
         self._execute(restore)
-        self._pool.start_replay_from(restore)
-        self._warnings.set_params(self._state.params)
+        self._pool.replay.start_from(restore)
         return self.observe()
 
     # -- properties
@@ -640,6 +647,8 @@ class Runner(SingleOwner):
         is_due = self.recorder is not None or self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
         if is_due and run is not None and not is_sent:
             self._prepare_ticks()
+        elif is_due and isinstance(operation, Reset):
+            self._prepare_reset()
         # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
@@ -665,11 +674,6 @@ class Runner(SingleOwner):
         if outcome.failure is not None:
             raise outcome.failure.error
         # Warnings come last: as errors they must leave a runner that can go on.
-        moving = self._warnings.moving
-        if run is not None and moving is not None:
-            rows = run.command.setpoint[: outcome.num_ticks]
-            rates = run.command.setpoint_rate
-            moving.see(rows, rates is not None, run.substeps * self.timestep)
         state = self._state
         if pool.warnings or state.faults.events:
             self._warnings.issue(state.faults, pool.warnings)
@@ -679,10 +683,29 @@ class Runner(SingleOwner):
         """Take a checkpoint if one is due, and let the recorder keep the state before its first
         tick.
         """
-        if self._state.steps_since_checkpoint >= CHECKPOINT_STEPS:
+        if self._keeps_bits and self._state.steps_since_checkpoint >= CHECKPOINT_STEPS:
             self._take_snapshot()
         if self.recorder is not None:
             self.recorder.prepare()
+
+    def _prepare_reset(self) -> None:
+        """Take a checkpoint before a reset, if one is due that the loops must not notice.
+
+        It holds all that there is of an env after its next reset. With ``build`` that is not so:
+        the user's content is not rebuilt.
+        """
+        is_wanted = not self._keeps_bits and self.options.build is None
+        if is_wanted and not self._pool.replay.waits:
+            state = self._state
+            snapshot = snapshot_of(self.options, state, self._read(ReadRows()))
+            restore = Restore(snapshot.copy(), state.draws)
+            self._pool.replay.start_at_resets(restore, self.num_envs)
+            self._state = state._replace(steps_since_checkpoint=0)
+
+    @cached_property
+    def _keeps_bits(self) -> bool:
+        """Whether envs go on with the same bits after a snapshot as without it."""
+        return "complete_state" in self.options.load_engine().capabilities
 
     def _record(
         self,
@@ -698,6 +721,7 @@ class Runner(SingleOwner):
                 time,
                 run.command.map(itemgetter(number)),
                 arrays.observation.copied(self._derived),
+                None if number else before.changes,
             )
 
     def _fail(self, error: BaseException) -> None:
@@ -713,7 +737,7 @@ class Runner(SingleOwner):
         """
         state = self._state
         snapshot = snapshot_of(self.options, state, self._read(TakeSnapshot()))
-        self._pool.start_replay_from(Restore(snapshot.copy(), state.draws))
+        self._pool.replay.start_from(Restore(snapshot.copy(), state.draws))
         return snapshot
 
     def _max_ticks(self) -> int:

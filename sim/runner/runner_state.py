@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, Fault, FaultLog
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 
+ALL = slice(None)
+"""All envs."""
 Motion = tuple[Float64, Float64 | None]
 """Setpoints of joints and their rates (envs, dof); None for 0."""
 
@@ -35,6 +37,15 @@ class RunnerState(NamedTuple):
     steps_since_checkpoint: int = 0
     work: tuple[tuple[float, ...], int] = ((), 1)
     """Seconds of each worker in the last run, and the ticks of that run."""
+    changes: Rows | None = None
+    """Changes of each env since the last tick (envs,): :attr:`batchpid.sim.Rollout.changes`."""
+
+    def changed(self, change: int, envs: Bool | slice = ALL, **values: Any) -> RunnerState:
+        """Return a state with other ``values``, which notes a ``change`` of some envs."""
+        changes = np.zeros(len(self.faults), np.uint8) if self.changes is None else self.changes
+        changes = changes.copy()
+        changes[envs] |= change
+        return self._replace(changes=changes, **values)
 
     @classmethod
     def first(cls, options: RunnerOptions) -> RunnerState:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Document, Float64, Rows
+from batchpid.arrays.digest import digest
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
@@ -32,20 +34,27 @@ if TYPE_CHECKING:
 RECORDED = {
     "setpoint": Quantity(np.float64, "setpoint", "rad|m"),
     "feedforward": Quantity(np.float64, "effort added before saturation", "N m|N"),
+    "changes": Quantity(np.uint8, "reset 1, restore 2, params 4, actuators 8", columns={}),
 } | QUANTITIES
 """Quantity of each array of a :class:`Rollout`, ``time`` aside."""
+OPTIONAL = ("feedforward", "changes")
+"""Arrays of a :class:`Rollout` that are None where there are none."""
 
 
-class Redraw(NamedTuple):
-    """Beginning of an episode during a run: a randomization drew for an env again."""
-
-    time: float
-    """End of the first tick [s]."""
-    env: int
-    stream: int
-    episode: int
-
-
+RESET, RESTORE, PARAMS, ACTUATORS = 1, 2, 4, 8
+"""Bits of :attr:`Rollout.changes`: the envs were reset, a snapshot was restored, params or
+actuators were assigned.
+"""
+_CHANGES = {
+    "params": PARAMS | RESTORE,
+    "actuators": ACTUATORS | RESTORE,
+    "draws": RESET | RESTORE,
+    "episodes": RESET | RESTORE,
+    "start": RESET | RESTORE,
+}
+"""Fields of :class:`RunInfo` that may change within a run, and the changes that may do it."""
+_OF_PARTS = ("start", "faults", "rates", "begun", "complete", "description", "urdf")
+"""Fields that differ from part to part of a run."""
 _OF_ROBOT = (
     *("joint_names", "units", "lower", "upper", "effort_limit"),
     *("digest", "dissipation", "fixed_base"),
@@ -110,10 +119,6 @@ class RunInfo:
     """
     params: PIDParams | None = None
     """PID parameters at the start."""
-    params_changed: bool = False
-    """True if the params changed during the run, or a snapshot was restored; None in an incomplete
-    recording.
-    """
     actuators: Actuators | None = None
     """Motors and sensors at the start, before draws of a randomization; None for ideal ones."""
     start: Rows | None = None
@@ -132,8 +137,6 @@ class RunInfo:
     """Draws at the start, by field: (envs, joints or links)."""
     episodes: NDArray[np.int64] | None = None
     """Stream and episode of each env at the start (envs, 2)."""
-    redraws: tuple[Redraw, ...] = ()
-    """Episodes that began after that."""
     description: Robot | None = field(default=None, repr=False)
     """Robot (:class:`batchpid.sim.Robot`) of the run, for :meth:`Rollout.findings`; a recording
     keeps its :attr:`urdf` instead.
@@ -167,7 +170,7 @@ class RunInfo:
     def recorded(self) -> dict[str, Quantity]:
         """Quantities of :data:`RECORDED` that this run has."""
         links = {"contacts": self.contacts, "wrenches": self.wrenches}
-        commands = {name: RECORDED[name] for name in ("setpoint", "feedforward")}
+        commands = {name: RECORDED[name] for name in ("setpoint", *OPTIONAL)}
         return commands | observed(self.fixed_base, self.tool, **links)
 
     def units_of(self, name: str) -> tuple[str, ...]:
@@ -199,41 +202,15 @@ class RunInfo:
                 return None
             return value[envs]
 
-        def events(values: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Return the events of these envs, under their new numbers."""
-            renumbered = []
-            for event in values:
-                numbers = np.flatnonzero(envs == event.env).tolist()
-                renumbered += [event._replace(env=number) for number in numbers]
-            return tuple(renumbered)
-
+        faults = []
+        for fault in self.faults:
+            numbers = np.flatnonzero(envs == fault.env).tolist()
+            faults += [fault._replace(env=number) for number in numbers]
         draws = self.draws
         if draws is not None:
             draws = {name: rows(table) for name, table in draws.items()}
         tables = {name: rows(getattr(self, name)) for name in _OF_ENVS}
-        faults = events(self.faults)
-        redraws = events(self.redraws)
-        return replace(self, draws=draws, faults=faults, redraws=redraws, **tables)
-
-    def for_ticks(self, start: Rows | None, begin: float, end: float) -> RunInfo:
-        """Return the info of the ticks between two times [s], where the first begins at the
-        positions ``start``.
-        """
-        # Episodes that began before these ticks are those of the start.
-        earlier = [redraw for redraw in self.redraws if redraw.time <= begin]
-        episodes = self.episodes
-        if episodes is not None and earlier:
-            episodes = episodes.copy()
-            for redraw in earlier:
-                episodes[redraw.env] = redraw.stream, redraw.episode
-        return replace(
-            self,
-            start=start,
-            draws=None if earlier else self.draws,  # they are known of the first episodes alone
-            episodes=episodes,
-            faults=tuple([fault for fault in self.faults if fault.time <= end]),
-            redraws=tuple([redraw for redraw in self.redraws if begin < redraw.time <= end]),
-        )
+        return replace(self, draws=draws, faults=tuple(faults), **tables)
 
     def __repr__(self) -> str:
         if self.control:
@@ -269,6 +246,11 @@ class Rollout:
     """Joint efforts added before saturation (ticks, envs, dof) [N m or N]; None if none were
     given.
     """
+    changes: Rows | None = None
+    """Changes of each env between the tick before and this one (ticks, envs) uint8, as a sum: 1
+    for a reset, 2 for a restored snapshot, 4 for other params, 8 for other actuators; None if there
+    were none.
+    """
 
     def __getattr__(self, name: str) -> Rows:
         if name not in QUANTITIES:
@@ -286,14 +268,15 @@ class Rollout:
         return int(self.qpos.shape[1])
 
     def arrays(self) -> dict[str, Rows]:
-        """Return time, setpoint, feedforward if one was given, and every quantity that was
-        observed, by name.
+        """Return time, setpoint, feedforward and changes if there are any, and every quantity that
+        was observed, by name.
         """
         seen = {
             name: array for name, array in self.observation._asdict().items() if array is not None
         }
-        if self.feedforward is not None:
-            seen["feedforward"] = self.feedforward
+        for name in OPTIONAL:
+            if getattr(self, name) is not None:
+                seen[name] = getattr(self, name)
         return {"time": self.time, "setpoint": self.setpoint, **seen}
 
     def for_envs(self, envs: slice | Sequence[int] | Rows) -> Rollout:
@@ -306,47 +289,68 @@ class Rollout:
         numbers = np.arange(len(self.time))[ticks]
         time = self.time[ticks]
         info = self.info
+        changes = self.changes
         if len(numbers):
             first = numbers[0]
-            start = info.start
-            begin = -np.inf
-            # A later part starts where the ticks before it ended.
+            faults = tuple([fault for fault in info.faults if fault.time <= time[-1]])
+            info = replace(info, faults=faults)
+            # A later part starts where the ticks before it ended, if nothing was changed there.
             if first:
-                start = self.qpos[first - 1]
-                begin = float(self.time[first - 1])
-            info = info.for_ticks(start, begin, float(time[-1]))
+                info = replace(info, start=self.qpos[first - 1])
+            earlier = 0
+            if changes is not None:
+                earlier = np.bitwise_or.reduce(changes[1 : first + 1], axis=None)
+                changes = merged_changes(changes, numbers)
+            unknown: dict[str, Any] = {}
+            for name, bits in _CHANGES.items():
+                if earlier & bits:
+                    unknown[name] = None
+            info = replace(info, **unknown)
         tick = self.tick * (ticks.step or 1)
-        return self._mapped(itemgetter(ticks), time=time, tick=tick, info=info)
+        part = self._mapped(itemgetter(ticks), time=time, tick=tick, info=info)
+        return replace(part, changes=changes)
 
     def _mapped(self, function: Callable[[Rows], Rows], **others: Any) -> Rollout:
         """Return a rollout with ``function`` applied to each array but the times, and with other
         fields.
         """
-        if self.feedforward is None:
-            feedforward = None
-        else:
-            feedforward = function(self.feedforward)
+        for name in OPTIONAL:
+            rows = getattr(self, name)
+            others[name] = None if rows is None else function(rows)
         setpoint = function(self.setpoint)
         seen = self.observation.map(function)
-        return replace(self, setpoint=setpoint, observation=seen, feedforward=feedforward, **others)
+        return replace(self, setpoint=setpoint, observation=seen, **others)
 
     @staticmethod
     def join(parts: Sequence[Rollout]) -> Rollout:
         """Return successive rollouts of one run as one, with the info of the first, and the faults
-        of the last, which include the earlier ones.
+        of the last, which include the earlier ones. :attr:`changes` has what changed in between.
+
+        Raises
+        ------
+        InvalidArgumentError
+            A part does not go on from the one before it, or has another info.
         """
+        parts = [part for part in parts if len(part.time)] or parts[:1]
+        for number, (before, after) in enumerate(pairwise(parts), start=1):
+            _check_successive(number, before, after)
         first = parts[0]
-        last = parts[-1]
-        feedforward = None
-        if first.feedforward is not None:
-            feedforward = np.concatenate([part.feedforward for part in parts])
+        info = replace(
+            first.info,
+            faults=parts[-1].info.faults,
+            rates=any(part.info.rates for part in parts),
+            complete=all(part.info.complete for part in parts),
+        )
         return replace(
             first,
             time=np.concatenate([part.time for part in parts]),
             setpoint=np.concatenate([part.setpoint for part in parts]),
             observation=Observation.join([part.observation for part in parts]),
-            info=replace(first.info, faults=last.info.faults, redraws=last.info.redraws),
-            feedforward=feedforward,
+            info=info,
+            feedforward=_joined(
+                [part.feedforward for part in parts], [part.qpos.shape for part in parts]
+            ),
+            changes=_joined([part.changes for part in parts], [part.ok.shape for part in parts]),
         )
 
     def __repr__(self) -> str:
@@ -385,12 +389,65 @@ class Rollout:
             raise InvalidArgumentError("robot", problem, remedy=remedy)
         return unsettled_findings(self, robot)
 
+    def check_ticks(self) -> None:
+        """Raise InvalidArgumentError if the run holds no tick, so that nothing can be shown."""
+        if not len(self.time):
+            remedy = "its run was cut short: run it again"
+            raise InvalidArgumentError("rollout", "holds no tick", remedy=remedy)
+
     def plot(self, **options: Any) -> Figure:
         """Return a Matplotlib figure of the run, which a notebook shows: positions above efforts
         for each joint.
 
-        ``options`` are arguments of :func:`batchpid.sim.plots.step_responses`: joints, mark, title.
+        ``options`` are arguments of :func:`batchpid.sim.plots.step_responses`: joints, title.
         """
         from batchpid.sim.plots import step_responses
 
         return step_responses(self, **options)
+
+
+def merged_changes(changes: Rows, ticks: Rows) -> Rows:
+    """Return the changes before each of the ``ticks`` (n,), those before ticks that are left out
+    in between included.
+    """
+    if not len(ticks):
+        return changes[ticks]
+    starts = np.append(ticks[:1], ticks[:-1] + 1)
+    merged: Rows = np.bitwise_or.reduceat(changes[: ticks.max() + 1], starts, axis=0)
+    return merged
+
+
+def _check_successive(number: int, before: Rollout, after: Rollout) -> None:
+    """Raise InvalidArgumentError unless ``after``, part ``number``, goes on from ``before``."""
+    changes = 0 if after.changes is None else np.bitwise_or.reduce(after.changes[0])
+    gap = after.time[0] - after.tick - before.time[-1]
+    differences = []
+    if abs(gap) > 1e-6 * after.tick and not changes & RESTORE:
+        differences.append("time")
+    if (before.tick, before.num_envs) != (after.tick, after.num_envs):
+        differences.append("tick or number of envs")
+    for name in (each.name for each in fields(RunInfo)):
+        if name in _OF_PARTS or changes & _CHANGES.get(name, 0):
+            continue
+        one = getattr(before.info, name)
+        other = getattr(after.info, name)
+        if one is not other and digest(one) != digest(other):
+            differences.append(name)
+    if differences:
+        problem = f"part {number} does not go on from the one before it: {', '.join(differences)}"
+        remedy = "join all rollouts of one run, in their order"
+        raise InvalidArgumentError("parts", problem, remedy=remedy)
+
+
+def _joined(parts: Sequence[Rows | None], shapes: Sequence[tuple[int, ...]]) -> Rows | None:
+    """Return the arrays of successive parts as one, with 0 for a part without; None if none has
+    one.
+    """
+    given = [part for part in parts if part is not None]
+    if not given:
+        return None
+    tables = [
+        np.zeros(shape, given[0].dtype) if part is None else part
+        for part, shape in zip(parts, shapes, strict=True)
+    ]
+    return np.concatenate(tables)

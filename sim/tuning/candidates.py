@@ -4,12 +4,10 @@ simulation.
 The cost of a move is the mean over its joints of the following sum. The cost of a candidate is the
 mean over its moves, plus the cost of its worst move::
 
-    w_itae log(1 + ITAE / (A 1 s^2)) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %) + w_final
-    log(1 + E / b)
-        + w_chatter log(1 + max(TV / TV_smooth - 1, 0)) + w_saturation S
+    log(1 + ITAE / (A 1 s^2)) + Ts / 1 s + log(1 + O / 5 %) + 2 log(1 + E / b)
+        + 0.3 log(1 + max(TV / TV_smooth - 1, 0)) + 3 S
 
-plus the mean over moves of w_late log(1 + max(Ts / Tmax - 1, 0) / 5 %) for the joint that settles
-last.
+plus the mean over moves of 4 log(1 + max(Ts / Tmax - 1, 0) / 5 %) for the joint that settles last.
 
 Ts is limited to 1.5 times the run; Tmax is the settling time asked for. A is the move, or the
 smallest move that counts; O the overshoot as a fraction of A; E the final error, and b the least
@@ -21,7 +19,7 @@ step, where the setpoint weight acts too. So some moves are also made as smooth 
 setpoint, with its rate: the half whose motions are the shortest, because these have the largest
 accelerations. Their cost, also the mean over moves plus the cost of the worst one, is added::
 
-    w_following log(1 + F / (10 b))
+    log(1 + F / (10 b))
 
 where F is the largest following error, b the least half width of the settling band, 1e-3 rad or
 1e-4 m, and F / b that of the arm's worst joint. With a randomization, a robot may be drawn that no
@@ -44,13 +42,11 @@ designs it allows.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, fields
 
 import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64
-from batchpid.checks.validate import number
 from batchpid.gains.stability import stability_bound
 from batchpid.metrics import StepMetrics
 from batchpid.sim.diagnosis.causes import absolute_band
@@ -87,36 +83,16 @@ PENALTY_RATIO = 0.8
 """Stability ratio (:func:`batchpid.stability_bound`) beyond which a candidate is penalised."""
 
 
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the terms of the cost."""
-
-    itae: float = 1.0
-    """Weight of the normalised ITAE, the time-weighted absolute error."""
-    settling: float = 1.0
-    """Weight of the settling time [1/s]."""
-    overshoot: float = 1.0
-    """Weight of log(1 + overshoot / 5 %): one move out of reach must not outweigh all others."""
-    late: float = 4.0
-    """Weight of log(1 + excess of the settling time over the time asked for / 5 %), of a move's
-    last joint.
-    """
-    final: float = 2.0
-    """Weight of log(1 + final error / least half width of the settling band)."""
-    chatter: float = 0.3
-    """Weight of log(variation of the effort / variation in the smooth move), if that is
-    positive.
-    """
-    saturation: float = 3.0
-    """Weight of the share of time for which the effort is saturated."""
-    following: float = 1.0
-    """Weight of log(1 + following error / 10 times the least half width of the settling band),
-    where moves are smooth motions of the setpoint.
-    """
-
-    def __post_init__(self) -> None:
-        for entry in fields(self):
-            number(entry.name, getattr(self, entry.name), 0.0, 1e6, "weight")
+FINAL_WEIGHT = 2.0
+"""Weight of log(1 + final error / least half width of the settling band)."""
+CHATTER_WEIGHT = 0.3
+"""Weight of log(variation of the effort / variation in the smooth move), if that is positive."""
+SATURATION_WEIGHT = 3.0
+"""Weight of the share of time for which the effort is saturated."""
+LATE_WEIGHT = 4.0
+"""Weight of log(1 + excess of the settling time over the time asked for / 5 %), of a move's last
+joint.
+"""
 
 
 class Candidates:
@@ -134,7 +110,6 @@ class Candidates:
         gain_units: str,
         moves: Moves,
         seconds: float,
-        weights: Weights,
         *,
         headroom: float,
         drawn: bool,
@@ -142,7 +117,6 @@ class Candidates:
     ) -> None:
         self.robot = robot
         self.seconds = seconds
-        self.weights = weights
         self.headroom = headroom
         self.motors = motors
         self.designed = robot.designed(gain_units)
@@ -234,7 +208,7 @@ class Candidates:
         figures = [np.minimum(figure, 1e6).reshape(count, rows, -1) for figure in metrics]
         steps = StepMetrics(*(figure[:, : self._steps] for figure in figures))
         total = self._cost_of_steps(steps)
-        total += self.weights.following * self._cost_of_motions(rollout, count)
+        total += self._cost_of_motions(rollout, count)
         # A candidate of which one move diverges is worse than all others, the earlier the worse.
         lasted = rollout.ok.mean(0).reshape(count, -1)
         diverged = DIVERGED_COST * (2 - lasted.mean(1))
@@ -243,20 +217,19 @@ class Candidates:
 
     def _cost_of_steps(self, metrics: StepMetrics) -> Float64:
         """Return the cost of moves that are made as steps of the setpoint (count,)."""
-        weights = self.weights
         settling = np.minimum(metrics.settling_time, 1.5 * self.seconds)
         chatter = np.maximum(metrics.effort_variation / self._variation, 1)
-        cost = weights.itae * np.log1p(metrics.itae / self._size)
-        cost += weights.settling * settling
-        cost += weights.overshoot * np.log1p(metrics.peak_deviation / self._size / 0.05)
-        cost += weights.final * np.log1p(metrics.steady_state_error / self._band)
-        cost += weights.chatter * np.log(chatter)
-        cost += weights.saturation * metrics.saturation_share
+        cost = np.log1p(metrics.itae / self._size)
+        cost += settling
+        cost += np.log1p(metrics.peak_deviation / self._size / 0.05)
+        cost += FINAL_WEIGHT * np.log1p(metrics.steady_state_error / self._band)
+        cost += CHATTER_WEIGHT * np.log(chatter)
+        cost += SATURATION_WEIGHT * metrics.saturation_share
         # A move is late when its last joint is.
         last = settling[..., arm_joints(self.robot)].max(2)
         late = np.log1p(np.maximum(last / self._limit - 1, 0) / 0.05)
         moves = cost[..., self.robot.independent].mean(2)
-        costs: Float64 = self._over_moves(moves) + weights.late * late.mean(1)
+        costs: Float64 = self._over_moves(moves) + LATE_WEIGHT * late.mean(1)
         return costs
 
     def _cost_of_motions(self, rollout: Rollout, count: int) -> Float64:

@@ -1,28 +1,20 @@
-"""Sets of gains by name, and their comparison on the same moves: as a table, as figures and as a
-picture.
-"""
+"""Comparison of sets of gains on the same moves: as a table, as figures and as a picture."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from tabulate import tabulate
 
-import batchpid as bp
-from batchpid.arrays.array_types import Document, Progress, Rows
-from batchpid.arrays.field_tables import Field
-from batchpid.errors import InvalidArgumentError
+from batchpid.arrays.array_types import Document, Progress
 from batchpid.motors import DRIVEN
+from batchpid.sim.diagnosis.text import cause_lines, median_and_worst, overshoot_of_settled, table
 from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.options.groups import ControlMode, EngineName
+from batchpid.sim.options.groups import EngineName
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.evaluation import (
     Evaluation,
@@ -31,13 +23,12 @@ from batchpid.sim.tuning.evaluation import (
     reseeded,
     tuning_engine,
 )
+from batchpid.sim.tuning.gain_sets import GainSet, default_sets, gain_set
 from batchpid.sim.tuning.moves import random_moves, tutorial_move
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LISTED = 3
-"""Causes that a report lists."""
 HEADERS = (
     "gains",
     "settling",
@@ -52,64 +43,6 @@ Median / worst over the arm's joints and all moves, made as steps of the setpoin
 |qpos - setpoint| of a joint [rad or m] on the same moves as smooth motions, with setpoint rates. overshoot: of joints
 that settled. chatter: variation of the effort over that of the smooth move. settled / in time: moves of which every
 joint settled, within the run and within a second or 1.2 times the shortest that the effort limits allow."""
-
-
-class GainSet(NamedTuple):
-    """Params with a name, and the control of :class:`batchpid.sim.Runner` that they are for."""
-
-    name: str
-    params: bp.PIDParams
-    control: ControlMode = "pid"
-
-
-def default_gains(robot: Robot) -> str:
-    """Return the name of the gains that a robot has by default."""
-    if robot.has_tuned:
-        return "tuned"
-    return "designed"
-
-
-def gain_set(robot: Robot, name: str | None = None) -> GainSet:
-    """Return the gains of ``robot`` by name; default "tuned" where the robot has them, else
-    "designed".
-
-    "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "sapien-tutorial"
-    are the gains in SAPIEN's tutorial, for a bundled robot, "mjcf" is
-    :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or "drive:STIFFNESS,DAMPING" is the engine's
-    internal drive. Other names are params files.
-
-    Raises
-    ------
-    InvalidArgumentError
-        There is no such name or file, or the robot lacks these gains.
-    """
-    name = name or default_gains(robot)
-    named = {
-        "tuned": robot.tuned,
-        "designed": robot.designed,
-        "sapien-tutorial": robot.params,
-        "mjcf": robot.mjcf_gains,
-    }
-    if name in named:
-        return GainSet(name, named[name]())
-    kind, _, figures = name.partition(":")
-    if kind == "drive":
-        try:
-            stiffness, damping = map(float, (figures or "20,5").split(","))
-        except ValueError:
-            remedy = "write drive:STIFFNESS,DAMPING, e.g. drive:20,5"
-            raise InvalidArgumentError(
-                "gains", "is not a drive", value=name, remedy=remedy
-            ) from None
-        params = robot.params(kp=stiffness, ki=0.0, kd=damping, effort_limit=None)
-        return GainSet(f"drive ({stiffness:g}, {damping:g})", params, "drive")
-    path = Path(name)
-    if not path.is_file():
-        remedy = f"use {', '.join(named)}, drive, or a params file"
-        raise InvalidArgumentError(
-            "gains", "is neither a name nor a file", value=name, remedy=remedy
-        )
-    return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,9 +134,9 @@ class Comparison:
 def compare(
     robot: Robot,
     gains: tuple[str, ...] | Sequence[GainSet] = (),
-    moves: Annotated[int, Field(low=1, high=100_000)] = 20,
-    seed: Annotated[int, Field(high=2**31 - 1)] = 0,
-    seconds: Annotated[float, Field("simulated time, s", low=1e-6, high=1e6)] = 2.0,
+    moves: int = 20,
+    seed: int = 0,
+    seconds: float = 2.0,
     engine: tuple[EngineName, ...] | EngineName | None = None,
     randomization: Randomization | None = None,
     workers: int | None = None,
@@ -278,44 +211,3 @@ def compare(
         )
         evaluations.append(evaluation)
     return Comparison(robot, tuple(evaluations), tuple(titles))
-
-
-def default_sets(robot: Robot) -> tuple[str, ...]:
-    """Return the names of the sets that are compared by default."""
-    if robot.settings:
-        return ("tuned", "sapien-tutorial", "drive")
-    return ("designed", "drive")
-
-
-def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:
-    """Return ``rows`` under ``headers`` as text; ``align`` has one letter per column, "l" or
-    "r".
-    """
-    sides = tuple("left" if side == "l" else "right" for side in align)
-    return tabulate(rows, headers, disable_numparse=True, colalign=sides)
-
-
-def cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
-    """Yield a line for each of the first causes, the most likely first."""
-    for cause in findings[:LISTED]:
-        yield f"WHY: {cause.where}: {cause.text} ({cause.figures}); {cause.remedy}."
-    if len(findings) > LISTED:
-        yield f"and {len(findings) - LISTED} more, which rollout.findings() lists."
-
-
-def overshoot_of_settled(overshoot: Rows, settling: Rows) -> Rows:
-    """Return the overshoots of joints that settled; NaN for the others, of which it says
-    nothing.
-    """
-    return np.where(np.isinf(settling) & np.isfinite(overshoot), np.nan, overshoot)
-
-
-def median_and_worst(figures: Rows, style: str) -> str:
-    """Return the median and the worst of ``figures``, "never" for infinity, and "-" where none is
-    defined.
-    """
-    if np.isnan(figures).all():
-        return "-"
-    # Infinite figures allow no interpolation between two of them.
-    quantiles = np.nanquantile(figures, [0.5, 1.0], method="higher")
-    return " / ".join("never" if math.isinf(value) else style.format(value) for value in quantiles)

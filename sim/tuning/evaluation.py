@@ -153,8 +153,9 @@ def settling_limits(robot: Robot, moves: Moves) -> Float64:
     return np.maximum(SETTLE_SECONDS, SETTLE_SLACK * shortest_durations(robot, moves))
 
 
-def load_randomization(path: str | Path, robot: Robot, seed: int = 0) -> Randomization:
-    """Return the randomization in a YAML or JSON file, with ``seed`` unless the file gives one.
+def load_randomization(path: str | Path | None, robot: Robot) -> Randomization | None:
+    """Return the randomization in a YAML or JSON file, with seed 0 unless the file gives one; None
+    without a file.
 
     Raises
     ------
@@ -163,11 +164,13 @@ def load_randomization(path: str | Path, robot: Robot, seed: int = 0) -> Randomi
     InvalidArgumentError
         It is not a randomization, or does not fit the robot.
     """
+    if path is None:
+        return None
     path = file_path("randomize", path)
     document = documents.read(path)
     with documents.named(str(path)):
         if isinstance(document, dict):
-            document = {"seed": seed, **document}
+            document = {"seed": 0, **document}
         randomization = Randomization.from_dict(document)
         check_robot(randomization, robot)
     return randomization

@@ -17,7 +17,7 @@ the designed ones. For such robots the first generation consists of other design
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,9 +33,10 @@ from batchpid.io.files import package_versions
 from batchpid.sim.options.groups import EngineName
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tuning.candidates import FACTORS, Candidates, Weights
-from batchpid.sim.tuning.comparison import Comparison, GainSet, compare
+from batchpid.sim.tuning.candidates import FACTORS, Candidates
+from batchpid.sim.tuning.comparison import Comparison, compare
 from batchpid.sim.tuning.evaluation import SUBSTEPS, reseeded, tuning_engine
+from batchpid.sim.tuning.gain_sets import GainSet, gain_table
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ class Tuning:
     rejected: str | None
     """Why the designed gains are the result; None if a candidate was best."""
     scene: Document
-    """Options of the comparison with the designed gains."""
+    """Options of the comparison with the designed gains, and its progress."""
 
     @cached_property
     def comparison(self) -> Comparison:
@@ -92,7 +93,8 @@ class Tuning:
         ]
         if self.rejected is not None:
             lines.append(f"The designed gains are the result: {self.rejected}.")
-        return "\n".join([*lines, self.comparison.report()])
+        lines += [self.comparison.report(), "", gain_table(self.robot, self.params)]
+        return "\n".join(lines)
 
     def save(self, path: str | Path) -> None:
         """Write the params and the settings of the search."""
@@ -114,13 +116,12 @@ def tune(
     seed: int = 0,
     seconds: float = 1.5,
     gain_units: Literal["mass_matrix", "effort"] = "mass_matrix",
-    weights: Weights | None = None,
     moves: Moves | None = None,
     randomization: Randomization | None = None,
     motors: bp.Actuators | None = None,
     engine: EngineName | None = None,
     workers: int | None = None,
-    progress: Progress[int] | None = None,
+    progress: Progress[Any] | None = None,
     **runner_options: Any,
 ) -> Tuning:
     """Tune the gains of any robot: design them from its inertia, then search by CMA-ES on simulated
@@ -141,9 +142,6 @@ def tune(
         Simulated time of each move of the search [s].
     gain_units
         Gains per mass matrix (all joints respond equally fast), or as efforts (for any controller).
-    weights
-        Of the terms of the cost. Default: 1 for a second of a step's settling time and 1 for the
-        logarithm of the following error.
     moves
         Default: the tutorial's move and SEARCH_MOVES random ones, and FINAL_MOVES others in the
         final round. Given moves replace them, with contacts, since they may touch something. There
@@ -161,7 +159,7 @@ def tune(
     workers
         Processes that step the scenes; 0: this one. Default: one per available core.
     progress
-        Wraps the range of generations, e.g. ``tqdm.tqdm``.
+        Wraps the range of generations, and the sets of the comparison, e.g. ``tqdm.tqdm``.
     runner_options
         More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``, for the final round.
         In the search, robots with a fixed base and without a ``build`` have no collision shapes and
@@ -187,7 +185,6 @@ def tune(
     if motors is not None and runner_options.get("actuators") is not None:
         remedy = "leave it out: the control knows the actuators of the robot"
         raise InvalidArgumentError("actuators", "cannot be combined with motors", remedy=remedy)
-    weights = Weights() if weights is None else weights
     build = runner_options.get("build")
     engine = tuning_engine(build) if engine is None else engine
     # Options of all rollouts; the search adds fast ones where moves are free of contact.
@@ -209,7 +206,6 @@ def tune(
             gain_units,
             moves,
             seconds,
-            weights,
             headroom=headroom,
             drawn=differs and motors is None,
             motors=motors,
@@ -248,7 +244,6 @@ def tune(
         "population": population,
         "seconds": seconds,
         "gain_units": gain_units,
-        "weights": asdict(weights),
         "moves": list(moves.names),
         "randomization": None if randomization is None else randomization.to_dict(),
         "engine": engine,
@@ -264,7 +259,7 @@ def tune(
         history=history,
         settings=settings,
         rejected=f"no candidate beats the designed gains in the {stage}" if best == 0 else None,
-        scene=scene | {"engine": (engine,), "randomization": randomization},
+        scene=scene | {"engine": (engine,), "randomization": randomization, "progress": progress},
     )
 
 

@@ -10,19 +10,21 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, Any, cast
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.transforms import IdentityTransform
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, Progress, Rows
 from batchpid.checks.validate import file_path, integer, number
-from batchpid.errors import BatchPIDError, MissingDependencyError
+from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import replacing
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.shapes import Surface
 from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
 from batchpid.sim.view.view_data import Playback, rows_at
@@ -35,12 +37,19 @@ _GRID = "#d5dae2"
 _BACKGROUND = "#f4f6f9"
 _NEAREST = 0.05
 """Distance from the camera below which nothing is drawn [m]."""
+_FARTHEST = 100.0
+"""Distance from the middle of a picture beyond which nothing is drawn, in half heights."""
+_CELL = 1.5
+"""Edge of the cubes that keep one vertex of a mesh [pixels]."""
 _NEARER = 0.85
 """Distance of the camera, as a share of that on the page, whose sides are covered by panels."""
 
 
 class Painter:
-    """Camera of ``size`` (width, height) [pixels] on a scene of ``count`` robots."""
+    """Camera of ``size`` (width, height) [pixels] on a scene of ``count`` robots.
+
+    Scene, floor and canvas are made once; a picture draws the robots' triangles over the floor.
+    """
 
     def __init__(
         self,
@@ -52,64 +61,70 @@ class Painter:
         self._scene = scene = RobotScene(robot, count, ground, deviation=8e-3)
         self._size = size
         self._eye = scene.target + _NEARER * (scene.eye - scene.target)
-        forward = (scene.target - self._eye) / np.linalg.norm(scene.target - self._eye)
+        distance = float(np.linalg.norm(scene.target - self._eye))
+        forward = (scene.target - self._eye) / distance
         right = np.cross(forward, [0.0, 0.0, 1.0]) / np.linalg.norm(forward[:2])
         self._axes = np.stack([right, np.cross(right, forward), forward])  # right, up, forward
-        counts = [len(surface.faces) for surface in scene.surfaces]
-        colours = np.repeat([surface.rgba[:3] for surface in scene.surfaces], counts, axis=0)
+        pixel = 2 * math.tan(FIELD_OF_VIEW / 2) * distance / size[1]
+        self._surfaces = [coarse(surface, _CELL * pixel) for surface in scene.surfaces]
+        counts = [len(surface.faces) for surface in self._surfaces]
+        colours = np.repeat([surface.rgba[:3] for surface in self._surfaces], counts, axis=0)
         self._colours = np.tile(colours, (count, 1))
-        half_x, half_y = scene.half_floor
-        x, y = np.meshgrid(np.arange(-half_x, half_x, TILE), np.arange(-half_y, half_y, TILE))
-        edges = TILE * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-        self._tiles = (
-            np.stack([x, y, np.full_like(x, scene.floor)], axis=-1).reshape(
-                -1,
-                1,
-                3,
-            )
-            + edges
-        )
+        self._canvas = self._draw_floor()
+        self._renderer: Any = self._canvas.get_renderer()
+        self._floor = self._renderer.copy_from_bbox(self._canvas.figure.bbox)
 
     def picture(self, qpos: Rows, base_pose: Rows | None = None) -> NDArray[np.uint8]:
         """Return the picture (height, width, 3) in RGB of robots in poses as for
         :meth:`RobotScene.place`.
         """
+        corners = self._corners(self._scene.place(qpos, base_pose))
+        places, depth = self._project(corners)
+        # A triangle far outside the picture, or of a pose that is not a number, is not drawn.
+        near = (np.abs(places) < _FARTHEST).all(axis=(1, 2))
+        visible = np.flatnonzero(near & (depth > _NEAREST).all(axis=1))
+        order = visible[np.argsort(-depth[visible].mean(axis=1))]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        brightness = 0.55 + 0.45 * np.clip(normals @ LIGHT, 0, 1)
+        # One colour at the three corners of a triangle.
+        shades = np.ones((len(order), 3, 4))
+        shades[..., :3] = np.clip(self._colours * brightness[:, None], 0, 1)[order, None]
+        width, height = self._size
+        points = places[order] * height / 2 + [width / 2, height / 2]
+        self._renderer.restore_region(self._floor)
+        context = self._renderer.new_gc()
+        self._renderer.draw_gouraud_triangles(context, points, shades, IdentityTransform())
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def _draw_floor(self) -> FigureCanvasAgg:
+        """Return a canvas with the floor: tiles with edges, filled where there is a ground."""
+        scene = self._scene
+        half_x, half_y = scene.half_floor
+        x, y = np.meshgrid(np.arange(-half_x, half_x, TILE), np.arange(-half_y, half_y, TILE))
+        corners = np.stack([x, y, np.full_like(x, scene.floor)], axis=-1).reshape(-1, 1, 3)
+        edges = TILE * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+        places, depth = self._project(corners + edges)
         width, height = self._size
         figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor=_BACKGROUND)
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set(xlim=(-width / height, width / height), ylim=(-1, 1))
         axes.axis("off")
-        places, depth = self._project(self._tiles)
-        tiles = list(places[np.flatnonzero((depth > _NEAREST).all(axis=1))])
-        face = _FLOOR if self._scene.ground else "none"
+        tiles = list(places[(depth > _NEAREST).all(axis=1)])
+        face = _FLOOR if scene.ground else "none"
         axes.add_collection(
             PolyCollection(tiles, facecolors=face, edgecolors=_GRID, linewidths=0.8)
         )
-
-        corners = self._corners(self._scene.place(qpos, base_pose))
-        places, depth = self._project(corners)
-        visible = np.flatnonzero((depth > _NEAREST).all(axis=1))
-        order = visible[np.argsort(-depth[visible].mean(axis=1))]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        brightness = 0.55 + 0.45 * np.clip(normals @ LIGHT, 0, 1)
-        shades = np.clip(self._colours * brightness[:, None], 0, 1)[order]
-        axes.add_collection(
-            PolyCollection(
-                list(places[order]), facecolors=shades, edgecolors=shades, linewidths=0.3
-            )
-        )
-
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        return canvas
 
     def _corners(self, poses: Float64) -> Float64:
         """Return the corners (triangles, 3, 3) [m] of all robots for the ``poses`` of their
         surfaces.
         """
         parts = []
-        for surface, pose in zip(self._scene.surfaces, poses.swapaxes(0, 1), strict=True):
+        for surface, pose in zip(self._surfaces, poses.swapaxes(0, 1), strict=True):
             vertices = rotate(matrix_of(pose[:, None, 3:]), surface.vertices) + pose[:, None, :3]
             parts.append(vertices[:, surface.faces])
         return np.concatenate(parts, axis=1).reshape(-1, 3, 3)
@@ -122,6 +137,28 @@ class Painter:
         return seen[..., :2] / scale[..., None], depth
 
 
+def coarse(surface: Surface, cell: float) -> Surface:
+    """Return a surface with one vertex in each cube of edge ``cell`` [m], and the triangles that
+    remain.
+
+    Published meshes have a hundred times as many triangles as a film can show. (Vertex clustering:
+    J. Rossignac and P. Borrel, Multi-resolution 3D approximations for rendering complex scenes,
+    1993.)
+    """
+    cubes = np.round((surface.vertices - surface.vertices.min(0)) / cell).astype(np.int64)
+    sizes = cubes.max(0) + 1
+    number = (cubes[:, 0] * sizes[1] + cubes[:, 1]) * sizes[2] + cubes[:, 2]
+    _, first, place = np.unique(number, return_index=True, return_inverse=True)
+    faces = place[surface.faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    # Triangles of the same corners are drawn once.
+    _, distinct = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return surface._replace(vertices=surface.vertices[first], faces=faces[np.sort(distinct)])
+
+
+MOST_FRAMES = 100_000
+"""Largest number of frames of a film, nearly an hour."""
 ENCODERS = {
     # Colours are halved on both sides, which are therefore even.
     ".mp4": "-vf pad=ceil(iw/2)*2:ceil(ih/2)*2 -pix_fmt yuv420p",
@@ -171,6 +208,10 @@ def write_film(
         raise MissingDependencyError("imageio-ffmpeg", "a film", "view") from None
     recorded = Playback(rollout, robot)
     painter = Painter(recorded.robot, rollout.num_envs, recorded.ground, size)
+    if not recorded.duration * rate <= MOST_FRAMES:
+        problem = f"lasts {recorded.duration:g} s, more than {MOST_FRAMES} frames"
+        remedy = "film a part: rollout.for_ticks(slice(...)), or fewer frames per second"
+        raise InvalidArgumentError("rollout", problem, remedy=remedy)
     times = np.arange(0.0, recorded.duration + 0.5 / rate, 1 / rate)
     rows = rows_at(rollout, times).tolist()
 

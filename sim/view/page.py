@@ -1,4 +1,4 @@
-"""Page that shows robots: their scene, charts of a joint, controls, and the loop that keeps real
+"""Page that shows robots: their scene, a chart of a joint, controls, and the loop that keeps real
 time.
 """
 
@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.errors import MissingDependencyError
+from batchpid.io.packages import uninterrupted
 from batchpid.sim.robot.findings import summary
-from batchpid.sim.robot.shapes import Surface
 from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.panel import Panel
 from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
@@ -25,16 +24,14 @@ from batchpid.sim.view.view_data import HISTORY_SECONDS, ViewData
 if TYPE_CHECKING:
     from viser import ViserServer
 
-CHARTS_EVERY = 5
-"""Frames between two updates of charts and status."""
-SETPOINT_COLOUR = (70, 130, 255)
-NO_SHADOW = {"cast_shadow": False, "receive_shadow": False}
-CURVE = {"stroke": "#15803d", "width": 2}
+CHART_FRAMES = 5
+"""Frames between two updates of chart and status."""
+CURVE = {"label": "qpos", "stroke": "#15803d", "width": 2}
 SETPOINT_CURVE = {"label": "setpoint", "stroke": "#4a82ff", "width": 1, "dash": [6, 4]}
 SCALES = {
     # Without a fixed range the axis drifts in viser 1.1.
     "x": {"time": False, "range": (-HISTORY_SECONDS, 0.0)},
-    # The smallest range [rad, m, N m or N] keeps noise alone from filling a chart.
+    # The smallest range [rad or m] keeps noise alone from filling a chart.
     "y": {
         "range": {
             "min": {"pad": 0.1, "soft": -0.012, "mode": 1},
@@ -58,9 +55,11 @@ class View(AbstractContextManager["View"]):
 
     def __init__(self, data: ViewData, *, port: int = 8080) -> None:
         try:
-            import viser
+            with uninterrupted():
+                import viser
 
-            from batchpid.sim.view.gate import HOST, Gate  # needs what viser needs
+                # It needs what viser needs.
+                from batchpid.sim.view.gate import HOST, Gate
         except ImportError:
             raise MissingDependencyError("viser", "the browser view", "view") from None
         self.data = data
@@ -76,25 +75,23 @@ class View(AbstractContextManager["View"]):
         with redirect_stdout(io.StringIO()):  # viser's banner
             self._server = gate.start(make)
 
-        # Controls on the right, charts on the left, the scene between them.
+        # Controls on the right, a chart on the left, the scene between them.
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(43, 92, 199))
         self.panel = Panel(gui, data)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
-        charts = gui.add_panel()
-        with charts.add_tab("Charts"):
-            self._position = _add_chart(gui, {"label": "qpos", **CURVE}, SETPOINT_CURVE)
-            self._effort = _add_chart(gui, {"label": "effort", **CURVE})
-        charts.dock_left()
-        charts.set_width(380)
+        left = gui.add_panel()
+        with left.add_tab("Chart"):
+            self._chart = _add_chart(gui)
+        left.dock_left()
+        left.set_width(380)
         # A browser without a GPU transforms every vertex in software: the more robots, the coarser.
         deviation = min(6e-3, 2.5e-4 + 1.25e-4 * data.num_envs)
         scene = RobotScene(data.robot, data.num_envs, data.ground, deviation)
         self.findings = summary(scene.findings)
         """Sentences on meshes that cannot be read."""
-        sets_positions = data.frame().info.sets_positions
-        self._nodes = SceneNodes(self._server, scene, sets_positions, self.panel.select)
+        self._nodes = SceneNodes(self._server, scene, self.panel.select)
 
     def run(self, seconds: float | None = None) -> None:
         """Serve the page for ``seconds`` of wall time, or until :meth:`stop` or Ctrl-C."""
@@ -112,9 +109,9 @@ class View(AbstractContextManager["View"]):
                 data.advance()
                 count += 1
             now = time.monotonic()
-            due = running and count % CHARTS_EVERY == 0
+            due = running and count % CHART_FRAMES == 0
             if due:
-                rate = CHARTS_EVERY / (now - lap)
+                rate = CHART_FRAMES / (now - lap)
                 lap = now
             if running or requested:
                 self._show(requested or due, rate)
@@ -136,18 +133,18 @@ class View(AbstractContextManager["View"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _show(self, charts: bool, rate: float) -> None:
-        """Send the present frame to the pages, and with ``charts`` these and the status: ``rate``
-        is the number of frames per second of wall time.
+    def _show(self, chart: bool, rate: float) -> None:
+        """Send the present frame to the pages, and with ``chart`` that and the status: ``rate`` is
+        the number of frames per second of wall time.
         """
         frame = self.data.frame()
-        self._nodes.update(frame, self.panel.env)
-        if charts:
-            self._draw_charts()
+        self._nodes.update(frame)
+        if chart:
+            self._draw_chart()
             self.panel.update_status(frame, rate)
 
-    def _draw_charts(self) -> None:
-        """Draw the recent past of the watched joint."""
+    def _draw_chart(self) -> None:
+        """Draw the recent past of the watched joint: position and setpoint."""
         history = self.data.history()
         past = history.time - history.time[-1]
         # One row makes no curve.
@@ -155,30 +152,25 @@ class View(AbstractContextManager["View"]):
             return
         place = (slice(None), self.panel.env, self.panel.joint)
         joint = self.data.robot.joints[self.panel.joint]
-        positions = history.qpos[place]
-        setpoints = positions
+        curves = [history.qpos[place]] * 2
         if history.info.sets_positions:
-            setpoints = history.setpoint[place]
-        _draw(self._position, f"{joint.name} [{joint.unit}]", past, positions, setpoints)
-        _draw(self._effort, f"effort [{joint.effort_unit}]", past, history.effort[place])
+            curves[1] = history.setpoint[place]
+        self._chart.title = f"{joint.name} [{joint.unit}]"
+        # Smaller differences make a flat line jitter, and a number that is not finite would empty
+        # the chart.
+        rounded = [np.nan_to_num(np.round(curve, 4).astype(np.float64)) for curve in curves]
+        self._chart.data = (past, *rounded)
 
 
 class SceneNodes:
-    """A ``scene`` on a viser ``server``, with the setpoint of a robot if ``sets_positions`` of
-    joints.
-
-    ``select(robot)`` is called when a robot is clicked.
+    """A ``scene`` on a viser ``server``; ``select(robot)`` is called when a robot is clicked.
 
     Every surface is one node, which is placed once for each robot. A frame is therefore two small
     arrays for each surface, for any number of robots.
     """
 
     def __init__(
-        self,
-        server: ViserServer,
-        scene: RobotScene,
-        sets_positions: bool,
-        select: Callable[[int], None],
+        self, server: ViserServer, scene: RobotScene, select: Callable[[int], None]
     ) -> None:
         self._server = server
         self._scene = scene
@@ -198,95 +190,49 @@ class SceneNodes:
             plane_opacity=float(scene.ground),
             position=(0.0, 0.0, scene.floor),
         )
+        copies = len(scene.positions)
         self._robots: list[Any] = []
-        self._setpoints: list[Any] = []
         for index, surface in enumerate(scene.surfaces):
-            *rgb, alpha = surface.rgba
-            node = self._add_surface(
+            colour = np.round(255 * np.asarray(surface.rgba)).astype(np.uint8)
+            alpha = surface.rgba[3]
+            node: Any = api.add_batched_meshes_simple(
                 f"/robots/{index}",
-                surface,
-                len(scene.positions),
-                batched_colors=tuple(round(255 * value) for value in rgb),
+                surface.vertices.astype(np.float32),
+                surface.faces.astype(np.uint32),
+                batched_wxyzs=np.tile(np.array([1, 0, 0, 0], np.float32), (copies, 1)),
+                batched_positions=np.zeros((copies, 3), np.float32),
+                batched_colors=np.tile(colour[:3], (copies, 1)),
                 opacity=alpha if alpha < 1 else None,
+                lod="off",
             )
             node.on_click(lambda event: select(event.instance_index))
             self._robots.append(node)
-            if sets_positions:
-                node = self._add_surface(
-                    f"/setpoint/{index}",
-                    surface,
-                    1,
-                    batched_colors=SETPOINT_COLOUR,
-                    opacity=0.22,
-                    **NO_SHADOW,
-                )
-                self._setpoints.append(node)
         camera = server.initial_camera
         camera.position = tuple(scene.eye)
         camera.look_at = tuple(scene.target)
         camera.fov = FIELD_OF_VIEW
 
-    def update(self, frame: Rollout, env: int) -> None:
-        """Place every robot, and the setpoint of robot ``env``."""
+    def update(self, frame: Rollout) -> None:
+        """Place every robot."""
         base = None
         if frame.base_pose is not None:
             base = frame.base_pose[0]
+        poses = self._scene.place(frame.qpos[0], base).astype(np.float32).swapaxes(0, 1)
         with self._server.atomic():
-            _place(self._robots, self._scene.place(frame.qpos[0], base))
-            if self._setpoints:
-                setpoint = self._scene.poses(frame.setpoint[0, [env]], np.array([env]))
-                _place(self._setpoints, setpoint)
-
-    def _add_surface(
-        self,
-        path: str,
-        surface: Surface,
-        copies: int,
-        **options: Any,
-    ) -> Any:
-        """Return a new node of a surface, in as many copies."""
-        return self._server.scene.add_batched_meshes_simple(
-            path,
-            surface.vertices.astype(np.float32),
-            surface.faces.astype(np.uint32),
-            batched_wxyzs=np.tile(np.array([1, 0, 0, 0], np.float32), (copies, 1)),
-            batched_positions=np.zeros((copies, 3), np.float32),
-            lod="off",
-            **options,
-        )
+            for node, pose in zip(self._robots, poses, strict=True):
+                node.batched_positions = np.ascontiguousarray(pose[:, :3])
+                node.batched_wxyzs = np.ascontiguousarray(pose[:, 3:])
 
 
-def _place(nodes: list[Any], poses: Float64) -> None:
-    """Put the nodes of surfaces at poses (robots, surfaces, 7)."""
-    for node, pose in zip(nodes, poses.astype(np.float32).swapaxes(0, 1), strict=True):
-        node.batched_positions = np.ascontiguousarray(pose[:, :3])
-        node.batched_wxyzs = np.ascontiguousarray(pose[:, 3:])
-
-
-def _add_chart(gui: Any, *curves: Document) -> Any:
+def _add_chart(gui: Any) -> Any:
     """Return a new chart over the past, flat until the first update."""
-    flat = (np.array([-HISTORY_SECONDS, 0.0]), *[np.zeros(2)] * len(curves))
+    flat = (np.array([-HISTORY_SECONDS, 0.0]), np.zeros(2), np.zeros(2))
     return gui.add_uplot(
         flat,
-        ({"label": "s"}, *curves),
+        ({"label": "s"}, CURVE, SETPOINT_CURVE),
         scales=SCALES,
         legend={"show": True, "live": False},
         height=220,
         axes=({"size": 30, "stroke": "#6b7280"}, {"size": 56, "stroke": "#6b7280"}),
         padding=(4, 14, 0, 0),
     )
-
-
-def _draw(
-    chart: Any,
-    title: str,
-    past: Float64,
-    *curves: Rows,
-) -> None:
-    """Show curves over the past in a chart."""
-    if chart.title != title:
-        chart.title = title
-    # Smaller differences make a flat line jitter, and a number that is not finite would empty the
-    # chart.
-    rounded = [np.nan_to_num(np.round(curve, 4).astype(np.float64)) for curve in curves]
-    chart.data = (past, *rounded)

@@ -1,4 +1,4 @@
-"""Controls of the page: motion, the watched joint, setpoints, gains. Requests are carried out
+"""Controls of the page: motion, the watched joint, setpoints. Requests are carried out
 between two frames.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from batchpid.errors import BatchPIDError
 from batchpid.sim.signals.rollout import Rollout
-from batchpid.sim.view.view_data import GAINS, LiveSimulation, Playback, ViewData
+from batchpid.sim.view.view_data import LiveSimulation, ViewData
 
 if TYPE_CHECKING:
     from viser import GuiApi
@@ -44,9 +44,6 @@ class Panel:
         buttons = gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset"))
         self._connect(buttons, self._control_motion)
         self._speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
-        if isinstance(data, Playback):
-            times = gui.add_slider("Time [s]", 0.0, data.duration, data.period, 0.0)
-            self._time = self._connect(times, data.seek)
         # The watched robot and joint; a change shows at the next frame.
         self._robot = gui.add_slider("Robot", 0, max(1, data.num_envs - 1), 1, 0)
         self._robot.disabled = data.num_envs == 1
@@ -54,11 +51,7 @@ class Panel:
         self._joint = gui.add_dropdown("Joint", data.robot.joint_names)
         self._connect(self._joint, lambda _: None)
         if isinstance(data, LiveSimulation):
-            tabs = gui.add_tab_group()
-            with tabs.add_tab("Setpoint"):
-                self._add_setpoints(data)
-            with tabs.add_tab("Gains"):
-                self._add_gains(data)
+            self._add_setpoints(data)
 
     @property
     def env(self) -> int:
@@ -109,8 +102,6 @@ class Panel:
             self._problem,
         ]
         self._status.content = "  \n".join(lines)
-        if isinstance(data, Playback):
-            self._time.value = time
 
     def _connect(self, handle: Any, action: Callable[[Any], object]) -> Any:
         """Request ``action(value)`` whenever a page, and not this program, changes a control;
@@ -169,33 +160,3 @@ class Panel:
             value = float(np.clip(live.setpoint[0, index], low, high))
             slider = gui.add_slider(f"{joint.name} [{joint.unit}]", low, high, 1e-3, value)
             sliders[index] = self._connect(slider, partial(move, index))
-
-    def _add_gains(self, live: LiveSimulation) -> None:
-        """Add a slider for each gain, and a button for the first gains."""
-        gui = self._gui
-        first = live.params
-        gui.add_markdown("Of the watched joint, on every robot.")
-        sliders: dict[str, Any] = {}
-
-        def show(*_: object) -> None:
-            for gain, slider in sliders.items():
-                # Four digits: the box next to a slider holds no more.
-                value = float(f"{getattr(live.params, gain)[0, self.joint]:.4g}")
-                largest = 4 * max(value, float(getattr(first, gain)[0, self.joint])) or 1.0
-                slider.max = largest
-                slider.step = largest / 1000
-                slider.value = value
-
-        def change(gain: str, value: float) -> None:
-            live.set_gain(gain, self.joint, value)
-
-        def restore(_: str) -> None:
-            live.params = first
-            show()
-
-        for gain in GAINS:
-            slider = gui.add_slider(gain, 0.0, 1.0, 0.001, 0.0)
-            sliders[gain] = self._connect(slider, partial(change, gain))
-        self._connect(gui.add_button_group("All joints", ("back to the first gains",)), restore)
-        self._connect(self._joint, show)
-        show()

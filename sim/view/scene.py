@@ -10,7 +10,7 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.shapes import surfaces
+from batchpid.sim.view.surfaces import surfaces
 from batchpid.task_space.frames import placed
 
 MAX_ROBOTS = 64
@@ -84,13 +84,7 @@ class RobotScene:
             finite &= np.isfinite(base_pose).all(1, keepdims=True)
             self._base = np.where(finite, base_pose, self._base)
         self._qpos = np.where(finite, qpos, self._qpos)
-        return self.poses(self._qpos, np.arange(len(qpos)))
-
-    def poses(self, qpos: Float64, robots: Rows) -> Float64:
-        """Return the poses of the surfaces (n, surfaces, 7) [m] of n ``robots`` at ``qpos`` (n,
-        dof) [rad or m].
-        """
-        links = ts.link_poses(self._tree, qpos)[:, self._links]
-        poses = placed(self._base[robots][:, None], links)
-        poses[..., :3] += self.positions[robots][:, None]
+        links = ts.link_poses(self._tree, self._qpos)[:, self._links]
+        poses = placed(self._base[:, None], links)
+        poses[..., :3] += self.positions[:, None]
         return poses

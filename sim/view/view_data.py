@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
-from batchpid.checks.validate import choice, integer, number
+from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot import Robot
@@ -24,10 +23,8 @@ from batchpid.sim.signals.quantities import Observation
 from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.view.scene import MAX_ROBOTS
 
-GAINS = ("kp", "ki", "kd")
-"""Gains that the page changes."""
 HISTORY_SECONDS = 8.0
-"""Longest past that the charts show [s]."""
+"""Longest past that the chart shows [s]."""
 
 
 class LiveSimulation:
@@ -77,21 +74,6 @@ class LiveSimulation:
         """True if the scenes have a ground at height 0."""
         self._info = RunInfo.of(robot, ground=self.ground)
         self.reset()
-
-    @property
-    def params(self) -> bp.PIDParams:
-        """Gains in force; assign others to change them in flight."""
-        return self._runner.params
-
-    @params.setter
-    def params(self, params: bp.PIDParams) -> None:
-        self._runner.params = params
-
-    def set_gain(self, gain: str, joint: int, value: float) -> None:
-        """Set one of :data:`GAINS` of a joint, on every robot."""
-        gains = np.array(getattr(self.params, choice("gain", gain, GAINS)))
-        gains[:, joint] = value
-        self.params = self.params.replace(**{gain: gains})
 
     def set_setpoint(self, position: ArrayLike, *, joint: int | None = None) -> None:
         """Set setpoints [rad or m] of every robot: of one joint, or of all, (dof,) or (envs,
@@ -154,13 +136,14 @@ class Playback:
     Raises
     ------
     InvalidArgumentError
-        The run has more robots than fit on a page, or another number of joints than the robot; or
-        the recording holds no robot.
+        The run has no tick, more robots than fit on a page, or another number of joints than the
+        robot; or the recording holds no robot.
     """
 
     def __init__(
         self, rollout: Rollout, robot: Robot | None = None, *, period: float = 1 / 30
     ) -> None:
+        rollout.check_ticks()
         robot = recorded_robot(rollout) if robot is None else robot
         joints = rollout.qpos.shape[2]
         if joints != robot.dof:
@@ -184,16 +167,10 @@ class Playback:
         """Go to the first row."""
         self._now = 0.0
 
-    def seek(self, time: float) -> None:
-        """Go to a time [s] since the first row."""
-        self._now = min(max(0.0, time), self.duration)
-
     def advance(self) -> None:
         """Go to the next frame; after the last to the first."""
-        if self._now >= self.duration:
-            self.reset()
-        else:
-            self.seek(self._now + self.period)
+        ended = self._now >= self.duration
+        self._now = 0.0 if ended else min(self._now + self.period, self.duration)
 
     def frame(self) -> Rollout:
         """Return the state recorded at the present time, as a rollout of one tick."""

@@ -77,7 +77,7 @@ class Node:
             outcome = self._pool.run(request)
         except Exception as error:
             return _failure(error), None
-        self._pool.start_replay_from(None)
+        self._pool.replay.start_from(None)
         arrays = None
         if outcome.num_ticks:
             arrays = self._pool.arrays.at(slice(outcome.num_ticks))

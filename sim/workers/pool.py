@@ -2,8 +2,7 @@
 replays its requests.
 
 Every request that changes the loops is kept until the next checkpoint, a snapshot of all envs. A
-new worker gets the last checkpoint and all later requests. At a checkpoint all workers rebuild
-their scenes (:mod:`batchpid.sim.loop.snapshot`), so the replayed envs are bit-identical.
+new worker gets the last checkpoint and all later requests, so the replayed envs are bit-identical.
 
 A request that has begun must be completed. An exception other than WorkerLost, such as one from a
 signal handler, leaves the pool in an invalid state, and its owner must close it.
@@ -16,6 +15,8 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
+import numpy as np
+
 import batchpid as bp
 from batchpid.errors import ClosedError, SingleOwner
 from batchpid.sim.loop.arrays import Arrays
@@ -23,6 +24,7 @@ from batchpid.sim.loop.loop import Failure, order
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeInfo, NodeWorker
+from batchpid.sim.workers.replay import Replay
 from batchpid.sim.workers.requests import Build, Request, Start, split
 from batchpid.sim.workers.worker import (
     LocalWorker,
@@ -34,6 +36,8 @@ from batchpid.sim.workers.worker import (
 
 MAX_LOSSES = 5
 """Number of losses of one worker during the same request after which the pool gives up."""
+MOST_BYTES = 1 << 28
+"""Memory for commands that are kept for a replay [B]."""
 _MAX_STEPS = 8000
 """Sim steps times envs of one request to a worker: a fifth of a second."""
 _LEAST_STEPS = 64
@@ -116,7 +120,9 @@ class WorkerPool(SingleOwner):
         self.present = self._at(0)
         """Tick with the present observation."""
         self._request: Request = Build()
-        self._replay: list[Request] = []
+        row = 3 * options.command.size + options.robot.dof
+        self.replay = Replay(MOST_BYTES // (row * num_envs * np.dtype(float).itemsize))
+        """Requests for the replacement of a lost worker."""
         self.workers: list[Worker] = []
         """Workers in the order of their envs."""
         cores = pinned_cores(len(slices))
@@ -205,20 +211,11 @@ class WorkerPool(SingleOwner):
             failure = min(failures, key=order)
             count = failure.ticks if request.counts_ticks else 0
         elif request.changes_loop:
-            self._replay.append(request)
+            self.replay.append(request)
         if count:
             self.present = self._at(count - 1)
         # No constructor of a named tuple, which is a call of Python in the path of a tick.
         return tuple.__new__(Outcome, (results, failure, count, self.arrays, self._at))
-
-    def start_replay_from(self, request: Request | None) -> None:
-        """Replace the kept requests by ``request``, which brings a new worker to the present state;
-        its arrays must not change.
-        """
-        if request is None:
-            self._replay = [Build()]
-        else:
-            self._replay = [Build(), request]
 
     def close(self) -> None:
         """End all workers at once. May be called again, as after an interrupt."""
@@ -244,6 +241,10 @@ class WorkerPool(SingleOwner):
 
     def _replace(self, worker: Worker, loss: WorkerLost) -> Any:
         """Replace a lost worker; return the result of the new one for the present request."""
+        if not self.replay.requests:
+            problem = "its commands since the last checkpoint are too many to be replayed"
+            remedy = "reset all envs, or take a runner.snapshot(), now and then"
+            raise WorkerLost(f"{loss}; {problem}: {remedy}") from loss
         cause = str(loss)
         began = time.monotonic()
         for _ in range(1, self.max_losses):
@@ -251,7 +252,7 @@ class WorkerPool(SingleOwner):
             try:
                 worker.close()
                 worker.open()
-                for request in (*self._replay, self._request):
+                for request in (*self.replay.requests, self._request):
                     request.write(self.arrays, worker.envs)
                     worker.send(request)
                     result = worker.receive()

@@ -11,6 +11,7 @@ from itertools import pairwise
 from typing import Any, Self
 
 import batchpid as bp
+from batchpid.arrays.array_types import Bool
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options.options import RunnerOptions
@@ -31,6 +32,11 @@ class Request(ABC):
     """Further time that the request may take [s]."""
     counts_ticks = False
     """True if the ticks that every env completed before an error are kept."""
+
+    @property
+    def placed(self) -> Bool | None:
+        """Envs that the request resets (envs,)."""
+        return None
 
     def for_envs(self, envs: slice) -> Self:
         """Return the request for some envs: fields are arrays (envs, ...), None, or have this
@@ -88,7 +94,10 @@ class Start:
 class Build(Request):
     """Build the loop; each worker has the :class:`Start` of its loop."""
 
-    patience = 60.0  # mostly imports, from a disk that may be slow
+    # Every replay begins with its own.
+    changes_loop = False
+    patience = 60.0
+    """Mostly for imports, from a disk that may be slow."""
 
     def apply(self, loop: Loop) -> None:
         pass

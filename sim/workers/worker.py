@@ -21,6 +21,7 @@ import time
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 import cloudpickle
 
@@ -135,6 +136,7 @@ class ProcessWorker(Worker):
         self._message = pickled((start, shared.layout))
         self._end = contextlib.ExitStack()
         """Ends the process and closes its files."""
+        _workers.add(self)
 
     def open(self) -> None:
         paths = [path for path in sys.path if isinstance(path, str)]
@@ -165,11 +167,11 @@ class ProcessWorker(Worker):
                     start_new_session=True,
                 )
         assert process.stdin is not None
-        self._end.callback(process.stdin.close)
+        self._pipe = process.stdin
+        self._end.callback(self._pipe.close)
         self._end.callback(process.wait)
-        self._end.callback(
-            process.kill
-        )  # in a forked child of the caller, whose child this is not, of no effect
+        # In a forked child of the caller, whose child this is not, it has no effect.
+        self._end.callback(process.kill)
         self._answers = self._socket.makefile("rb")
         self.pid = process.pid
         if self._core is not None:
@@ -183,9 +185,9 @@ class ProcessWorker(Worker):
         self._deadline = time.monotonic() + limit
         self._socket.settimeout(limit)
         try:
-            self._socket.sendall(
-                self._message if type(request) is Build else request.encode(self.envs)
-            )
+            message = self._message if type(request) is Build else request.encode(self.envs)
+            # A worker that has died is an error here, where SIGPIPE would end the process.
+            self._socket.sendall(message, socket.MSG_NOSIGNAL)
         except OSError as error:
             self._raise_early(error)
             self._process.kill()  # receive() reports it
@@ -199,6 +201,13 @@ class ProcessWorker(Worker):
         if isinstance(result, Failure):
             return result.of_worker(f"worker {self.label}")
         return result
+
+    def let_go(self) -> None:
+        """Close the pipe in a forked child of the caller, which may live longer than the caller:
+        the pipe is to close when the caller ends.
+        """
+        if hasattr(self, "_pipe"):
+            self._pipe.close()
 
     def close(self) -> None:
         self._end.close()
@@ -223,6 +232,17 @@ class ProcessWorker(Worker):
             else:
                 cause = f"died (exit code {code})"
         return WorkerLost(f"worker {self.label} {cause}")
+
+
+_workers = WeakSet[ProcessWorker]()
+
+
+def _let_go() -> None:
+    for worker in _workers:
+        worker.let_go()
+
+
+os.register_at_fork(after_in_child=_let_go)
 
 
 def pickled(message: object) -> bytes:

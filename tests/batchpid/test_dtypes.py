@@ -82,6 +82,18 @@ def test_jax(seed, dtype, x64):
         assert dtypes(result) <= {"float64"}
 
 
+def test_a_controller_keeps_the_precision_that_it_was_built_with(x64):
+    jax = pytest.importorskip("jax")
+    params = bp.make_params(2, 3.0, ki=1.0)
+    pid = bp.BatchPID(params, 1, DT, backend="jax")
+    oracle = bp.BatchPID(params, 1, DT)
+    for wide in (True, False):
+        jax.config.update("jax_enable_x64", wide)
+        effort = np.asarray(pid(1.0, np.full((1, 2), 0.1)))
+        assert effort.dtype == np.float64
+        np.testing.assert_allclose(effort, oracle(1.0, np.full((1, 2), 0.1)), rtol=1e-14)
+
+
 def test_operational_space():
     tree = tree_of("panda")
     qpos = np.zeros((2, tree.dof), np.longdouble)

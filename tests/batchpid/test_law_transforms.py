@@ -3,6 +3,7 @@ NumPy's.
 """
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -71,6 +72,35 @@ def test_scan_vmap_and_grad(inputs, x64):
     assert not np.allclose(many[1], many[0])
     assert jax.tree.structure(gradients) == jax.tree.structure(params)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+
+
+@pytest.mark.parametrize("transform", ["vmap", "export"])
+def test_functions_of_one_robot(transform, inputs, x64):
+    """Arrays (joints,) in, arrays (joints,) out: under vmap, and from a serialized program."""
+    params = bp.make_params(JOINTS, kp=40.0, ki=5.0, kd=2.0, effort_limit=9.0, setpoint_weight=0.7)
+    expected = numpy_rollout(params, inputs.setpoint, inputs.measurement)
+
+    def last_state(setpoint, measurement):
+        state = bp.init(params, measurement[0])
+        return jax.lax.scan(
+            lambda state, now: bp.step(params, state, *now, DT), state, (setpoint, measurement)
+        )
+
+    if transform == "export":
+        one = [jnp.asarray(array[:, 0]) for array in (inputs.setpoint, inputs.measurement)]
+        program = jax.export.export(jax.jit(last_state))(*one)
+        state, efforts = jax.export.deserialize(program.serialize()).call(*one)
+        expected, reset_shape = expected[:, 0], ()
+    else:
+        state, efforts = jax.vmap(last_state, 1, (0, 1))(inputs.setpoint, inputs.measurement)
+        reset_shape = (expected.shape[1],)
+    np.testing.assert_allclose(efforts, expected, rtol=1e-12, atol=1e-11)
+    assert isinstance(state, bp.PIDState)
+    # A reset by a mask () of one robot.
+    mask = jnp.zeros(reset_shape, bool)
+    reset = lambda state, mask: bp.reset(params, state, state.origin, mask)  # noqa: E731
+    kept = jax.vmap(reset)(state, mask) if reset_shape else reset(state, mask)
+    assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), kept, state))
 
 
 @pytest.mark.parametrize("options", GRADIENTS, indirect=True)

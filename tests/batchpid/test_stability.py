@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid import spectral_radius, stability_bound
-from batchpid.gains import oscillation
 
 DT = 1 / 2000
 
@@ -62,37 +61,6 @@ def test_stacks():
     bound = stability_bound(mass, [1.0, 1.0], [100.0, 1.0], DT)
     assert bound.ratio[0] == pytest.approx(2 * bound.ratio[1])
     np.testing.assert_allclose(bound.participation, [[1, 0], [1, 0]])
-
-
-@settings(max_examples=25)
-@given(st.floats(0.02, 0.6), st.floats(0.3, 3.0), st.floats(0.01, 10.0))
-def test_the_least_damped_oscillation_of_one_joint(zeta, hertz, inertia):
-    """Of I q'' = -I w^2 q - 2 zeta w I q', as long as it lasts."""
-    w = 2 * np.pi * hertz
-    found = oscillation([[inertia]], inertia * w**2, 0.0, 2 * zeta * w * inertia, 1e-4)
-    if -np.log(0.02) / (zeta * w) > 1.01:
-        assert found.damping_ratio == pytest.approx(zeta, abs=2e-3)
-        assert found.frequency == pytest.approx(hertz * np.sqrt(1 - zeta**2), rel=5e-3)
-    elif -np.log(0.02) / (zeta * w) < 0.99:
-        assert (found.damping_ratio, found.frequency) == (1, 0)
-    assert found.participation.sum() == pytest.approx(1)
-
-
-def test_the_oscillation_is_that_of_its_joint():
-    mass = np.tile(np.diag([1.0, 2.0]), (3, 1, 1))
-    found = oscillation(
-        mass, [40.0, 40.0], [0.0, 0.0], [[12.0, 0.5], [0.5, 12.0], [12.0, 12.0]], 1e-3
-    )
-    np.testing.assert_allclose(found.participation[:2], [[0, 1], [1, 0]], atol=1e-9)
-    assert (found.damping_ratio[:2] < 0.05).all()
-    assert found.damping_ratio[2] > 0.5
-
-
-def test_an_integral_that_is_too_fast_rings_and_grows():
-    ratios = [
-        oscillation([[1.0]], 40.0, ki, 4.0, 1e-3).damping_ratio for ki in (20.0, 120.0, 200.0)
-    ]
-    assert ratios[0] > ratios[1] > 0 > ratios[2]
 
 
 def test_the_joint_whose_motor_is_late_is_in_the_mode_that_becomes_unstable():

@@ -22,7 +22,7 @@ from batchpid.sim import (
     write_recording,
 )
 from batchpid.sim.identification import identify
-from batchpid.sim.tuning import step_response_metrics
+from batchpid.sim.tuning.evaluation import step_response_metrics
 
 N, LENGTH = 5, 1.0
 """Envs, and length of each link [m]; both joints turn about y, and the arm hangs up along z at

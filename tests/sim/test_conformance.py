@@ -80,7 +80,9 @@ class Feature(NamedTuple):
     repeats: bool = True
     """Whether a second episode is bit-identical: not with noise."""
     exact: bool = False
-    """Whether results are bit-identical with and without native code, instead of close."""
+    """Whether results are bit-identical with and without native code, instead of close; in MuJoCo
+    without drives they differ by rounding, since native code has its own steps.
+    """
     alike: bool = True
     """Whether the engines agree on the motion: not in contact, nor under large efforts or drives at
     their limits.
@@ -423,8 +425,12 @@ def in_python(case: tuple[str, str]) -> None:
         with make(case) as runner:
             assert "native calls into" not in runner.backend
             result = program(runner, case)
-    check = check_equal if FEATURES[case[0]].exact else functools.partial(check_close, atol=1e-6)
-    check(reference(case), result)
+    feature = FEATURES[case[0]]
+    rounds = case[1] == "mujoco" and feature.options.get("control") != "drive"
+    if feature.exact and not rounds:
+        check_equal(reference(case), result)
+    else:
+        check_close(reference(case), result, 1e-7 if feature.exact else 1e-6)
 
 
 def in_numpy(case: tuple[str, str]) -> None:

@@ -30,7 +30,7 @@ from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.sim import Robot, Runner, Snapshot
 from batchpid.sim.identification import read_logs
 from batchpid.sim.recording.setpoint_files import read_setpoints
-from batchpid.sim.tuning import load_randomization
+from batchpid.sim.tuning.evaluation import load_randomization
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of unusual values
 JOINTS = list(ARM.joint_names)

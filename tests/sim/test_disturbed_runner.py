@@ -9,6 +9,8 @@ import gc
 import os
 import random
 import signal
+import subprocess
+import sys
 import threading
 import time
 import warnings
@@ -193,6 +195,52 @@ def test_a_lost_worker_is_named_and_the_others_stay() -> None:
         assert runner.time == 2 * SUBSTEPS * runner.timestep
 
 
+WITH_SIGPIPE = """
+import os, signal, sys, time, warnings
+from batchpid.sim import Robot, Runner
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+warnings.simplefilter("ignore")
+robot = Robot.load("panda")
+with Runner(robot, 1, workers=1, engine="mujoco") as runner:
+    os.kill(runner.pids[0], signal.SIGKILL)
+    time.sleep(0.3)
+    runner.step(robot.start)
+    print(runner.recoveries)
+"""
+WITH_CHILD = """
+import os, sys, time
+from batchpid.sim import Robot, Runner
+robot = Robot.load("panda")
+runner = Runner(robot, 2, workers=2, engine="mujoco")
+child = os.fork()
+if child == 0:
+    time.sleep(600)
+print(child, *runner.pids, flush=True)
+time.sleep(600)
+"""
+
+
+def start(program: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", program]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
+def test_a_dead_worker_does_not_end_a_caller_with_sigpipe_at_its_default() -> None:
+    with start(WITH_SIGPIPE) as process:
+        assert process.communicate()[0].split() == ["1"]
+
+
+def test_a_forked_child_does_not_keep_the_workers_of_a_killed_caller() -> None:
+    with start(WITH_CHILD) as process:
+        assert process.stdout is not None
+        child, *workers = map(int, process.stdout.readline().split())
+        process.kill()
+    try:
+        assert have_ended(workers)
+    finally:
+        os.kill(child, signal.SIGKILL)
+
+
 def test_closing_does_not_wait_for_a_worker_that_is_stopped_in_a_tick() -> None:
     # The time limit of a test is shorter than that of the request.
     with Runner(ROBOT, N, workers=2, timeout=3600.0) as runner:
@@ -231,7 +279,19 @@ def test_a_request_that_kills_every_worker_is_given_up(monkeypatch, tmp_path) ->
     assert runner.closed
 
 
-def test_only_the_requests_since_the_last_checkpoint_are_replayed(tmp_path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("engine", "resets", "replayed"),
+    [
+        ("mujoco", {}, 10),
+        # Env 0 is reset at 20 and 30 sim steps, env 1 at 25: from a checkpoint at 20.
+        ("sapien", {4: [0], 5: [1], 6: [0]}, 30),
+        ("sapien", {4: [0], 6: [0]}, 50),
+        ("sapien", {4: [0, 1]}, 30),
+    ],
+)
+def test_only_the_requests_since_the_last_checkpoint_are_replayed(
+    tmp_path, monkeypatch, engine, resets, replayed
+) -> None:
     monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 20)
     path = tmp_path / "steps"
 
@@ -239,14 +299,66 @@ def test_only_the_requests_since_the_last_checkpoint_are_replayed(tmp_path, monk
         with path.open("ab") as file:
             file.write(b".")
 
-    with acting(write_a_dot, 1) as runner:
-        for _ in range(9):
-            runner.step(ROBOT.start)  # checkpoints after 20 and 40 sim steps
+    with acting(write_a_dot, 1, engine=engine) as runner:
+        # In MuJoCo checkpoints come after 20 and 40 sim steps.
+        for tick in range(9):
+            if tick in resets:
+                runner.reset(mask=np.isin([0, 1], resets[tick]))
+            runner.step(ROBOT.start)
         before = path.stat().st_size
         send(runner.pids[0], signal.SIGKILL)
         with pytest.warns(RecoveryWarning):
             runner.step(ROBOT.start)
-    assert (before, path.stat().st_size - before) == (45, 10)
+    assert (before, path.stat().st_size - before) == (45, replayed)
+
+
+DOG = Robot.load("quadruped", fixed_base=False)
+WALK = DOG.start + 0.15 * np.sin(np.arange(24))[:, None, None] * np.ones((1, 3, DOG.dof))
+
+
+def test_an_episode_in_contact_does_not_depend_on_the_time_before_it(engine, monkeypatch) -> None:
+    """Neither do checkpoints change it, of which there are several."""
+    monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 60)
+    episodes = []
+    for ticks in (1, 2, 5):
+        with Runner(DOG, 3, workers=0, engine=engine) as runner:
+            runner.rollout(WALK[:ticks])
+            runner.reset()
+            episodes.append(runner.rollout(WALK))
+    assert np.ptp(episodes[0].qpos, axis=0).max() > 1e-3
+    for episode in episodes[1:]:
+        assert_identical(episode.observation, episodes[0].observation)
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
+def test_a_replay_from_resets_of_some_envs_in_contact(engine, monkeypatch) -> None:
+    monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 60)
+    masks = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 1], [0, 1, 0], [0, 0, 0]], bool)
+    with (
+        Runner(DOG, 3, workers=2, engine=engine) as runner,
+        Runner(DOG, 3, workers=0, engine=engine) as model,
+    ):
+        for number, mask in enumerate(masks):
+            send(runner.pids[number % 2], signal.SIGKILL)
+            part = slice(4 * number, 4 * number + 4)
+            for each in (runner, model):
+                if mask.any():
+                    each.reset(mask=mask)
+            assert_identical(runner.rollout(WALK[part]), model.rollout(WALK[part]))
+
+
+def test_a_run_whose_commands_are_too_many_cannot_be_replayed(monkeypatch) -> None:
+    monkeypatch.setattr("batchpid.sim.workers.pool.MOST_BYTES", 4 * 8 * N * ROBOT.dof * 8)
+    with make(1, engine="sapien") as runner:
+        runner.rollout(np.tile(NEAR, (20, 1)))
+        runner.snapshot()
+        send(runner.pids[0], signal.SIGKILL)
+        with pytest.warns(RecoveryWarning):
+            runner.step(NEAR)
+        runner.rollout(np.tile(NEAR, (20, 1)))
+        send(runner.pids[0], signal.SIGKILL)
+        with pytest.raises(WorkerError, match=r"too many to be replayed: .*runner\.snapshot"):
+            runner.step(NEAR)
 
 
 # -- Ctrl-C and other signals

@@ -54,7 +54,7 @@ class ListRecorder:
     def prepare(self):
         pass
 
-    def append(self, time_, command, observation):
+    def append(self, time_, command, observation, changes):
         self.rows.append((time_, command.setpoint, observation))
 
 

@@ -1,5 +1,10 @@
 """Gymnasium environments: Gymnasium's own checks, and the vector env against single envs."""
 
+import importlib.util
+import sys
+import types
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -307,7 +312,6 @@ def test_a_hook_of_a_wrong_shape_is_named(hook):
     env.close()
 
 
-@pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
 def test_increments_are_followed_closely():
     """After half a second of constant increments, joints are at most 20 ms behind the setpoint."""
     rate = 0.25  # [rad/s]
@@ -321,3 +325,42 @@ def test_increments_are_followed_closely():
     behind = rate - np.abs(observation[0, :7] - start)
     assert np.abs(behind).max() < 0.02 * rate
     envs.close()
+
+
+@pytest.fixture
+def without_torch(monkeypatch):
+    """Packages of Stable-Baselines3 whose own imports, PyTorch among them, are left out."""
+    spec = importlib.util.find_spec("stable_baselines3")
+    if spec is None:
+        pytest.skip("needs stable-baselines3; without PyTorch: pip install --no-deps")
+    folder = Path(spec.submodule_search_locations[0])
+    for name in ("", "common", "common/vec_env"):
+        module = types.ModuleType(".".join(["stable_baselines3", *name.split("/")]).rstrip("."))
+        module.__path__ = [str(folder / name)]
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+
+
+@pytest.mark.usefixtures("without_torch")
+def test_stable_baselines3_gets_the_same_steps_and_the_last_observations():
+    from batchpid.sim.gym import SB3VecEnv
+
+    options = {"num_envs": 2, "workers": 0, "max_episode_steps": 3, "autoreset_mode": "SameStep"}
+    with pytest.raises(InvalidArgumentError, match="do not reset within a step"):
+        SB3VecEnv(gymnasium.make_vec(ID, num_envs=1, workers=0))
+    plain = gymnasium.make_vec(ID, **options)
+    adapted = SB3VecEnv(gymnasium.make_vec(ID, **options))
+    adapted.seed(7)
+    assert data_equivalence(adapted.reset(), plain.reset(seed=[7, 8])[0])
+    assert adapted.env_is_wrapped(object) == [False, False]
+    for step in range(5):
+        action = plain.action_space.sample()
+        observation, reward, terminated, truncated, info = plain.step(action)
+        found, rewards, ends, infos = adapted.step(action)
+        np.testing.assert_array_equal(found, observation)
+        np.testing.assert_allclose(rewards, reward, rtol=1e-6)
+        assert ends.tolist() == (terminated | truncated).tolist() == [step == 2] * 2
+        if step == 2:
+            assert infos[1]["TimeLimit.truncated"]
+            np.testing.assert_array_equal(infos[1]["terminal_observation"], info["final_obs"][1])
+    adapted.close()
+    plain.close()

@@ -56,8 +56,8 @@ def test_a_flag_of_an_option_has_its_default_and_reaches_the_runner():
     flags = {each.name: each.default for each in fields(RunnerKeywords) if DECLARED[each.name].flag}
     _, values = parse(["rollout"])
     assert flags.items() <= vars(values).items()
-    _, values = parse(["rollout", "--ground", "off", "--workers", "2", "--backend", "jax"])
-    assert (values.ground, values.workers, values.backend) == ("off", 2, "jax")
+    _, values = parse(["rollout", "--workers", "2", "--engine", "mujoco"])
+    assert (values.workers, values.engine) == (2, "mujoco")
 
 
 def test_every_option_is_documented_where_it_is_declared():

@@ -130,20 +130,3 @@ def test_a_recording_holds_the_distributions_and_the_draws(tmp_path):
     part = info.for_envs(np.array([1]))
     np.testing.assert_array_equal(part.draws["payload"], draws["payload"][[1]])
     np.testing.assert_array_equal(part.episodes, [[1, 1]])
-
-
-def test_a_recording_holds_the_episodes_that_begin_in_it(tmp_path):
-    with make() as runner:
-        with Recorder(tmp_path / "run.h5", runner):
-            runner.rollout(setpoints())
-            runner.reset(mask=np.arange(N) == 4)
-            runner.rollout(setpoints())
-        draws, order = runner.draws, runner.episodes
-    info = read_recording(tmp_path / "run.h5").info
-    (begun,) = info.redraws
-    assert begun == (pytest.approx(0.005 * (TICKS + 1)), 4, 4, 1)
-    again = Randomization.from_dict(info.randomization).draw(PANDA, order)
-    for name, rows in again.values.items():
-        np.testing.assert_array_equal(rows, draws[name], name)
-    assert info.for_envs(np.array([4, 5])).redraws == ((begun.time, 0, 4, 1),)
-    assert info.for_envs(np.array([1])).redraws == ()

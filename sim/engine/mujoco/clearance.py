@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Float64, MjData, MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.mujoco.speed_bounds import speed_bounds
-from batchpid.sim.engine.native.interface import Clearance
+from batchpid.sim.engine.mujoco.vectors import aligned
+from batchpid.sim.engine.native.interface import WIDTH, Clearance
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -51,7 +52,6 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
         return None
     bodies = model.geom_bodyid[pairs]
     arms, travel = _arms(robot, bodies)
-    at = arms > 0
     meshes = model.geom_dataid
     hulls = np.zeros((model.ngeom, 2), np.int32)
     hulls[meshes >= 0] = np.stack([model.mesh_vertadr, model.mesh_vertnum], axis=1)[
@@ -65,11 +65,16 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
         "vertices": model.mesh_vert.astype(float).reshape(-1, 3),
         "pairs": pairs,
         "bodies": bodies.astype(np.int32),
-        "arms": arms[at],
-        "arm_ways": at.nonzero()[1].astype(np.int32),
-        "begins": np.cumsum([0, *at.sum(axis=1)], dtype=np.int32),
+        "arms": _vectors(arms),
         "travel": travel,
     }
+
+
+def _vectors(arms: Float64) -> Float64:
+    """Return the arms of all pairs, with zeros for those beyond the last (ways, blocks, WIDTH)."""
+    padded = aligned(arms.shape[1], -(-len(arms) // WIDTH), WIDTH)
+    padded.reshape(arms.shape[1], -1)[:, : len(arms)] = arms.T
+    return padded
 
 
 def touching_pairs(model: MjModel) -> NDArray[np.int32]:
@@ -192,15 +197,15 @@ class GroupClearance:
         pairs = len(tables["pairs"])
         bodies = models[0].nbody
         floats = bool((models[0].jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
-        ways = dof + 2 * floats
+        blocks, ways = -(-robots // WIDTH), dof + 2 * floats
         arrays = tables | {
             # Native code reads the places of shapes where MuJoCo writes them.
             "models": np.array([model._address for model in models], np.uint64),
             "places": np.array([scene.geom_xpos.ctypes.data for scene in data], np.uint64),
             "turns": np.array([scene.geom_xmat.ctypes.data for scene in data], np.uint64),
-            "moved": np.zeros((robots, ways)),
-            "rate": np.zeros((robots, ways)),
-            "last": np.zeros((robots, dof + 7 * floats)),
+            "last": aligned(blocks, dof, WIDTH),
+            "shares": aligned(blocks, 3, WIDTH),
+            **{name: aligned(blocks, ways, WIDTH) for name in ("moved", "rate", "near_rate")},
             "open": np.zeros((robots, bodies), np.int8),
             "left": np.zeros((robots, pairs), np.uint16),
             "wait": np.ones(robots, np.int32),
@@ -211,6 +216,8 @@ class GroupClearance:
             "near": np.full((robots, _MOST_NEAR), -1, np.int32),
             "age": np.full(robots, _NEVER, np.int32),
         }
+        if floats:
+            arrays["poses"] = np.zeros((robots, 7))
         self.arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         # Native code has their addresses.
         self._kept = [*models], data
@@ -221,7 +228,6 @@ class GroupClearance:
             ways=ways,
             size=bodies,
             contact=_NO_CONTACT,
-            floats=floats,
             **dict(fields),
             **{name: array.ctypes.data for name, array in self.arrays.items()},
         )

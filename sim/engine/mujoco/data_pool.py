@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel
+from batchpid.sim.engine.mujoco.free_motion import FreeMotions
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import FARTHEST
 
@@ -44,7 +45,7 @@ class DataPool:
         self.model = copy.copy(robot.model)
         self._data = list[MjData]()
         self._taken = list[MjData]()
-        self._rows: Float64 | None = None
+        self._owner: object = None
         self._initial = np.empty(mujoco.mj_stateSize(robot.model, STATE))
         (data,) = self._new(1)
         rest(robot.model, data)
@@ -61,11 +62,11 @@ class DataPool:
         of the previous pack are first saved to its rows. The robots ``placed`` get another state
         next, and are not updated here.
         """
-        if self._rows is not rows:
-            if self._rows is not None:
-                for data, row in zip(self._taken, self._rows, strict=True):
+        if self._owner is not rows:
+            if isinstance(self._owner, np.ndarray):
+                for data, row in zip(self._taken, self._owner, strict=True):
                     mujoco.mj_getState(self.model, data, row, STATE)
-            self._rows = rows
+            self._owner = rows
             self._taken = self._new(len(rows))
             # MuJoCo warns of states that are not finite, and the loop finds them by itself.
             qpos = rows[:, POSITIONS : POSITIONS + self.model.nq]
@@ -77,10 +78,18 @@ class DataPool:
                     mujoco.mj_step1(model, data)
         return self._taken
 
-    def leave(self, rows: Float64) -> None:
-        """Forget the states ``rows``."""
-        if self._rows is rows:
-            self._rows = None
+    def lend(self, robots: FreeMotions) -> list[MjData]:
+        """Return data of ``robots``, which hold their states themselves."""
+        if self._owner is not robots:
+            self._owner = robots
+            self._taken = self._new(robots.size)
+            robots.forget_contacts()
+        return self._taken
+
+    def leave(self, owner: object) -> None:
+        """Forget the states of the rows or robots ``owner``."""
+        if self._owner is owner:
+            self._owner = None
 
     def _new(self, size: int) -> list[MjData]:
         self._data += [mujoco.MjData(self.robot.model) for _ in range(size - len(self._data))]

@@ -18,9 +18,10 @@ import numpy as np
 from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.findings import Notes
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.mjcf_model import RobotInFile, compile_scene
-from batchpid.sim.robot.mjcf_reader import home
+from batchpid.sim.robot.mjcf.model import RobotInFile, compile_scene
+from batchpid.sim.robot.mjcf.reader import home
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.task_space.frames import inverse, matrix_of, rotate
 
@@ -81,7 +82,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
         raise RobotError(
             f"{file.path}: has changed since the robot was loaded; load the robot again"
         )
-    names = RobotInFile(model, Path(file.path), [])
+    names = RobotInFile(model, Path(file.path), Notes([], []))
     robot = {body: name for body, name in names.bodies.items() if names.is_of_robot(body)}
     for joint in scene.joints:
         joint.name = names.joints.get(joint.id, joint.name)
@@ -135,8 +136,13 @@ def set_ground(scene: MjSpec, ground: bool) -> None:
     one at height 0.
     """
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    planes = [geom for geom in scene.worldbody.geoms if geom.type == plane]
-    planes = [geom for geom in planes if geom.contype or geom.conaffinity]
+    # A <pair> makes geoms collide whatever their masks say.
+    paired = {name for pair in scene.pairs for name in (pair.geomname1, pair.geomname2)}
+    planes = [
+        geom
+        for geom in scene.worldbody.geoms
+        if geom.type == plane and (geom.contype or geom.conaffinity or geom.name in paired)
+    ]
     if ground and not planes:
         added = scene.worldbody.add_geom(type=plane, size=[0, 0, 1])
         plain = mujoco.MjSpec().worldbody.add_geom()
@@ -146,6 +152,9 @@ def set_ground(scene: MjSpec, ground: bool) -> None:
     if not ground:
         for geom in planes:
             geom.contype = geom.conaffinity = 0
+        for pair in list(scene.pairs):
+            if {pair.geomname1, pair.geomname2} & {geom.name for geom in planes}:
+                scene.delete(pair)
 
 
 def _start(model: MjModel) -> Document:

@@ -13,9 +13,9 @@ import numpy as np
 from lxml import etree
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Float64, MjModel, MjSpec
+from batchpid.arrays.array_types import Bool, MjModel, MjSpec
 from batchpid.errors import InvalidArgumentError, RobotError
-from batchpid.export.differences import Drive, Exported, joint_values
+from batchpid.export.differences import Exported, Law, differences, export_law
 from batchpid.law.params import PIDParams, make_params
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.friction import Friction
@@ -24,8 +24,8 @@ from batchpid.sim.engine.mujoco.actuator_export import FAR, MjcfActuators, numbe
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
+from batchpid.sim.geometry.inertia import nearest_physical
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.inertia import nearest_physical
 from batchpid.sim.robot.robot_model import base_start
 from batchpid.task_space.frames import SpatialInertia
 
@@ -71,29 +71,20 @@ def to_mjcf(
     RobotError
         MuJoCo cannot build the robot.
     """
-    if params is None:
-        law = make_params(robot.dof, 0.0, measurement_rate="measured")
-    else:
-        law = params
+    has_law = params is not None
     if guard is not None:
         guard.check(1, robot.joint_names)
-        if params is None:
+        if not has_law:
             raise InvalidArgumentError(
                 "guard",
                 "needs a law, whose setpoints it limits",
                 remedy="pass params, or leave it out",
             )
-    drive = Drive(law, robot.joint_names, dt, inertia, actuators)
-    spec = SceneSpec(
-        robot.tables,
-        robot.ignored_pairs,
-        robot.joints,
-        drive.dt,
-        SOLVERS["accurate"],
-        dissipation=robot.dissipation,
-        ground=robot.has_ground,
-        fixed_base=robot.fixed_base,
-    )
+    if params is None:
+        params = make_params(robot.dof, 0.0, measurement_rate="measured")
+    law = export_law(params, robot.joint_names, dt, inertia, actuators, guard, has_law)
+    sentences = differences(law, "mjcf", robot.independent)
+    spec = SceneSpec.of(robot, law.dt, SOLVERS["accurate"], ground=robot.has_ground)
     # The bodies are those that the engine simulates; inertias and efforts are then written with all
     # their digits.
     scene, names = robot_spec(spec)
@@ -101,16 +92,18 @@ def to_mjcf(
     # Our engine switches off effects that the loop computes. Other programs need them.
     scene.option.disableflags = 0
     for row in spec.simulated.bodies:
-        _set_inertia(scene.body(names[row.name]), row.spatial_inertia, row.name, drive)
-    motors = MjcfActuators(drive, robot.independent, params is not None, guard)
-    motors.compare(robot.continuous)
-    _set_joints(
-        scene,
-        robot,
-        drive,
-        added_friction(own_friction(spec), drive.actuators),
-        motors.effort_range,
-    )
+        inertia_kept = _set_inertia(scene.body(names[row.name]), row.spatial_inertia)
+        if not inertia_kept:
+            text = f"the nearest possible tensor instead of that of link {row.name!r}"
+            sentences.append(f"inertia: {text}")
+    motors = MjcfActuators(law, robot.independent)
+    friction = added_friction(own_friction(spec), law.actuators)
+    _set_joints(scene, robot, law, friction)
+    if np.any(friction.coulomb):
+        text = "a soft constraint in MuJoCo, in which a joint creeps under smaller efforts"
+        sentences.append(f"friction: {text}")
+    if followers := [robot.joint_names[joint] for joint in robot.coupling.followers]:
+        sentences.append(f"followers: soft constraints in MuJoCo: {', '.join(followers)}")
     try:
         # Actuators are added to the text, which then has all their digits.
         scene.compile()
@@ -122,45 +115,42 @@ def to_mjcf(
     except ValueError as error:
         raise RobotError(f"MuJoCo cannot build the robot: {error}; correct the URDF") from error
     # The model gives the sizes and places of the keyframe's rows.
-    etree.SubElement(etree.SubElement(root, "keyframe"), "key", _start(model, robot, motors))
+    etree.SubElement(
+        etree.SubElement(root, "keyframe"), "key", _start(model, robot, has_law, motors.has_rate)
+    )
     etree.indent(root)
     # The tables of an MJCF robot hold the robot alone.
     if robot.mjcf is not None:
-        drive.append(
-            "scene: the robot alone, without objects, tendons, springs and equalities of its MJCF"
-            " file"
-        )
-    head = "".join(
-        f"<!-- differs: {' '.join(text.split()).replace('--', '- -')} -->\n" for text in drive
-    )
-    return Exported(f"{head}{etree.tostring(root, encoding='unicode')}\n", tuple(drive))
+        text = "the robot alone, without objects, tendons, springs and equalities of its MJCF file"
+        sentences.append(f"scene: {text}")
+    head = "".join(f"<!-- differs: {text.replace('--', '- -')} -->\n" for text in sentences)
+    return Exported(f"{head}{etree.tostring(root, encoding='unicode')}\n", tuple(sentences))
 
 
-def _set_inertia(
-    body: Any,
-    inertia: SpatialInertia,
-    link: str,
-    drive: Drive,
-) -> None:
-    """Set the inertia of a body: the nearest of a physical body, which MuJoCo requires."""
+def _set_inertia(body: Any, inertia: SpatialInertia) -> bool:
+    """Set the inertia of a body to the nearest of a physical body, which MuJoCo requires; return
+    whether that is its own.
+    """
     low, middle, high = np.linalg.eigvalsh(inertia.tensor)
-    if low <= 0 or low + middle < high:
+    is_physical = low > 0 and low + middle >= high
+    if not is_physical:
         inertia = inertia._replace(tensor=nearest_physical(inertia.tensor * (1 + 1e-9)))
-        drive.append(f"inertia: the nearest possible tensor instead of that of link {link!r}")
     body.inertia, body.iquat = principal_inertia(inertia)
+    return bool(is_physical)
 
 
 def _set_joints(
     scene: MjSpec,
     robot: RobotDescription,
-    drive: Drive,
+    law: Law,
     friction: Friction,
-    effort_range: Float64,
 ) -> None:
     """Set damping, friction, armature and effort limits of the joints, and tie the followers."""
-    rubs = joint_values(friction.coulomb, robot.dof, 0.0)
-    damping = joint_values(friction.viscous, robot.dof, 0.0)
-    armature = drive.motor("armature")
+    still = np.zeros(robot.dof)
+    rubs = still if friction.coulomb is None else friction.coulomb[0]
+    damping = still if friction.viscous is None else friction.viscous[0]
+    armature = law.column("armature")
+    effort_range = law.effort_range.T
     for at, name in enumerate(robot.joint_names):
         joint = scene.joint(name)
         joint.armature = armature[at]
@@ -178,15 +168,14 @@ def _set_joints(
         tie.name2 = robot.joint_names[coupling.leader[follower]]
         figures = [coupling.offset[follower], coupling.multiplier[follower]]
         tie.data = np.pad(figures, (0, len(tie.data) - 2))
-    if rubs.any():
-        drive.append(
-            "friction: a soft constraint in MuJoCo, in which a joint creeps under smaller efforts"
-        )
-    if names := [robot.joint_names[joint] for joint in coupling.followers]:
-        drive.append(f"followers: soft constraints in MuJoCo: {', '.join(names)}")
 
 
-def _start(model: MjModel, robot: RobotDescription, motors: MjcfActuators) -> dict[str, str]:
+def _start(
+    model: MjModel,
+    robot: RobotDescription,
+    has_law: bool,
+    has_rate: Bool,
+) -> dict[str, str]:
     """Return the keyframe "home": the start pose as positions and setpoints."""
     qpos = model.qpos0.copy()
     ctrl = np.zeros(model.nu)
@@ -196,9 +185,9 @@ def _start(model: MjModel, robot: RobotDescription, motors: MjcfActuators) -> di
     for at, name in enumerate(robot.joint_names):
         qpos[model.joint(name).qposadr] = robot.start[at]
     for actuator, joint in enumerate(np.flatnonzero(robot.independent)):
-        if motors.is_law:
+        if has_law:
             ctrl[model.actuator_ctrladr[actuator]] = robot.start[joint]
-        if motors.has_rate[joint]:  # the setpoint is the first of the states
+        if has_rate[joint]:  # the setpoint is the first of the states
             act[model.actuator_actadr[actuator]] = robot.start[joint]
     columns = {"qpos": qpos, "ctrl": ctrl, "act": act}
     return {"name": "home"} | {key: numbers_text(*row) for key, row in columns.items() if row.any()}

@@ -6,12 +6,14 @@ Longer than 350 lines because that is the whole interface between loop and engin
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Bool, Float64, MjData, Rows
 from batchpid.motors import Actuators
@@ -19,6 +21,7 @@ from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ORIGIN, ModelPack
 from batchpid.sim.engine.mujoco.data_pool import STATE, DataPool, rest
 from batchpid.sim.engine.mujoco.file_scene import check_links
+from batchpid.sim.engine.mujoco.free_motion import FreeMotions, place_of_contacts
 from batchpid.sim.engine.mujoco.model_builder import (
     FLOATING,
     LARGEST_FORCE,
@@ -51,8 +54,6 @@ class MujocoPack(ModelPack):
     Implements :class:`batchpid.sim.engine.protocol.EnginePack`.
     """
 
-    state_is_complete = True
-
     def __init__(
         self,
         spec: SceneSpec,
@@ -74,9 +75,6 @@ class MujocoPack(ModelPack):
                 size, coupling, np.zeros(self.dof, bool), spec.timestep
             )
             self._constraint.implicit[...] = spec.timestep * (0.0 if viscous is None else viscous)
-            if self.steps_natively:
-                reads = spec.fixed_base and self.steps_read_force(True, True)
-                self._constraint.use(self.joint_model, None if reads else self._bias_model)
         if spec.mjcf is not None:
             links = *(spec.contacts or ()), *(spec.wrenches or ()), spec.carrier
             check_links(spec, spec.mjcf, filter(None, links))
@@ -94,27 +92,52 @@ class MujocoPack(ModelPack):
         self._sensed = np.zeros((self.size, self._sensors.size))
         self.models, self.rows = [self._pool.model] * self.size, self._pool.initial(self.size)
         self._at, self._moves = robot.qpos, robot.qvel
+        self._free: FreeMotions | None = None
+        if self.steps_natively and self._moves_freely:
+            self._free = FreeMotions(robot, self.size, self.joint_model)
+        if self._constraint is not None and self.steps_natively:
+            reads = self.spec.fixed_base and self.steps_read_force(True, True)
+            is_read = reads and self._free is None
+            self._constraint.use(self.joint_model, None if is_read else self._bias_model)
         self._change_world(range(self.size))
         self._change_masses(range(self.size))
         self._update(range(self.size))
 
     @property
+    def _moves_freely(self) -> bool:
+        """Whether a robot that touches nothing is a tree of rigid bodies on a fixed base, under
+        efforts alone.
+        """
+        spec = self.spec
+        is_tree = spec.fixed_base and spec.mjcf is None and self.dof > 0
+        has_parts = self._robot.model.nu > 0 or spec.wrenches
+        return is_tree and not has_parts and place_of_contacts() is not None
+
+    @property
     def data(self) -> list[MjData]:
         """``mujoco.MjData`` of each robot, in its state."""
-        data: list[Any] = self._pool.take(self.models, self.rows)
+        if self._free is None:
+            return self._pool.take(self.models, self.rows)
+        data = self._pool.lend(self._free)
+        for row, (model, own) in enumerate(zip(self.models, data, strict=True)):
+            self._free.show(row, model, own)
         return data
 
     def _update(self, rows: Iterable[int]) -> None:
         """Compute all that follows from the states of robots ``rows``, after a change of models."""
-        self._evaluate(rows)
+        if self._free is None:
+            self._evaluate(rows)
+        else:
+            self._free.use(self.models)
         self._calls: object = object()
         self._own_step: MujocoStep | None = None
 
     def _evaluate(self, rows: Iterable[int]) -> None:
         """Compute all that follows from the states of robots ``rows``."""
         data = self.data
-        for row in rows:
-            mujoco.mj_step1(self.models[row], data[row])
+        with _without_warnings():
+            for row in rows:
+                mujoco.mj_step1(self.models[row], data[row])
 
     def _own_model(self, row: int) -> Any:
         """Return the model of robot ``row`` alone, which may be changed."""
@@ -127,13 +150,20 @@ class MujocoPack(ModelPack):
     # ----------------------------------------------------------------------------------------------
 
     def read_qpos(self) -> Float64:
+        if self._free is not None:
+            return self._free.read()[0]
         return np.array([data.qpos[self._at] for data in self.data])
 
     def read_qvel(self) -> Float64:
+        if self._free is not None:
+            return self._free.read()[1]
         return np.array([data.qvel[self._moves] for data in self.data])
 
     def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         if self.steps_read_force(gravity, coriolis):
+            if self._free is not None:
+                qpos, qvel, _ = self._free.read()
+                return self._bias_model.passive_force(qpos, qvel, True, True)
             return np.array([data.qfrc_bias[self._moves] for data in self.data])
         return self._model_force(gravity, coriolis)
 
@@ -158,11 +188,7 @@ class MujocoPack(ModelPack):
         effort = self.qf
         if self._constraint is not None:
             effort = self._constraint.apply(self.qf, self.read_qpos(), self.read_qvel())
-        handler = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(
-            lambda message: None
-        )  # the loop finds states that are not finite
-        try:
+        with _without_warnings():
             everyone = self.data
             for row in np.flatnonzero(~self._suspended):
                 model = self.models[row]
@@ -172,8 +198,6 @@ class MujocoPack(ModelPack):
                 self._sensed[row] += data.sensordata
                 if (np.abs(data.qpos[self._at]) <= FARTHEST).all():
                     mujoco.mj_step1(model, data)
-        finally:
-            mujoco.set_mju_user_warning(handler)
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         return gravity and coriolis and self._is_model
@@ -202,6 +226,7 @@ class MujocoPack(ModelPack):
             arrays,
             self._suspended,
             self._constraint_address,
+            self._free,
         )
 
     def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
@@ -277,6 +302,23 @@ class MujocoPack(ModelPack):
         """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root
         at ``base``.
         """
+        self.qf[[*rows]] = 0.0
+        self._sensed[[*rows]] = 0.0
+        if self._free is None:
+            self._place(rows, qpos, qvel, base)
+        else:
+            self._free.write(rows, qpos, qvel, 0.0)
+            self._free.time[[*rows]] = 0.0
+        self.update_constraint(list(rows))  # within a tick, the robots may have failed
+
+    def _place(
+        self,
+        rows: Sequence[int],
+        qpos: Rows,
+        qvel: Rows,
+        base: Float64 | None,
+    ) -> None:
+        """Write the states of robots ``rows`` to their data."""
         everyone = self._pool.take(self.models, self.rows, rows)
         floats = self._robot.base is not None
         bases = np.tile(ORIGIN, (len(rows), 1)) if base is None else base.copy()
@@ -299,10 +341,7 @@ class MujocoPack(ModelPack):
             data.qpos[self._robot.qpos] = position
             data.qvel[self._robot.qvel] = velocity
             data.ctrl[:] = ctrl
-            self.qf[row] = 0.0
-            self._sensed[row] = 0.0
         self._evaluate(rows)
-        self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
     def suspend(self, mask: Bool) -> None:
         """Leave the robots of ``mask`` (M,) where they are, and step the others."""
@@ -442,14 +481,44 @@ class MujocoPack(ModelPack):
         """Return the number of values in the state of each robot."""
         return [mujoco.mj_stateSize(self._robot.model, _KEPT)] * self.size
 
+    @cached_property
+    def _columns(self) -> list[NDArray[np.intp]]:
+        """Columns of time, positions, velocities, accelerations and efforts in MuJoCo's states."""
+        robot, state = self._robot, mujoco.mjtState
+        places = {
+            state.mjSTATE_TIME: np.arange(1),
+            state.mjSTATE_QPOS: robot.qpos,
+            state.mjSTATE_QVEL: robot.qvel,
+            state.mjSTATE_WARMSTART: robot.qvel,
+            state.mjSTATE_QFRC_APPLIED: robot.qvel,
+        }
+        # The parts of a state are in the order of their bits.
+        return [
+            mujoco.mj_stateSize(robot.model, _KEPT & (int(part) - 1)) + place
+            for part, place in places.items()
+        ]
+
     def read_state(self) -> Float64:
         """Return the state of each robot (M, values), in MuJoCo's order."""
+        if self._free is not None:
+            start = np.empty(self.state_sizes()[0])
+            mujoco.mj_extractState(self._robot.model, self.rows[0], STATE, start, _KEPT)
+            states = np.tile(start, (self.size, 1))
+            parts = self._free.time[:, None], *self._free.read(), self.qf
+            for columns, values in zip(self._columns, parts, strict=True):
+                states[:, columns] = values
+            return states
         states = np.empty((self.size, self.state_sizes()[0]))
         for model, data, state in zip(self.models, self.data, states, strict=True):
             mujoco.mj_getState(model, data, state, _KEPT)
         return states
 
     def write_state_rows(self, states: Float64) -> None:
+        if self._free is not None:
+            time, *parts, _ = (states[:, columns] for columns in self._columns)
+            self._free.write(slice(None), *parts)
+            self._free.time[:] = time[:, 0]
+            return
         for model, data, state in zip(self.models, self.data, states, strict=True):
             mujoco.mj_setState(model, data, state, _KEPT)
         self._update(range(self.size))
@@ -467,16 +536,27 @@ class MujocoPack(ModelPack):
         """Give back all that fits the present kind of model alone: working memory, and data made
         for its size.
         """
-        self._pool.leave(self.rows)
+        self._pool.leave(self.rows if self._free is None else self._free)
         self._own_step = None
         for name in ("_scratch", "_rubbing"):
             self.__dict__.pop(name, None)
 
 
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Silence MuJoCo's warnings of states that are not finite: the loop finds and reports them."""
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
+
+
 ENGINE = Engine(
     name="mujoco",
     title="MuJoCo",
-    capabilities=frozenset({"base_state"}),
+    capabilities=frozenset({"base_state", "complete_state"}),
     physics=SOLVERS,
     group_size=64,
     make_pack=MujocoPack,

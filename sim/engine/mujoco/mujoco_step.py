@@ -19,6 +19,7 @@ from batchpid.arrays.array_types import Bool, Float64, MjModel, Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
 from batchpid.sim.engine.mujoco.data_pool import DataPool
+from batchpid.sim.engine.mujoco.free_motion import FreeMotions, place_of_contacts
 from batchpid.sim.engine.native.interface import Mujoco
 from batchpid.sim.engine.native_model import NativeStep
 
@@ -38,6 +39,7 @@ FIELDS = (
     ("qvel", "qvel"),
     ("applied", "qfrc_applied"),
     ("bias", "qfrc_bias"),
+    ("warm", "qacc_warmstart"),
     ("ctrl", "ctrl"),
     ("sensors", "sensordata"),
 )
@@ -95,6 +97,9 @@ class MujocoStep(NativeStep):
         Robots that are not stepped (robots,).
     constraint
         Address of the constraint of coupled joints, or None.
+    free
+        States of robots that step without MuJoCo where they touch nothing, in place of ``rows``;
+        or None.
     """
 
     def __init__(
@@ -107,8 +112,9 @@ class MujocoStep(NativeStep):
         arrays: dict[str, Rows],
         skip: Bool,
         constraint: int | None,
+        free: FreeMotions | None,
     ) -> None:
-        data = pool.take(models, rows)
+        data = pool.take(models, rows) if free is None else pool.lend(free)
         robot = pool.robot
         dof = len(robot.qpos)
         addresses = dict(functions() or {})
@@ -116,11 +122,14 @@ class MujocoStep(NativeStep):
         tables = {name: [getattr(row, field).ctypes.data for row in data] for name, field in FIELDS}
         tables["models"] = [model._address for model in models]
         tables["data"] = [row._address for row in data]
+        tables["contacts"] = [row._address + (place_of_contacts() or 0) for row in data]
         arrays = arrays | {name: np.array(rows, np.uint64) for name, rows in tables.items()}
         arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64)}
         robots = Mujoco(**addresses, **{name: array.ctypes.data for name, array in arrays.items()})
         robots.sensor_size = arrays["sensed"].shape[1]
         robots.base_qpos, robots.base_qvel = robot.base or (0, 0)
+        if free is not None:
+            robots.free = free.address
         clearance = None
         shapes = shape_tables(robot)
         if shapes is not None:
@@ -128,6 +137,7 @@ class MujocoStep(NativeStep):
             robots.clearance = clearance.address
         self._pool = pool
         self._states = [*models], rows
+        self._free = free
         self._kept = data, arrays, robots, clearance
         super().__init__(
             len(data),
@@ -144,5 +154,8 @@ class MujocoStep(NativeStep):
         """Return the address of the group, for a call of the extension or of XLA; the robots are in
         their states.
         """
-        self._pool.take(*self._states)
+        if self._free is None:
+            self._pool.take(*self._states)
+        else:
+            self._pool.lend(self._free)
         return super().prepare()

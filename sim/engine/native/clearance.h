@@ -9,13 +9,11 @@
 
 #pragma once
 
+#include "batchpid/native/lanes.h"
 #include "batchpid/native/rigid_body.h"
 
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
 #include <cstring>
-#include <limits>
+#include <vector>
 
 namespace batchpid {
 
@@ -35,14 +33,16 @@ struct Clearance {
   double const *vertices;            // (vertices, 3)
   std::int32_t const *pairs;         // (pairs, 2): shapes that may touch; a plane comes first
   std::int32_t const *bodies;        // (pairs, 2): bodies of these shapes
-  // Arms that are not zero, and the way of each (entries,). The arms of a pair begin at `begins[pair]` (pairs + 1,).
-  double const *arms;
-  std::int32_t const *arm_ways, *begins;
+  Lanes const *arms;                 // (ways, pairs / WIDTH, rounded up), 0 beyond the last pair
   double const *travel;              // (2, dof): range of joint positions in which the arms are upper bounds
-  double *last;                      // (robots, dof, and 7 for a floating base): positions after the last sim step
-  double *moved;                     // (robots, ways): sum of |dq| since the last proof
+  Lanes *last;                       // (blocks, dof): positions after the last sim step
+  double *poses;                     // (robots, 7): of floating bases, or null
+  Lanes *moved;                      // (blocks, ways): sum of |dq| since the last proof
   std::uint16_t *left;               // (robots, pairs): clearances [m], as from `shortened`, or NOT_PROVED
-  double *rate;                      // (robots, ways): largest arm over clearance of the pairs not in `near` [1/rad, 1/m]
+  Lanes *rate, *near_rate;           // (blocks, ways): largest arm over clearance of other pairs, and those in `near`
+  // (blocks, 3): shares of the clearances that are used since the last proof by `rate` and, since the pairs in `near` were
+  // checked, by `near_rate`; and that of the latter at which they have to be checked again.
+  Lanes *shares;
   std::int32_t *wait;                // (robots,): sim steps to the next attempt to prove the open pairs; 0 without any
   std::int32_t *age;                 // (robots,): sim steps since the last proof
   char *brief;                       // (robots,): whether the last proof held for BRIEF sim steps or less
@@ -54,7 +54,6 @@ struct Clearance {
   // Offsets in mjModel [bytes]: of opt.disableflags, body_geomnum, body_contype and body_conaffinity.
   std::int64_t flags, counts, types_at, affinities_at;
   std::int32_t contact;              // mjDSBL_CONTACT
-  std::int32_t floats;               // the base moves freely
 };
 
 constexpr double MARGIN = 1e-4;        // [m], far above the rounding of positions and of MuJoCo's own distances
@@ -78,9 +77,10 @@ using Point = Vector<double>;
 // Return a positive number as the upper two bytes of its float32, rounded down to three digits; NOT_PROVED for others.
 // Two bytes, because a robot has many clearances.
 inline std::uint16_t shortened(double value) {
-  float const single = std::nextafter(static_cast<float>(value), -1.0f);
+  float const single = static_cast<float>(value);
   std::uint32_t bits = 0;
   std::memcpy(&bits, &single, sizeof bits);
+  bits -= 1;  // the next number towards 0
   return single > 0.0f ? static_cast<std::uint16_t>(bits >> 16) : NOT_PROVED;
 }
 inline double widened(std::uint16_t value) {
@@ -188,32 +188,49 @@ struct NearPairs {
   }
 };
 
-// Return an upper bound of how much closer the shapes of a pair have come through the motions `moved` [m].
-inline double used_by(Clearance const &clearance, std::int64_t pair, double const *moved) {
-  double used = 0.0;
-  for (std::int32_t k = clearance.begins[pair]; k < clearance.begins[pair + 1]; ++k) {
-    used += clearance.arms[k] * moved[clearance.arm_ways[k]];
+// Return the largest share of the clearances of the near pairs of a robot that its motions have used.
+inline double near_share(Clearance const &clearance, std::int64_t row) {
+  std::int64_t const ways = clearance.ways, blocks = (clearance.number + WIDTH - 1) / WIDTH;
+  Lanes const *moved = clearance.moved + row / WIDTH * ways;
+  std::int32_t const *near = clearance.near + row * MOST_NEAR;
+  double most = 0.0;
+  for (int at = 0; at < MOST_NEAR && near[at] >= 0; ++at) {
+    double used = 0.0;
+    for (std::int64_t way = 0; way < ways; ++way) {
+      used += clearance.arms[way * blocks + near[at] / WIDTH].of[near[at] % WIDTH] * moved[way].of[row % WIDTH];
+    }
+    most = std::max(most, used / widened(clearance.left[row * clearance.number + near[at]]));
   }
-  return used;
+  return most;
 }
 
 // Recompute the clearances of one robot that are partly used up, and with `retry` also the clearances of open pairs.
 // Return whether all pairs are proved.
-inline bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
-  std::int64_t const ways = clearance.ways;
-  double *moved = clearance.moved + row * ways, *rate = clearance.rate + row * ways;
+FOR_EACH_PROCESSOR static bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
+  std::int64_t const ways = clearance.ways, at = row / WIDTH * ways, k = row % WIDTH;
+  std::int64_t const blocks = (clearance.number + WIDTH - 1) / WIDTH;
   std::uint16_t *left = clearance.left + row * clearance.number;
   std::int32_t *near = clearance.near + row * MOST_NEAR;
   char *open = clearance.open + row * clearance.size;
   double const *places = clearance.places[row], *turns = clearance.turns[row];
   double const age = clearance.age[row];
+  thread_local std::vector<Lanes> use, inverse, near_inverse;
+  for (auto *table : {&use, &inverse, &near_inverse}) table->assign(static_cast<std::size_t>(blocks), Lanes{});
+  for (std::int64_t way = 0; way < ways; ++way) {
+    Lanes const moved = clearance.moved[at + way].of[k];
+    Lanes const *arms = clearance.arms + way * blocks;
+    for (std::int64_t block = 0; block < blocks; ++block) use[block] += arms[block] * moved;
+  }
+  auto const of = [](std::vector<Lanes> &table, std::int64_t pair) -> double & {
+    return reinterpret_cast<double *>(table.data())[pair];
+  };
   NearPairs first;
   bool all = true;
   std::fill(open, open + clearance.size, char{0});
   for (std::int64_t pair = 0; pair < clearance.number; ++pair) {
     bool proved = left[pair] != NOT_PROVED;
     if (proved || retry) {
-      double const used = used_by(clearance, pair, moved);
+      double const used = of(use, pair);
       double rest = widened(left[pair]) - used;
       bool const anew = !proved || !(used < SHARE * rest);
       if (anew) {
@@ -226,39 +243,30 @@ inline bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
       proved = left[pair] != NOT_PROVED;
       if (proved && age < LONG_STEPS) first.add(pair, used / rest);
     }
-    if (!proved) {
+    if (proved) {
+      of(inverse, pair) = 1.0 / widened(left[pair]);
+    } else {
       open[clearance.bodies[2 * pair]] = open[clearance.bodies[2 * pair + 1]] = 1;
       all = false;
     }
   }
   first.write(near);
-  std::fill(rate, rate + ways, 0.0);
-  for (std::int64_t pair = 0, at = 0; pair < clearance.number; ++pair) {
-    if (at < first.size && near[at] == pair) {
-      ++at;
-    } else if (left[pair] != NOT_PROVED) {
-      double const inverse = 1.0 / widened(left[pair]);
-      for (std::int32_t k = clearance.begins[pair]; k < clearance.begins[pair + 1]; ++k) {
-        double &most = rate[clearance.arm_ways[k]];
-        most = std::max(most, clearance.arms[k] * inverse);
-      }
+  for (int i = 0; i < first.size; ++i) std::swap(of(inverse, near[i]), of(near_inverse, near[i]));
+  for (std::int64_t way = 0; way < ways; ++way) {
+    Lanes const *arms = clearance.arms + way * blocks;
+    Lanes most{}, near_most{};
+    for (std::int64_t block = 0; block < blocks; ++block) {
+      most = at_least(most, arms[block] * inverse[block]);
+      if (first.size > 0) near_most = at_least(near_most, arms[block] * near_inverse[block]);
     }
+    clearance.rate[at + way].of[k] = largest(most);
+    clearance.near_rate[at + way].of[k] = largest(near_most);
+    clearance.moved[at + way].of[k] = 0.0;
   }
-  std::fill(moved, moved + ways, 0.0);
+  Lanes *shares = clearance.shares + row / WIDTH * 3;
+  shares[0].of[k] = shares[1].of[k] = 0.0;
+  shares[2].of[k] = 1.0;
   return all;
-}
-
-// Return whether the last proof of one robot still holds.
-inline bool is_proved(Clearance const &clearance, std::int64_t row) {
-  double const *moved = clearance.moved + row * clearance.ways, *rate = clearance.rate + row * clearance.ways;
-  double used = 0.0;
-  for (std::int64_t way = 0; way < clearance.ways; ++way) used += rate[way] * moved[way];
-  bool proved = used < 1.0;
-  std::int32_t const *near = clearance.near + row * MOST_NEAR;
-  for (int at = 0; proved && at < MOST_NEAR && near[at] >= 0; ++at) {
-    proved = used_by(clearance, near[at], moved) < widened(clearance.left[row * clearance.number + near[at]]);
-  }
-  return proved;
 }
 
 // Add the motion of a floating base to `moved`: its displacement and its rotation angle, from its pose (7,).
@@ -274,32 +282,60 @@ inline void add_base_motion(double const *now, double *last, double *moved) {
   std::copy(now, now + 7, last);
 }
 
-// Return the shapes that MuJoCo has to check at `qpos`, after a new proof if one is due; `qpos_at`: indices of joints.
-inline Looked looked_at(Clearance const &clearance, std::int64_t row, std::int64_t dof, void *data,
-                                  double const *qpos, std::int64_t const *qpos_at) {
-  std::int64_t const ways = clearance.ways;
-  double *last = clearance.last + row * (dof + (clearance.floats ? 7 : 0)), *moved = clearance.moved + row * ways;
-  double const *least = clearance.travel, *largest = least + dof;
-  bool inside = true;
-  for (std::int64_t joint = 0; joint < dof; ++joint) {
-    double const q = qpos[qpos_at[joint]];
-    moved[joint] += std::fabs(q - last[joint]);
-    last[joint] = q;
-    inside = inside && q >= least[joint] && q <= largest[joint];
+// Masks of WIDTH robots: whether they are in the range of the arms, and whether the shares of their clearances hold.
+struct Holding {
+  Lanes inside, proved, far;
+};
+
+// Add the motion of a block of robots since the last sim step: positions (dof,), and the ways of floating bases, or null.
+FOR_EACH_PROCESSOR static void add_motion(Clearance const &clearance, std::int64_t block, Lanes const *qpos,
+                                          Lanes const *base, Holding &holding) {
+  std::int64_t const ways = clearance.ways, dof = base == nullptr ? ways : ways - 2, at = block * ways;
+  Lanes *last = clearance.last + block * dof, *shares = clearance.shares + 3 * block;
+  Lanes outside{}, used = shares[0], near_used = shares[1];
+  for (std::int64_t way = 0; way < ways; ++way) {
+    Lanes moved;
+    if (way < dof) {
+      moved = absolute(qpos[way] - last[way]);
+      last[way] = qpos[way];
+      outside += 2.0 - at_least_mask(qpos[way], clearance.travel[way]);
+      outside -= at_least_mask(clearance.travel[dof + way], qpos[way]);
+    } else {
+      moved = base[way - dof];
+    }
+    clearance.moved[at + way] += moved;
+    used += clearance.rate[at + way] * moved;
+    near_used += clearance.near_rate[at + way] * moved;
   }
-  if (clearance.floats) add_base_motion(qpos, last + dof, moved + dof);
-  if (!inside) return Looked::ALL;
+  shares[0] = used, shares[1] = near_used;
+  holding = {1.0 - outside, below_mask(used, 1.0), below_mask(near_used, shares[2])};
+}
+
+// Return the shapes that MuJoCo has to check of a robot, after a new proof if one is due; `place` writes its positions to
+// its mjData.
+template <class Place>
+Looked looked_at(Clearance const &clearance, std::int64_t row, Holding const &holding, Place place) {
+  std::int64_t const k = row % WIDTH;
+  if (!(holding.inside.of[k] > 0.0)) return Looked::ALL;
   std::int32_t &wait = clearance.wait[row], &age = clearance.age[row];
   bool const retry = wait > 0 && --wait == 0;
   age = std::min(age + 1, NEVER);
   if (!retry && age > BRIEF && age <= BRIEF + PAUSE && clearance.brief[row] != 0) return Looked::ALL;
-  if (retry || !is_proved(clearance, row)) {
+  bool proved = holding.proved.of[k] > 0.0;
+  if (proved && !(holding.far.of[k] > 0.0)) {
+    Lanes *shares = clearance.shares + row / WIDTH * 3;
+    double const most = near_share(clearance, row);
+    proved = most < 1.0;
+    shares[1].of[k] = 0.0;
+    shares[2].of[k] = 1.0 - most;
+  }
+  if (retry || !proved) {
     if (!retry && age <= BRIEF) {
       clearance.brief[row] = 1;
       return Looked::ALL;
     }
     clearance.brief[row] = 0;
-    clearance.kinematics(clearance.models[row], data);
+    place();
     if (!prove(clearance, row, retry) && wait == 0) wait = RETRY_STEPS;
     age = 0;
   }

@@ -24,6 +24,10 @@ SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation22getRootAngularVelocityEv",
 )
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
+WIDTH = 4
+"""Number of robots in a vector, as in lanes.h."""
+CONTACT = ("none", "some", "unknown")
+"""What is known about the contacts of a robot, as Contact in free_motion.h."""
 BASES = ("fixed", "free", "held")
 """Kinds of the base of a :class:`ModelStruct`, as Base in model.h."""
 STATUS = ("not_finite", "too_fast", "failed", "no_noise", "sense")
@@ -92,13 +96,14 @@ class Clearance(ctypes.Structure):
             "pairs",
             "bodies",
             "arms",
-            "arm_ways",
-            "begins",
             "travel",
             "last",
+            "poses",
             "moved",
             "left",
             "rate",
+            "near_rate",
+            "shares",
             "wait",
             "age",
             "brief",
@@ -110,7 +115,35 @@ class Clearance(ctypes.Structure):
         *_all(
             ctypes.c_int64, "number", "ways", "size", "flags", "counts", "types_at", "affinities_at"
         ),
-        *_all(ctypes.c_int32, "contact", "floats"),
+        *_all(ctypes.c_int32, "contact", "unused"),
+    ]
+
+
+class FreeMotion(ctypes.Structure):
+    """Robots on fixed bases that step without MuJoCo where nothing touches, as FreeMotion in
+    free_motion.h.
+    """
+
+    _fields_ = [
+        *_all(
+            ctypes.c_void_p,
+            "model",
+            "qpos",
+            "qvel",
+            "acceleration",
+            "bias",
+            "mass",
+            "armature",
+            "weight",
+            "gravity",
+            "low",
+            "high",
+            "contact",
+            "time",
+        ),
+        ("robots", ctypes.c_int64),
+        *_all(ctypes.c_double, "stiffness", "rate_gain", "least", "most", "width", "timestep"),
+        *_all(ctypes.c_int32, "has_pairs", "unused"),
     ]
 
 
@@ -130,6 +163,8 @@ class Mujoco(ctypes.Structure):
             "qvel",
             "applied",
             "bias",
+            "warm",
+            "contacts",
             "qpos_at",
             "qvel_at",
             "qf",
@@ -137,6 +172,7 @@ class Mujoco(ctypes.Structure):
             "stiffness",
             "rate_gain",
             "clearance",
+            "free",
             "sensors",
             "sensed",
         ),
@@ -276,6 +312,7 @@ _NAMES = (
         "model.h",
         "mujoco_step.h",
         "clearance.h",
+        "free_motion.h",
         "constraint.h",
         "refresh.h",
     ),

@@ -32,6 +32,19 @@ struct Model {
   std::int64_t dof;
   std::int32_t varies;       // each robot has its own inertias
   Base base;
+
+  // Return the inertias of body j of robots `first` to `first + WIDTH`.
+  inline __attribute__((always_inline)) BodyInertia<Lanes> inertia(std::int64_t j, std::int64_t first,
+                                                                   std::int64_t robots) const {
+    constexpr std::int64_t NUMBERS = sizeof(BodyInertia<double>) / sizeof(double);
+    BodyInertia<Lanes> own;
+    auto *leaf = reinterpret_cast<Lanes *>(&own);
+    for (std::int64_t k = 0; k < NUMBERS; ++k) {
+      std::int64_t const place = j * NUMBERS + k;
+      leaf[k] = varies ? gather(inertias, (dof + 1) * NUMBERS, place, first, robots) : Lanes(inertias[place]);
+    }
+    return own;
+  }
 };
 
 // WIDTH robots at a pose.
@@ -50,23 +63,19 @@ struct Posed {
     auto const *rows = reinterpret_cast<BodyRow<double> const *>(of.rows);
     place_bodies(of.dof, of.tree, rows, cosine.data(), sine.data(), qpos.data(), bodies.data());
   }
+  // Weigh the placed bodies of robots `first` to `first + WIDTH` of a model.
+  inline __attribute__((always_inline)) void weigh(Model const &of, std::int64_t first, std::int64_t rows) {
+    for (std::int64_t j = 0; j < of.dof; ++j) batchpid::weigh(of.inertia(j, first, rows), bodies[j]);
+  }
   // Place and weigh the bodies of robots `first` to `first + WIDTH` of a model; return the inertia of their base.
   inline __attribute__((always_inline)) Inertia<Lanes> pose(Model const &of, std::int64_t first, std::int64_t rows,
                                                             double const *at) {
     for (std::int64_t j = 0; j < of.dof; ++j) qpos[j] = gather(at, of.dof, j, first, rows);
     place(Bodies{of.dof, of.tree, of.rows});
+    weigh(of, first, rows);
     BodyState<Lanes> base{};
     base.axes[0].x = base.axes[1].y = base.axes[2].z = Lanes(1.0);
-    std::int64_t const numbers = sizeof(BodyInertia<double>) / sizeof(double), columns = (of.dof + 1) * numbers;
-    for (std::int64_t j = 0; j <= of.dof; ++j) {
-      BodyInertia<Lanes> own;
-      auto *leaf = reinterpret_cast<Lanes *>(&own);
-      for (std::int64_t k = 0; k < numbers; ++k) {
-        std::int64_t const place = j * numbers + k;
-        leaf[k] = of.varies ? gather(of.inertias, columns, place, first, rows) : Lanes(of.inertias[place]);
-      }
-      weigh(own, j < of.dof ? bodies[j] : base);
-    }
+    batchpid::weigh(of.inertia(of.dof, first, rows), base);
     return base.inertia;
   }
 };

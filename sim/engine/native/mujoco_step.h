@@ -4,6 +4,7 @@
 #pragma once
 
 #include "clearance.h"
+#include "free_motion.h"
 
 #include <atomic>
 #include <csetjmp>
@@ -31,11 +32,14 @@ struct Mujoco {
   void *const *data;                        // (robots,)
   double *const *qpos, *const *qvel;        // (robots,): arrays of their mjData
   double *const *applied, *const *bias;
+  double *const *warm;                      // (robots,): accelerations at which the solver starts, in their mjData
+  int const *const *contacts;               // (robots,): numbers of contacts, in their mjData
   std::int64_t const *qpos_at, *qvel_at;    // (dof,): indices of the joints in these arrays
   double *qf;                               // (robots, dof): efforts last applied
   double *const *ctrl;                      // (robots,): arrays of their mjData, (dof,) each with drives
   double const *stiffness, *rate_gain;      // (robots, dof): gains of the drives, or null if no target changes
   Clearance const *clearance;               // or null: collision detection of all shapes in every sim step
+  FreeMotion const *free;                   // of robots without contact, or null: all steps are MuJoCo's
   double const *const *sensors;             // (robots,): arrays of their mjData, (sensor_size,) each
   double *sensed;                           // (robots, sensor_size): sums of the sensors over sim steps
   std::int64_t sensor_size;
@@ -88,9 +92,9 @@ class StoppedClock {
   static inline Clock before_ = nullptr;
 };
 
-// Advance one robot: mj_step2 of this sim step, then mj_step1 of the next one. A robot that has diverged keeps its
-// state, without mj_step1. Return false, with a message, after an error of MuJoCo.
-inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, double farthest, char *message) {
+// Call functions of MuJoCo for a robot. Return false, with a message, after an error of it.
+template <class Calls>
+bool succeeds_in_mujoco(Mujoco const &mujoco, std::int64_t row, char *message, Calls calls) {
   std::jmp_buf frame;
   Clearance const *clearance = mujoco.clearance;
   Shapes const shapes = clearance == nullptr ? Shapes{} : get_shapes(*clearance, row);
@@ -101,26 +105,50 @@ inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, do
     Messages::frame = nullptr;
     return false;
   }
-  mujoco.step2(mujoco.models[row], mujoco.data[row]);
-  for (std::int64_t i = 0; i < mujoco.sensor_size; ++i) {
-    mujoco.sensed[row * mujoco.sensor_size + i] += mujoco.sensors[row][i];
-  }
-  bool finite = true;
-  for (std::int64_t joint = 0; joint < dof; ++joint) {
-    double const q = mujoco.qpos[row][mujoco.qpos_at[joint]];
-    finite = finite && q <= farthest && q >= -farthest;
-  }
-  if (finite) {
-    Looked looked = Looked::ALL;
-    if (clearance != nullptr) {
-      looked = looked_at(*clearance, row, dof, mujoco.data[row], mujoco.qpos[row], mujoco.qpos_at);
-    }
-    if (looked != Looked::ALL) set_shapes(*clearance, row, part_of(shapes, *clearance, row, looked));
-    mujoco.step1(mujoco.models[row], mujoco.data[row]);
-    if (looked != Looked::ALL) set_shapes(*clearance, row, shapes);
-  }
+  calls();
   Messages::frame = nullptr;
   return true;
+}
+
+// Do mj_step1 of a robot with a part of its shapes.
+inline bool prepare(Mujoco const &mujoco, std::int64_t row, Looked looked, char *message) {
+  return succeeds_in_mujoco(mujoco, row, message, [&] {
+    if (looked == Looked::ALL) return mujoco.step1(mujoco.models[row], mujoco.data[row]);
+    Shapes const shapes = get_shapes(*mujoco.clearance, row);
+    set_shapes(*mujoco.clearance, row, part_of(shapes, *mujoco.clearance, row, looked));
+    mujoco.step1(mujoco.models[row], mujoco.data[row]);
+    set_shapes(*mujoco.clearance, row, shapes);
+  });
+}
+
+// Do mj_step2 of a robot, and add its sensors.
+inline bool advance(Mujoco const &mujoco, std::int64_t row, char *message) {
+  bool const good = succeeds_in_mujoco(
+      mujoco, row, message, [&] { mujoco.step2(mujoco.models[row], mujoco.data[row]); });
+  for (std::int64_t i = 0; good && i < mujoco.sensor_size; ++i) {
+    mujoco.sensed[row * mujoco.sensor_size + i] += mujoco.sensors[row][i];
+  }
+  return good;
+}
+
+// Copy the state of a robot to its mjData, or from there.
+inline void write_to_mujoco(Mujoco const &mujoco, std::int64_t row) {
+  FreeMotion const &free = *mujoco.free;
+  std::int64_t const dof = free.model->dof, at = row / WIDTH * dof, k = row % WIDTH;
+  for (std::int64_t j = 0; j < dof; ++j) {
+    mujoco.qpos[row][mujoco.qpos_at[j]] = free.qpos[at + j].of[k];
+    mujoco.qvel[row][mujoco.qvel_at[j]] = free.qvel[at + j].of[k];
+    mujoco.warm[row][mujoco.qvel_at[j]] = free.acceleration[at + j].of[k];
+  }
+}
+inline void read_from_mujoco(Mujoco const &mujoco, std::int64_t row) {
+  FreeMotion const &free = *mujoco.free;
+  std::int64_t const dof = free.model->dof, at = row / WIDTH * dof, k = row % WIDTH;
+  for (std::int64_t j = 0; j < dof; ++j) {
+    free.qpos[at + j].of[k] = mujoco.qpos[row][mujoco.qpos_at[j]];
+    free.qvel[at + j].of[k] = mujoco.qvel[row][mujoco.qvel_at[j]];
+    free.acceleration[at + j].of[k] = mujoco.warm[row][mujoco.qvel_at[j]];
+  }
 }
 
 }  // namespace batchpid

@@ -74,41 +74,171 @@ inline void step_in_sapien(Group const &group, double const *effort, double *qpo
   if (!bears) std::fill_n(passive, all, 0.0);
 }
 
-// Apply the efforts of a robot in MuJoCo, and those of its constraint.
-inline void apply_efforts(Group const &group, std::int64_t row) {
+// Robots of a block, and which of them a sim step moves.
+struct Block {
+  std::int64_t number, first, end;
+  bool moves[WIDTH];
+
+  Block(Group const &group, std::int64_t number)
+      : number(number), first(number * WIDTH), end(std::min(first + WIDTH, group.robots)) {
+    for (std::int64_t row = first; row < end; ++row) moves[row - first] = group.skip[row] == 0;
+  }
+};
+
+// Return the efforts (dof,) of a robot in MuJoCo with those of its constraint.
+inline double const *joint_efforts(Group const &group, std::int64_t row) {
   Mujoco const &mujoco = *group.mujoco;
-  double const *qpos = mujoco.qpos[row], *qvel = mujoco.qvel[row];
   thread_local std::vector<double> effort;
   effort.assign(mujoco.qf + row * group.dof, mujoco.qf + (row + 1) * group.dof);
-  if (group.constraint != nullptr) {
-    constrain(
-        *group.constraint, row, group.dof, effort.data(), [&](std::int64_t j) { return qpos[mujoco.qpos_at[j]]; },
-        [&](std::int64_t j) { return qvel[mujoco.qvel_at[j]]; });
-  }
-  for (std::int64_t j = 0; j < group.dof; ++j) {
-    mujoco.applied[row][mujoco.qvel_at[j]] = effort[static_cast<std::size_t>(j)];
-  }
+  if (group.constraint == nullptr) return effort.data();
+  FreeMotion const *free = mujoco.free;
+  std::int64_t const at = row / WIDTH * group.dof, k = row % WIDTH;
+  auto const position = [&](std::int64_t j) {
+    return free != nullptr ? free->qpos[at + j].of[k] : mujoco.qpos[row][mujoco.qpos_at[j]];
+  };
+  auto const velocity = [&](std::int64_t j) {
+    return free != nullptr ? free->qvel[at + j].of[k] : mujoco.qvel[row][mujoco.qvel_at[j]];
+  };
+  constrain(*group.constraint, row, group.dof, effort.data(), position, velocity);
+  return effort.data();
 }
 
-// The same in MuJoCo. Return false, with a message, after an error of it.
-inline bool step_in_mujoco(Group &group, double const *effort, double *qpos, double *qvel, double *passive) {
+// Do mj_step2 of a robot under its efforts.
+inline bool step_with_solver(Group &group, std::int64_t row) {
+  Mujoco const &mujoco = *group.mujoco;
+  double const *effort = joint_efforts(group, row);
+  for (std::int64_t j = 0; j < group.dof; ++j) mujoco.applied[row][mujoco.qvel_at[j]] = effort[j];
+  return advance(mujoco, row, group.message);
+}
+
+// Do mj_step1 of the robots of a block that need it at positions (dof,): all that may touch something, and without
+// FreeMotion all. A robot that has diverged keeps its state, without mj_step1.
+inline bool look_for_contacts(Group &group, Block const &block, Lanes const *qpos) {
+  Mujoco const &mujoco = *group.mujoco;
+  Clearance const *clearance = mujoco.clearance;
+  FreeMotion const *free = mujoco.free;
+  Holding holding;
+  if (clearance != nullptr) {
+    Lanes base[2];
+    for (std::int64_t row = block.first; clearance->poses != nullptr && row < block.end; ++row) {
+      double moved[2] = {};
+      if (block.moves[row - block.first]) add_base_motion(mujoco.qpos[row], clearance->poses + 7 * row, moved);
+      for (int i = 0; i < 2; ++i) base[i].of[row - block.first] = moved[i];
+    }
+    add_motion(*clearance, block.number, qpos, clearance->poses == nullptr ? nullptr : base, holding);
+  }
+  for (std::int64_t row = block.first; row < block.end; ++row) {
+    std::int64_t const k = row - block.first;
+    if (!block.moves[k]) continue;
+    Looked looked = Looked::ALL;
+    if (free != nullptr) {
+      free->contact[row] = Contact::NONE;
+      if (free->has_pairs == 0) continue;
+    }
+    if (clearance != nullptr) {
+      looked = looked_at(*clearance, row, holding, [&] {
+        if (free != nullptr) write_to_mujoco(mujoco, row);
+        clearance->kinematics(clearance->models[row], mujoco.data[row]);
+      });
+    }
+    if (free != nullptr && looked == Looked::NONE) continue;
+    bool near = true;
+    for (std::int64_t j = 0; j < group.dof; ++j) near = near && std::fabs(qpos[j].of[k]) <= FARTHEST;
+    if (!near) continue;
+    if (free != nullptr) write_to_mujoco(mujoco, row);
+    if (!prepare(mujoco, row, looked, group.message)) return false;
+    if (free != nullptr && *mujoco.contacts[row] > 0) free->contact[row] = Contact::SOME;
+  }
+  return true;
+}
+
+// Do a sim step of a block of robots in MuJoCo that has no FreeMotion.
+inline bool step_block(Group &group, Block const &block, double *qpos, double *qvel, double *passive) {
   Mujoco const &mujoco = *group.mujoco;
   std::int64_t const dof = group.dof;
+  thread_local std::vector<Lanes> places;
+  places.resize(static_cast<std::size_t>(dof));
+  bool good = true;
+  for (std::int64_t row = block.first; row < block.end && good; ++row) {
+    if (block.moves[row - block.first]) good = step_with_solver(group, row);
+    for (std::int64_t j = 0; j < dof; ++j) {
+      places[j].of[row - block.first] = qpos[row * dof + j] = mujoco.qpos[row][mujoco.qpos_at[j]];
+      qvel[row * dof + j] = mujoco.qvel[row][mujoco.qvel_at[j]];
+    }
+  }
+  good = good && look_for_contacts(group, block, places.data());
+  for (std::int64_t row = block.first; row < block.end; ++row) {
+    for (std::int64_t j = 0; j < dof; ++j) {
+      passive[row * dof + j] = group.gravity ? mujoco.bias[row][mujoco.qvel_at[j]] : 0.0;
+    }
+  }
+  return good;
+}
+
+// Do a sim step of a block of robots of which those without contact do not need MuJoCo.
+inline bool step_block_freely(Group &group, Block const &block, double *qpos, double *qvel, double *passive) {
+  Mujoco const &mujoco = *group.mujoco;
+  FreeMotion const &free = *mujoco.free;
+  std::int64_t const dof = group.dof, at = block.number * dof;
+  FreeRoom &room = FreeRoom::of(dof);
+  Block unknown = block;
+  bool written = false, is_free = false, good = true;
+  for (std::int64_t row = block.first; row < block.end; ++row) {
+    bool &own = unknown.moves[row - block.first];
+    own = own && free.contact[row] == Contact::UNKNOWN;
+    written = written || own;
+  }
+  if (written) {
+    evaluate(free, block.number, room);
+    if (!look_for_contacts(group, unknown, free.qpos + at)) return false;
+  }
+  Lanes mask{};
+  for (std::int64_t row = block.first; row < block.end; ++row) {
+    std::int64_t const k = row - block.first;
+    if (!block.moves[k]) continue;
+    free.time[row] += free.timestep;
+    bool const own = free.contact[row] == Contact::NONE;
+    is_free = is_free || own;
+    mask.of[k] = own ? 1.0 : 0.0;
+    double const *effort = group.constraint == nullptr ? mujoco.qf + row * dof : joint_efforts(group, row);
+    for (std::int64_t j = 0; own && j < dof; ++j) room.effort[j].of[k] = effort[j];
+  }
+  Lanes stepped = mask;
+  bool const solved = !is_free || advance_freely(free, block.number, room, stepped);
+  for (std::int64_t row = block.first; row < block.end && good; ++row) {
+    std::int64_t const k = row - block.first;
+    if (!block.moves[k] || stepped.of[k] > 0.0) continue;
+    if (!solved && mask.of[k] > 0.0) {
+      write_to_mujoco(mujoco, row);
+      good = prepare(mujoco, row, Looked::ALL, group.message);
+    }
+    good = good && step_with_solver(group, row);
+    if (good) read_from_mujoco(mujoco, row);
+  }
+  if (!good) return false;
+  evaluate(free, block.number, room);
+  good = look_for_contacts(group, block, free.qpos + at);
+  for (std::int64_t row = block.first; row < block.end; ++row) {
+    std::int64_t const k = row - block.first;
+    for (std::int64_t j = 0; j < dof; ++j) qpos[row * dof + j] = free.qpos[at + j].of[k];
+    for (std::int64_t j = 0; j < dof; ++j) qvel[row * dof + j] = free.qvel[at + j].of[k];
+    for (std::int64_t j = 0; j < dof; ++j) passive[row * dof + j] = group.gravity ? free.bias[at + j].of[k] : 0.0;
+  }
+  return good;
+}
+
+// The same for the robots in MuJoCo. Return false, with a message, after an error of it.
+inline bool step_in_mujoco(Group &group, double const *effort, double *qpos, double *qvel, double *passive) {
+  Mujoco const &mujoco = *group.mujoco;
   bool good = true;
   StoppedClock const stopped(mujoco.clock);
   LogHandler const before = mujoco.set_log_handler(Messages::handle);
   if (before != Messages::handle) Messages::previous = before;
-  for (std::int64_t row = 0; row < group.robots && good; ++row) {
-    std::int64_t const at = row * dof;
-    for (std::int64_t joint = 0; joint < dof; ++joint) mujoco.qf[at + joint] = static_cast<double>(effort[at + joint]);
-    if (!group.skip[row]) apply_efforts(group, row);
-    if (!group.skip[row]) good = advance(mujoco, row, dof, FARTHEST, group.message);
-    for (std::int64_t joint = 0; joint < dof; ++joint) {
-      std::int64_t const place = mujoco.qvel_at[joint];
-      qpos[at + joint] = mujoco.qpos[row][mujoco.qpos_at[joint]];
-      qvel[at + joint] = mujoco.qvel[row][place];
-      passive[at + joint] = group.gravity ? mujoco.bias[row][place] : 0.0;
-    }
+  std::copy(effort, effort + group.robots * group.dof, mujoco.qf);
+  for (std::int64_t number = 0; number * WIDTH < group.robots && good; ++number) {
+    Block const block(group, number);
+    auto const step = mujoco.free != nullptr ? step_block_freely : step_block;
+    good = step(group, block, qpos, qvel, passive);
   }
   mujoco.set_log_handler(before);
   return good;
@@ -123,10 +253,13 @@ inline std::int32_t try_sim_step(Group &group, std::int64_t rows, double const *
   if (!good) return FAILED;
   std::int64_t const dof = group.dof;
   std::int32_t status = group.senses != 0 ? SENSE : 0;
-  for (std::int64_t at = 0; at < group.robots * dof; ++at) {
-    if (!(std::fabs(qpos[at]) <= FARTHEST)) status |= NOT_FINITE;
-    if (group.speed_limit && !(std::fabs(qvel[at]) <= group.speed_limit[at % dof])) status |= TOO_FAST;
+  std::int64_t far = 0, fast = 0;  // counted, since a loop without branches is of vectors
+  for (std::int64_t at = 0; at < group.robots * dof; ++at) far += !(std::fabs(qpos[at]) <= FARTHEST);
+  for (std::int64_t row = 0; group.speed_limit != nullptr && row < group.robots; ++row) {
+    for (std::int64_t j = 0; j < dof; ++j) fast += !(std::fabs(qvel[row * dof + j]) <= group.speed_limit[j]);
   }
+  if (far != 0) status |= NOT_FINITE;
+  if (fast != 0) status |= TOO_FAST;
   for (std::int64_t row = group.robots; row < rows; ++row) {
     for (double *table : {qpos, qvel, passive}) std::copy_n(table, dof, table + row * dof);
   }

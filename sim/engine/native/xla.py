@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import threading
 from functools import cache
 
@@ -18,6 +19,9 @@ def obstacle() -> str:
     """Return why programs of JAX cannot call the extension; "" if they can. Imports JAX."""
     if reason := native.obstacle():
         return reason
+    platforms = os.environ.get("JAX_PLATFORMS") or "cpu"
+    if "cpu" not in platforms.split(","):
+        return f"JAX has no CPU, since JAX_PLATFORMS is {platforms!r}: add cpu to it"
     with _lock:  # JAX takes a name once
         return _registered()
 

@@ -17,14 +17,14 @@ from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
+from batchpid.sim.engine.sapien.limits import Words, filter_words
 from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.collision_shapes import hull, mesh_file
-from batchpid.sim.robot.meshes import note_meshes
+from batchpid.sim.geometry.mesh_files import mesh_bytes
+from batchpid.sim.geometry.shapes import Shape, hull, mesh_file
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
-from batchpid.sim.robot.self_collision import Words, link_groups
 from batchpid.sim.robot.simulated_links import rigid_tree
-from batchpid.sim.robot.tables import Body, Shape, Tables
+from batchpid.sim.robot.tables import Body, Tables
 from batchpid.task_space.frames import SpatialInertia, from_rpy, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -38,6 +38,9 @@ _building = RLock()
 """Lock of the thread that builds a robot: SAPIEN's settings are process-wide, and builders are
 shared.
 """
+
+_meshes_read: dict[str, str] = {}
+"""Content of each mesh file that SAPIEN has read in this process: it reads no path again."""
 
 _JOINT_TYPES = {
     "fixed": "fixed",
@@ -88,7 +91,6 @@ def articulation_builder(spec: SceneSpec) -> ArticulationBuilder:
         )
     for shape in tables.shapes if spec.collisions else ():
         _add_shape(links[shape.body], shape)
-    note_meshes(shape.file for shape in tables.shapes if shape.file)
     return builder
 
 
@@ -111,7 +113,14 @@ def _add_shape(link: Any, shape: Shape) -> None:
             # mesh gets a file of its own.
             shape = shape._replace(vertices=hull(shape))
             scale = (1.0, 1.0, 1.0)
-        link.add_convex_collision_from_file(mesh_file(shape), place, scale, material)
+        file = mesh_file(shape)
+        if shape.vertices is None:
+            mesh_bytes(file, shape.content)
+            if _meshes_read.setdefault(file, shape.content) != shape.content:
+                problem = "has changed since this process simulated it, and SAPIEN keeps the mesh"
+                remedy = "start Python again, or save the mesh under another name"
+                raise RobotError(f"{file}: {problem} that it read first; {remedy}")
+        link.add_convex_collision_from_file(file, place, scale, material)
 
 
 def _pose(position: Float64, axes: Float64) -> Pose:
@@ -250,8 +259,7 @@ def _set_words(spec: SceneSpec, robot: physx.PhysxArticulation) -> None:
 @lru_cache(maxsize=8)
 def _shape_words(spec: SceneSpec) -> dict[str, list[Words]]:
     """Return the filter words of the shapes of each simulated link, in the order of its shapes."""
-    ignored = {frozenset(pair) for pair in spec.ignored}
-    words, _ = link_groups(spec.tables, spec.separate, spec.fixed_base, ignored)
+    words, _ = filter_words(spec)
     of_links: dict[str, list[Words]] = {body.name: [] for body in spec.simulated.bodies}
     for shape in spec.simulated.shapes if spec.collisions else ():
         of_links[shape.body].append(words[shape.owner])

@@ -43,6 +43,7 @@ from batchpid.sim.engine.sapien.calls import (
     SapienStep,
     obstacle,
 )
+from batchpid.sim.engine.sapien.limits import refusals, shortfalls
 from batchpid.sim.engine.sapien.sapien_sensors import SapienLinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
@@ -68,8 +69,6 @@ class Pack(ModelPack):
     steps_natively
         Whether the calls into the engine are native.
     """
-
-    state_is_complete = False  # PhysX remembers contacts
 
     def __init__(
         self,
@@ -97,6 +96,7 @@ class Pack(ModelPack):
                     SceneContent(spec, spec.build, scene, env, frames[env - first_env])
                     for env, scene in envs
                 ]
+            self.content = np.array([content.digest for content in self._contents])
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
         coupling = coupling_of(spec.joints)
@@ -487,4 +487,6 @@ ENGINE = Engine(
     group_size=4,
     make_pack=Pack,
     native_obstacle=obstacle,
+    refusals=refusals,
+    shortfalls=shortfalls,
 )

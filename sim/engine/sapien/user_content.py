@@ -11,21 +11,33 @@ import numpy as np
 import sapien
 from sapien.physx import (
     PhysxArticulation,
+    PhysxArticulationJoint,
     PhysxArticulationLinkComponent,
     PhysxCollisionShapeConvexMesh,
     PhysxCpuSystem,
+    PhysxMaterial,
     PhysxRigidDynamicComponent,
+    PhysxRigidStaticComponent,
 )
 from sapien.wrapper.actor_builder import ActorBuilder
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
-from batchpid.arrays.array_types import Float32
+from batchpid.arrays.array_types import Document, Float32
+from batchpid.arrays.digest import digest
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import Build, SceneSpec
 
 Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
 """Entity of each link of a robot, by name, and the pose of the link in it; None for the same frame.
 """
+
+
+_STATE = (
+    *("pose", "entity_pose", "linear_velocity", "angular_velocity"),
+    *("sleeping", "is_sleeping", "children"),
+)
+"""Properties that a snapshot holds, or that follow from others."""
+_PLAIN = (bool, int, float, str, tuple, list, dict, np.ndarray)
 
 
 class _HeadlessBuilder(ActorBuilder):
@@ -87,14 +99,18 @@ class SceneContent:
         _check_shapes(scene, env, spec.collisions)
         self._bodies = []
         self._articulations = []
+        parts = []
         for entity in scene.entities:
             if entity.per_scene_id in before:
                 continue
             for component in entity.components:
+                parts.append(_describe(component))
                 if isinstance(component, PhysxRigidDynamicComponent):
                     self._bodies.append((entity, component))
                 elif isinstance(component, PhysxArticulationLinkComponent) and component.is_root:
                     self._articulations.append(component.articulation)
+        self.digest = int.from_bytes(bytes.fromhex(digest(parts))[:7], "big")
+        """Number that tells this content from another, whose properties differ."""
         self._start = self.read()
         self.size = self._start.size
 
@@ -143,6 +159,31 @@ class SceneContent:
         poses = [pose if frame is None else pose * frame for pose, frame in frames]
         rows = [np.concatenate([pose.p, pose.q]) for pose in poses]
         return np.array(rows, np.float32).reshape(len(rows), 7)
+
+
+def _describe(part: object) -> Document:
+    """Return the properties of a component, a shape or a material, all that are plain values, by
+    name; not those that its state changes.
+    """
+    properties: Document = {"type": type(part).__name__}
+    for name in dir(part):
+        is_state = name in _STATE and not isinstance(part, PhysxRigidStaticComponent)
+        # ``pose`` is the deprecated name of ``entity_pose``.
+        if name.startswith("_") or is_state or "gpu" in name or name == "pose":
+            continue
+        try:
+            value = getattr(part, name)
+        except RuntimeError:  # a property of another kind of body
+            continue
+        if isinstance(value, sapien.Pose):
+            value = value.p, value.q
+        elif isinstance(value, PhysxMaterial | PhysxArticulationJoint):
+            value = _describe(value)
+        elif name == "collision_shapes":
+            value = [_describe(shape) for shape in value]
+        if isinstance(value, _PLAIN):
+            properties[name] = value
+    return properties
 
 
 def _check_shapes(scene: HeadlessScene, env: int, collisions: bool) -> None:

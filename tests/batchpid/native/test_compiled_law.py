@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -16,6 +17,8 @@ from native_cases import bits, numbers
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
+from batchpid.native import extensions
+from batchpid.native.fused import header, segments
 
 NATIVE = bp.BatchPID(bp.make_params(1, 1.0), 1, 0.01).native
 needs_extension = pytest.mark.skipif(not NATIVE, reason="there are no native programs")
@@ -256,3 +259,29 @@ def test_out_is_for_numpy():
         pid(1.0, np.zeros((5, 3)), out=np.zeros((5, 3), np.float32))
     with pytest.raises(InvalidArgumentError, match="threads"):
         bp.BatchPID(bp.make_params(3, 1.0), 5, DT, threads=0)
+
+
+@needs_extension
+def test_the_commonest_laws_are_one_pass_and_compiled():
+    """Each has one segment of all its operations, and the extension was built from these."""
+    found = list(segments())
+    assert found
+    assert {segment.first for segment in found} == {0}
+    file = Path(extensions.ROOT) / "batchpid" / "native" / "fused.h"
+    assert not file.is_file() or file.read_text() == header()
+
+
+@needs_extension
+def test_efforts_that_somebody_holds_keep_their_values():
+    """Large efforts that nobody holds are written again; a view of an array holds it."""
+    envs = 2**16
+    pid = bp.BatchPID(bp.make_params(9, **EVERYTHING), envs, DT, terms=False)
+    measurement = np.zeros((envs, 9))
+    setpoints = [np.full((envs, 9), float(number)) for number in range(6)]
+    views, copies = [], []
+    for number, setpoint in enumerate(setpoints):
+        effort = pid(setpoint, measurement)
+        copies.append(effort.copy())
+        views.append(effort[:1] if number % 2 == 0 else effort)
+    for view, copied in zip(views, copies, strict=True):
+        np.testing.assert_array_equal(view, copied[: len(view)])

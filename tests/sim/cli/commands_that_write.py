@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from batchpid.sim.cli import COMMANDS
 
-SHORT = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02)
+SHORT = ("--num-envs", 1, "--seconds", 0.02)
 WORDS = {
     "demo": ("demo", *SHORT),
-    "rollout": ("rollout", *SHORT),
+    "rollout": ("rollout", *SHORT, "--workers", 0),
     "tune": ("tune", "arm.urdf"),
     "compare": ("compare", "arm.urdf"),
     "excite": ("excite", "arm.urdf"),
     "export": ("export", "arm.urdf"),
     "identify": ("identify", "arm.urdf", "run.h5"),
-    "inspect": ("inspect", "arm.urdf"),
     "plot": ("plot", "run.h5"),
 }
 """Words of each command that writes, without its outputs."""
-SUFFIXES = {"picture": ".png", "json": ".json", "out": ".yaml"}
+SUFFIXES = {"picture": ".png", "out": ".yaml"}
 OUT = {"rollout": ".h5", "excite": ".csv", "export": ".h"}
 
 

@@ -99,20 +99,3 @@ def test_the_robot_is_written_for_mujoco(batchpid, tmp_path):
     assert "<!-- differs: guard" in out.read_text()
     model = mujoco.MjModel.from_xml_path(str(out))
     assert (model.nq, model.nu, model.opt.timestep) == (9, 27, 0.0005)
-    status, said, _ = batchpid(
-        "export", "panda", "--to", "mjcf", "--motors", "--force", "--out", out
-    )
-    assert (status, said.splitlines()[-1]) == (0, f"written: {out}")
-    assert mujoco.MjModel.from_xml_path(str(out)).nu == 9
-    words = [
-        "export",
-        "panda",
-        "--to",
-        "mjcf",
-        "--motors",
-        "--gains",
-        "designed",
-        "--force",
-        "--out",
-    ]
-    assert batchpid(*words, out)[0] == 2

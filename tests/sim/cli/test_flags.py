@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import itertools
 import sys
 import warnings
 from functools import cache
@@ -15,17 +16,15 @@ import pytest
 import tyro
 from commands_that_write import WORDS, output, output_flags
 
-from batchpid.sim import Robot
 from batchpid.sim.cli import COMMANDS
 from batchpid.sim.cli.commands import bar
-from batchpid.sim.tuning import compare
 
 HAVE = {
-    "--gains": {"demo", "rollout", "compare", "identify", "export", "inspect", "view"},
-    "--seconds": {"demo", "rollout", "tune", "compare", "excite"},
-    "--engine": {"demo", "rollout", "tune", "compare", "view"},
-    "--base": COMMANDS.keys() - {"plot"},
-    "--json": {"rollout", "compare", "identify", "inspect"},
+    "--gains": {"rollout", "compare", "identify", "export", "inspect", "view"},
+    "--seconds": {"demo", "rollout", "excite"},
+    "--engine": {"demo", "rollout", "compare", "view"},
+    "--base": {"rollout", "tune", "compare", "identify", "inspect", "view"},
+    "--actuators": {"rollout", "tune", "compare", "export", "view"},
     "--out": {"rollout", "tune", "excite", "identify", "export"},
     "--picture": {"demo", "rollout", "tune", "compare", "identify", "plot"},
 }
@@ -58,7 +57,7 @@ def choices(command: str) -> set[str]:
 
 
 def test_there_are_few_flags():
-    assert sum(len(flags(command).keys() - {"-h", "--help"}) for command in COMMANDS) <= 110
+    assert sum(len(flags(command).keys() - {"-h", "--help"}) for command in COMMANDS) <= 92
 
 
 @pytest.mark.parametrize("flag", HAVE)
@@ -112,9 +111,10 @@ BAD = {
 kinds.
 """
 SHORT = {
-    "demo": ("demo", "--num-envs", 1, "--workers", 0, "--seconds", 0.02),
+    "demo": ("demo", "--num-envs", 1, "--seconds", 0.02),
     "rollout": ("rollout", "arm.urdf", "--num-envs", 1, "--workers", 0, "--seconds", 0.02),
     "identify": (*WORDS["identify"], "--gains", "designed"),
+    "inspect": ("inspect", "arm.urdf"),
     "view": ("view", "arm.urdf", "--num-envs", 1, "--workers", 0, "--time-limit", 0.1),
 }
 """Words of commands, where they are other ones than in WORDS."""
@@ -164,12 +164,12 @@ def written(folder: Path) -> set[Path]:
         ("rollout --setpoint 1 2", "setpoint: has shape (2,)"),
         ("rollout --control osc --setpoint 1 2", "setpoint: has shape (2,)"),
         ("rollout --control osc --gains tuned", "gains: are for the control of joints"),
-        ("rollout --tool panda_hand", "tool: is for control 'osc'"),
-        ("rollout --substeps 0", "substeps: out of range"),
+        ("rollout --timestep 0", "timestep: out of range"),
         ("rollout --out a.npz", "out: unknown file format"),
         ("rollout --gains tunned", "use tuned, designed, "),
         ("tune nobody", "no robot 'nobody'"),
-        ("tune arm.urdf --population 1", "population: out of range"),
+        ("tune arm.urdf --generations 0", "generations: out of range"),
+        ("compare --gains drive:-1,3", "gains: is no drive"),
         ("compare --gains drive:a,b", "DAMPING"),
         ("identify arm.urdf", "logs: are missing"),
         ("identify arm.urdf run.h5 --extras speed", "extras"),
@@ -196,7 +196,7 @@ def test_flags_that_contradict_each_other_are_answered_in_one_line(
     status, said, complaint = batchpid(*words.split())
     assert written(Path()) == before
     assert (status, complaint.count("\n")) == (2, 1)
-    assert said.count("\n") <= 2  # the first line, and one about the engine
+    assert said.count("\n") <= 1  # the first line
     assert complaint.startswith("batchpid: ")
     assert message in complaint
 
@@ -212,23 +212,16 @@ class Terminal(io.StringIO):
         return self.is_terminal
 
 
-def test_an_engine_is_a_word_several_or_the_default(files, batchpid, monkeypatch):
-    monkeypatch.chdir(files)
-    short = ("--moves", 1, "--seconds", 0.05, "--workers", 0)
-    status, said, _ = batchpid("compare", "arm.urdf", *short, "--engine")
-    assert (status, said.count(" of 1")) == (0, 2)
-    options = {"moves": 1, "seconds": 0.05, "workers": 0, "engine": "mujoco"}
-    assert compare(Robot.load("arm.urdf"), **options).engines == ("mujoco",)
-
-
-@pytest.mark.parametrize("is_terminal", [False, True])
-def test_bars_are_for_terminals_alone(is_terminal, monkeypatch):
-    monkeypatch.setattr("sys.stderr", Terminal(is_terminal))
-    shown = bar("working", delay=0.0, mininterval=0.0)
-    assert list(shown(range(3))) == [0, 1, 2]
-    assert ("working" in sys.stderr.getvalue()) == is_terminal
+def test_a_terminal_has_a_bar_and_a_pipe_a_line_every_ten_seconds(monkeypatch):
+    for is_terminal in (True, False):
+        monkeypatch.setattr("sys.stderr", Terminal(is_terminal))
+        monkeypatch.setattr("time.monotonic", itertools.count(step=4).__next__)
+        assert list(bar("working")(range(8))) == [*range(8)]
+        said = sys.stderr.getvalue()
+        assert said.count("\n") == (0 if is_terminal else 2)
+    assert said.splitlines()[-1] == "batchpid: working: 5 of 8 it, 24 s"
 
 
 def test_no_default_output_needs_a_folder_of_the_user(batchpid):
-    assert batchpid("excite", "panda", "--seconds", 1, "--rate", 100)[0] == 0
+    assert batchpid("excite", "panda", "--seconds", 1)[0] == 0
     assert [path.name for path in Path("out").iterdir()] == ["panda.excite.csv"]

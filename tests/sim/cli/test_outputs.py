@@ -130,14 +130,6 @@ def test_an_export_does_not_replace_its_robot(target, file, batchpid, tmp_path):
     assert (status, "out: is a file to read" in complaint, path.read_text()) == (2, True, text)
 
 
-def test_no_two_outputs_are_one_file(files, batchpid, tmp_path):
-    same = tmp_path / "a.json"
-    _, _, complaint = batchpid(
-        "identify", files / "arm.urdf", files / "run.h5", "--out", same, "--json", same
-    )
-    assert "json: is another output of this run" in complaint
-
-
 def test_make_can_repeat_its_runs():
     makefile = (Path(__file__).parents[3] / "Makefile").read_text().replace("\\\n", "")
     runs = [

@@ -8,20 +8,9 @@ from tiny_urdf import one_joint, write
 
 import batchpid as bp
 from batchpid.sim import Robot
-from batchpid.sim.tuning import random_moves
+from batchpid.sim.tuning.moves import random_moves
 
 pytest.importorskip("cmaes")
-
-SHORT = (
-    "--generations",
-    1,
-    "--population",
-    4,
-    "--seconds",
-    0.1,
-    "--workers",
-    0,
-)
 
 
 @pytest.fixture(autouse=True)
@@ -45,12 +34,13 @@ def test_tune_writes_the_better_gains_with_settings(batchpid, tmp_path, monkeypa
     Path("payload.yaml").write_text("payload: {uniform: [0, 0.5]}")
     bp.save_actuators("motors.yaml", bp.make_actuators(1, command_delay=0.001), robot.joint_names)
     flags = ("--actuators", "motors.yaml", "--randomize", "payload.yaml", "--out", "gains.yaml")
-    status, said, error = batchpid("tune", "my arm.urdf", *SHORT, *flags)
+    status, said, error = batchpid("tune", "my arm.urdf", "--generations", 1, *flags)
     assert status == 0, error
     about = bp.load_about("gains.yaml")
     assert (about["seed"], about["engine"]) == (0, "mujoco")
     assert about["gains"] == ("designed" if "rejected" in about else "tuned")
     assert ("The designed gains are the result" in said) == ("rejected" in about)
+    assert "gains at the start pose" in said
     assert {"mujoco", "numpy", "cmaes"} <= about["versions"].keys()
     assert not [name for name, value in about.items() if value in ("True", "False", "None")]
     same = (bp.load_params("gains.yaml")[0].kp == robot.designed().kp).all()
@@ -63,7 +53,7 @@ def test_compare_runs_each_set_in_both_engines(drawn, batchpid, tmp_path, reques
     if not drawn:
         request.getfixturevalue("undrawn")
     picture = tmp_path / "two.png"
-    flags = ("--moves", 1, "--seconds", 0.9, "--workers", 0, "--picture", picture)
+    flags = ("--moves", 1, "--picture", picture)
     status, said, error = batchpid(
         "compare", "--gains", "tuned", "--engine", "sapien", "mujoco", *flags
     )

@@ -1,20 +1,15 @@
-"""Trajectories under the default gains: robots follow them with rates, and a warning names rates
-that are missing.
-"""
+"""Trajectories under the default gains: robots follow them with rates."""
 
 from __future__ import annotations
-
-import warnings
 
 import numpy as np
 import pytest
 from robots import load_bundled
 
-from batchpid.sim import MovingSetpointWarning, Runner
+from batchpid.sim import Runner
 from batchpid.trajectories import minimum_jerk, trapezoidal
 
 N, DT = 2, 0.01
-QUIET = pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
 
 
 def moves(robot, count=N, seed=0, profile=minimum_jerk, **limits):
@@ -34,7 +29,6 @@ def follow(robot, start, move, *, rates=True, accelerations=False, **options):
         return runner.rollout(move.position, **given)
 
 
-@QUIET
 @pytest.mark.quick_rows(4)
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
@@ -62,7 +56,6 @@ def test_default_gains_follow_a_trajectory(name, engine, gains):
     assert error["accelerations"] < 0.002
 
 
-@QUIET
 def test_a_trapezoid_is_followed_too():
     panda = load_bundled("panda")
     start, move = moves(panda, profile=trapezoidal, max_acceleration=4.0)
@@ -82,7 +75,6 @@ def test_a_trapezoid_is_followed_too():
     ids=str,
 )
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
-@QUIET
 def test_every_control_carries_the_setpoint_on(options, engine):
     panda = load_bundled("panda")
     start, move = moves(panda, seed=1)
@@ -134,27 +126,3 @@ def test_a_setpoint_at_rest_with_an_acceleration_gives_its_effort():
     np.testing.assert_allclose(
         np.subtract(*efforts[::-1]), panda.mass_matrix(start)[0] @ acceleration, rtol=0.02
     )
-
-
-def test_it_warns_once_of_setpoints_that_move_without_rates():
-    panda = load_bundled("panda")
-    path = panda.settings.target + np.outer(np.linspace(0, 0.2, 80), np.arange(9) < 7)
-    with Runner(panda, 2, workers=0) as runner:
-        with pytest.warns(MovingSetpointWarning, match="ms behind.*setpoint_rate") as seen:
-            runner.rollout(path)
-        assert [each.filename for each in seen] == [__file__]
-        runner.rollout(path)  # a warning is an error here
-    steps = np.repeat(path[::16], 16, axis=0)
-    jumps = panda.sample(60, seed=0)
-    for setpoints, rates, params in (
-        (steps, None, None),
-        (jumps, None, None),
-        (path, np.gradient(path, DT, axis=0), None),
-        (path, None, panda.params(kp=300.0, ki=50.0, kd=30.0)),
-    ):
-        with (
-            Runner(panda, 2, workers=0, params=params, collisions=False) as runner,
-            warnings.catch_warnings(),
-        ):
-            warnings.simplefilter("error", MovingSetpointWarning)
-            runner.rollout(setpoints, setpoint_rates=rates)

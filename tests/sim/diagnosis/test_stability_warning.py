@@ -41,8 +41,9 @@ def make(arm, num_envs=1, **options):
 def test_it_names_joint_factor_and_remedy_at_construction_and_assignment(arm):
     runner, (message,) = warned(lambda: make(arm, params=arm.params(**BAD)))
     with runner:
-        finding = next(one for one in arm.check(params=arm.params(**BAD)) if one.joint is None)
-        factor = finding.text.split(" times")[0].rsplit(" ", 1)[1]
+        checked = arm.check(params=arm.params(**BAD))
+        (finding,) = (one for one in checked if one.code == "unstable")
+        factor = finding.detail.split(" times")[0]
         assert f"gains are {factor} times the stability bound" in message
         assert "mostly of joint 'two', at the start pose with a time step of 0.0005 s" in message
         assert "use at most" in message

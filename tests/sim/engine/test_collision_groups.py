@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physx_filter import may_touch
 
+from batchpid.sim.engine.sapien.limits import collision_groups
 from batchpid.sim.engine.sapien.user_content import HeadlessScene, sapien
-from batchpid.sim.robot.self_collision import collision_groups
 
 DEFAULT = (1, 1, 0, 0)
 

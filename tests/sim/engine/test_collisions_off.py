@@ -8,7 +8,7 @@ from robots import RUBBING, load_bundled
 
 import batchpid
 from batchpid.sim import Randomization, Robot, Runner, Uniform
-from batchpid.sim.tuning import random_moves
+from batchpid.sim.tuning.moves import random_moves
 
 BOX = '<collision><geometry><box size="0.1 0.1 0.4"/></geometry></collision>'
 TICKS = 15

@@ -63,7 +63,8 @@ def test_an_engine_has_the_members_of_each_protocol(name):
 class DoubleIntegrators:
     """Pack whose joints have unit inertia: q'' = u, by the semi-implicit Euler method."""
 
-    state_is_complete, steps_natively = True, False
+    steps_natively = False
+    content = np.zeros(0, np.int64)
 
     def __init__(self, spec, size, first_env):
         self.spec, self.size, self.first_env, self.dof = spec, size, first_env, len(spec.joints)
@@ -148,7 +149,7 @@ def sliders(spec):
 ENGINE = engines.Engine(
     name="toy",
     title="Toy",
-    capabilities=frozenset(),
+    capabilities=frozenset({"complete_state"}),
     physics={"accurate": Solver(1)},
     group_size=4,
     make_pack=lambda spec, size, first_env=0, **_: DoubleIntegrators(spec, size, first_env),

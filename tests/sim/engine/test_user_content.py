@@ -106,6 +106,47 @@ def test_a_function_that_no_worker_can_import_is_sent_to_the_workers():
     np.testing.assert_array_equal(poses[:, 0, 1], [0, 1, 2])
 
 
+def body_of(**properties):
+    """Return a ``build`` whose body has other properties in env 2 than elsewhere."""
+
+    def build(scene, env):
+        size, friction, mass = (
+            values[env == 2]
+            for values in (
+                properties.get(name, (default, default))
+                for name, default in (("size", 0.1), ("friction", 0.3), ("mass", 1.0))
+            )
+        )
+        builder = scene.create_actor_builder()
+        material = scene.create_physical_material(friction, friction, 0.0)
+        builder.add_box_collision(half_size=[0.1, 0.1, size], material=material)
+        builder.set_initial_pose(pose([2, 0, 1]))
+        box = builder.build()
+        for component in box.components:
+            component.mass = mass
+        return box
+
+    return build
+
+
+@pytest.mark.parametrize(
+    "properties", [{}, {"size": (0.1, 0.2)}, {"friction": (0.3, 0.4)}, {"mass": (1, 2)}]
+)
+def test_an_env_goes_on_only_where_build_makes_the_same_content(properties):
+    with Runner(ROBOT, 3, workers=0, params=ROBOT.params(), build=body_of(**properties)) as runner:
+        runner.step(ROBOT.start)
+        snapshot = runner.snapshot()
+        runner.restore(snapshot.for_envs([1, 0, 2]))
+        if properties:
+            with pytest.raises(
+                InvalidArgumentError, match=r"snapshot: .* build made other content"
+            ):
+                runner.restore(snapshot.for_envs([0, 1, 1]))
+        else:
+            runner.restore(snapshot.for_envs([0, 1, 1]))
+            np.testing.assert_array_equal(*runner.poses()[1:])
+
+
 def test_errors_of_build_name_it_and_the_env():
     def wrong(scene, env):
         if env == 2:

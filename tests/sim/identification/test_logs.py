@@ -174,18 +174,31 @@ def test_runs_that_a_fit_cannot_simulate_are_refused(robot, problem):
         logs_of_rollout(robot, rollout)
 
 
-def test_a_recording_of_changed_params_is_refused(robot, tmp_path):
+@pytest.mark.parametrize("change", ["params", "actuators", "snapshot", "reset"])
+def test_a_recording_is_refused_or_divided_at_a_change(robot, tmp_path, change):
+    """Params have no effect under control "effort", and a reset begins another stretch."""
     path = tmp_path / "run.h5"
+    changes = {
+        "params": lambda runner: setattr(runner, "params", gains().replace(kp=1.0)),
+        "actuators": lambda runner: setattr(runner, "actuators", bp.make_actuators(2, strength=2)),
+        "snapshot": lambda runner: runner.restore(runner.snapshot()),
+        "reset": lambda runner: runner.reset(np.full(2, 0.3), mask=[True, False]),
+    }
     with (
-        Runner(robot, 1, params=gains(), workers=0, engine="mujoco") as runner,
+        Runner(robot, 2, params=gains(), workers=0, engine="mujoco") as runner,
         Recorder(path, runner),
     ):
-        for row in motion(0.5):
-            runner.step(row)
-            runner.params = gains().replace(kp=0.5 * gains().kp)
-        runner.params = gains()
-    with pytest.raises(bp.InvalidArgumentError, match="params that were changed"):
-        read_logs(robot, [path])
+        runner.rollout(motion(1.0))
+        changes[change](runner)
+        rows = len(runner.rollout(motion(1.0)).time)
+        changes[change](runner)
+    if change == "reset":
+        logs = read_logs(robot, [path])
+        assert [len(log.time) for log in logs] == [rows, rows, 2 * rows]
+        assert all(np.abs(np.diff(log.qpos, axis=0)).max() < 0.1 for log in logs)
+    else:
+        with pytest.raises(bp.InvalidArgumentError, match=f"has .*{change} that w"):
+            read_logs(robot, [path])
 
 
 def bag(path, messages):

@@ -15,10 +15,12 @@ import pytest
 from identical import assert_identical
 from robots import load_bundled
 
+import batchpid as bp
 from batchpid.errors import ClosedError, InvalidArgumentError
-from batchpid.sim import FaultWarning, Recorder, Runner, read_recording
+from batchpid.sim import FaultWarning, Recorder, RecordingError, Runner, read_recording
 from batchpid.sim.cli import main
 from batchpid.sim.recording import recorder as recorder_module
+from batchpid.sim.signals.rollout import ACTUATORS, PARAMS, RESET, RESTORE
 
 ROBOT = load_bundled("panda")
 N = 3
@@ -67,6 +69,54 @@ def test_the_start_is_that_of_the_reset_before_the_first_tick(tmp_path):
     np.testing.assert_array_equal(read_recording(tmp_path / "run.h5").info.start, start)
 
 
+def reset(runner):
+    runner.reset(table(1)[0], mask=[True, False, True])
+
+
+def restore(runner):
+    runner.restore(runner.snapshot())
+
+
+def set_params(runner):
+    runner.params = ROBOT.params(kp=5.0)
+
+
+def set_actuators(runner):
+    runner.actuators = bp.make_actuators(ROBOT.dof, strength=0.5)
+
+
+CHANGES = {
+    reset: [RESET, 0, RESET],
+    restore: [RESTORE] * N,
+    set_params: [PARAMS] * N,
+    set_actuators: [ACTUATORS] * N,
+}
+"""Every method that changes the state of a runner, and what its recording says of each env."""
+
+
+def test_every_change_of_the_state_is_recorded_before_its_tick(tmp_path):
+    path = tmp_path / "run.h5"
+    expected = []
+    with make() as runner:
+        runner.step(ROBOT.start)
+        with Recorder(path, runner):
+            for change, codes in CHANGES.items():
+                runner.rollout(table(2))
+                change(runner)
+                runner.send(ROBOT.start)
+                runner.recv()
+                expected += [[0] * N, [0] * N, codes]
+            assert runner.rollout(table(1)).changes is None
+            # Several changes at once.
+            for change in CHANGES:
+                change(runner)
+            expected += [[0] * N, list(map(sum, zip(*CHANGES.values(), strict=True)))]
+            assert runner.rollout(table(1)).changes.tolist() == expected[-1:]
+    np.testing.assert_array_equal(read_recording(path).changes, expected)
+    rows = np.add.reduceat(expected, [0, 1, 5, 9, 13], axis=0)
+    np.testing.assert_array_equal(read_recording(path, every=4).changes, rows[:4])
+
+
 def test_feedforwards_are_recorded_where_they_are_given(tmp_path):
     efforts = np.random.default_rng(0).uniform(-1, 1, (4, N, ROBOT.dof))
     with make() as runner, Recorder(tmp_path / "run.h5", runner):
@@ -106,6 +156,12 @@ def test_an_existing_file_is_replaced_only_when_asked(tmp_path):
             Recorder(path, runner)
         recorder = Recorder(path, runner, overwrite=True)
         assert path.read_text() == "precious"
+        with make() as other:
+            late = Recorder(tmp_path / "late.h5", other)
+            (tmp_path / "late.h5").write_text("since then")
+            other.step(ROBOT.start)
+            with pytest.raises(RecordingError, match="pass overwrite=True"):
+                late.close()
         runner.step(ROBOT.start)
         recorder.close()
         recorder.close()
@@ -172,7 +228,7 @@ with Runner(robot, 3, params=robot.params(), workers=0, substeps=2) as runner:
     with pytest.raises(RecordingError):
         recorder.close()
     assert runner.step(robot.start).ok.all()
-os._exit(0)  # HDF5 would crash
+
 """
 
 

@@ -75,6 +75,8 @@ def test_rollouts_are_read_as_they_were_written(tmp_path, rollout):
 
 def test_rollouts_made_by_hand_and_empty_ones_can_be_written(tmp_path, rollout, panda):
     bare = replace(rollout, info=RunInfo.of(panda)).for_ticks(slice(0, 0))
+    with pytest.raises(InvalidArgumentError, match="rollout: holds no tick"):
+        bare.plot()
     read = read_recording(write_recording(bare, tmp_path / "run.h5"))
     assert_identical(read, bare)
     assert_same_info(read.info, bare.info)
@@ -113,7 +115,10 @@ def test_files_that_are_no_recordings_are_refused_by_name(tmp_path, rollout):
     with h5py.File(shape, "r+") as file:
         del file["qpos"]
         file["qpos"] = np.zeros((6, 2, 9), np.float32)
-    for path in (text, other, shape):
+    start = write_recording(rollout, tmp_path / "start.h5")
+    with h5py.File(start, "r+") as file:
+        file.attrs["start"] = np.zeros((1, 2))
+    for path in (text, other, shape, start):
         with pytest.raises(RecordingError, match=rf"{path.name}: cannot be read as a recording: "):
             read_recording(path)
 

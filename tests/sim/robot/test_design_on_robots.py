@@ -12,7 +12,8 @@ import pytest
 from robots import load_published
 
 import batchpid as bp
-from batchpid.sim.tuning import evaluate_gains, random_moves
+from batchpid.sim.tuning.evaluation import evaluate_gains
+from batchpid.sim.tuning.moves import random_moves
 
 ROBOTS = [
     "panda",

@@ -148,22 +148,56 @@ def test_a_mesh_that_only_the_engine_refuses_is_an_error_of_the_runner(tmp_path)
         Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0))
 
 
-def test_a_mesh_that_changed_since_it_was_simulated_is_refused(tmp_path):
-    """SAPIEN caches the first shape: without an error, it would simulate the old shape for the new
-    one.
-    """
-    arm = '<collision><geometry><mesh filename="m.stl"/></geometry></collision>'
-    path, mesh = write(tmp_path, one_joint(arm=arm)), tmp_path / "m.stl"
-    mesh.write_bytes(stl())
+SCENE = """<mujoco><asset><mesh name="m" file="d.obj"/></asset><worldbody>
+  <body pos="3 0 1"><freejoint/><geom type="mesh" mesh="m" mass="2"/></body>
+  <include file="part.xml"/></worldbody></mujoco>"""
+PART = """<mujocoinclude><body name="arm" pos="0 0 1"><joint name="j"/>
+  <inertial pos="0 0 0" mass="1" diaginertia="4.1e-8 4.1e-8 4.1e-8"/><geom size=".1"/>
+  <body pos=".1 0 0"><geom type="mesh" mesh="m"/></body></body></mujocoinclude>"""
+
+
+@pytest.mark.parametrize("kind", ["urdf", "mjcf"])
+def test_another_digit_of_any_file_is_another_robot(kind, tmp_path):
+    """Whatever the caches of engines and of this process hold: size and time stamp stay."""
+    (tmp_path / "d.obj").write_bytes(obj())
+    path = write(tmp_path, arm("d.obj"))
+    (tmp_path / "part.xml").write_text(PART)
+    if kind == "mjcf":
+        path = tmp_path / "scene.xml"
+        path.write_text(SCENE)
+    opened = {path, tmp_path / "d.obj"} | ({tmp_path / "part.xml"} if kind == "mjcf" else set())
+    first = Robot.load(path).describe()
+    for file in sorted(opened):
+        text, stamp = file.read_text(), file.stat()
+        # The version of the XML changes nothing.
+        digits = [at for at, letter in enumerate(text) if letter in "12" and at > 20]
+        for at in digits[:: max(1, len(digits) // 6)]:
+            changed = text[:at] + {"1": "2", "2": "1"}[text[at]] + text[at + 1 :]
+            file.write_text(changed)
+            os.utime(file, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+            try:
+                assert Robot.load(path).describe() != first, changed
+            except RobotError:
+                continue  # no mesh any more
+        file.write_text(text)
+    assert Robot.load(path).describe() == first
+
+
+def test_a_mesh_that_changed_since_it_was_loaded_is_refused(tmp_path):
+    """And where SAPIEN would simulate the first mesh of this name for a new one."""
+    (tmp_path / "d.obj").write_bytes(obj())
+    path = write(tmp_path, arm("d.obj"))
     robot = Robot.load(path)
-    robot.mass_matrix(robot.start)
-    longer = np.frombuffer(stl()[84:], np.dtype([("numbers", "<f4", 12), ("end", "u2")])).copy()
-    longer["numbers"] *= 2
-    mesh.write_bytes(stl()[:84] + longer.tobytes())
-    with pytest.raises(RobotError, match=r"m\.stl: has changed since.*under another name"):
-        Robot.load(path)
-    mesh.write_bytes(stl())
-    assert Robot.load(path).describe() == robot.describe()
+    Runner(robot, 1, workers=0, engine="sapien", control="effort").close()
+    (tmp_path / "d.obj").write_bytes(obj().replace(b"1.0", b"0.8"))
+    robot = Robot.load(path)
+    (tmp_path / "d.obj").write_bytes(obj().replace(b"1.0", b"0.9"))
+    other = Robot.load(path, self_collision="none")
+    Runner(other, 1, workers=0, engine="mujoco", control="effort").close()
+    with pytest.raises(RobotError, match=r"d\.obj: has changed.*SAPIEN.*under another name"):
+        Runner(other, 1, workers=0, engine="sapien", control="effort")
+    with pytest.raises(RobotError, match=r"d\.obj: has changed since the robot was loaded"):
+        Runner(robot, 1, workers=0, engine="mujoco", control="effort")
 
 
 def test_robots_of_other_content_differ_in_what_they_say_about_themselves(tmp_path):

@@ -5,6 +5,7 @@ a finding.
 from __future__ import annotations
 
 import random
+import re
 from contextlib import suppress
 
 import mujoco
@@ -16,8 +17,8 @@ from batchpid.sim import Robot, Runner, to_urdf
 from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.protocol import SceneSpec
-from batchpid.sim.robot.shapes import surfaces
-from batchpid.sim.tuning import gain_set
+from batchpid.sim.tuning.gain_sets import gain_set
+from batchpid.sim.view.surfaces import surfaces
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
@@ -356,90 +357,107 @@ def test_floating_base(load):
     fixed, floating = load(WALKER, fixed_base=True), load(WALKER, self_collision="none")
     assert fixed.dof == floating.dof == 2
     assert (fixed.fixed_base, floating.fixed_base) == (True, False)
-    assert {each.link for each in fixed.repairs if each.code == "loose-link"} == {"ball", "goal"}
+    assert {each.link for each in fixed.mjcf.losses} == {"ball", "goal"}
     for engine in ("sapien", "mujoco"):
         with Runner(floating, num_envs=1, workers=0, engine=engine, ground=False) as runner:
             runner.reset()
             assert runner.step(floating.start).ok.all()
 
 
-FINDINGS = {
-    "spring": (two_links('<joint name="j" stiffness="3"/>'), "spring", "j"),
-    "gravity": (two_links(rest='<option gravity="0 0 0"/>'), "option", None),
-    "flag": (two_links(rest='<option><flag contact="disable"/></option>'), "option", None),
-    "medium": (two_links(rest='<option density="1.2"/>'), "option", None),
-    "gravcomp": (two_links().replace('name="b"', 'name="b" gravcomp="1"'), "gravcomp", None),
-    "site": (two_links().replace(BOX, f'{BOX}<site name="s"/>', 1), "unknown-element", None),
-    "weld": (two_links(rest='<equality><weld body1="b"/></equality>'), "equality", None),
-    "held joint": (two_links(rest='<equality><joint joint1="j"/></equality>'), "mimic", "j"),
+TENDON = '<tendon><fixed {}><joint joint="j" coef="1"/></fixed></tendon>'
+SITE = f'{BOX}<site name="s"/>'
+DRIVEN = '<actuator><{} joint="j" {}/></actuator>'
+REPAIRED = {  # a file, code of the finding in every engine, and what it says
+    "gravity": (two_links(rest='<option gravity="0 0 0"/>'), "option", "robot: gravity is"),
+    "no gravity": (
+        two_links(rest='<option><flag gravity="disable"/></option>'),
+        "option",
+        "no eff",
+    ),
+    "gravcomp": (two_links().replace('name="b"', 'name="b" gravcomp="1"'), "option", "'b': grav"),
     "passive joint": (
-        two_links(rest='<actuator><motor joint="j"/></actuator>').replace(
-            '<joint name="j"/>', '<joint name="j"/><joint name="k" axis="0 1 0"/>'
-        ),
+        two_links('<joint name="j"/><joint name="k" axis="0 1 0"/>', DRIVEN.format("motor", "")),
         "actuator",
-        "k",
+        "'k': no actuator",
     ),
     "one-sided force": (
-        two_links(rest='<actuator><motor joint="j" forcerange="-2 5"/></actuator>'),
+        two_links(rest=DRIVEN.format("motor", 'forcerange="-2 5"')),
         "limits",
-        "j",
+        r"'j' \(-2 to 5\): effort limits differ",
     ),
-    "filter": (
-        two_links(rest='<actuator><position joint="j" timeconst=".1"/></actuator>'),
-        "actuator",
-        "j",
-    ),
+    "filter": (two_links(rest=DRIVEN.format("position", 'timeconst=".1"')), "actuator", "'j'"),
     "thruster": (
-        two_links(rest='<actuator><motor site="s"/></actuator>').replace(
-            BOX, f'{BOX}<site name="s"/>', 1
-        ),
+        two_links(rest='<actuator><motor site="s"/></actuator>').replace(BOX, SITE, 1),
         "actuator",
-        None,
+        "robot: actuator",
     ),
-    "inert tendon": (
-        two_links(rest='<tendon><fixed armature="2"><joint joint="j" coef="1"/></fixed></tendon>'),
-        "tendon",
-        None,
+    "range of a servo": (
+        two_links(rest=DRIVEN.format("position", 'ctrlrange="-.5 .7" gear="2"')),
+        "limits",
+        r"'j' \(-0.25 to 0.35, inf/s\): its servo.*guard=True",
     ),
-    "stiff tendon": (
-        two_links(rest='<tendon><fixed stiffness="2"><joint joint="j" coef="1"/></fixed></tendon>'),
-        "tendon",
-        None,
+}
+NOTED = {  # what is left out everywhere and changes no motion
+    "site": (two_links().replace(BOX, SITE, 1), "1 sites"),
+    "camera": (two_links().replace(BOX, f"{BOX}<camera/>", 1), "1 cameras"),
+    "sleep": (two_links(rest='<option><flag sleep="enable"/></option>'), "1 <flag sleep"),
+}
+LOST = {  # a file, and what SAPIEN says of it
+    "spring": (two_links('<joint name="j" stiffness="3"/>'), "'j': without the spring"),
+    "bent spring": (two_links('<joint name="j" stiffness="0 5"/>'), "'j': without the spring"),
+    "bent damping": (two_links('<joint name="j" damping="1 5"/>'), "'j': the damping that grows"),
+    "flag": (two_links(rest='<option><flag contact="disable"/></option>'), "disables contact;"),
+    "medium": (two_links(rest='<option density="1.2"/>'), "without the medium"),
+    "weld": (two_links(rest='<equality><weld body1="b"/></equality>'), "loops are open"),
+    "held joint": (two_links(rest='<equality><joint joint1="j"/></equality>'), "'j': .*not linear"),
+    "inert tendon": (two_links(rest=TENDON.format('armature="2"')), "tendons: 'number 0'"),
+    "stiff tendon": (two_links(rest=TENDON.format('stiffness="0 2"')), "tendons: 'number 0'"),
+    "damped tendon": (two_links(rest=TENDON.format('damping="0 2"')), "tendons: 'number 0'"),
+    "raised plane": (
+        two_links().replace(
+            "<worldbody>", '<worldbody><geom type="plane" size="1 1 1" pos="0 0 1"/>'
+        ),
+        "plane 'number 0'",
     ),
 }
 
 
-@pytest.mark.parametrize("name", FINDINGS)
-def test_what_has_no_equivalent_is_told(load, name):
-    text, code, joint = FINDINGS[name]
-    found = [each for each in load(text).repairs if each.code == code and each.joint == joint]
-    assert found
-    assert all(each.remedy for each in found)
+def said(robot, code, **options):
+    return "\n".join(str(each) for each in robot.check(**options) if each.code == code)
+
+
+@pytest.mark.parametrize("name", REPAIRED)
+def test_what_is_simulated_otherwise_is_a_repair(load, name):
+    text, code, message = REPAIRED[name]
+    assert re.search(message, said(load(text), code))
     with pytest.raises(RobotError, match="needs"):
         load(text, strict=True)
 
 
+@pytest.mark.parametrize("name", NOTED)
+def test_what_has_no_effect_is_named(load, name):
+    text, message = NOTED[name]
+    assert message in said(load(text, strict=True), "unknown-element")
+
+
+@pytest.mark.parametrize("name", LOST)
+def test_what_sapien_loses_sapien_says(load, name):
+    text, message = LOST[name]
+    robot = load(text, strict=True)
+    assert said(robot, "engine", engine="mujoco") == said(robot, "engine") == ""
+    assert re.search(message, said(robot, "engine", engine="sapien"))
+
+
 def test_all_that_is_left_out_is_named(load):
     """A floating robot is not fixed to the world, whose shapes are not its links'."""
-    floor = '<geom type="plane" size="1 1 .1" pos="0 0 0"/>'
+    floor = '<geom type="plane" size="1 1 .1"/>'
     world = f'{floor}<geom name="wall" size=".1"/><geom type="box" size=".1 .1 .1"/>'
-    rest = """<equality><weld name="hold" body1="leg1"/></equality>"""
-    told = "\n".join(
-        map(str, load(WALKER.replace("<worldbody>", f"{rest}<worldbody>{world}")).repairs)
-    )
-    for name in (
-        "sphere 'wall', box 'number 2'",
-        "'hold'",
-        "'ball'",
-        "'goal'",
-    ):
-        assert name in told
-    for place in ('pos="0 0 -1"', 'euler="30 0 0"'):
-        plane = floor.replace('pos="0 0 0"', place)
-        (found,) = load(two_links().replace("<worldbody>", f"<worldbody>{plane}")).repairs
-        assert (found.severity, found.code) == ("warning", "collision")
-        assert "plane 'number 0'" in found.text
-    assert load(two_links().replace("<worldbody>", f"<worldbody>{floor}")).repairs == ()
+    rest = '<equality><weld name="hold" body1="leg1"/></equality>'
+    robot = load(WALKER.replace("<worldbody>", f"{rest}<worldbody>{world}"))
+    for name in ("sphere 'wall', box 'number 2'", "'hold'", "'ball'", "'goal'"):
+        assert name in said(robot, "engine", engine="sapien")
+    level = load(two_links().replace("<worldbody>", f"<worldbody>{floor}"))
+    assert level.check(engine="sapien") == level.check()
 
 
 def test_a_plain_file_needs_no_repair(load):
@@ -595,7 +613,7 @@ def test_a_damaged_file_is_a_robot_or_an_error(load, seed, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)  # for MuJoCo's log
     rng = random.Random(seed)
     for _ in range(25):
-        text = rng.choice([*TEXTS.values(), *(text for text, *_ in FINDINGS.values())])
+        text = rng.choice([*TEXTS.values(), *(text for text, *_ in (REPAIRED | LOST).values())])
         begin = rng.randrange(len(text))
         part = rng.choice(
             ["", "0", "-1", "nan", "1e300", "<joint/>", "<freejoint/>", "</body>", 'mass="0"', "<"]

@@ -57,6 +57,14 @@ READ = {  # of an actuator with a moment arm of 1: input's gain, kp, kd, and lim
     '<position kp="5" kv="2" forcerange="-3 3" {}/>': (5, 5, 2, 3),
     '<position kp="5" ctrlrange="-9 9" {}/>': (5, 5, 0, np.inf),
     '<general gainprm="4" biastype="affine" biasprm="0 -5 -2" {}/>': (4, 5, 2, np.inf),
+    '<pid kp="5" kv="2" forcerange="-3 3" {}/>': (5, 5, 2, 3),
+    '<dcmotor motorconst="2 3" resistance="5" input="ff" {}/>': (1, 0, 0, np.inf),
+    '<dcmotor motorconst="1 1" resistance="1" input="pos ff" controller="5 0 2 0 0 0" {}/>': (
+        5,
+        5,
+        2,
+        np.inf,
+    ),
 }
 ARMS = {
     'joint="j"': 1,
@@ -118,7 +126,6 @@ OTHERS = (
     '<damper kv="2" ctrlrange="0 1" {}/>',
     '<cylinder timeconst=".1" area="2" bias="0 -5 0" {}/>',
     '<muscle lengthrange="0 1" {}/>',
-    '<pid kp="5" kv="2" ki="1" imax=".2" slewmax="1e12" {}/>',
     '<pid kp="5" input="vel ff" {}/>',
     '<motor delay="0.01" nsample="9" {}/>',
     '<dcmotor nominal="24 6 3" {}/>',
@@ -178,9 +185,7 @@ def test_stiff_servos_diverge_as_pid_and_not_as_drives(load, kp, kv):
         "substeps": 400,
     }
     (unstable,) = [
-        each
-        for each in robot.check(params=robot.mjcf_gains())
-        if each.joint is None and each.code == "unstable"
+        each for each in robot.check(params=robot.mjcf_gains()) if each.code == "unstable"
     ]
     with pytest.warns(
         StabilityWarning,

@@ -115,4 +115,4 @@ def test_degrees_are_recognised(old, new, said, tmp_path):
         return "\n".join(map(str, Robot.load(write(tmp_path, text)).check()))
 
     assert re.search(said, findings(WHOLE.replace(old, new)))
-    assert "degrees" not in findings(WHOLE)
+    assert "angles" not in findings(WHOLE)

@@ -12,11 +12,11 @@ import pytest
 from faulty_urdfs import ARM, HINGE, REPAIRED
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_urdf import INERTIAL, LIMIT, link, one_joint, robot, write
+from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 from batchpid.errors import RobotError
 from batchpid.sim import RepairWarning, Robot
-from batchpid.sim.robot.inertia import ball, nearest_physical, triangle_excess
+from batchpid.sim.geometry.inertia import ball, nearest_physical, triangle_excess
 
 
 @pytest.mark.parametrize("case", REPAIRED)
@@ -47,7 +47,7 @@ def test_repairs_have_the_effect_that_they_tell(tmp_path):
     assert load("joint name twice").joint_names == ("hinge", "hinge_2")
     assert [joint.mimic for joint in load("mimics in a circle").joints].count(None) == 1
     assert load("floating base").joint_names == ("hinge",)
-    assert {"placeholder", "no-effort-limit"} <= {
+    assert {"limits", "no-effort-limit"} <= {
         finding.code for finding in load("effort of 0").check()
     }
     heavy = load("no inertia").mass_matrix([0.0])[0]
@@ -67,12 +67,48 @@ def test_latin_1_that_claims_to_be_utf_8_is_read(tmp_path):
     assert Robot.load(path).joint_names == ("Drehgelenk für Rück",)
 
 
-def test_what_urdfs_hold_for_others_is_no_repair(tmp_path):
-    unused = "<visual/>", "<material/>", "<transmission/>", "<gazebo/>", "<sensor/>"
-    text = robot(link("base", "<visual/>" + INERTIAL), ARM, HINGE, *unused[1:])
+UNREAD = {  # what has no effect, and a URDF with it
+    "1 armature of <dynamics>": one_joint(LIMIT + '<dynamics armature="1"/>'),
+    "1 stiffness of <dynamics>": one_joint(LIMIT + '<dynamics damping="1" stiffness="2"/>'),
+    "1 jerk of <limit>": one_joint(LIMIT.replace("/>", ' jerk="9"/>')),
+    "1 <rotor_inertia>": robot(
+        link("base"),
+        ARM,
+        HINGE,
+        '<transmission name="t" xmlns:d="urn:drake"><joint name="hinge"/><actuator name="a">'
+        '<mechanicalReduction>2</mechanicalReduction><d:rotor_inertia value="1"/></actuator>'
+        "</transmission>",
+    ),
+    "": robot(
+        link("base", "<visual/>" + INERTIAL),
+        ARM,
+        HINGE,
+        "<material/><transmission/><gazebo/><sensor/>",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNREAD)
+def test_what_has_no_effect_is_named_and_no_repair(name, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert Robot.load(write(tmp_path, text)).repairs == ()
+        loaded = Robot.load(write(tmp_path, UNREAD[name]), strict=True)
+    notes = [(found.code, f"left out: {name};" in str(found)) for found in loaded.repairs]
+    assert notes == ([("unknown-element", True)] if name else [])
+
+
+def test_limits_of_urdf_1_2_are_those_of_the_guard(tmp_path):
+    limit = LIMIT.replace("/>", ' acceleration="3" deceleration="2"/>')
+    guard = Robot.load(write(tmp_path, one_joint(limit)), strict=True).guard()
+    assert guard.acceleration == 2
+
+
+def test_a_mass_of_zero_is_not_that_of_the_shapes(tmp_path):
+    shape = '<collision><geometry><box size="1 1 1"/></geometry></collision>'
+    arm = INERTIAL.replace('mass value="1"', 'mass value="0"') + shape
+    text = robot(link("base"), link("arm", arm), link("tip"), HINGE, joint("k", "arm", "tip"))
+    loaded = Robot.load(write(tmp_path, text), strict=True)
+    assert loaded.link_masses["arm"].mass < 1e-6
 
 
 # -- Inertia

@@ -61,8 +61,6 @@ def test_links_that_touch_at_the_start_are_not_pushed_apart(gap, tmp_path):
     """PhysX answers 0.01 mm with a large impulse."""
     loaded = Robot.load(write(tmp_path, sliders(0.0, 0.2 + gap)))
     assert reasons(loaded) == {("l0", "l1"): "Default"}
-    (finding,) = [each for each in loaded.check() if each.code == "pairs-left-out"]
-    assert (finding.link, finding.detail) == ("l0", "with 'l1'")
     with Runner(loaded, 1, engine="sapien", control="effort", workers=0) as runner:
         assert np.abs(runner.step(np.zeros(2)).qvel).max() < 1e-3
 
@@ -119,7 +117,7 @@ def test_an_srdf_disables_and_enables_pairs_whatever_their_reason(tmp_path):
     assert reasons(loaded) == {("l1", "l2"): "Default", ("l2", "l0"): "Never"}
     assert reasons(Robot.load(path, self_collision="urdf")) == {("l2", "l0"): "Never"}
     assert [finding.code for finding in loaded.check() if finding.severity == "warning"].count(
-        "srdf-link"
+        "self-collision"
     ) == 2
 
 
@@ -130,19 +128,18 @@ def test_the_pairs_of_a_robot_travel_with_it(tmp_path):
     assert vars(pickle.loads(pickle.dumps(loaded)))["self_contact"] == pairs
 
 
-def test_pairs_that_the_filter_cannot_hold_go_on_colliding_and_are_told(tmp_path):
+def test_pairs_that_physx_cannot_hold_collide_in_sapien_alone(tmp_path):
     rng, count = np.random.default_rng(0), 60
     path = write(tmp_path, sliders(*(0.0 for _ in range(count))))
     pairs = [(a, b) for a, b in combinations(range(count), 2) if rng.random() < 0.5]
     lines = (f'<disable_collisions link1="l{a}" link2="l{b}"/>' for a, b in pairs)
     write(tmp_path, robot(*lines), "test.srdf")
     loaded = Robot.load(path, self_collision="urdf")
-    contact = loaded.self_contact
-    assert len(contact.pairs) + len(contact.left_over) == len(pairs)
-    assert len(contact.left_over) > 0
-    assert next(f for f in loaded.check() if f.code == "pairs-left-over").text.startswith(
-        str(len(contact.left_over))
-    )
+    assert len(loaded.ignored_pairs) == len(pairs)
+    assert loaded.check(engine="mujoco") == loaded.check()
+    left = [found for found in loaded.check(engine="sapien") if found.code == "engine"]
+    assert 0 < len(left) < len(pairs)
+    assert all("filter of pairs is full" in found.text for found in left)
 
 
 def test_a_base_that_is_fixed_too_low_has_no_ground(tmp_path):

@@ -14,7 +14,7 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import RobotError
 from batchpid.sim import Robot
-from batchpid.sim.robot.shapes import FEWEST, MOST, segments_of, surfaces
+from batchpid.sim.view.surfaces import FEWEST, MOST, segments_of, surfaces
 
 RED = '<material name="red"><color rgba="1 0 0 0.5"/></material>'
 BOX = '<box size="0.1 0.2 0.4"/>'
@@ -178,7 +178,7 @@ def test_meshes_that_cannot_be_read_are_reported_with_link_file_and_remedy(tmp_p
                 load(tmp_path, b=visual(f'<mesh filename="{name}"/>') + shape), findings=findings
             )
             (finding,) = findings
-            assert (finding.code, finding.link, finding.detail) == ("visual-mesh", "b", repr(name))
+            assert (finding.code, finding.link, finding.detail) == ("missing-mesh", "b", repr(name))
             assert re.search(
                 f"{reason}.*: collision shapes are drawn.*; .*{remedy}", str(finding)
             ), str(finding)

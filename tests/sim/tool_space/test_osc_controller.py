@@ -220,9 +220,7 @@ def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
     assert recorded.info.tool == HAND
     assert recorded.info.units_of("tool_pose") == ("m",) * 3 + ("",) * 4
     assert rollout.for_envs([1]).for_ticks(slice(2)).tool_pose.shape == (2, 1, 7)
-    named = {
-        axes.get_title(loc="left"): axes for axes in plots.step_responses(rollout, mark=1).axes
-    }
+    named = {axes.get_title(loc="left"): axes for axes in plots.step_responses(rollout).axes}
     marked = [line.get_ydata() for line in named["setpoint qx"].get_lines()][-1]
     np.testing.assert_allclose(marked, -rollout.tool_pose[:, 1, 4])
     with Runner(panda, 1, **OPTIONS) as runner:

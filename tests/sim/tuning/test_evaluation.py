@@ -8,17 +8,15 @@ import pytest
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import LogUniform, Randomization, Runner, Uniform
-from batchpid.sim.tuning import (
-    Moves,
+from batchpid.sim.tuning.evaluation import (
     arm_joints,
     evaluate_gains,
     following_error,
     load_randomization,
-    random_moves,
     run_moves,
     step_response_metrics,
-    tutorial_move,
 )
+from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 
 def hold(pose, name="hold"):
@@ -104,11 +102,12 @@ def test_payload_outside_the_model_pulls_the_hand_down_and_the_integral_lifts_it
 def test_randomization_is_a_file(panda, tmp_path):
     path = tmp_path / "drawn.yaml"
     path.write_text(
-        "payload: {uniform: [0, 0.3]}\nparams: {kp: {log_uniform: [0.5, 2], operation: scale}}\n"
+        "seed: 4\npayload: {uniform: [0, 0.3]}\nparams: {kp: {log_uniform: [0.5, 2], operation: scale}}\n"
     )
-    loaded = load_randomization(path, panda, seed=4)
+    loaded = load_randomization(path, panda)
     kp = LogUniform(0.5, 2, operation="scale")
     assert loaded == Randomization(seed=4, payload=Uniform(0, 0.3), params={"kp": kp})
+    assert load_randomization(None, panda) is None
     path.write_text("payload: {uniform: [-1, 0]}")
     with pytest.raises(InvalidArgumentError, match=r"payload, entry 'payload': must be .*got -1"):
         load_randomization(path, panda)

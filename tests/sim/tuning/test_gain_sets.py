@@ -9,7 +9,7 @@ import pytest
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.tuning import gain_set
+from batchpid.sim.tuning.gain_sets import gain_set
 
 
 def same(one, other):
@@ -40,6 +40,12 @@ def test_drive_has_a_control_stiffness_and_damping(panda):
     assert (gains.params.kp == 30).all()
     assert (gains.params.kd == 4).all()
     assert gain_set(panda, "drive").name == "drive (20, 5)"
+
+
+@pytest.mark.parametrize("name", ["drive:-1,3", "drive:1,nan", "drive:1", "drive:a,b"])
+def test_a_wrong_drive_is_refused_by_the_name_of_the_argument(panda, name):
+    with pytest.raises(InvalidArgumentError, match=r"^gains: is no drive.*STIFFNESS,DAMPING"):
+        gain_set(panda, name)
 
 
 def test_params_file_is_named_after_the_file(panda, tmp_path):

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from batchpid.sim.tuning import Moves, random_moves, tutorial_move
 from batchpid.sim.tuning.moves import (
+    Moves,
+    random_moves,
     shortest_durations,
     smooth_durations,
     smooth_effort,
     smooth_variation,
+    tutorial_move,
 )
 from batchpid.trajectories import minimum_jerk
 

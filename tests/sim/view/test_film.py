@@ -1,14 +1,18 @@
 """Pictures and films, drawn by Matplotlib."""
 
+import dataclasses
 import os
 import subprocess
 
 import numpy as np
 import pytest
+import trimesh
+from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError
-from batchpid.sim import Runner
+from batchpid.sim import Robot, Runner
 from batchpid.sim.view import film
+from batchpid.sim.view.scene import RobotScene
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +90,44 @@ def test_the_message_of_ffmpeg_is_in_the_error(tmp_path):
     pictures = [np.zeros((90, 160, 3), np.uint8)] * 100
     with pytest.raises(BatchPIDError, match=r"ffmpeg: .*No such file"):
         film.encode(pictures, tmp_path / "none" / "film.mp4", ffmpeg, (160, 90), 30.0)
+
+
+@pytest.mark.parametrize("gap", [1e7, 1e12, np.inf])
+def test_runs_that_no_film_can_hold_are_refused(rollout, gap, tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    far = dataclasses.replace(rollout, time=np.append(rollout.time[:-1], gap))
+    empty = rollout.for_ticks(slice(0, 0))
+    for bad in (far, empty):
+        with pytest.raises(InvalidArgumentError, match=r"rollout: (lasts|holds no tick)"):
+            film.write_film(bad, tmp_path / "film.gif")
+    with pytest.raises(InvalidArgumentError, match="holds no tick"):
+        empty.plot()
+
+
+def test_meshes_of_many_triangles_are_coarser(tmp_path):
+    """A ball of 80,000 triangles, with the outline of the ball."""
+    trimesh.creation.icosphere(6, radius=0.3).export(tmp_path / "ball.stl")
+    mesh = '<visual><geometry><mesh filename="ball.stl"/></geometry></visual>'
+    parts = [
+        link("base"),
+        link("ball", INERTIAL + mesh),
+        joint("hinge", "base", "ball", origin="0 0 0"),
+    ]
+    described = Robot.load(write(tmp_path, robot(*parts)))
+    (surface,) = RobotScene(described, 1, True, 8e-3).surfaces
+    painter = film.Painter(described, 1, True, (160, 90))
+    cell = 0.05
+    coarse = film.coarse(surface, cell)
+    assert len(coarse.faces) < len(surface.faces) / 50
+    np.testing.assert_allclose(coarse.vertices.min(0), surface.vertices.min(0), atol=cell)
+    np.testing.assert_allclose(coarse.vertices.max(0), surface.vertices.max(0), atol=cell)
+    # A pose far away leaves the floor alone.
+    near, far = (
+        painter.picture(described.start[None], np.array([[place, 0, 0, 1, 0, 0, 0]]))
+        for place in (0.0, 1e38)
+    )
+    assert (near != far).any(-1).mean() > 0.02
+    assert (far == painter.picture(described.start[None], np.eye(1, 7, 3) + 1e30)).all()
 
 
 def test_bad_arguments_are_named(rollout, tmp_path):

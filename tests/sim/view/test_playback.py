@@ -29,17 +29,6 @@ def test_a_rollout_plays_from_the_first_row_to_the_last_and_starts_over(panda, r
     assert playback.frame().time[0] == 0.0
 
 
-def test_a_playback_seeks(rollout):
-    playback = Playback(rollout)
-    playback.seek(0.15)
-    assert playback.frame().time[0] == pytest.approx(0.15)
-    assert len(playback.history().time) == 16
-    playback.seek(99.0)
-    assert playback.frame().time[0] == playback.duration
-    playback.reset()
-    assert playback.frame().time[0] == 0.0
-
-
 def test_a_rollout_of_another_robot_is_refused(jaco2, rollout):
     with pytest.raises(InvalidArgumentError, match="joints"):
         Playback(rollout, jaco2)

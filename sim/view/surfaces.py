@@ -16,11 +16,11 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
-from batchpid.sim.robot.collision_shapes import convex_hull
+from batchpid.io.packages import imported
+from batchpid.sim.geometry.mesh_files import find_mesh, read_mesh
+from batchpid.sim.geometry.shapes import Shape, convex_hull
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.meshes import find_mesh, read_mesh
-from batchpid.sim.robot.tables import Shape
 from batchpid.sim.robot.urdf import SHAPES, is_mjcf, read_origin, read_shape
 from batchpid.sim.robot.xml import parse_xml, read_numbers
 from batchpid.task_space.frames import matrix_of, rotate
@@ -71,7 +71,7 @@ def surfaces(
     RobotError
         A visual element is malformed.
     """
-    from trimesh.util import concatenate
+    concatenate = imported("trimesh.util").concatenate
 
     visuals = _read_visuals(robot)
     result = []
@@ -95,7 +95,7 @@ def surfaces(
             for mesh, reason in (error.args for error in unreadable):
                 text = f"mesh cannot be read ({reason}): collision shapes are drawn, if any"
                 findings.append(
-                    Finding("warning", "visual-mesh", text, _REMEDY, link=name, detail=repr(mesh))
+                    Finding("missing-mesh", text, _REMEDY, link=name, detail=repr(mesh))
                 )
         for rgba, same in parts.items():
             joined: Any = concatenate(same)
@@ -141,7 +141,7 @@ def _rods(robot: RobotDescription) -> list[Surface]:
     """Return a rod from the frame of each link to each joint on it, from the last links to their
     centers of mass.
     """
-    from trimesh import creation
+    creation = imported("trimesh.creation")
 
     tree = robot.rigid_tree
     ends = [(parent, tree.position[link]) for link, parent in enumerate(tree.parent) if parent >= 0]
@@ -195,17 +195,16 @@ def _mesh(shape: Shape | None, robot: RobotDescription, deviation: float) -> Any
 
     Raises OSError with the name of a mesh that cannot be read, and the reason.
     """
-    from trimesh import Trimesh, creation
-
     if shape is None:
         return None
+    trimesh = imported("trimesh")
+    creation = imported("trimesh.creation")
     if shape.kind == "mesh":
         if shape.vertices is not None:
-            surface = convex_hull(shape.vertices)
+            surface: Any = convex_hull(shape.vertices)
         else:
-            loaded = _read_mesh(shape.file, robot)
-            surface = loaded.vertices, loaded.faces
-        mesh: Any = Trimesh(*surface, process=False)
+            surface = _read_mesh(shape.file, robot)
+        mesh: Any = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
         mesh.apply_scale(shape.scale)
     elif shape.kind == "box":
         mesh = creation.box([2 * side for side in shape.size])

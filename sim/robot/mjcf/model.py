@@ -16,13 +16,11 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import MjModel, MjSpec
+from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.findings import Finding, Notes
 
-ALONE = "engine 'mujoco' alone simulates"
-"""First words of the findings for elements without equivalent in a URDF."""
 PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 _PREFIXES = (
     "body_",
@@ -40,6 +38,7 @@ _PREFIXES = (
     "wrap_",
     "mesh_vert",
     "flex",
+    "plugin_",
 )
 """Beginnings of the names of the model's arrays that the simulation depends on."""
 _FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
@@ -66,9 +65,16 @@ class Compiled(NamedTuple):
         """Digest of the elements that move, collide or act."""
         model = self.model
         names = [name for name in dir(model) if name.startswith(_PREFIXES)]
-        # The last bits may differ between kinds of processors.
-        arrays = {name: np.round(1.0 * getattr(model, name), 9) + 0.0 for name in names}
+        arrays = {name: _rounded(np.asarray(getattr(model, name), float)) for name in names}
         return digest(arrays, model.names, str(model.opt))
+
+
+def _rounded(values: Float64) -> Float64:
+    """Return ``values`` to nine digits: the last bits may differ between kinds of processors."""
+    # What cancels out leaves a rest of rounding.
+    shares, exponents = np.frexp(np.where(np.abs(values) < 1e-12, 0.0, values))
+    rounded: Float64 = np.ldexp(np.round(shares, 9), exponents)
+    return rounded
 
 
 def compile_file(path: Path, missing_meshes: str, findings: list[Finding]) -> Compiled:
@@ -90,7 +96,7 @@ def compile_file(path: Path, missing_meshes: str, findings: list[Finding]) -> Co
             raise
     text = f"collision meshes not found, simulated without: {', '.join(lean.missing)}"
     remedy = "put the files where the MJCF names them"
-    findings.append(Finding("warning", "missing-mesh", text, remedy))
+    findings.append(Finding("missing-mesh", text, remedy))
     return lean
 
 
@@ -100,6 +106,8 @@ def compile_scene(path: Path, is_whole: bool) -> Compiled:
     Raises RobotError if MuJoCo refuses it.
     """
     missing: tuple[str, ...] = ()
+    # MuJoCo takes a file of the same name, size and second for the one that it has read.
+    mujoco.mj_clearCache(mujoco.mj_getCache())
     try:
         scene = mujoco.MjSpec.from_file(str(path))
         if not is_whole:
@@ -193,7 +201,7 @@ class RobotInFile:
     Raises RobotError for a ball joint, and for several robots.
     """
 
-    def __init__(self, model: MjModel, path: Path, findings: list[Finding]) -> None:
+    def __init__(self, model: MjModel, path: Path, notes: Notes) -> None:
         names = [model.body(body).name for body in range(1, model.nbody)]
         self.link_names = {"world", *names}
         self.joint_names = {model.joint(joint).name for joint in range(model.njnt)}
@@ -207,7 +215,7 @@ class RobotInFile:
             for joint in range(model.njnt)
             if int(model.jnt_type[joint]) not in (_FREE, _BALL)
         }
-        self.base = self._find_base(model, joints, path, findings)
+        self.base = self._find_base(model, joints, path, notes)
         self.joints = {
             joint: name
             for joint, name in joints.items()
@@ -223,7 +231,7 @@ class RobotInFile:
         model: MjModel,
         joints: dict[int, str],
         path: Path,
-        findings: list[Finding],
+        notes: Notes,
     ) -> int:
         """Return the base, after the bodies that are not of the robot are left out."""
         # Every child of the world is the root of an object; some of them are the robot.
@@ -257,9 +265,8 @@ class RobotInFile:
                 problem = f"the ball joint {label(model.joint(joint))} has no single position"
                 raise RobotError(f"{where}: {problem} to control; replace it by three hinges")
         for body in sorted(self._left_out - soft):
-            text = f"is apart from the robot: {ALONE} it"
-            remedy = "in SAPIEN add it with build="
-            findings.append(Finding("note", "loose-link", text, remedy, link=self.bodies[body]))
+            text = "is apart from the robot: left out"
+            notes.lose(text, link=self.bodies[body])
         if floating:
             return floating.pop()
         # The only body, if it is held at the origin, is the root in place of the world.

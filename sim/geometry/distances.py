@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.sim.robot.collision_shapes import add_geom
-from batchpid.sim.robot.tables import Shape
+from batchpid.sim.geometry.shapes import Shape, add_geom
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 

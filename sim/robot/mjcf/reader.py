@@ -4,20 +4,18 @@ pose.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Float64, MjModel
+from batchpid.arrays.array_types import Document, Float64, MjModel
 from batchpid.arrays.elementwise import read_only
 from batchpid.motors import make_actuators
-from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.mjcf_actuators import read_couplings, read_motors
-from batchpid.sim.robot.mjcf_model import (
-    ALONE,
+from batchpid.sim.robot.findings import Finding, Notes
+from batchpid.sim.robot.mjcf.bodies import TableReader, excluded_pairs
+from batchpid.sim.robot.mjcf.model import (
     PLANE,
     Compiled,
     RobotInFile,
@@ -25,7 +23,7 @@ from batchpid.sim.robot.mjcf_model import (
     compile_file,
     label,
 )
-from batchpid.sim.robot.mjcf_tables import TableReader, excluded_pairs
+from batchpid.sim.robot.mjcf.motors import read_couplings, read_motors
 from batchpid.sim.robot.parts import FileDefaults, MjcfFile
 from batchpid.sim.robot.tables import Source
 from batchpid.task_space.rigid_tree import GRAVITY
@@ -33,8 +31,6 @@ from batchpid.task_space.rigid_tree import GRAVITY
 _KEYFRAME = "home"
 """Keyframe with the start pose."""
 _SWITCHES = (
-    "GRAVITY",
-    "ACTUATION",
     "CONTACT",
     "LIMIT",
     "EQUALITY",
@@ -42,9 +38,7 @@ _SWITCHES = (
     "DAMPER",
     "CONSTRAINT",
 )
-"""Parts of MuJoCo's physics that a file can disable; of the first two neither engine takes note."""
-_ELSEWHERE = "expect another motion in SAPIEN"
-"""Remedy for content that only the engine MuJoCo simulates."""
+"""Parts of MuJoCo's physics that a file can disable."""
 
 
 def read_mjcf(
@@ -58,18 +52,18 @@ def read_mjcf(
     For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses
     the file, it has a ball joint or several robots, or missing meshes are refused.
     """
-    findings: list[Finding] = []
-    compiled = compile_file(path, missing_meshes, findings)
+    notes = Notes([], [])
+    compiled = compile_file(path, missing_meshes, notes.repairs)
     model = compiled.model
-    robot = RobotInFile(model, path, findings)
+    robot = RobotInFile(model, path, notes)
     # A base is free where the file has a free joint, unless the caller fixes it.
     if fixed_base is None:
         fixed_base = not (robot.base and model.body_jntnum[robot.base])
-    couplings = read_couplings(model, robot, findings)
-    motors = read_motors(model, robot, couplings, findings)
-    reader = TableReader(model, robot, findings, motors)
+    couplings = read_couplings(model, robot, notes)
+    motors = read_motors(model, robot, couplings, notes)
+    reader = TableReader(model, robot, notes, motors)
     tables = reader.read(couplings, is_held=fixed_base)
-    findings += _unused(model, robot)
+    _report_unused(model, robot, notes)
     # The start pose is that of the keyframe, else the reference pose.
     key = home(model)
     pose = model.qpos0 if key is None else model.key_qpos[key]
@@ -80,24 +74,32 @@ def read_mjcf(
     start = {name: pose[model.jnt_qposadr[joint]] for joint, name in robot.joints.items()}
     joints = [joint.name for joint in tables.joints if joint.moves]
 
-    def column(values: Mapping[str, float]) -> Float64:
-        return read_only(np.array([values.get(joint, 0.0) for joint in joints], np.float64))
+    def column(values: Mapping[str, float], missing: float = 0.0) -> Float64:
+        return read_only(np.array([values.get(joint, missing) for joint in joints], np.float64))
 
-    defaults = FileDefaults(column(start))
+    gains = {"kp": motors.kp, "ki": motors.ki, "kd": motors.kd}
+    columns = {name: column(gain) for name, gain in gains.items()}
     # A file of motors alone has no gains to offer.
-    if any((*motors.kp.values(), *motors.kv.values())):
-        defaults = replace(defaults, kp=column(motors.kp), kv=column(motors.kv))
-    armature = column(motors.armature)
+    if any(gain.any() for gain in columns.values()):
+        columns["integral_limit"] = column(motors.integral_limit, np.inf)
+    else:
+        columns = {}
+    effects: Document = {"armature": column(motors.armature), "lag": column(motors.lag)}
+    for effect in ("saturation_effort", "no_load_speed"):
+        effects[effect] = column(getattr(motors, effect), np.inf)
+    actuators = None
+    if joints:
+        actuators = make_actuators(len(joints), **effects)
     return Source(
         name,
         tables,
-        tuple(findings),
+        tuple(notes.repairs),
         fixed_base,
         base_start,
-        mjcf=_file(path, compiled, robot, fixed_base),
+        mjcf=_file(path, compiled, robot, fixed_base, notes.losses),
         pairs=excluded_pairs(model, reader.solid),
-        defaults=defaults,
-        actuators=make_actuators(len(joints), armature=armature) if armature.any() else None,
+        defaults=FileDefaults(column(start), **columns),
+        actuators=actuators if actuators is not None and actuators.num_joints else None,
     )
 
 
@@ -111,6 +113,7 @@ def _file(
     compiled: Compiled,
     robot: RobotInFile,
     fixed_base: bool,
+    losses: Iterable[Finding],
 ) -> MjcfFile:
     """Return the data of the file that the engine MuJoCo needs."""
     model = compiled.model
@@ -136,42 +139,59 @@ def _file(
         bodies=tuple(robot.bodies.values()),
         falling=tuple(robot.bodies[body] for body in free if not robot.is_of_robot(body)),
         loops=tuple(loops),
+        losses=tuple(losses),
         is_alone=all(robot.is_of_robot(body) for body in model.jnt_bodyid),
         has_floor=bool(grounds) and not (floats and fixed_base),
         friction=float(model.geom_friction[grounds[0], 0]) if grounds else 1.0,
     )
 
 
-def _unused(model: MjModel, robot: RobotInFile) -> Iterator[Finding]:
-    """Yield findings of content that is not simulated, apart from motors, couplings and shapes."""
-    keyframes = model.nkey - (home(model) is not None)
-    counts = {"sites": model.nsite, "sensors": model.nsensor, "keyframes": keyframes}
+def _report_unused(model: MjModel, robot: RobotInFile, notes: Notes) -> None:
+    """Report content that is not simulated, apart from motors, couplings and shapes."""
+    counts = {
+        "sites": model.nsite,
+        "sensors": model.nsensor,
+        "cameras": model.ncam,
+        "keyframes": model.nkey - (home(model) is not None),
+        "<flag sleep='enable'>": int(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP > 0),
+    }
     left_out = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
     if left_out:
         text = f"elements that the simulation does not use are left out: {left_out}"
-        yield Finding("note", "unknown-element", text, "expect no effect")
+        notes.repairs.append(Finding("unknown-element", text, "expect no effect"))
     option = model.opt
+    bits = mujoco.mjtDisableBit
+    if tuple(option.gravity) != GRAVITY:
+        text = f"gravity is {GRAVITY} m/s^2, not the file's"
+        remedy = "draw the file's with Randomization(gravity=...)"
+        notes.repairs.append(Finding("option", text, remedy))
+    for switch in ("GRAVITY", "ACTUATION"):
+        if option.disableflags & getattr(bits, f"mjDSBL_{switch}"):
+            text = f"<flag {switch.lower()}='disable'/> has no effect"
+            remedy = "expect gravity, and the efforts of the controller"
+            notes.repairs.append(Finding("option", text, remedy))
     disabled = ", ".join(
         switch.lower()
         for switch in _SWITCHES
-        if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{switch}")
+        if option.disableflags & getattr(bits, f"mjDSBL_{switch}")
     )
-    # Every row: whether the file has it, and what is simulated.
+    # Every row: whether the file has it, and what is lost.
     for is_there, text in (
-        (tuple(option.gravity) != GRAVITY, f"gravity is {GRAVITY} m/s^2, not the file's"),
-        (disabled, f"{ALONE} <flag>, which disables {disabled}, but for gravity and actuation"),
-        (option.density or option.viscosity, f"{ALONE} the medium (<option density= viscosity=>)"),
-        (model.nflex, f"{ALONE} flexible bodies"),
+        (disabled, f"without <flag>, which disables {disabled}"),
+        (option.density or option.viscosity, "without the medium (<option density= viscosity=>)"),
+        (model.nflex, "flexible bodies are rigid"),
+        ((model.body_plugin >= 0).any(), "without the plugins of bodies"),
     ):
         if is_there:
-            yield Finding("warning", "option", text, _ELSEWHERE)
+            notes.lose(text)
     for joint, name in robot.joints.items():
-        if stiffness := model.jnt_stiffness[joint]:
-            text = f"{ALONE} the spring of the joint"
-            detail = f"{stiffness:g} in units of N, m and rad"
-            yield Finding("warning", "spring", text, _ELSEWHERE, name, detail=detail)
+        if model.jnt_stiffness[joint] or model.jnt_stiffnesspoly[joint].any():
+            notes.lose("without the spring of the joint", name)
+        if model.dof_dampingpoly[model.jnt_dofadr[joint]].any():
+            notes.lose("the damping that grows with the speed is left out", name)
     for body in np.flatnonzero(model.body_gravcomp).tolist():
         if robot.is_of_robot(body):
             text = "gravity compensation of this body (gravcomp) is not simulated"
             remedy = "let the controller compensate"
-            yield Finding("note", "gravcomp", text, remedy, link=robot.bodies[body])
+            finding = Finding("option", text, remedy, link=robot.bodies[body])
+            notes.repairs.append(finding)

@@ -8,20 +8,23 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
-from functools import lru_cache
+from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
+from lxml import etree
 
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
-from batchpid.sim.robot.tables import Shape
-from batchpid.sim.robot.xml import LARGEST, LFS_POINTER, parse_bytes
+from batchpid.io.packages import imported
 
+LARGEST = 1e18
+"""Largest magnitude of a number of a file, whose square fits in single precision."""
+LFS_POINTER = b"version https://git-lfs"
+"""Beginning of git-lfs's file in place of another."""
 FORMATS = (".stl", ".obj", ".dae", ".glb")
 SIZE_LIMIT = 2**27  # bytes of a mesh file
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attributes", "<u2")])
@@ -39,9 +42,9 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
     the URDF's folder, or to one of these. The suffix may be in the other case, and the name
     percent-encoded.
     """
-    name = re.sub(
-        r"^(file:/*)?\$\(find ([^)]+)\)", r"package://\2", name.strip().replace("\\", "/")
-    )  # xacro, Windows
+    # As in xacro, and on Windows.
+    slashes = name.strip().replace("\\", "/")
+    name = re.sub(r"^(file:/*)?\$\(find ([^)]+)\)", r"package://\2", slashes)
     spellings = dict.fromkeys([name, unquote(name)])
     # The places are a generator: nearly every mesh is at the first one.
     for change in (str, str.lower, str.upper, str.title):
@@ -86,55 +89,75 @@ def _ros_packages(package: str) -> Iterator[Path]:
             yield from sorted(root.glob(pattern))
 
 
-def read_mesh(path: str | Path) -> Any:
-    """Return the result of ``trimesh`` for a mesh file, in metres. Raises errors of many types."""
-    from trimesh import load
+class Mesh(NamedTuple):
+    """Content of a mesh file: digest of its bytes, and the reason for which it cannot be used, or
+    None.
+    """
 
+    content: str
+    problem: str | None
+
+
+def read_mesh(path: str | Path, data: bytes | None = None) -> Any:
+    """Return the result of ``trimesh`` for a mesh file, or for its bytes ``data``, in metres.
+
+    Raises errors of many types.
+    """
+    data = Path(path).read_bytes() if data is None else data
+    kind = Path(path).suffix.lower().removeprefix(".")
     # Materials are textures to decode, of which nothing here needs any.
-    mesh: Any = load(path, force="mesh", process=False, skip_materials=True)
-    factor, _, unit = str(mesh.metadata.get("units", "")).partition(
-        " * "
-    )  # of COLLADA: "0.01 * meters"
+    load = imported("trimesh").load
+    mesh: Any = load(
+        BytesIO(data), file_type=kind, force="mesh", process=False, skip_materials=True
+    )
+    # Of COLLADA: "0.01 * meters".
+    factor, _, unit = str(mesh.metadata.get("units", "")).partition(" * ")
     # trimesh leaves the vertices in the file's unit.
     if unit == "meters":
         mesh.vertices = np.asarray(mesh.vertices) * float(factor)
     return mesh
 
 
-def mesh_problem(path: Path) -> str | None:
-    """Return the reason for which a mesh file cannot be used, or None."""
-    try:
-        status = path.stat()
-    except OSError as error:
-        return str(error)
-    return _problem(path, status.st_mtime_ns, status.st_size)
+_PROBLEMS: dict[tuple[str, str], str | None] = {}
+"""Problem of each content that was checked, by format: robots of a family share meshes, and most
+are loaded again.
+"""
 
 
-@lru_cache(maxsize=4096)
-def _problem(path: Path, changed: int, size: int) -> str | None:
-    """Return :func:`mesh_problem`. Robots of a family share meshes, and most are loaded again: a
-    file is read once until it changes.
-    """
-    if path.suffix.lower() not in FORMATS:
-        return f"format not among {', '.join(FORMATS)}"
+def check_mesh(path: Path) -> Mesh:
+    """Return content and problem of a mesh file."""
     try:
         with open(path, "rb") as file:
             data = file.read(SIZE_LIMIT + 1)
-        if not data:
-            return "empty"
-        if len(data) > SIZE_LIMIT:
-            return f"larger than {SIZE_LIMIT >> 20} MiB"
-        if data.startswith(LFS_POINTER):
-            return LFS_PROBLEM
-        if path.suffix.lower() == ".dae" and not _has_its_numbers(data):
+    except OSError as error:
+        return Mesh("", str(error))
+    content = digest(data)
+    key = content, path.suffix.lower()
+    if key not in _PROBLEMS:
+        _PROBLEMS[key] = _problem(path, data)
+    return Mesh(content, _PROBLEMS[key])
+
+
+def _problem(path: Path, data: bytes) -> str | None:
+    """Return the reason for which the bytes of a mesh file cannot be used, or None."""
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        return f"format not among {', '.join(FORMATS)}"
+    if not data:
+        return "empty"
+    if len(data) > SIZE_LIMIT:
+        return f"larger than {SIZE_LIMIT >> 20} MiB"
+    if data.startswith(LFS_POINTER):
+        return LFS_PROBLEM
+    try:
+        if suffix == ".dae" and not _has_its_numbers(data):
             return "array lengths that do not match count="
-        if path.suffix.lower() == ".stl" and len(data) == 84 + _TRIANGLE.itemsize * int.from_bytes(
-            data[80:84], "little"
-        ):
+        count = int.from_bytes(data[80:84], "little")
+        if suffix == ".stl" and len(data) == 84 + _TRIANGLE.itemsize * count:
             # Most meshes of robots are such rows, which take a tenth of trimesh's time.
             corners = np.frombuffer(data, _TRIANGLE, offset=84)["corners"]
         else:
-            mesh = read_mesh(path)
+            mesh = read_mesh(path, data)
             corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
     except Exception as error:
         return str(error) or type(error).__name__
@@ -143,6 +166,15 @@ def _problem(path: Path, changed: int, size: int) -> str | None:
     if (np.abs(corners) <= LARGEST).all():
         return None
     return f"vertices beyond {LARGEST:g} m"
+
+
+def parse_bytes(data: bytes, **options: bool) -> etree._Element:
+    """Return the root element of untrusted XML, without entities, DTD and network.
+
+    ``options`` are more of those of lxml's parser.
+    """
+    safe = {"resolve_entities": False, "no_network": True, "load_dtd": False}
+    return etree.fromstring(data, etree.XMLParser(**safe, **options))
 
 
 def _has_its_numbers(data: bytes) -> bool:
@@ -167,40 +199,15 @@ def _has_its_numbers(data: bytes) -> bool:
     return all(0 <= end <= sizes.get(source, -1) for end, source in ends)
 
 
-_in_use: dict[str, str] = {}
-"""Digests of the mesh files that SAPIEN has read in this process; it never reads the same path
-again.
-"""
+def mesh_bytes(path: str, content: str) -> bytes:
+    """Return the bytes of a mesh file with this digest.
 
-
-def note_meshes(paths: Iterable[str]) -> None:
-    """Record the digests of mesh files that SAPIEN reads."""
-    for path in {*paths} - _in_use.keys():
-        with suppress(OSError):  # SAPIEN's error says more
-            _in_use[path] = digest(Path(path).read_bytes())
-
-
-def check_unchanged(path: Path) -> None:
-    """Raise RobotError if a mesh file has changed since SAPIEN read it in this process."""
-    if (digest_in_use := _in_use.get(str(path))) is not None and digest(
-        path.read_bytes()
-    ) != digest_in_use:
-        problem = (
-            f"{path}: has changed since this process simulated it, and SAPIEN keeps the mesh that"
-            " it read first"
-        )
-        raise RobotError(f"{problem}; start Python again, or save the mesh under another name")
-
-
-def content_of(shapes: Sequence[Shape]) -> list[Shape]:
-    """Return ``shapes`` with the digest of each mesh file in place of its path.
-
-    Raises RobotError for a file that cannot be read.
+    Raises RobotError if it cannot be read, or has another one.
     """
     try:
-        return [
-            shape._replace(file=digest(Path(shape.file).read_bytes()) if shape.file else "")
-            for shape in shapes
-        ]
+        data = Path(path).read_bytes()
     except OSError as error:
         raise RobotError(f"{error}; restore the mesh, or load the robot again") from None
+    if digest(data) != content:
+        raise RobotError(f"{path}: has changed since the robot was loaded; load it again")
+    return data

@@ -21,16 +21,22 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjModel
-from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.inertia import possible_inertia
-from batchpid.sim.robot.mjcf_actuators import Couplings, Motors
-from batchpid.sim.robot.mjcf_model import ALONE, RobotInFile, can_collide, label, unique
+from batchpid.sim.geometry.inertia import possible_inertia
+from batchpid.sim.geometry.shapes import Shape, ShapeKind
+from batchpid.sim.robot.findings import Finding, Notes
+from batchpid.sim.robot.mjcf.model import RobotInFile, can_collide, label, unique
+from batchpid.sim.robot.mjcf.motors import Couplings, Motors
 from batchpid.sim.robot.parts import DisabledPair, Joint, Mimic
-from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Shape, ShapeKind, Tables, breadth_first
+from batchpid.sim.robot.tables import (
+    NO_TURN,
+    ORIGIN,
+    Body,
+    Tables,
+    breadth_first,
+    without_mass,
+)
 from batchpid.task_space.frames import about, compose, matrix_of, rotate
 
-NO_MASS = 1e-9
-"""Mass [kg] of a body with shapes and without mass: a row without mass gets that of its shapes."""
 _KINDS: dict[int, tuple[ShapeKind, int]] = {
     mujoco.mjtGeom.mjGEOM_SPHERE: ("sphere", 1),
     mujoco.mjtGeom.mjGEOM_BOX: ("box", 3),
@@ -52,12 +58,12 @@ class TableReader:
         self,
         model: MjModel,
         robot: RobotInFile,
-        findings: list[Finding],
+        notes: Notes,
         motors: Motors,
     ) -> None:
         self._model = model
         self._robot = robot
-        self._findings = findings
+        self._notes = notes
         self._motors = motors
         self._anchors = {0: ORIGIN}  # origin of each body's row, in the frame of the body
         self._bodies: list[Body] = []
@@ -129,6 +135,7 @@ class TableReader:
         couplings: Couplings,
     ) -> Joint:
         model = self._model
+        motors = self._motors
         name = self._robot.joints[number]
         dof = model.jnt_dofadr[number]
         lower, upper = -np.inf, np.inf
@@ -140,6 +147,14 @@ class TableReader:
             kind = "revolute"
         else:
             kind = "continuous"
+        soft_lower, soft_upper = motors.setpoints.get(name, (-np.inf, np.inf))
+        rate = motors.setpoint_rate.get(name, np.inf)
+        if soft_lower > lower or soft_upper < upper or rate < np.inf:
+            text = "its servo in the file limits position or rate of the setpoint"
+            remedy = "pass guard=True to a runner for these limits"
+            detail = f"{soft_lower:g} to {soft_upper:g}, {rate:g}/s"
+            finding = Finding("limits", text, remedy, name, detail=detail)
+            self._notes.repairs.append(finding)
         return Joint(
             name,
             kind,
@@ -147,7 +162,10 @@ class TableReader:
             link,
             lower,
             upper,
-            effort_limit=self._motors.effort_limit[name],
+            effort_limit=motors.effort_limit[name],
+            velocity_limit=rate,
+            soft_lower=soft_lower,
+            soft_upper=soft_upper,
             damping=float(model.dof_damping[dof]),
             friction=float(model.dof_frictionloss[dof]),
             mimic=Mimic(*couplings[name]) if name in couplings else None,
@@ -167,16 +185,14 @@ class TableReader:
         inertia = np.diag(model.body_inertia[body])
         # Else the row would get the mass of its shapes.
         if mass == 0 and body in self.solid:
-            mass = NO_MASS
-            center = ORIGIN
-            inertia = 1e-3 * NO_MASS * np.eye(3)
+            row = without_mass(row)
         if mass > 0:
             inertia, repair = possible_inertia(mass, inertia)
             if repair is not None:
                 text, detail = repair
                 remedy = "correct <inertia>"
-                self._findings.append(
-                    Finding("warning", "inertia", text, remedy, link=row.name, detail=detail)
+                self._notes.repairs.append(
+                    Finding("inertia", text, remedy, link=row.name, detail=detail)
                 )
             axes = model.body_iquat[body].copy()
             row = row._replace(mass=mass, center=center, inertia=inertia, inertia_wxyz=axes)
@@ -221,9 +237,8 @@ class TableReader:
             if not is_ground and not is_solid:
                 absent.append(f"{kind} {label(model.geom(geom))}")
         if absent:
-            text = f"{ALONE} planes, height fields and shapes of the world: {', '.join(absent)}"
-            remedy = "in SAPIEN add them with build= of Runner"
-            self._findings.append(Finding("warning", "collision", text, remedy))
+            text = f"without planes, height fields and shapes of the world: {', '.join(absent)}"
+            self._notes.lose(text)
 
 
 def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair, ...]:

@@ -1,0 +1,151 @@
+"""States of robots on fixed bases, and what native code needs to step them without MuJoCo where
+they touch nothing (``free_motion.h``).
+
+A robot steps so exactly where its state has no contact, so the bits of a motion depend on nothing
+else. The arrays of a pack hold the state of every robot, and ``mujoco.MjData`` is working memory.
+Native code steps vectors of robots, so a table has the shape (blocks, columns, WIDTH).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from functools import cache
+
+import mujoco
+import numpy as np
+
+from batchpid.arrays.array_types import Float64, MjData, MjModel, Rows
+from batchpid.sim.engine.mujoco.clearance import touching_pairs
+from batchpid.sim.engine.mujoco.model_builder import RobotMj
+from batchpid.sim.engine.mujoco.vectors import aligned, table
+from batchpid.sim.engine.native.interface import CONTACT, FARTHEST, WIDTH, FreeMotion
+from batchpid.sim.engine.native_model import NativeModel
+
+_NONE, _SOME, _UNKNOWN = range(len(CONTACT))
+_COUNTS = 7, 0, 3
+"""Numbers of contacts by which the place of this number in ``mjData`` is found."""
+
+
+@cache
+def place_of_contacts() -> int | None:
+    """Return the offset of the number of contacts in ``mjData`` [bytes], found by its values; None
+    if it is ambiguous.
+    """
+    ball = '<body pos="{} 0 {}"><freejoint/><geom size="0.1"/></body>'
+    plane = '<geom type="plane" size="0 0 1"/>'
+    places = np.arange(0)
+    for attempt, count in enumerate(_COUNTS):
+        heights = np.where(np.arange(max(_COUNTS)) < count, 0.05, 1.0)
+        balls = "".join(ball.format(*place) for place in enumerate(heights))
+        model = mujoco.MjModel.from_xml_string(
+            f"<mujoco><worldbody>{plane}{balls}</worldbody></mujoco>"
+        )
+        # Each ball on the plane would be an island.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
+        data = mujoco.MjData(model)
+        mujoco.mj_fwdPosition(model, data)
+        # The number lies between these two arrays of the structure.
+        start = data.solver_fwdinv.ctypes.data
+        size = data.energy.ctypes.data - start
+        numbers = np.frombuffer(ctypes.string_at(start, size), np.int32)
+        equal = start - data._address + 4 * np.flatnonzero(numbers == count)
+        places = equal if attempt == 0 else np.intersect1d(places, equal)
+    return int(places[0]) if len(places) == 1 else None
+
+
+class FreeMotions:
+    """States of ``size`` robots of ``robot``, whose rigid bodies are those of ``model``.
+
+    Attributes
+    ----------
+    contact
+        What is known about the contacts of each robot (M,), by number in :data:`CONTACT`.
+    time
+        Time of each robot (M,) [s].
+    """
+
+    def __init__(self, robot: RobotMj, size: int, model: NativeModel) -> None:
+        dof = len(robot.joints)
+        scene = robot.model
+        self.size = size
+        self._robot, self._rigid = robot, model
+        at = robot.qvel
+        joints = scene.dof_jntid[at]
+        blocks = -(-size // WIDTH)
+        limited = scene.jnt_limited[joints] != 0
+        ends = np.where(limited, scene.jnt_range[joints].T, [[-np.inf], [np.inf]])
+        self.contact = np.full(size, _UNKNOWN, np.int8)
+        self.time = np.zeros(size)
+        self._states = [aligned(blocks, dof, WIDTH) for _ in range(3)]
+        self._arrays = {
+            "bias": aligned(blocks, dof, WIDTH),
+            "mass": aligned(blocks, dof * (dof + 1) // 2, WIDTH),
+            "low": ends[0].copy(),
+            "high": ends[1].copy(),
+            "contact": self.contact,
+            "time": self.time,
+            **dict(zip(("qpos", "qvel", "acceleration"), self._states, strict=True)),
+        }
+        least, most, width, *_ = scene.jnt_solimp[joints[0]]
+        time, ratio = scene.jnt_solref[joints[0]]
+        self._numbers = {
+            # The reference acceleration of a limit: "Computation" in MuJoCo's documentation.
+            "stiffness": 1 / (most * time * ratio) ** 2,
+            "rate_gain": 2 / (most * time),
+            "least": least,
+            "most": most,
+            "width": width,
+            "timestep": scene.opt.timestep,
+            "has_pairs": len(touching_pairs(scene)) > 0,
+            "robots": size,
+        }
+
+    def use(self, models: Sequence[MjModel]) -> None:
+        """Take the constants of the robots' models (M,), which may have changed."""
+        at = self._robot.qvel
+        kinds = models[:1] if all(model is models[0] for model in models) else models
+        columns = {
+            "armature": [model.dof_armature[at] for model in kinds],
+            "weight": [model.dof_invweight0[at] for model in kinds],
+            "gravity": [model.opt.gravity for model in kinds],
+        }
+        tables = {name: table(np.array(rows), self.size) for name, rows in columns.items()}
+        self._arrays |= tables
+        addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
+        self._structure = FreeMotion(model=self._rigid.address, **addresses, **self._numbers)
+        self.contact[...] = _UNKNOWN
+
+    @property
+    def address(self) -> int:
+        """Address of the structure, for native code."""
+        return ctypes.addressof(self._structure)
+
+    def forget_contacts(self) -> None:
+        """Look for the contacts of robots in contact anew: their ``mujoco.MjData`` have changed."""
+        self.contact[self.contact == _SOME] = _UNKNOWN
+
+    def read(self) -> tuple[Float64, Float64, Float64]:
+        """Return positions, velocities and last accelerations (M, dof)."""
+        qpos, qvel, acceleration = (
+            array.swapaxes(1, 2).reshape(-1, array.shape[1])[: self.size] for array in self._states
+        )
+        return qpos, qvel, acceleration
+
+    def write(self, rows: Sequence[int] | slice, *states: Rows | float) -> None:
+        """Set positions, velocities and last accelerations (len(rows), dof) of robots ``rows``."""
+        numbers = np.arange(self.size)[rows]
+        for array, values in zip(self._states, states, strict=True):
+            array[numbers // WIDTH, :, numbers % WIDTH] = values
+        self.contact[numbers] = _UNKNOWN
+
+    def show(self, row: int, model: MjModel, data: MjData) -> None:
+        """Bring the data of a robot up to date."""
+        at = row // WIDTH, slice(None), row % WIDTH
+        data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = (
+            array[at] for array in self._states[:2]
+        )
+        data.qacc_warmstart[self._robot.qvel] = self._states[2][at]
+        data.time = self.time[row]
+        if (np.abs(data.qpos) <= FARTHEST).all():
+            mujoco.mj_step1(model, data)

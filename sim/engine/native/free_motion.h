@@ -1,0 +1,169 @@
+// Sim steps of robots without contact on fixed bases, WIDTH robots at once: MuJoCo's step, without its constraint solver.
+//
+// Velocities follow from M a = effort - bias by the factor of the mass matrix along the tree (R. Featherstone, Rigid Body
+// Dynamics Algorithms, Springer, 2008, section 6.5), and positions from the new velocities. MuJoCo makes joint limits
+// soft: it minimizes the sum of (a - a_free)^T M (a - a_free) / 2 and D_j min(0, s_j a_j - r_j)^2 / 2 over the joints
+// beyond a limit ("Computation" in MuJoCo's documentation). The Hessian is M plus a diagonal, so Newton steps on the set
+// of active limits find the minimum.
+
+#pragma once
+
+#include "model.h"
+
+#include <memory>
+
+namespace batchpid {
+
+// What is known about the contacts of a robot at its present state. UNKNOWN: its state was written from outside.
+enum class Contact : char { NONE, SOME, UNKNOWN };
+
+// Robots of a group. Python fills in the fields (FreeMotion in interface.py) and owns the memory behind the pointers.
+// The state is the truth for every robot, also for one in contact; mjData is working memory.
+struct FreeMotion {
+  Model const *model;
+  Lanes *qpos, *qvel, *acceleration;  // (blocks, dof)
+  Lanes *bias;                        // (blocks, dof): gravity, Coriolis and centrifugal forces
+  Lanes *mass;                        // (blocks, dof (dof + 1) / 2): lower triangles of the mass matrices
+  Lanes const *armature, *weight;     // (blocks, dof): inertia of the motors, dof_invweight0 of MuJoCo
+  Lanes const *gravity;               // (blocks, 3)
+  double const *low, *high;           // (dof,): limits
+  Contact *contact;                   // (robots,)
+  double *time;                       // (robots,) [s]
+  std::int64_t robots;
+  double stiffness, rate_gain;        // of a limit's reference acceleration
+  double least, most, width;          // impedance of limits: MuJoCo's solimp
+  double timestep;
+  std::int32_t has_pairs;             // whether shapes may touch
+};
+
+// Working memory for one block of robots.
+struct FreeRoom {
+  Posed posed;
+  std::vector<BodyMotion<Lanes>> motions;
+  std::vector<Lanes> effort, acceleration, inverse, factor, cost, push, sign, active;
+
+  explicit FreeRoom(std::int64_t dof) : posed(dof), motions(static_cast<std::size_t>(dof)) {
+    auto const n = static_cast<std::size_t>(dof);
+    for (auto *each : {&effort, &acceleration, &inverse, &cost, &push, &sign, &active}) each->resize(n);
+    factor.resize(n * (n + 1) / 2);
+  }
+  // Return the memory of this thread.
+  static FreeRoom &of(std::int64_t dof) {
+    static thread_local std::unique_ptr<FreeRoom> room;
+    if (room == nullptr || static_cast<std::int64_t>(room->effort.size()) != dof) room = std::make_unique<FreeRoom>(dof);
+    return *room;
+  }
+};
+
+// Solve M x = x in place for a packed lower triangle, which becomes the factor L^T D L along the tree.
+inline __attribute__((always_inline)) void solve_along_tree(Model const &model, Lanes *m, Lanes *inverse, Lanes *x) {
+  std::int32_t const *tree = model.tree;
+  auto const row = [&](std::int64_t i) { return m + i * (i + 1) / 2; };
+  for (std::int64_t k = model.dof - 1; k >= 0; --k) {
+    Lanes *own = row(k);
+    inverse[k] = 1.0 / own[k];
+    for (std::int64_t i = tree[2 * k]; i >= 0; i = tree[2 * i]) {
+      Lanes const factor = own[i] * inverse[k];
+      for (std::int64_t j = i; j >= 0; j = tree[2 * j]) row(i)[j] -= factor * own[j];
+      own[i] = factor;
+      x[i] -= factor * x[k];
+    }
+  }
+  for (std::int64_t k = 0; k < model.dof; ++k) {
+    x[k] = x[k] * inverse[k];
+    for (std::int64_t i = tree[2 * k]; i >= 0; i = tree[2 * i]) x[k] -= row(k)[i] * x[i];
+  }
+}
+
+// Write mass matrix and bias of a block at its state.
+FOR_EACH_PROCESSOR static void evaluate(FreeMotion const &of, std::int64_t block, FreeRoom &room) {
+  Model const &model = *of.model;
+  std::int64_t const dof = model.dof;
+  Lanes const *qpos = of.qpos + block * dof, *qvel = of.qvel + block * dof;
+  Lanes const *armature = of.armature + block * dof, *gravity = of.gravity + 3 * block;
+  Lanes *bias = of.bias + block * dof, *mass = of.mass + block * (dof * (dof + 1) / 2);
+  Posed &posed = room.posed;
+  std::copy(qpos, qpos + dof, posed.qpos.data());
+  posed.place(Bodies{dof, model.tree, model.rows});
+  posed.weigh(model, block * WIDTH, of.robots);
+  BodyMotion<Lanes> root{};
+  root.moving_change = {-gravity[0], -gravity[1], -gravity[2]};
+  move_bodies(dof, model.tree, posed.bodies.data(), qvel, root, room.motions.data());
+  for (std::int64_t j = 0; j < dof; ++j) room.motions[j].accelerate(posed.bodies[j].inertia);
+  efforts_of_wrenches(dof, model.tree, posed.bodies.data(), room.motions.data(), bias);
+  composite_mass_matrix(dof, model.tree, posed.bodies.data(), [&](std::int64_t i, std::int64_t j, Lanes product) {
+    mass[j * (j + 1) / 2 + i] = product;
+  });
+  for (std::int64_t j = 0; j < dof; ++j) mass[j * (j + 3) / 2] += armature[j];
+}
+
+// Replace the efforts of room.acceleration by accelerations, with the limits beyond which joints are. Return a mask of
+// the robots whose active limits were not found.
+inline __attribute__((always_inline)) Lanes solve_with_limits(FreeMotion const &of, std::int64_t block, FreeRoom &room) {
+  constexpr int MOST_TURNS = 20;
+  constexpr double LEAST_REGULARIZER = 1e-15;  // mjMINVAL
+  Model const &model = *of.model;
+  std::int64_t const dof = model.dof, size = dof * (dof + 1) / 2;
+  Lanes const *qpos = of.qpos + block * dof, *qvel = of.qvel + block * dof, *weight = of.weight + block * dof;
+  Lanes const *mass = of.mass + block * size;
+  Lanes *a = room.acceleration.data(), *effort = room.effort.data(), *m = room.factor.data();
+  for (std::int64_t j = 0; j < dof; ++j) {
+    Lanes const below = qpos[j] - of.low[j], above = of.high[j] - qpos[j];
+    Lanes const sign = room.sign[j] = below_mask(below, 0.0) - below_mask(above, 0.0);
+    Lanes const distance = where_positive(sign, below, above), x = absolute(distance) * (1.0 / of.width);
+    Lanes const late = 1.0 - x, curve = where_positive(x - 0.5, 1.0 - 2.0 * late * late, 2.0 * x * x);
+    Lanes const impedance = where_positive(below_mask(x, 1.0), of.least + curve * (of.most - of.least), of.most);
+    Lanes const regularizer = at_least((1.0 - impedance) / impedance * weight[j], LEAST_REGULARIZER);
+    room.active[j] = sign * sign;
+    room.cost[j] = 1.0 / regularizer;
+    room.push[j] = sign * (-of.rate_gain * sign * qvel[j] - of.stiffness * impedance * distance);
+    effort[j] = a[j];
+  }
+  Lanes changed{};
+  for (int turn = 0; turn < MOST_TURNS; ++turn) {
+    std::copy(mass, mass + size, m);
+    for (std::int64_t j = 0; j < dof; ++j) {
+      Lanes const active = room.active[j];
+      Lanes &diagonal = m[j * (j + 3) / 2];
+      diagonal = where_positive(active, diagonal + room.cost[j], diagonal);
+      a[j] = where_positive(active, effort[j] + room.cost[j] * room.push[j], effort[j]);
+    }
+    solve_along_tree(model, m, room.inverse.data(), a);
+    changed = Lanes{};
+    for (std::int64_t j = 0; j < dof; ++j) {
+      Lanes const active = below_mask(room.sign[j] * (a[j] - room.push[j]), 0.0);
+      changed += differs_mask(active, room.active[j]);
+      room.active[j] = active;
+    }
+    if (!any_positive(changed)) break;
+  }
+  return changed;
+}
+
+// Advance the robots of the mask `free` by the efforts in `room`. Return a mask of those that MuJoCo has to advance.
+FOR_EACH_PROCESSOR static bool advance_freely(FreeMotion const &of, std::int64_t block, FreeRoom &room, Lanes &free) {
+  std::int64_t const dof = of.model->dof;
+  Lanes *qpos = of.qpos + block * dof, *qvel = of.qvel + block * dof, *before = of.acceleration + block * dof;
+  Lanes const *bias = of.bias + block * dof;
+  Lanes *a = room.acceleration.data(), beyond{};
+  for (std::int64_t j = 0; j < dof; ++j) {
+    a[j] = room.effort[j] - bias[j];
+    beyond += below_mask(qpos[j], of.low[j]) + below_mask(of.high[j], qpos[j]);
+  }
+  bool solved = true;
+  if (any_positive(beyond)) {
+    Lanes const unsolved = solve_with_limits(of, block, room);
+    if (any_positive(free * unsolved)) solved = false, free = where_positive(unsolved, 0.0, free);
+  } else {
+    solve_along_tree(*of.model, of.mass + block * (dof * (dof + 1) / 2), room.inverse.data(), a);
+  }
+  for (std::int64_t j = 0; j < dof; ++j) {
+    Lanes const rate = qvel[j] + of.timestep * a[j], place = qpos[j] + of.timestep * rate;
+    before[j] = where_positive(free, a[j], before[j]);
+    qvel[j] = where_positive(free, rate, qvel[j]);
+    qpos[j] = where_positive(free, place, qpos[j]);
+  }
+  return solved;
+}
+
+}  // namespace batchpid

@@ -1,0 +1,257 @@
+"""Collision shapes as plain values for engines, distances and masses.
+
+A mesh collides as its convex hull, in both engines; a mass from shapes is that of the mesh itself
+where it encloses a volume.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.arrays.array_types import Document, Float64, MjModel, MjsBody, MjSpec, Rows
+from batchpid.arrays.digest import digest
+from batchpid.arrays.elementwise import read_only
+from batchpid.errors import RobotError
+from batchpid.io.files import write_atomically
+from batchpid.sim.geometry.inertia import DENSITY
+from batchpid.sim.geometry.mesh_files import mesh_bytes, read_mesh
+from batchpid.task_space.frames import SpatialInertia
+
+ShapeKind = Literal["sphere", "box", "capsule", "cylinder", "mesh"]
+
+
+class Shape(NamedTuple):
+    """Convex collision shape."""
+
+    body: str
+    """Body that has the shape."""
+    owner: str
+    """Link of the file that has the shape; another than ``body`` after a merge."""
+    kind: ShapeKind
+    size: tuple[float, ...]
+    """Radius; half lengths of a box's sides; radius and half length, without the ends of a capsule
+    [m]; () for a mesh. Capsules and cylinders lie along the z axis of the shape.
+    """
+    position: Float64
+    """Place of the shape in the frame of the body (3,) [m]."""
+    wxyz: Float64
+    """Orientation of the shape in the frame of the body (4,)."""
+    file: str = ""
+    """Absolute path of a mesh, which counts as its convex hull; "" for other shapes."""
+    scale: tuple[float, ...] = (1.0, 1.0, 1.0)
+    """Factors of the vertices of the file; an odd number of negative ones mirrors the mesh."""
+    vertices: Float64 | None = None
+    """Vertices (n, 3) [m] of a mesh without a file, in the frame of the shape."""
+    content: str = ""
+    """Digest of the bytes of ``file``, which say what it is: paths and time stamps do not."""
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether a factor of a mesh is negative: SAPIEN builds such shapes last."""
+        return min(self.scale) < 0
+
+
+class Triangles(NamedTuple):
+    """Triangles: ``vertices`` (v, 3) [m], and ``faces`` (f, 3), numbers of vertices."""
+
+    vertices: Float64
+    faces: NDArray[np.int64]
+
+    @property
+    def volume(self) -> float:
+        """Volume within a closed surface [m^3]."""
+        return float(np.linalg.det(self.vertices[self.faces]).sum() / 6)
+
+
+def hull(shape: Shape) -> Float64:
+    """Return the vertices of the convex hull of a mesh (n, 3) [m], in the frame of the shape.
+
+    Raises RobotError for a file that cannot be read.
+    """
+    if shape.vertices is not None:
+        return shape.vertices
+    return read_only(mesh_hull(shape.file, shape.content).vertices * shape.scale)
+
+
+def mesh_file(shape: Shape) -> str:
+    """Return the path of a mesh file: the shape's, else that of its hull.
+
+    The hull is written to ``batchpid/meshes`` in the user's cache folder, named by its content.
+    Raises RobotError if it cannot be written.
+    """
+    if shape.vertices is None:
+        return shape.file
+    vertices, faces = convex_hull(shape.vertices)
+    lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices.tolist()]
+    lines += ["f {} {} {}".format(*face) for face in (faces + 1).tolist()]
+    content = ("\n".join(lines) + "\n").encode()
+    # SAPIEN reads meshes from files alone, so a hull becomes one.
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    path = Path(cache, "batchpid", "meshes", f"{digest(content)[:32]}.obj")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Another process may have written the same hull.
+        if not path.is_file() or path.read_bytes() != content:
+            write_atomically(path, content)
+    except OSError as error:
+        problem = f"{path}: cannot be written: {error.strerror}"
+        raise RobotError(
+            f"{problem}; set XDG_CACHE_HOME to a folder for the hulls of meshes"
+        ) from error
+    return str(path)
+
+
+def half_extents(shape: Shape) -> tuple[Float64, Float64]:
+    """Return center (3,) and half size (3,) [m] of the box around a shape, in its frame."""
+    if shape.kind == "mesh":
+        vertices = hull(shape)
+        low = vertices.min(0)
+        high = vertices.max(0)
+        return (high + low) / 2, (high - low) / 2
+    if shape.kind == "box":
+        return np.zeros(3), np.array(shape.size)
+    radius = shape.size[0]
+    height = {"sphere": radius, "cylinder": shape.size[-1], "capsule": radius + shape.size[-1]}
+    return np.zeros(3), np.array([radius, radius, height[shape.kind]])
+
+
+@lru_cache(maxsize=256)
+def mesh_hull(file: str, content: str) -> Triangles:
+    """Return the convex hull of a mesh file with this digest, unscaled [m]. Raises RobotError."""
+    try:
+        hull_of_mesh = convex_hull(_mesh_surface(file, content).vertices)
+    except ValueError as error:
+        raise RobotError(
+            f"{file}: cannot be read: {error}; repair the file, or remove that <collision>"
+        ) from error
+    return hull_of_mesh
+
+
+def _mesh_surface(file: str, content: str) -> Triangles:
+    """Return the triangles of a mesh file, without copies of vertices, unscaled [m]."""
+    data = mesh_bytes(file, content)
+    try:
+        mesh = read_mesh(file, data)
+        rows = np.ascontiguousarray(mesh.vertices, float) + 0.0  # no -0.0
+        # Unique by their bytes, which is much faster than along an axis.
+        vertices, numbers = np.unique(rows.view("V24"), return_inverse=True)
+    except Exception as error:
+        raise RobotError(
+            f"{file}: cannot be read: {error}; repair the file, or remove that <collision>"
+        ) from error
+    return Triangles(vertices.view(float).reshape(-1, 3), numbers.ravel()[mesh.faces])
+
+
+@lru_cache(maxsize=256)
+def mesh_solid(file: str, content: str) -> Triangles | None:
+    """Return the surface of a mesh file that encloses a volume, unscaled [m]; None for others."""
+    surface = _mesh_surface(file, content)
+    edges = surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    forth, back = ({*map(tuple, rows.tolist())} for rows in (edges, edges[:, ::-1]))
+    # Around a volume every edge is one of two triangles, once in each direction.
+    is_closed = len(forth) == len(edges) and forth == back
+    return surface if is_closed and surface.volume > 0 else None
+
+
+def hull_share(shape: Shape) -> float:
+    """Return the volume of a mesh's hull over that of the mesh; 1.0 where it encloses none."""
+    solid = mesh_solid(shape.file, shape.content) if shape.file else None
+    if solid is None:
+        return 1.0
+    return mesh_hull(shape.file, shape.content).volume / solid.volume
+
+
+def convex_hull(points: Float64) -> Triangles:
+    """Return the convex hull of points, by MuJoCo.
+
+    Raises ValueError if MuJoCo's compiler refuses the points.
+    """
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    spec.add_mesh(name="mesh", uservert=points.ravel(), inertia=shell)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+    model = spec.compile()
+    # The hull's graph has two counts, the addresses and numbers of the vertices, edges, triangles.
+    graph = model.mesh_graph[model.mesh_graphadr[0] :]
+    corners, count = graph[:2].tolist()
+    numbers = graph[2 + corners : 2 + 2 * corners]
+    faces = graph[2 + 3 * corners + 3 * count :][: 3 * count]
+    row = {number: index for index, number in enumerate(numbers.tolist())}
+    triangles = np.array([row[number] for number in faces.tolist()], np.int64).reshape(-1, 3)
+    return Triangles(read_only(vertices_in_file(model, numbers)), triangles)
+
+
+def vertices_in_file(model: MjModel, indices: Rows) -> Float64:
+    """Return vertices of the only mesh of a model in the frame of its file; MuJoCo's are in
+    principal axes.
+    """
+    import mujoco
+
+    turned = np.zeros(9)
+    place = model.mesh_pos[0]
+    mujoco.mju_quat2Mat(turned, model.mesh_quat[0])
+    points: Float64 = model.mesh_vert[indices].astype(float) @ turned.reshape(3, 3).T + place
+    return points
+
+
+def inertia_of(shapes: Sequence[Shape]) -> SpatialInertia:
+    """Return the sum of the inertias of shapes of DENSITY, in the frame of their body, by MuJoCo's
+    compiler.
+    """
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body()
+    for shape in shapes:
+        add_geom(spec, body, shape, density=DENSITY)
+    model = spec.compile()
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, model.body_iquat[1])
+    turn = axes.reshape(3, 3)
+    tensor = turn * model.body_inertia[1] @ turn.T
+    center = model.body_ipos[1].copy()
+    return SpatialInertia(float(model.body_mass[1]), read_only(center), read_only(tensor))
+
+
+def add_geom(
+    spec: MjSpec,
+    body: MjsBody,
+    shape: Shape,
+    **options: object,
+) -> None:
+    """Add a shape to a body of a ``mujoco.MjSpec``; equal hulls share a mesh."""
+    import mujoco
+
+    kinds = mujoco.mjtGeom
+    if shape.kind == "mesh":
+        vertices = hull(shape)
+        inertias = mujoco.mjtMeshInertia
+        # A flat hull has no volume, which a mass from the density alone needs.
+        mesh: Document = {"inertia": inertias.mjMESH_INERTIA_SHELL}
+        if "density" in options:
+            mesh["inertia"] = inertias.mjMESH_INERTIA_CONVEX
+            solid = mesh_solid(shape.file, shape.content) if shape.file else None
+            if solid is not None:
+                vertices = solid.vertices * shape.scale
+                faces = solid.faces[:, :: -1 if np.prod(shape.scale) < 0 else 1]
+                mesh = {"inertia": inertias.mjMESH_INERTIA_EXACT, "userface": faces.ravel()}
+        options["meshname"] = name = f"mesh {digest(vertices)}"
+        if spec.mesh(name) is None:
+            spec.add_mesh(name=name, uservert=vertices.ravel(), **mesh)
+    else:
+        options["size"] = np.pad(shape.size, (0, 3 - len(shape.size)))
+    body.add_geom(
+        type=getattr(kinds, f"mjGEOM_{shape.kind.upper()}"),
+        pos=shape.position,
+        quat=shape.wxyz,
+        **options,
+    )

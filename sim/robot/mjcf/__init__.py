@@ -1,0 +1,1 @@
+"""MJCF files: MuJoCo compiles them, and the model becomes the tables of a robot."""
