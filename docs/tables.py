@@ -21,10 +21,10 @@ from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.law.params import FIELDS as PARAMS
 from batchpid.motors.actuators import FIELDS as ACTUATORS
+from batchpid.sim.findings import OF_FILES, OF_ROBOTS, FindingKind
 from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.options.options import GROUPS, OPTIONS, RunnerKeywords
 from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
-from batchpid.sim.robot.findings import OF_FILES, OF_ROBOTS, FindingKind
 
 DOCS = Path(__file__).parent
 

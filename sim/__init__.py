@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
+from batchpid.sim.findings import Finding, RepairWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import Controller, Ray
@@ -20,10 +21,9 @@ from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal,
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
-from batchpid.sim.robot.findings import Finding, RepairWarning
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.rollout import Rollout, RunInfo
 from batchpid.sim.signals.quantities import CommandSpec, Observation
-from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.tool_space import OperationalSpace
 
 if TYPE_CHECKING:

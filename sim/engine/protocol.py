@@ -23,7 +23,8 @@ from batchpid.io.packages import imported
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
+from batchpid.sim.robot.robot import Robot
 from batchpid.task_space.rigid_tree import RigidTree
 
 Capability = Literal["build", "partial_force", "base_state", "complete_state", "sapien_dissipation"]
@@ -38,9 +39,7 @@ Capability = Literal["build", "partial_force", "base_state", "complete_state", "
 
 
 class CompiledStep(Protocol):
-    """Sim step of a pack as one native call, also from XLA
-    (:func:`batchpid.sim.engine.native.xla.sim_step`).
-    """
+    """Sim step of a pack as one native call."""
 
     def prepare(self) -> int:
         """Return the address of the native group for the next steps."""
@@ -243,7 +242,7 @@ class EnginePack(Protocol):
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
 
-    # Sim steps in native code and in programs of XLA, where they are native.
+    # Sim steps in native code, where they are native.
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether a compiled step reads this part of the passive force; otherwise call
@@ -362,6 +361,15 @@ def load_engine(name: str = "sapien") -> Engine:
         raise InvalidArgumentError("engine", problem, value=name, remedy="use 'mujoco'")
     engine: Engine = imported(module).ENGINE
     return engine
+
+
+def engine_findings(robot: Robot, name: str, timestep: float) -> Iterator[Finding]:
+    """Yield what of ``robot`` an engine cannot run, or runs otherwise than the file says."""
+    engine = load_engine(name)
+    ground = {"ground": robot.has_ground, "mjcf": robot.mjcf}
+    scene = SceneSpec.of(robot, timestep, engine.physics["accurate"], **ground)
+    yield from engine.refusals(scene)
+    yield from engine.shortfalls(scene)
 
 
 def _require_mujoco() -> None:

@@ -30,8 +30,8 @@ from batchpid.sim.options.groups import EngineName
 from batchpid.sim.randomization.checks import check_robot
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.rollout import Rollout
 from batchpid.sim.runner.runner import Runner
-from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.tuning.moves import (
     Moves,
     shortest_durations,

@@ -7,7 +7,7 @@ import pytest
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Fault, Rollout, Runner
-from batchpid.sim.signals.rollout import PARAMS, RESET
+from batchpid.sim.rollout import PARAMS, RESET
 
 
 @pytest.fixture(scope="module")

@@ -102,12 +102,10 @@ class Clearance(ctypes.Structure):
             "moved",
             "left",
             "rate",
-            "near_rate",
             "shares",
             "wait",
             "age",
             "brief",
-            "near",
             "open",
             "no_shapes",
             "some_types",
@@ -316,7 +314,7 @@ _NAMES = (
         "constraint.h",
         "refresh.h",
     ),
-    *("sim_step.h", "tick.h", "xla_call.h", "interface.py"),
+    *("sim_step.h", "tick.h", "interface.py"),
 )
 
 EXTENSIONS = {
