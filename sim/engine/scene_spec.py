@@ -233,4 +233,5 @@ def _sum(first: Float64 | None, second: Float64 | None) -> Float64 | None:
         return second
     if second is None:
         return first
-    return first + second
+    # A randomization may draw less friction than the actuators take away.
+    return np.maximum(first + second, 0.0)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.records import frozen
-from batchpid.checks.validate import instance
+from batchpid.checks.validate import entries, instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN, JOINT_SIDE
 from batchpid.sim.robot.description import RobotDescription
@@ -104,6 +104,14 @@ def fit_actuators(
     motors = {name: getattr(actuators, name) for name in ("bias", *JOINT_SIDE)}
     # The leader carries friction and armature of its followers.
     motors = {name: leaf * robot.independent for name, leaf in motors.items() if leaf is not None}
+    described = {"coulomb": robot.friction, "static": robot.friction, "viscous": robot.damping}
+    for name, least in described.items():
+        if name in motors:
+            problem = "is less than none, together with the description's"
+            remedy = "give at least minus the friction or damping of the robot's file"
+            # Of a float32 the sum may be zero but for its rounding.
+            good = motors[name] >= -(1 + 1e-6) * least
+            entries(name, motors[name], good, problem, robot.joint_names, remedy=remedy)
     return actuators.replace(**motors, continuous=robot.continuous)
 
 
