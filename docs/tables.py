@@ -66,13 +66,35 @@ def first_sentence(text: str) -> str:
     return re.match(r".*?(?<!e\.g)(?=\. |\.?$)", plain)[0]  # type: ignore[index]
 
 
+ADVANCED = (
+    *("wrenches", "build", "backend", "speed_limit", "on_invalid_input", "first_env"),
+    *("timeout", "cluster"),
+)
+"""Options of the Runner that few programs need."""
+
+
+def option_texts() -> Iterator[tuple[str, str]]:
+    """Yield the name and the text of each option of the Runner."""
+    for group in (RunnerKeywords, *GROUPS):
+        for (name,), text in attributes(group):
+            yield name, text
+
+
+def advanced() -> str:
+    """Return a paragraph about the advanced options."""
+    texts = dict(option_texts())
+    entries = [f"`{name}` ({first_sentence(texts[name])})" for name in ADVANCED]
+    return textwrap.fill(f"Few programs need the others: {'; '.join(entries)}.", 120)
+
+
 def options() -> str:
     """Return the list of the Runner's options, with their defaults and the places that keep them."""
     defaults = {each.name: each.default for each in fields(RunnerKeywords)}
     bounds = declared(RunnerKeywords, Field)
     rows = []
-    texts = [text for group in (RunnerKeywords, *GROUPS) for text in attributes(group)]
-    for (name,), text in texts:
+    for name, text in option_texts():
+        if name in ADVANCED:
+            continue
         details = []
         if name in bounds:
             details.append(bound(bounds[name]))
@@ -150,6 +172,7 @@ def tables() -> dict[tuple[str, str], str]:
             attributes(Randomization), PHYSICAL | START | EVENTS, ("seed", "per"), off=False
         ),
         ("runner.md", "options"): options(),
+        ("runner.md", "advanced"): advanced(),
         ("robots.md", "files"): findings(OF_FILES, "Simulated"),
         ("robots.md", "preflight"): findings(OF_ROBOTS, "Remedy"),
     }

@@ -111,7 +111,7 @@ LONGER = {
     "task-space.md": 160,
     "reliability.md": 200,
     "robots.md": 215,
-    "sim-to-real.md": 155,
+    "sim-to-real.md": 170,
     "architecture.md": 190,
     "performance.md": 200,
     "runner.md": 215,

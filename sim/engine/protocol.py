@@ -342,7 +342,7 @@ MODULES = {
 """Module of each engine by name. Its constant ENGINE is the :class:`Engine`."""
 
 
-def load_engine(name: str = "sapien") -> Engine:
+def load_engine(name: str) -> Engine:
     """Return an engine.
 
     Raises
