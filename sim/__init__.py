@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from batchpid.io.packages import attributes_of
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
-from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.findings import Finding, RepairWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
@@ -57,7 +56,6 @@ __all__ = [
     "RunInfo",
     "Runner",
     "RunnerOptions",
-    "SetpointWarning",
     "Snapshot",
     "StabilityWarning",
     "Uniform",
