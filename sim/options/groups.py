@@ -158,8 +158,8 @@ class Scene(OptionGroup):
     """
     contacts: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``; default
-    none. Links that are connected by fixed joints count as one. A fixed base is refused. SAPIEN
-    needs ``dissipation="urdf"``.
+    none. Each link senses the contacts of its own shapes. A fixed base is refused. SAPIEN needs
+    ``dissipation="urdf"``.
     """
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links with a sensor of the force and torque that the parent exerts on the link:
