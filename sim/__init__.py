@@ -29,6 +29,7 @@ from batchpid.sim.tool_space import OperationalSpace
 if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
     from batchpid.sim.engine.physics import MujocoSolver, Physics
+    from batchpid.sim.loop.closed_loop import closed_loop
     from batchpid.sim.robot.urdf_export import to_urdf
     from batchpid.sim.runner.runner import Runner
     from batchpid.sim.workers.pool import RecoveryWarning
@@ -62,6 +63,7 @@ __all__ = [
     "Snapshot",
     "StabilityWarning",
     "Uniform",
+    "closed_loop",
     "read_recording",
     "to_mjcf",
     "to_urdf",
@@ -71,6 +73,7 @@ __all__ = [
 _LOADED_LATE = {
     "MujocoSolver": "batchpid.sim.engine.physics",
     "Physics": "batchpid.sim.engine.physics",
+    "closed_loop": "batchpid.sim.loop.closed_loop",
     "Runner": "batchpid.sim.runner.runner",
     "RecoveryWarning": "batchpid.sim.workers.pool",
     "to_mjcf": "batchpid.sim.engine.mujoco.mjcf_export",

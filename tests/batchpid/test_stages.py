@@ -90,7 +90,8 @@ def test_a_commanded_effort_is_limited_by_params_and_motors():
 
 def test_limits_are_narrowed_from_both_sides():
     values = at(limits=(None, np.full((N, DOF), 1.0))).within(rows(), np.full((N, DOF), 3.0))
-    assert (values.limits[1] == 1.0).all() and values.limits[0].shape == (N, DOF)
+    assert (values.limits[1] == 1.0).all()
+    assert values.limits[0].shape == (N, DOF)
 
 
 def test_targets_of_drives_are_next_to_the_joint():
