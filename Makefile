@@ -1,11 +1,12 @@
-# make demo    64 robots in MuJoCo under one batch PID: a table, and a picture in out/demo.png
+# make demo    64 robots under one batch PID in SAPIEN and MuJoCo: both rates; a table, and a picture in out/demo.png
 # make test     all tests but the slow ones, and every benchmark on a tiny workload
 # make test-isa the tests with other instruction sets of NumPy, OpenBLAS and XLA (two runs)
 # make check    linter, formatter, types, layers of imports and docs: what CI runs before the tests
 # make docs     the API reference and the guides, as pages in out/site
 # make bench    benchmarks and their baselines, on an idle machine (10 minutes); the last lines compare them
 # make bench-check  ratios of speeds against their floors: 3 minutes, on an idle machine
-# make figures  measure and redraw docs/performance.md (5 to 15 minutes, on an idle machine)
+# make figures  measure and redraw docs/performance.md, and draw the pictures of the guides (5 to 15 minutes, on an idle
+#               machine; the pictures alone: python docs/pictures.py)
 # make soak     the slow tests, each result as it comes (an hour)
 # make wheel    dist/: the sdist, and from it the wheel, tried in a clean environment; needs network and a C++ compiler
 #
@@ -35,6 +36,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.base
+	@$(RUN) examples/two_engines.py
 	@$(RUN) -m batchpid demo --engine mujoco --picture out/demo.png --force $(ARGS)
 	@echo "the command: . $(VENV)/bin/activate, then batchpid --help"
 
@@ -83,6 +85,7 @@ figures: $(VENV)/.dev
 	$(call bench_case,jaco2,accurate)
 	$(call bench_case,jaco2,fast)
 	@$(RUN) bench/draw.py $(MEASURED)
+	@$(RUN) docs/pictures.py
 
 soak: $(VENV)/.dev
 	@$(RUN) -u -m pytest -m slow -vv --durations 20 --numprocesses 2 --dist worksteal $(ARGS)

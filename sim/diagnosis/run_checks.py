@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Rows
 from batchpid.errors import warn
-from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
+from batchpid.sim.findings import LIMIT_TOLERANCE
+
+if TYPE_CHECKING:
+    from batchpid.sim.robot.robot import Robot
 
 
 class SetpointWarning(UserWarning):
@@ -19,7 +24,7 @@ class SetpointCheck:
     joint.
     """
 
-    def __init__(self, robot: RobotDescription) -> None:
+    def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._low = robot.lower - LIMIT_TOLERANCE
         self._high = robot.upper + LIMIT_TOLERANCE

@@ -27,7 +27,7 @@ from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checke
 from batchpid.sim.recording.recording_files import read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
+from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
 
 QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
@@ -126,6 +126,7 @@ def logs_of_rollout(
         within = rollout.changes[1:]
     obstacles = {
         f"is of the joints {', '.join(info.joint_names)}": info.joint_names != robot.joint_names,
+        "was made with a plan": info.plan is not None,
         "was made with setpoints that are not of joints": info.own_command is not None,
         f"was made under control {info.control!r}": info.control not in (None, "pid", "effort"),
         f"holds {recorded}s": kind not in (None, recorded),

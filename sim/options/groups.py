@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from importlib.util import find_spec
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, Self, get_args, get_type_hints
 
 from numpy.typing import ArrayLike
@@ -35,8 +34,8 @@ from batchpid.sim.tool_space import OperationalSpace
 from batchpid.stages import Stage, fit_stages
 
 EngineName = Literal["sapien", "mujoco"]
-DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
-"""SAPIEN where it is installed, which is on Linux with x86-64; elsewhere MuJoCo."""
+DEFAULT_ENGINE: EngineName = "mujoco"
+"""Engine of runners, commands, searches and comparisons that name none."""
 PhysicsPreset = Literal["accurate", "fast"]
 ControlMode = Literal["pid", "drive", "effort"]
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
@@ -115,11 +114,11 @@ class Scene(OptionGroup):
         option(
             "snapshot",
             "recording",
-            flag="Physics engine; mujoco is several times as fast, with other contacts.",
+            flag="Physics engine; sapien is several times as slow, with other contacts.",
         ),
     ] = DEFAULT_ENGINE
-    """Physics engine: ``"sapien"``, the reference and the default where it is installed, or
-    ``"mujoco"``, several times as fast (docs/performance.md).
+    """Physics engine: ``"mujoco"`` (the default), or ``"sapien"``, which is for Linux on x86-64 and
+    several times as slow (docs/performance.md).
     """
     physics: Annotated[
         PhysicsPreset | Physics | MujocoSolver,
@@ -159,15 +158,16 @@ class Scene(OptionGroup):
     """
     contacts: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``; default
-    none. Links that are connected by fixed joints count as one. A fixed base is refused. SAPIEN
-    needs ``dissipation="urdf"``.
+    none. Each link senses the contacts of its own shapes. A fixed base is refused. SAPIEN needs
+    ``dissipation="urdf"``.
     """
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links with a sensor of the force and torque that the parent exerts on the link:
     ``obs.wrench``; default none. SAPIEN needs ``dissipation="urdf"``.
     """
     build: Annotated[Callable[[Any, int], Any] | None, option("snapshot", "scene")] = None
-    """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env.
+    """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env;
+    it needs ``engine="sapien"``.
     Visuals and lights are ignored, so code that was written for a screen runs unchanged. It may
     return the entities that :meth:`batchpid.sim.Runner.poses` reports. A reset returns the content
     to the poses that ``build`` gave it.
@@ -399,6 +399,10 @@ class Control(OptionGroup):
     """Further stages of a sim step, such as a thermal limit, each a :class:`batchpid.stages.Stage`
     with ``after``, the name of the stage before it (docs/stages.md); default none.
     """
+    plan: Annotated[bp.Plan | None, option("snapshot", recording="plan_blend")] = None
+    """Plan of the chunks of a slow policy: :func:`batchpid.make_plan`. :meth:`Runner.step` then
+    takes chunks, and ``obs.starved`` counts the sim steps without a row ahead. Default none.
+    """
     guard: Annotated[bool | bp.Guard | None, option("snapshot")] = None
     """Limits of setpoints, applied at every sim step: True for :meth:`batchpid.sim.Robot.guard`, or
     :func:`batchpid.make_guard`; default none. ``obs.guarded`` is True where a setpoint was
@@ -443,6 +447,13 @@ class Control(OptionGroup):
         if isinstance(self.control, str):
             return self.control
         return type(self.control).__name__
+
+    @property
+    def plan_blend(self) -> str | None:
+        """Blend of the plan; None without a plan."""
+        if self.plan is None:
+            return None
+        return str(self.plan.options()["blend"])
 
     @property
     def sets_positions(self) -> bool:

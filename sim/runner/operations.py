@@ -28,9 +28,9 @@ from batchpid.sim.loop.loop import Loop
 from batchpid.sim.loop.snapshot import Snapshot, join_rows
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
+from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE
 from batchpid.sim.runner.arguments import base_rows, joint_rows
 from batchpid.sim.runner.runner_state import RunnerState
-from batchpid.sim.signals.rollout import ACTUATORS, PARAMS, RESET, RESTORE
 from batchpid.sim.workers.pool import Outcome
 from batchpid.sim.workers.requests import Request
 from batchpid.stages.stage import by_name
@@ -190,6 +190,27 @@ class SetActuators(Operation):
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         return state.changed(ACTUATORS, actuators=self.actuators)
+
+
+@dataclass(frozen=True)
+class AddChunk(Operation):
+    """Add a chunk (envs, rows, dof) that is ``latency`` (envs,) [s] old to the plans; infinite for
+    no chunk.
+    """
+
+    chunk: Float64
+    latency: Float64
+
+    def goal(self, before: Float64) -> Float64:
+        """Return the last row of each env (envs, dof), NaN where a row is not finite, or ``before``
+        without a chunk.
+        """
+        is_finite = np.isfinite(self.chunk).all(1)
+        goal = np.where(is_finite, self.chunk[:, -1], np.nan)
+        return np.where(np.isfinite(self.latency)[:, None], goal, before)
+
+    def apply(self, loop: Loop) -> None:
+        loop.add_chunk(self.chunk, self.latency)
 
 
 @dataclass(frozen=True)
