@@ -75,7 +75,7 @@ bench-check: $(VENV)/.dev
 
 MEASURED := out/bench
 bench_case = $(RUN) bench/measure.py $(1) --physics $(2) --json $(MEASURED)/$(1)-$(2).json \
-	--ticks 60 --rounds 3 --xla $(3)
+	--ticks 60 --rounds 3 $(3)
 
 figures: $(VENV)/.dev
 	$(call bench_case,panda,accurate,--peers)

@@ -1,6 +1,6 @@
 """Speed of the runner and of its baselines in one run.
 
-    python bench/measure.py panda --physics fast [--peers] [--xla] [--json FILE]
+    python bench/measure.py panda --physics fast [--peers] [--json FILE]
 
 Every case moves the same robots from ``start`` to ``target`` with the tutorial's gains and, in
 SAPIEN, with SAPIEN's friction and damping. So the cases differ in the way of stepping and not in
@@ -36,10 +36,11 @@ from batchpid.sim.cli.report import table
 from batchpid.sim.engine import native
 from batchpid.sim.engine.protocol import EnginePack, load_engine
 from batchpid.sim.loop import env_group
-from batchpid.sim.loop.arrays import Arrays, Command
+from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
+from batchpid.stages.values import Command
 
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"
 POLICY, NO_SHAPES = "closed loop, policy network", "closed loop, no shapes"
@@ -51,10 +52,9 @@ LOOPS = {
     POLICY: {},
     NO_SHAPES: {"collisions": False},
 }
-XLA_LOOPS = {f"{name}, XLA": LOOPS[name] | {"backend": "jax"} for name in (OURS, POLICY, NO_SHAPES)}
 MUJOCO_LOOPS = {"closed loop, MuJoCo": {"engine": "mujoco"}}
 CASES = (*TUTORIALS, *ENGINES, *LOOPS)
-"""Cases without JAX, MuJoCo and peers."""
+"""Cases without MuJoCo and peers."""
 PHASES = {
     # phase of a sim step: methods of the pack that it calls
     "read": ("read_qpos", "read_qvel"),
@@ -88,7 +88,7 @@ class Result:
 
 def make_loop(workload: Workload, name: str) -> Case:
     """Return a case of the Runner."""
-    options = dict((LOOPS | XLA_LOOPS | MUJOCO_LOOPS)[name])
+    options = dict((LOOPS | MUJOCO_LOOPS)[name])
     if name.startswith(POLICY):
         options["control"] = ResidualPolicy(workload.robot)
     with patch.dict(os.environ, {native.SWITCH: "0"} if name == PYTHON else {}):
@@ -120,14 +120,10 @@ def measure_rates(workload: Workload, names: Iterable[str] = CASES) -> dict[str,
         cases = {name: make(workload) for name, (_, make) in PEERS.items() if name in seconds}
         cases |= make_baselines(workload)
         cases |= {
-            name: make_loop(workload, name)
-            for name in LOOPS | XLA_LOOPS | MUJOCO_LOOPS
-            if name in seconds
+            name: make_loop(workload, name) for name in LOOPS | MUJOCO_LOOPS if name in seconds
         }
         for case in cases.values():
             stack.callback(case.close)
-        for name in XLA_LOOPS.keys() & cases.keys():
-            run_round(cases[name])  # compiles
         for _ in range(workload.rounds):
             for name, rounds in seconds.items():
                 took, final[name] = run_round(cases[name])
@@ -229,8 +225,6 @@ class Options:
     """Measure MuJoCo, with the closed loop and alone, and Gymnasium's AsyncVectorEnv, too, where
     installed.
     """
-    xla: bool = False
-    """Measure the closed loop in XLA, too."""
     json: Path | None = None
     """File for the figures, for draw.py."""
 
@@ -249,7 +243,6 @@ def main(options: Options) -> None:
     peers = installed_peers() if options.peers else []
     names = [
         *CASES,
-        *(XLA_LOOPS if options.xla else ()),
         *(MUJOCO_LOOPS if "mujoco" in peers else ()),
         *peers,
     ]

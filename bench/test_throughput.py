@@ -5,7 +5,7 @@ measure.py prints the same.
 """
 
 import pytest
-from measure import CASES, MUJOCO_LOOPS, OURS, XLA_LOOPS, measure_rates
+from measure import CASES, MUJOCO_LOOPS, OURS, measure_rates
 from peers import installed_peers
 from workload import Workload
 
@@ -18,7 +18,7 @@ ENVS, TICKS, ROUNDS = 32, 50, 3  # two groups of envs
 @pytest.mark.parametrize("physics", ["accurate", "fast"])
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_cases(benchmark, report, compare, most, name, physics):
-    """Env-steps per second of the closed loop over those of every case; XLA, MuJoCo and peers with
+    """Env-steps per second of the closed loop over those of every case; MuJoCo and peers with
     "accurate" only.
     """
     benchmark.group = f"{name}, {physics}"
@@ -27,7 +27,6 @@ def test_cases(benchmark, report, compare, most, name, physics):
     names = [*CASES]
     if physics == "accurate":
         peers = installed_peers()
-        names += [*XLA_LOOPS][: None if most.floors else 1]  # each is compiled
         names += [*(MUJOCO_LOOPS if "mujoco" in peers else ()), *peers]
     results = benchmark.pedantic(lambda: measure_rates(workload, names), rounds=1)
     report([1 / rate for rate in results[OURS].rates])

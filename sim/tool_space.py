@@ -256,7 +256,7 @@ class OperationalSpace:
 
     def _carried(self, setpoint: Array, left: Array) -> Array:
         """Return the setpoints of the moment ``left`` [s] before the end of the tick: the pose
-        moves with its twist, as joints do in :func:`batchpid.sim.loop.control_step.carried`.
+        moves with its twist, as joints do in :class:`batchpid.stages.setpoint.Setpoint`.
         """
         if "twist" not in self._parts:
             return setpoint

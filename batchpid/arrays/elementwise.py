@@ -5,7 +5,7 @@ read-only views.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache, wraps
 from types import NoneType
 from typing import Any, TypeVar
@@ -14,8 +14,9 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule, DType
 from batchpid.arrays.choices import CHOICE_TYPES
+from batchpid.arrays.trees import parts, rebuilt_as
 
-T = TypeVar("T", bound=tuple[Any, ...])
+T = TypeVar("T")
 V = TypeVar("V")
 TURN = 2 * math.pi
 NAMED_TUPLES: list[type] = [*CHOICE_TYPES]
@@ -134,22 +135,23 @@ def read_history(history: Array, places: Array) -> Array:
 
 
 def replace_envs(state: T, fresh: T, mask: Array) -> T:
-    """Return ``state``, a named tuple of arrays (envs, ...), with the envs of ``mask`` (envs,) bool
-    as in ``fresh``.
+    """Return ``state``, a tree of arrays (envs, ...), with the envs of ``mask`` (envs,) bool as in
+    ``fresh``, which has the same structure.
     """
-    xp = namespace(*state, mask)
-    chosen = xp.asarray(mask)
-
-    def choose(new: Array, old: Array) -> Array:
-        if old is None:
-            return None
-        return xp.where(
-            chosen.reshape(*chosen.shape, *[1] * (old.ndim - chosen.ndim)),
-            new,
-            old,
+    if state is None:
+        return state
+    if isinstance(state, Mapping | tuple):
+        new = parts(fresh)  # by name: JAX sorts the keys of a mapping
+        rebuilt: T = rebuilt_as(
+            state, [replace_envs(old, new[name], mask) for name, old in parts(state).items()]
         )
-
-    return type(state)(*map(choose, fresh, state))
+        return rebuilt
+    old: Any = state
+    xp = namespace(old, fresh, mask)
+    wanted = xp.asarray(mask)
+    wanted = wanted.reshape(*wanted.shape, *[1] * (old.ndim - wanted.ndim))
+    chosen: T = xp.where(wanted, fresh, old)
+    return chosen
 
 
 def wrap(angle: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:

@@ -1,7 +1,7 @@
-"""Trees of arrays: nested tuples, lists and mappings. A leaf is an array, a traced symbol, or a
-placeholder (``...``).
+"""Trees of arrays: nested tuples, lists, mappings and dataclasses. A leaf is an array, a traced
+symbol, or a placeholder (``...``).
 
-Programs take the leaves of a tree of tuples in order: :func:`leaves`, :func:`mapped`,
+Programs take the leaves of a tree of tuples and dataclasses in order: :func:`leaves`, :func:`mapped`,
 :func:`structure` and :func:`filled`. Numbers and other values are constants there, not leaves.
 Files and snapshots take all values by name: :func:`flatten` and :func:`unflatten`. None is a tree
 without leaves.
@@ -10,6 +10,7 @@ without leaves.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import is_dataclass
 
 import numpy as np
 
@@ -24,25 +25,30 @@ def is_leaf(tree: Pytree) -> bool:
 
 
 def leaves(tree: Pytree) -> list[Pytree]:
-    """Return the leaves of a tree of tuples, in order."""
+    """Return the leaves of a tree of tuples and dataclasses, in order."""
     if is_leaf(tree):
         return [tree]
     if isinstance(tree, tuple):
         return [leaf for part in tree for leaf in leaves(part)]
+    if is_dataclass(tree):
+        return leaves(tuple(vars(tree).values()))
     return []
 
 
 def mapped(function: Callable[[Pytree], Pytree], tree: Pytree) -> Pytree:
-    """Return a tree of tuples with ``function`` applied to its leaves."""
+    """Return a tree of tuples and dataclasses with ``function`` applied to its leaves."""
     if is_leaf(tree):
         return function(tree)
     if isinstance(tree, tuple) and tree:
-        return _rebuilt(tree, [mapped(function, part) for part in tree])
+        return rebuilt_as(tree, [mapped(function, part) for part in tree])
+    if is_dataclass(tree):
+        kind: Callable[..., Pytree] = type(tree)
+        return kind(*[mapped(function, part) for part in vars(tree).values()])
     return tree
 
 
 def structure(tree: Pytree) -> Pytree:
-    """Return a tree of tuples with ``...`` in place of each leaf; the result is hashable."""
+    """Return a tree with ``...`` in place of each leaf; the result is hashable."""
     return mapped(lambda _: ..., tree)
 
 
@@ -92,7 +98,7 @@ def unflatten(
         unflatten(part, named, separator, f"{name}{separator}{key}" if name else key)
         for key, part in parts(like).items()
     ]
-    return _rebuilt(like, rebuilt)
+    return rebuilt_as(like, rebuilt)
 
 
 def parts(tree: Pytree) -> Document:
@@ -102,7 +108,7 @@ def parts(tree: Pytree) -> Document:
     return dict(zip(getattr(tree, "_fields", map(str, range(len(tree)))), tree, strict=True))
 
 
-def _rebuilt(like: Pytree, parts: list[Pytree]) -> Pytree:
+def rebuilt_as(like: Pytree, parts: list[Pytree]) -> Pytree:
     """Return a mapping, tuple or list of the type of ``like`` with other parts."""
     if isinstance(like, Mapping):
         return dict(zip(like, parts, strict=True))

@@ -141,7 +141,8 @@ def advance(
     check_time_step(dt)
     (setpoint,) = in_dtype_of(guard, setpoint)
     xp = namespace(*guard, setpoint, *state)
-    requested = clip(setpoint, guard.lower, guard.upper, xp)
+    # A copy: the state keeps it, and the caller may change the setpoint.
+    requested = clip(setpoint.copy(), guard.lower, guard.upper, xp)
     # On a continuous joint the short way round.
     arriving = rate = wrap(requested - state.setpoint, guard.turns, xp) / dt
     if guard.acceleration is not None:

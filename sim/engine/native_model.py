@@ -225,7 +225,7 @@ class NativeStep:
         self._group = Group(robots=robots, dof=dof, **addresses, **fields)
 
     def prepare(self) -> int:
-        """Return the address of the group, for a call of the extension or of XLA that does a sim
+        """Return the address of the group, for a call of the extension that does a sim
         step.
         """
         return ctypes.addressof(self._group)

@@ -38,9 +38,7 @@ Capability = Literal["build", "partial_force", "base_state", "complete_state", "
 
 
 class CompiledStep(Protocol):
-    """Sim step of a pack as one native call, also from XLA
-    (:func:`batchpid.sim.engine.native.xla.sim_step`).
-    """
+    """Sim step of a pack as one native call."""
 
     def prepare(self) -> int:
         """Return the address of the native group for the next steps."""
@@ -243,7 +241,7 @@ class EnginePack(Protocol):
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
 
-    # Sim steps in native code and in programs of XLA, where they are native.
+    # Sim steps in native code, where they are native.
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether a compiled step reads this part of the passive force; otherwise call

@@ -32,7 +32,6 @@ from batchpid.sim.identification.regression import (
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import Dynamics, LogControl, Plant
 from batchpid.sim.identification.unknowns import BASIC, EXTRAS, KINDS, Unknowns
-from batchpid.sim.loop.step_values import ModelledFriction
 from batchpid.sim.options.groups import Compensation
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
@@ -207,7 +206,8 @@ def _prepared(
     friction = (robot.friction + known_joints(robot).coulomb)[joints]
     if is_friction and friction.any():
         band = np.array([BAND[robot.units[joint]] for joint in joints])
-        modelled = ModelledFriction(friction, band, robot.continuous[joints] / TURN)
+        turns = robot.continuous[joints] / TURN
+        modelled = {"modelled": friction, "band": band, "turns": turns}
     plants = dict[Robot, Plant]()
     data = list[LogData]()
     for log in logs:

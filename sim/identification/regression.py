@@ -232,13 +232,14 @@ def _commanded(part: LogData) -> Float64:
     ideal = PlantCandidates(Actuators(), {}, SETPOINT_DELAYS, [()] * count)
     q, v = (np.repeat(table[:, None], count, axis=1) for table in motion[:2])
     dynamics = Dynamics(part.plant, ideal.masses, q[0], v[0])
-    control = SimulatedControl(drive, ideal, dynamics, q[0], v[0])
+    qpos, qvel = q[0].copy(), v[0].copy()
+    control = SimulatedControl(drive, ideal, dynamics, qpos, qvel)
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)
     efforts = np.empty(q.shape)
-    zero = np.zeros(q.shape[1:])
     for step in range(steps):
-        setpoint = motion.command[np.clip(step - late, 0, steps - 1)]
-        efforts[step] = control.advance(setpoint, q[step], v[step], zero)
+        control.command[...] = motion.command[np.clip(step - late, 0, steps - 1)]
+        qpos[...], qvel[...] = q[step], v[step]
+        efforts[step] = control.advance()
     return efforts.swapaxes(0, 1)
 
 

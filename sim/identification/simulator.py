@@ -1,10 +1,9 @@
-r"""Simulation of many candidates along stretches of logs: the Runner's control step on a rigid
-tree.
+r"""Simulation of many candidates along stretches of logs: the Runner's stages on a rigid tree.
 
-Control, motors and friction are :func:`batchpid.sim.loop.control_step.control_step` at every sim
-step, as in a Runner. In place of an engine the rigid tree of the logged joints moves by
-semi-implicit Euler with steps of dt, as in SAPIEN and MuJoCo, with mass matrix M, armature A,
-viscous damping B, gravity and Coriolis forces h, and the effort u of motors and friction::
+Control, motors and friction are the stages of a sim step (:mod:`batchpid.stages`), as in a Runner.
+In place of an engine the rigid tree of the logged joints moves by semi-implicit Euler with steps of
+dt, as in SAPIEN and MuJoCo, with mass matrix M, armature A, viscous damping B, gravity and Coriolis
+forces h, and the effort u of motors and friction::
 
     (M + A + dt B) (v+ - v) = dt (u - h),     q+ = q + dt v+
 
@@ -25,30 +24,20 @@ import numpy as np
 import batchpid as bp
 import batchpid.task_space as ts
 from batchpid import motors as motor_model
-from batchpid.arrays.array_types import Float64
-from batchpid.arrays.trees import leaves, mapped, structure
-from batchpid.motors import friction as friction_model
-from batchpid.motors import guard as guard_model
+from batchpid.arrays.array_types import Document, Float64
+from batchpid.arrays.trees import mapped
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.coupling import Coupling, Follower
 from batchpid.motors.friction import Friction
 from batchpid.motors.guard import Guard
-from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
-from batchpid.native.tracing import Trace, trace_trees
 from batchpid.sim.engine.scene_spec import added_friction
-from batchpid.sim.loop.control_step import REFRESH_STEPS, control_step
-from batchpid.sim.loop.step_values import (
-    Constants,
-    Layout,
-    Measured,
-    Model,
-    ModelledFriction,
-    PIDLaw,
-    Step,
-    StepState,
-)
 from batchpid.sim.robot.robot import Robot
+from batchpid.stages import Control, stages_of
+from batchpid.stages.friction import REFRESH_STEPS, Inertia
+from batchpid.stages.program import StageProgram
+from batchpid.stages.stage import by_name, running, started, stepped
+from batchpid.stages.values import Command, Measured, Model, Values
 from batchpid.task_space import native_rows
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -72,8 +61,8 @@ class LogControl(NamedTuple):
     """Forces that the robot compensates: "gravity+coriolis", "gravity" or "none"."""
     through: bool = True
     """True if the compensation passes through the motors, as in a Runner; False if it is exact."""
-    modelled: ModelledFriction | None = None
-    """Friction that the law compensates."""
+    modelled: Document | None = None
+    """Friction that the law compensates: those fields of :class:`batchpid.stages.Control`."""
 
 
 class PlantCandidates(NamedTuple):
@@ -229,125 +218,79 @@ class SimulatedControl:
         efforts: Float64 | None = None,
         described: Friction = _NONE,
     ) -> None:
-        """Begin at ``qpos`` and ``qvel`` (n, joints), after the commanded ``efforts`` (samples, n,
-        joints), the latest first; the motors' friction adds to that ``described``.
+        """Begin at ``qpos`` and ``qvel`` (n, joints), which the caller changes in place, after the
+        commanded ``efforts`` (samples, n, joints), the latest first; the motors' friction adds to
+        that ``described``.
         """
-        dt = drive.timestep
-        count = len(qpos)
         actuators = candidates.actuators
-        k = law = guard = motors = None
-        state = StepState(None)
-        if drive.params is not None:
-            law = PIDLaw.of(drive.params)
-            # The law of the layout decides on rates that are measured, not the params.
-            params = changed_params(drive.params, candidates.law)._replace(measurement_rate=None)
-            k = bp.discretise(params, dt, count)
-            offset = 0.0 if actuators.position_offset is None else actuators.position_offset
-            state = StepState(bp.init(params, qpos + offset))
-        if "slew" in candidates.law:
-            guard = Guard(rate=candidates.law["slew"])
-            state = state._replace(guard=guard_model.init(guard, qpos))
-        if not actuators._replace(**dict.fromkeys(motor_model.JOINT_SIDE)).is_ideal:
-            history = motor_model.init(actuators, qpos, dt, qvel=qvel)
-            if history.command is not None and efforts is not None:
-                samples = np.minimum(np.arange(history.command.shape[1]), len(efforts) - 1)
-                history = history._replace(command=efforts[samples].swapaxes(0, 1))
-            motors = motor_model.discretise(actuators, history, dt, count)
-            state = state._replace(motors=history)
         self.friction = added_friction(described, actuators)
         self.armature = np.zeros_like(qpos)
         if actuators.armature is not None:
             self.armature += actuators.armature
-        if self.friction.coulomb is not None:
-            begin = (qvel, dynamics.force, self._inertia(dynamics.matrix), dt)
-            state = state._replace(
-                friction=friction_model.init(self.friction, *begin), age=np.ones_like(qpos)
-            )
-        self._layout = Layout("effort" if law is None else "pid", law, actuators.measures, _MODEL)
-        self._constants = Constants(
-            dt,
-            (None, None),
-            Coupling.of(qpos.shape[1]),
-            k,
-            friction=self.friction,
-            modelled=None if law is None else drive.modelled,
+        guard = Guard(rate=candidates.law["slew"]) if "slew" in candidates.law else None
+        law = drive.params
+        control = Control(
+            timestep=drive.timestep,
+            envs=len(qpos),
+            coupling=Coupling.of(qpos.shape[1]),
+            params=bp.PIDParams(kp=None) if law is None else changed_params(law, candidates.law),
+            mode="effort" if law is None else "pid",
+            actuators=actuators._replace(**dict.fromkeys(motor_model.JOINT_SIDE)),
             guard=guard,
-            motors=motors,
+            friction=self.friction,
         )
-        self._state = mapped(lambda leaf: np.array(leaf, order="C"), state)
-        self._program: Any = None
+        control = control._replace(**(drive.modelled or {}))
+        # The program is bound to these arrays.
+        self.command = np.zeros_like(qpos)
+        """Setpoints or efforts of the next step."""
+        self.passive = np.zeros_like(qpos)
+        """Compensated force of the next step."""
+        model = Model(
+            joint_mass_matrix=lambda _: (
+                dynamics.matrix + self.armature[:, :, None] * np.eye(qpos.shape[1])
+            ),
+            load=lambda: dynamics.force,
+        )
+        reading = Measured(qpos, qvel, self.passive)
+        command = Command(self.command, feedforward=0.0)
+        self._values = Values(command, reading, reading, drive.timestep, model=model)
+        stages = stages_of(control)
+        start = self._values._replace(measured=reading._replace(passive=None))
+        states = by_name(stages, started(stages, start))
+        motors = states.get("motors")
+        if motors is not None and motors.command is not None and efforts is not None:
+            samples = np.minimum(np.arange(motors.command.shape[1]), len(efforts) - 1)
+            states["motors"] = motors._replace(command=efforts[samples].swapaxes(0, 1))
+        # The simulation refreshes the inertia of the friction model by itself.
+        self._inertia = next((stage for stage in stages if isinstance(stage, Inertia)), None)
+        if self._inertia is not None:
+            gain, memory, _ = states.pop("inertia")
+            self._values = self._values._replace(inertia=(np.array(gain), np.array(memory)))
+        rest = [stage for stage in stages if stage.name in states]
+        self._stages = running(rest)
+        kept = tuple([states[stage.name] for stage in rest])
+        self._states = mapped(lambda leaf: np.array(leaf, order="C"), kept)
+        self._program: StageProgram | None = None
         if not obstacle():
-            inputs = (qpos,) * 4
-            constants = mapped(
-                lambda leaf: tuple(leaf) if leaf.ndim == 3 else leaf, self._constants
-            )
-            trees = constants, self._state, inputs
-            trace = _trace(self._layout, *map(structure, trees))
-            self._arrays = leaves(self._state)
-            self._results = *leaves(_returned(self._state)), np.zeros_like(qpos)
-            numbers = len(self._arrays) + len(inputs)
-            self._program = ArrayProgram(trace, leaves(constants), numbers, qpos.shape)
+            inputs = self._values._replace(model=Model())
+            self._program = StageProgram(rest, self._states, inputs, qpos.shape)
 
-    def _inertia(self, matrix: Float64) -> Float64:
-        return matrix + self.armature[:, :, None] * np.eye(matrix.shape[1])
-
-    def refresh(self, matrix: Float64) -> None:
+    def refresh(self) -> None:
         """Update the inertia of the friction model."""
-        if self.friction.coulomb is None:
-            return
-        dt = self._constants.timestep
-        state = self._state.friction
-        fresh = friction_model.refresh(self.friction, state, self._inertia(matrix), dt)
-        # In place: the program is bound to these arrays.
-        state.gain[...] = fresh.gain
-        state.memory[...] = fresh.memory
+        if self._inertia is not None:
+            fresh = self._inertia.factors(self._values)
+            for array, factor in zip(self._values.inertia, fresh, strict=True):
+                array[...] = factor
 
-    def advance(self, *inputs: Float64) -> Any:
-        """Return the efforts of motors and friction (n, joints), which the next call may reuse.
-
-        ``inputs`` are setpoints or efforts, positions, velocities and the compensated force.
+    def advance(self) -> Any:
+        """Return the efforts of motors and friction (n, joints), which the next call may reuse, at
+        the present command, compensated force, positions and velocities.
         """
         if self._program is None:
-            self._state, effort = _step(self._layout, self._constants, self._state, inputs)
-        else:
-            self._program(*self._arrays, *inputs, out=self._results)
-            effort = self._results[-1]
-        return effort
-
-
-_MODEL = Model(when=lambda due, function, otherwise: otherwise)
-"""The simulation refreshes the friction model by itself."""
-
-
-def _step(
-    layout: Layout,
-    constants: Constants,
-    state: StepState,
-    inputs: Any,
-) -> Any:
-    """Return state and efforts of a control step."""
-    command, *reading = inputs
-    measured = Measured(*reading)
-    new, outputs = control_step(layout, constants, state, command, measured, Step(0, 1))
-    return new, outputs.qf
-
-
-@lru_cache(maxsize=64)
-def _trace(layout: Layout, *structures: Any) -> Trace:
-    def function(*parts: Any) -> list[Any]:
-        new, effort = _step(layout, *parts)
-        return [*leaves(_returned(new)), effort]
-
-    return trace_trees(function, *structures)
-
-
-def _returned(state: StepState) -> StepState:
-    """Return the leaves of a state that a program returns: without histories, which it changes in
-    place.
-    """
-    if state.motors is None:
-        return state
-    return state._replace(motors=state.motors._replace(command=None, sensor=None))
+            self._states, values = stepped(self._stages, self._states, self._values)
+            return values.outputs.qf
+        self._program()
+        return self._program.values.outputs.qf
 
 
 def changed_params(params: bp.PIDParams, law: Mapping[str, Float64]) -> bp.PIDParams:
@@ -413,14 +356,13 @@ def simulate(
     share = (late - whole)[:, None]
     # Inertias that are added to the mass matrix: armature, and damping, which is implicit.
     added = control.armature + dt * control.friction.viscous
-    passive = np.zeros_like(q)
     # Positions and velocities are stored at the steps of rows: a long log has many others.
     stored = set(np.concatenate([stretch.step for stretch in stretches]).tolist())
     track = dict[int, Float64]()
     with np.errstate(all="ignore"):
         for step in range(len(commands) - past):
             if step % REFRESH_STEPS == 0:
-                control.refresh(dynamics.matrix)
+                control.refresh()
             newest = past + step - whole
             command = commands[np.maximum(newest, 0), stretch_of]
             if share.any():
@@ -428,10 +370,11 @@ def simulate(
             # What the robot compensates is added to the command, or cancels forces exactly.
             force = dynamics.force
             if described is not None and drive.through:
-                passive = described.force
+                control.passive[...] = described.force
             elif described is not None:
                 force = force - described.force
-            effort = control.advance(command, q, v, passive) - force
+            control.command[...] = command
+            effort = control.advance() - force
             _move(plant, dt, q, v, dynamics.matrix, effort, added)
             measured[...] = q + offset
             if step in stored:

@@ -2,46 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from itertools import repeat
-from operator import is_not, itemgetter
+from collections.abc import Mapping
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Array, Rows
+from batchpid.arrays.array_types import Rows
 from batchpid.sim.signals.quantities import Observation, Quantity
+from batchpid.stages.values import Command
 
 Layout = dict[str, tuple[tuple[int, ...], Any]]
 """Name -> (shape, dtype)."""
-
-
-class Command(NamedTuple):
-    """Command of one tick, (envs, ...), or of several, (ticks, envs, ...).
-
-    In a loop an array that the caller does not give is 0; in the calling process it is None.
-    """
-
-    setpoint: Array
-    """(envs, size), as :attr:`batchpid.sim.RunnerOptions.command` describes it: for joints (envs,
-    dof) [rad or m].
-    """
-    setpoint_rate: Array = None
-    """Rate of the setpoint, per second (envs, size)."""
-    setpoint_acceleration: Array = None
-    """Acceleration of the setpoint, per second squared (envs, size)."""
-    feedforward: Array = None
-    """Joint effort added before saturation (envs, dof) [N m or N]."""
-
-    def map(self, function: Callable[[Array], Array]) -> Command:
-        """Return a command with ``function`` applied to each array that is given."""
-        return Command(*[None if rows is None else function(rows) for rows in self])
-
-    @property
-    def given(self) -> tuple[bool, ...]:
-        """Which arrays are given."""
-        return tuple(map(is_not, self, repeat(None)))
 
 
 class FaultArrays(NamedTuple):

@@ -10,10 +10,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-import batchpid as bp
-from batchpid.arrays.array_types import Array, Document, Float64, Pytree, Rows
+from batchpid.arrays.array_types import Array, Document, Float64, Rows
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.jax_settings import precision
 from batchpid.arrays.trees import flatten, unflatten
@@ -46,8 +44,17 @@ class OwnController:
         """Return a checked copy of the controller's initial state for ``envs`` envs.
 
         Raises InvalidArgumentError if an array of the state does not have the envs as its first
-        axis.
+        axis; at a later start ControllerError if the controller fails, or its state has other
+        arrays than the first.
         """
+        if self._structure is None:
+            self._first = self._begun(envs)
+            return self._first
+        with controller_errors(self):
+            like = {name: leaf[:1].repeat(envs, 0) for name, leaf in self._first.items()}
+            return _like(like, self._begun(envs))
+
+    def _begun(self, envs: int) -> dict[str, Rows]:
         # The structure stays the same; between sim steps only its arrays are kept, by name.
         state = self._structure = _begin(self._options, envs)
         leaves = {name: np.array(leaf) for name, leaf in flatten(state).items()}
@@ -60,15 +67,6 @@ class OwnController:
                     remedy="make the envs the first axis of every array of the state",
                 )
         return leaves
-
-    def reset(self, state: Document, mask: NDArray[np.bool_]) -> dict[str, Rows]:
-        """Return ``state`` with the envs of ``mask`` (M,) at their start."""
-        rows = {name: np.array(leaf) for name, leaf in state.items()}
-        with controller_errors(self):
-            fresh = _like(rows, self.init(len(mask)))
-        for name, leaf in rows.items():
-            leaf[mask] = fresh[name][mask]
-        return rows
 
     def __call__(self, state: Document, *inputs: Float64) -> tuple[Array, ...]:
         """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel, passive
@@ -115,13 +113,6 @@ class OwnController:
                 remedy="write it in jax.numpy, or use backend='numpy'",
             ) from error
         return new, _like({"effort": qpos}, efforts)["effort"], *limited
-
-
-def initial_state(options: RunnerOptions, params: bp.PIDParams) -> Pytree:
-    """Return the initial state of the law of all envs."""
-    if isinstance(options.control, str):
-        return bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32))
-    return flatten(_begin(options, options.num_envs))
 
 
 @contextmanager

@@ -17,30 +17,20 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.arrays.elementwise import clip
 from batchpid.arrays.trees import flatten, leaves, structure, unflatten
-from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.arrays import Arrays, Command
+from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_parts import ActingDraws, LinkSensors, Pushes, variation
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
+from batchpid.sim.loop.group_control import GroupControl
+from batchpid.sim.loop.jax_executor import JAXExecutor
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
 from batchpid.sim.loop.native_program import Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
-from batchpid.sim.loop.step_setup import (
-    Setup,
-    empty_state,
-    init_motors,
-    make_setup,
-    reset_friction,
-    reset_guard,
-    with_friction,
-    with_matrix,
-    with_params,
-)
-from batchpid.sim.loop.step_values import StepState
-from batchpid.sim.loop.xla_executor import XLAExecutor
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
+from batchpid.stages.stage import States, adopted, by_name, placed, started
+from batchpid.stages.values import Command, Measured, Values
 
 _RESULTS = ("effort", "saturated", "guarded")
 """Results of a sim step that are observed, by name."""
@@ -87,34 +77,49 @@ class EnvGroup:
         is_read = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
         has_parts = bool(self._sensors.values or self._pushes.counts)
         self._observes_natively = is_read and not has_parts
-        qpos = pack.read_qpos()
-        everyone = np.ones(pack.size, bool)
-        law = bp.init(params, qpos) if controller is None else controller.init(pack.size)
-        setup = self._setup(None)
-        state = reset_guard(setup, StepState(law), qpos, everyone)
-        self._prepare(setup, reset_friction(setup, state, everyone))
+        setup = self._setup()
+        self._prepare(setup, started(setup.stages, self._values(setup)))
 
-    def _setup(self, motors: ActuatorState | None) -> Setup:
-        """Return the control step of the present robots, params and actuators."""
+    def _setup(self) -> GroupControl:
+        """Return the control of the present robots, params and actuators."""
         acting = self.acting
-        inputs = acting.acting_params, acting.motors, motors, self._controller
-        return make_setup(self._options, self.pack, *inputs)
+        inputs = acting.acting_params, acting.acting_actuators, self._controller
+        return GroupControl.of(self._options, self.pack, *inputs)
 
-    def _prepare(self, setup: Setup, state: StepState) -> None:
-        """Make the executor, which goes on from a state, and set the engine's drives."""
-        # An executor keeps the shapes of the state that it starts from.
-        state = with_matrix(setup, state)
+    def _values(self, setup: GroupControl) -> Values:
+        """Return the values in which stages start, at the present state of the robots."""
+        pack, control = self.pack, setup.control
+        passive = None
+        if control.gravity:
+            passive = pack.passive_force(True, control.coriolis)
+        measured = Measured(pack.read_qpos(), pack.read_qvel(), passive)
+        model = setup.model._replace(episode=self._episode)
+        return Values(Command(None), measured, measured, control.timestep, model=model)
+
+    def _adopt(self) -> None:
+        """Make the stages of the present robots, params and actuators, which go on from the states
+        so far.
+        """
+        executor = self._executor
+        stages = executor.setup.stages
+        pairs = zip(stages, executor.read_state(), strict=True)
+        before = {stage.name: (stage, state) for stage, state in pairs}
+        setup = self._setup()
+        self._prepare(setup, adopted(setup.stages, before, self._values(setup)))
+
+    def _prepare(self, setup: GroupControl, states: States) -> None:
+        """Make the executor, which goes on from the states, and set the engine's drives."""
         # Native wherever the engine has native steps, under backend "numpy" too: the bits are the
         # same.
-        self._executor: NumPyExecutor | NativeExecutor | XLAExecutor
+        self._executor: NumPyExecutor | NativeExecutor
         if self._options.backend == "jax":
-            self._executor = XLAExecutor(setup, state)
+            self._executor = JAXExecutor(setup, states)
         elif self.pack.steps_natively and runs_natively(setup):
-            self._executor = NativeExecutor(setup, state, self._last)
+            self._executor = NativeExecutor(setup, states, self._last)
         else:
-            self._executor = NumPyExecutor(setup, state)
+            self._executor = NumPyExecutor(setup, states)
         if self._options.control == "drive":
-            damping, stiffness = setup.constants.drive
+            damping, stiffness = setup.control.drive
             limit = self.acting.acting_params.effort_max
             if limit is None:
                 limit = np.full_like(stiffness, np.inf)
@@ -124,43 +129,23 @@ class EnvGroup:
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state carries on."""
-        self._set_params(params, self._executor.read_state())
-
-    def _set_params(self, params: bp.PIDParams, state: StepState) -> None:
-        before = self._executor.setup
-        old = self.acting.acting_params
         self.acting.set_params(params)
-        setup = self._setup(state.motors)
-        state = with_params(before, setup, state, old, self.acting.acting_params)
-        if state.age is None:  # the draws may have brought friction
-            state = reset_friction(setup, state, np.ones(self.pack.size, bool))
-        self._prepare(setup, state)
+        self._adopt()
 
     def set_actuators(self, actuators: bp.Actuators | None) -> None:
         """Change the actuators in flight; their state carries on."""
         if actuators is not None or self.acting.actuators is not None:
-            state = self._with_actuators(self._executor.read_state(), actuators)
-            setup = self._setup(state.motors)
-            self._prepare(setup, with_friction(setup, state))
+            self._put_actuators(actuators)
+            self._adopt()
 
-    def _with_actuators(
-        self, state: StepState, actuators: bp.Actuators | None, rows: list[int] | None = None
-    ) -> StepState:
-        """Put actuators into effect, for the robots ``rows`` or all; return the state with motors
-        for them.
-        """
-        old, motors = state.motors, None
+    def _put_actuators(self, actuators: bp.Actuators | None, rows: list[int] | None = None) -> None:
+        """Put actuators into effect, for the robots ``rows`` or all."""
+        had_motors = self.acting.has_motors
         # Friction and armature behind the gear belong to the engine's joints.
         self.pack.write_joints(self.acting.set_actuators(actuators), rows)
-        if self.acting.motors is not None:
-            # New motors begin the streams of their noise again.
-            if old is None:
-                self._episode[:] = 0
-            qpos = self.pack.read_qpos()
-            motors = init_motors(self.acting.motors, self.pack, qpos, self._episode)
-            if old is not None:
-                motors = old.matched_to(motors)
-        return state._replace(motors=motors)
+        # New motors begin the streams of their noise again.
+        if self.acting.has_motors and not had_motors:
+            self._episode[:] = 0
 
     def reset(
         self,
@@ -208,8 +193,9 @@ class EnvGroup:
         # The robots first: friction and inertia of the motors add to theirs.
         if randomization.changes_robot:
             self.pack.vary(rows, variation(self._options, len(rows), acting.draws.for_envs(rows)))
-        state = self._with_actuators(self._executor.read_state(), acting.actuators, rows)
-        self._set_params(acting.params, state)
+        self._put_actuators(acting.actuators, rows)
+        acting.set_params(acting.params)
+        self._adopt()
 
     # -- ticks
 
@@ -330,11 +316,10 @@ class EnvGroup:
         """Return the state of these envs, physics and controller, as arrays by name (M, ...).
 
         ``engine`` are robots and content, of which only the engine knows the meaning
-        (:meth:`batchpid.sim.engine.protocol.EnginePack.read_state`). ``control/...`` are the arrays
-        of :class:`batchpid.sim.loop.step_values.StepState`.
+        (:meth:`batchpid.sim.engine.protocol.EnginePack.read_state`). ``control/...`` are the states
+        of stages, by their names.
         """
-        # Each tick begins with a new mass matrix.
-        control = self._executor.read_state()._replace(matrix=None)
+        control = by_name(self._executor.setup.stages, self._executor.read_state())
         tree = {"engine": self.pack.read_state(), "control": control} | self._parts()
         return flatten(tree, read=np.array)
 
@@ -377,7 +362,7 @@ class EnvGroup:
         if not stays:
             acting.set_params(params)
             if actuators is not None or acting.actuators is not None:
-                self._with_actuators(self._executor.read_state(), actuators)
+                self._put_actuators(actuators)
         # Placing robots clears efforts and suspension, so these follow.
         pack.write_state_rows(rows["engine"])
         for name, array in flatten(self._parts()).items():
@@ -385,18 +370,20 @@ class EnvGroup:
         pack.suspend(self._faults.suspended)
         pack.write_qf(self._last.effort)
         executor = self._executor
-        like = executor.read_state()
-        if not stays:
-            law = like.law if is_custom else bp.init(acting.acting_params, pack.read_qpos())
-            slips = pack.friction.coulomb is not None
-            like = empty_state(self._options, law, acting.motors, slips, pack.size)
-        state = unflatten(like._replace(matrix=None), rows, name="control")
+        if stays:
+            setup, like = executor.setup, executor.read_state()
+        else:
+            setup = self._setup()
+            like = started(setup.stages, self._values(setup))
+        control = unflatten(by_name(setup.stages, like), rows, name="control")
+        pairs = zip(setup.stages, like, strict=True)
+        states = tuple([control.get(stage.name, state) for stage, state in pairs])
         if stays:
             executor.failed = False
             executor.measure()
-            executor.write_state(with_matrix(executor.setup, state))
+            executor.write_state(states)
         else:
-            self._prepare(self._setup(state.motors), state)
+            self._prepare(setup, states)
 
     # -- envs that fail
 
@@ -409,7 +396,8 @@ class EnvGroup:
         # The fault is handled here, and the tick goes on.
         self._executor.failed = False
         if returned is not None:
-            returned = clip(returned, *self._executor.setup.constants.limits, np)
+            params = self.acting.acting_params
+            returned = clip(returned, params.effort_min, params.effort_max, np)
         limit = self._options.speed_limit
         self._faults.fail_state(self.pack, step, before, returned, limit)
         self._place_failed()
@@ -445,11 +433,7 @@ class EnvGroup:
         acting = self.acting
         executor = self._executor
         setup = executor.setup
-        state = executor.read_state()
-        constants = setup.constants
-        model = setup.layout.model
         rows = np.flatnonzero(mask)
-        # 1: the robots
         base = None if pack.spec.fixed_base else self._faults.start_base[rows]
         pack.write_state(rows.tolist(), qpos[rows], qvel[rows], base)
         pack.suspend(self._faults.suspended)
@@ -458,28 +442,10 @@ class EnvGroup:
         if acting.draws is not None:
             self._pushes.begin(mask, acting.draws.episodes)
         executor.measure()
-        # 2: guard and motors, from the robots' state as the engine has it
-        qpos = pack.read_qpos()
-        qvel = pack.read_qvel()
-        state = reset_guard(setup, state, qpos, mask)
-        if acting.motors is not None and state.motors is not None:
+        if acting.has_motors:
             self._episode[mask] += 1
-            holding = None
-            if setup.layout.gravity:
-                passive = pack.passive_force(True, setup.layout.coriolis)
-                holding = constants.coupling.efforts(passive)
-            start = {"qvel": qvel, "effort": holding}
-            fresh = init_motors(acting.motors, pack, qpos, self._episode, **start)
-            motors = bp.motors.reset(state.motors, fresh, mask)
-            state = state._replace(motors=motors)
-            # 3: the law, from the joints' state as the sensors show it
-            noise = model.noise(constants.motors, motors, qpos)
-            _, qpos, _ = advance_measurement(constants.motors, motors, qpos, qvel, noise)
-        if self._controller is None:
-            state = state._replace(law=bp.reset(acting.acting_params, state.law, qpos, mask))
-        else:
-            state = state._replace(law=self._controller.reset(state.law, mask))
-        executor.write_state(reset_friction(setup, state, mask))
+        states = placed(setup.stages, executor.read_state(), self._values(setup), mask)
+        executor.write_state(states)
 
 
 def _are_equal(one: Any, other: Any) -> bool:

@@ -37,8 +37,8 @@ class ActingDraws:
         As they were given.
     acting_params
         With the draws in effect.
-    motors
-        Actuators with the draws in effect; None without an effect on efforts or measurements.
+    acting_actuators
+        With the draws in effect.
     """
 
     def __init__(self, options: RunnerOptions, params: bp.PIDParams) -> None:
@@ -46,7 +46,13 @@ class ActingDraws:
         self.draws: Draws | None = None
         self.params = self.acting_params = params
         self.actuators: bp.Actuators | None = None
-        self.motors: bp.Actuators | None = None
+        self.acting_actuators: bp.Actuators | None = None
+
+    @property
+    def has_motors(self) -> bool:
+        """Whether the actuators have an effect on efforts or measurements."""
+        actuators = self.acting_actuators
+        return actuators is not None and (actuators.measures or actuators.delivers)
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Put params into effect."""
@@ -63,15 +69,8 @@ class ActingDraws:
         self.actuators = actuators
         if randomization is not None:
             actuators = randomization.randomized("actuators", actuators, self.draws, robot)
-        self.motors = effective(actuators)
+        self.acting_actuators = actuators
         return actuators
-
-
-def effective(actuators: bp.Actuators | None) -> bp.Actuators | None:
-    """Return ``actuators`` if they have an effect on efforts or measurements, else None."""
-    if actuators is not None and (actuators.measures or actuators.delivers):
-        return actuators
-    return None
 
 
 def make_pack(

@@ -23,9 +23,9 @@ from batchpid.sim.loop.backend import native_obstacle
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_group import EnvGroup
 from batchpid.sim.loop.env_parts import make_pack
+from batchpid.sim.loop.jax_executor import ROWS
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks
 from batchpid.sim.loop.snapshot import Snapshot, join_rows
-from batchpid.sim.loop.xla_executor import ROWS
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 
@@ -291,7 +291,7 @@ def group_size(options: RunnerOptions) -> int:
     """Return the number of envs of a group, which changes no result."""
     engine = options.load_engine()
     obstacle = engine.native_obstacle() or native_obstacle(options)
-    # Calls of NumPy and XLA have an overhead, which more envs share.
+    # Calls of NumPy and JAX have an overhead, which more envs share.
     if obstacle or options.backend != "numpy":
         return max(engine.group_size, ROWS)
     return engine.group_size

@@ -5,21 +5,21 @@ needs Python.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Float64, Rows
-from batchpid.arrays.trees import leaves, mapped
+from batchpid.arrays.array_types import Float64, Pytree, Rows
+from batchpid.arrays.trees import flatten, leaves, mapped, rebuilt_as
+from batchpid.motors import ActuatorState
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
-from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.backend import native_obstacle
+from batchpid.sim.loop.group_control import GroupControl
 from batchpid.sim.loop.native_program import Buffers, Table, TickProgram
 from batchpid.sim.loop.numpy_executor import EngineSteps
-from batchpid.sim.loop.step_setup import Setup
-from batchpid.sim.loop.step_values import Measured, Outputs, StepState
+from batchpid.stages.stage import States, running
+from batchpid.stages.values import Command, Measured, Outputs
 
 _NO_NOISE = 1 << interface.STATUS.index("no_noise")
 
@@ -31,16 +31,17 @@ class NativeExecutor:
     :func:`run_ticks` it also runs whole ticks, with their commands and observations in ``table``.
     """
 
-    def __init__(self, setup: Setup, state: StepState, table: Table) -> None:
+    def __init__(self, setup: GroupControl, states: States, table: Table) -> None:
         self.setup = setup
         self._table = table
         self._engine = EngineSteps(setup)
         shape = table.effort.shape
         command = Command(*np.zeros((4, *shape)))
-        if setup.layout.control == "custom":  # it has its own copy of setpoints, of any size
+        if setup.control.mode == "custom":  # it has its own copy of setpoints, of any size
             command = Command(None, feedforward=command.feedforward)
         measured = Measured(*np.zeros((3, *shape)))
-        self._buffers = Buffers(_copied(state), command, measured, np.zeros(shape))
+        self._buffers = Buffers(_copied(states), command, measured, np.zeros(shape))
+        self._places = {stage.name: place for place, stage in enumerate(setup.stages)}
         self._programs: dict[bool, TickProgram] = {}
         self._program: TickProgram | None = None
         self.failed = False
@@ -51,7 +52,7 @@ class NativeExecutor:
         """Whether :func:`run_ticks` can be used: a native controller takes setpoints from
         Python.
         """
-        return self.setup.layout.control != "custom"
+        return self.setup.control.mode != "custom"
 
     @property
     def before(self) -> Rows:
@@ -68,20 +69,32 @@ class NativeExecutor:
         qpos: Float64 = self._buffers.measured.qpos
         return qpos
 
-    def read_state(self) -> StepState:
-        """Return the state of the control as new NumPy arrays."""
-        return _copied(self._buffers.state)
+    def read_state(self) -> States:
+        """Return the states as new NumPy arrays."""
+        return tuple(map(_copied, self._buffers.states))
 
-    def write_state(self, state: StepState) -> None:
-        """Replace the state of the control; it has the arrays of the state before."""
-        for array, rows in zip(_arrays(self._buffers.state), _arrays(state), strict=True):
+    def write_state(self, states: States) -> None:
+        """Replace the states; they have the arrays of the states before."""
+        for array, rows in zip(_arrays(self._buffers.states), _arrays(states), strict=True):
             array[...] = rows
-        if state.motors is not None:  # its noise is drawn anew for another object as the key
-            motors = self._buffers.state.motors._replace(key=state.motors.key)
-            self._change_state(motors=motors)
+        sensors = self._sensors()
+        if sensors is not None:  # the noise is drawn anew for another object as the key
+            key = states[self._places["sensors"]].key
+            self._replace("sensors", sensors._replace(key=key))
 
-    def _change_state(self, **parts: Any) -> None:
-        self._buffers = self._buffers._replace(state=self._buffers.state._replace(**parts))
+    def _sensors(self) -> ActuatorState | None:
+        """Return the state of the sensors, if there are some."""
+        place = self._places.get("sensors")
+        if place is None:
+            return None
+        state: ActuatorState = self._buffers.states[place]
+        return state
+
+    def _replace(self, name: str, state: Pytree) -> None:
+        """Replace the state of a stage by one with other arrays."""
+        states = list(self._buffers.states)
+        states[self._places[name]] = state
+        self._buffers = self._buffers._replace(states=tuple(states))
 
     def results(self) -> Outputs:
         """Return the results of the last sim step."""
@@ -112,18 +125,18 @@ class NativeExecutor:
     def start(self, moves: bool, step: int = 0, tick: int = 0) -> None:
         """Prepare the next ticks, from sim step ``step`` of ``tick`` on."""
         if moves not in self._programs:
-            layout = self.setup.layout._replace(moves=moves)
             noise = mapped(lambda block: block[0].copy(), self._noise())
             self._programs[moves] = program = TickProgram(
-                self.setup._replace(layout=layout),
+                self.setup,
                 self._buffers,
                 self._table,
                 noise,
                 self._engine.native_force,
+                moves,
             )
             # A native controller has arrays of its own for its state.
             if program.control is not None:
-                self._change_state(law=program.control.state)
+                self._replace("law", program.control.state)
         self._program = program = self._programs[moves]
         program.tick.tick, program.tick.step = tick, step
 
@@ -154,18 +167,18 @@ class NativeExecutor:
         """Count the sim steps that ran; return whether the others wait for noise."""
         assert self._program is not None
         tick = self._program.tick
-        motors = self._buffers.state.motors
-        if motors is not None and motors.step is not None:
-            motors.step[...] += tick.ran
+        sensors = self._sensors()
+        if sensors is not None and sensors.step is not None:
+            sensors.step[...] += tick.ran
         return bool(tick.status & _NO_NOISE)
 
     def _noise(self) -> Any:
         """Return the noise of positions and velocities in the next sim steps (steps, M, dof)."""
-        layout = self.setup.layout
-        motors = self._buffers.state.motors
-        if motors is None or not layout.measures:
+        sensors = self._sensors()
+        if sensors is None:
             return ()
-        return layout.model.noise.from_step(self.setup.constants.motors, motors, self.before)
+        setup = self.setup
+        return setup.model.noise.from_step(setup.stage("sensors").k, sensors, self.before)
 
 
 def run_ticks(
@@ -187,23 +200,22 @@ def run_ticks(
         executors = [executor for executor in executors if executor.count_steps()]
 
 
-def runs_natively(setup: Setup) -> bool:
-    """Return whether the control step can be native: a law of batchpid, in float64."""
-    constants = leaves(setup.constants)
+def runs_natively(setup: GroupControl) -> bool:
+    """Return whether the stages can be native: with a law of batchpid, in float64."""
+    constants = leaves(running(setup.stages))
     is_double = all(leaf.dtype != np.float32 for leaf in constants)
     return is_double and not native_obstacle(setup.options)
 
 
-def _copied(state: StepState) -> StepState:
-    """Return new arrays of a state."""
-    law = state.law
-    if isinstance(law, dict):
-        law = {name: np.array(leaf) for name, leaf in law.items()}
-    copied: StepState = mapped(partial(np.array, order="C"), state._replace(law=law))
-    return copied
+def _copied(state: Pytree) -> Any:
+    """Return a tree of arrays with new arrays."""
+    if isinstance(state, dict):
+        return {name: np.array(leaf) for name, leaf in state.items()}
+    if isinstance(state, tuple):
+        return rebuilt_as(state, list(map(_copied, state)))
+    return None if state is None else np.array(state, order="C")
 
 
-def _arrays(state: StepState) -> list[Rows]:
-    """Return all arrays of a state."""
-    law = state.law
-    return [*leaves(state), *(law.values() if isinstance(law, dict) else ())]
+def _arrays(state: Pytree) -> list[Rows]:
+    """Return all arrays of a tree."""
+    return list(flatten(state).values())

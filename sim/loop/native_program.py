@@ -7,31 +7,21 @@ have a native function.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Array, DType, Pytree, Rows
-from batchpid.arrays.trees import filled, leaves, mapped, structure
-from batchpid.native.array_program import ArrayProgram
-from batchpid.native.symbols import Symbol
-from batchpid.native.tracing import Trace, trace
+from batchpid.arrays.array_types import DType, Pytree, Rows
+from batchpid.arrays.trees import leaves
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
-from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
-from batchpid.sim.loop.control_step import COUPLING_STEPS, STAGES, SimStage
-from batchpid.sim.loop.step_setup import Setup, moves_drives
-from batchpid.sim.loop.step_values import (
-    Layout,
-    Measured,
-    Model,
-    Step,
-    StepState,
-    Values,
-)
+from batchpid.sim.loop.arrays import Arrays, FaultArrays
+from batchpid.sim.loop.group_control import GroupControl
+from batchpid.sim.loop.numpy_executor import COUPLING_STEPS
+from batchpid.stages.program import StageProgram
+from batchpid.stages.stage import States, recalled
+from batchpid.stages.values import Command, Measured, Outputs, Step, Values
 
 
 class Table(NamedTuple):
@@ -50,7 +40,7 @@ class Table(NamedTuple):
 class Buffers(NamedTuple):
     """Arrays that native code reads and writes in each sim step."""
 
-    state: StepState
+    states: States
     command: Command
     measured: Measured
     before: Rows
@@ -60,8 +50,9 @@ class Buffers(NamedTuple):
 class TickProgram:
     """Stages and arrays of the ticks of a group.
 
-    ``reads_force`` says whether the engine's sim step reads the passive force, and ``noise`` is
-    that of positions and velocities in a sim step.
+    ``reads_force`` says whether the engine's sim step reads the passive force, ``moves`` whether
+    joint setpoints move within a tick, and ``noise`` is that of positions and velocities in a sim
+    step.
 
     Attributes
     ----------
@@ -77,51 +68,48 @@ class TickProgram:
 
     def __init__(
         self,
-        setup: Setup,
+        setup: GroupControl,
         buffers: Buffers,
         table: Table,
         noise: Pytree,
         reads_force: bool,
+        moves: bool,
     ) -> None:
-        _, pack, layout, constants, _ = setup
+        _, pack, control, _, model = setup
         self._setup, self._buffers = setup, buffers
+        self.pack, self.model = pack, model
         self._native = native.extension("_gateway")
         self._programs, self._stages = list[Any](), list[interface.Stage]()
         self._references = list[Any]()  # keeps arrays alive that native code has addresses of
         self.control: Any = None
         # The structure has the addresses of all arrays.
         self.tick = interface.Tick(
-            timestep=constants.timestep,
+            timestep=control.timestep,
             dof=pack.dof,
-            late=layout.late,
-            matrix_steps=1 if layout.law is None else layout.law.matrix_steps,
-            gravity=layout.gravity,
-            coriolis=layout.coriolis,
+            late=control.late,
+            matrix_steps=getattr(setup.stage("matrix"), "steps", 1),
+            gravity=control.gravity,
+            coriolis=control.coriolis,
         )
         self._left = np.zeros(())
-        self._place(**buffers.measured._asdict(), before=buffers.before, left=self._left)
+        self.place(**buffers.measured._asdict(), before=buffers.before, left=self._left)
         # SAPIEN knows neither measured states nor the model of varied robots.
-        if layout.gravity and (layout.measures or not reads_force):
-            if layout.measures:
+        if control.gravity and (control.measures or not reads_force):
+            if control.measures:
                 field = "measured_force"
             else:
                 field = "read_force"
             setattr(self.tick, field, pack.force_model.address)
-        # Programs have no key of the noise, counts, or state of a controller.
-        state, motors = buffers.state, buffers.state.motors
-        if motors is not None:
-            state = state._replace(motors=motors._replace(key=None, step=None))
-        law = None if layout.control == "custom" else state.law
         values = Values(
-            state=state._replace(law=law, age=None),
-            command=buffers.command,
+            command=buffers.command if moves else buffers.command.resting(),
             measured=buffers.measured,
-            step=Step(0, 1, self._left if layout.moves else None),
             seen=buffers.measured,
+            timestep=control.timestep,
+            step=Step(0, 1, self._left if moves else None),
             noise=noise,
         )
-        self.outputs = self._add_stages(values).outputs
-        self._place(qf=self.outputs.qf)
+        self.outputs = self._add_stages(recalled(setup.stages, buffers.states, values), moves)
+        self.place(qf=self.outputs.qf)
         stages = (interface.Stage * len(self._stages))(*self._stages)
         self.tick.stages, self.tick.stage_count = ctypes.addressof(stages), len(stages)
         transfers = self._transfers(table)
@@ -130,11 +118,29 @@ class TickProgram:
         self._references += stages, transfers, table
         self.bound = self._native.bind_ticks(tuple(self._programs), ctypes.addressof(self.tick))
 
-    def _place(self, **arrays: Rows | None) -> None:
+    # -- for stages in C++
+
+    def place(self, **arrays: Rows | None) -> None:
         """Let fields of the structure of native code point to these arrays."""
         for name, array in arrays.items():
             if array is not None:
                 setattr(self.tick, name, self._address(array, _TYPES.get(name, np.float64)))
+
+    def use(self, **owners: Any) -> None:
+        """Let fields of the structure of native code point to the structures of these objects."""
+        for name, owner in owners.items():
+            setattr(self.tick, name, owner.address)
+            self._references.append(owner)
+
+    def control_by(self, state: Pytree, *seen: Rows) -> tuple[Rows, Rows]:
+        """Let the native controller follow ``seen``: qpos, qvel and feedforward; return its
+        effort, and the joints whose effort it limits.
+        """
+        controller: Any = self._setup.options.control
+        self.control = controller.bound(*seen, self._left)
+        self.control.set_state(state)
+        self.use(control=self.control)
+        return self.control.effort, self.control.limited
 
     def _address(self, array: Rows, dtype: DType) -> int:
         """Return the address of an array for native code, which has this dtype."""
@@ -169,7 +175,7 @@ class TickProgram:
         if seen.base_pose is not None and seen.base_twist is not None:
             pose = np.zeros((len(none), 7))
             twist = np.zeros((len(none), 6))
-            self._place(base_pose=pose, base_twist=twist)
+            self.place(base_pose=pose, base_twist=twist)
             copies += (seen.base_pose, pose), (seen.base_twist, twist)
         transfers = [self._transfer(rows, row) for rows, row in copies]
         for rows, row in zip(command, self._buffers.command, strict=True):
@@ -195,184 +201,61 @@ class TickProgram:
 
     # -- stages
 
-    def _add_stages(self, values: Values) -> Values:
-        """Add the stages that apply; return the values after them."""
-        _, _, layout, constants, _ = self._setup
-        stages = [stage for stage in STAGES if stage.applies(layout, constants)]
-        every = {"constraint": COUPLING_STEPS}
-        # Writing the targets of drives costs a call for each joint.
-        every["targets"] = int(moves_drives(layout, constants))
-        if layout.law is not None:
-            every["mass matrix"] = layout.law.matrix_steps
-        waiting = list[SimStage]()
-        for stage in stages:
-            if stage.name not in _NATIVE:
-                waiting.append(stage)
+    def _add_stages(self, values: Values, moves: bool) -> Outputs:
+        """Add the stages; return the results after them."""
+        setup = self._setup
+        waiting = list[tuple[Any, Pytree]]()
+        for stage, state in zip(setup.stages, self._buffers.states, strict=True):
+            if not stage.native:
+                waiting.append((stage, state))
                 continue
-            if waiting:
-                values = self._add_program(tuple(waiting), values)
-                waiting = []
-            values = _NATIVE[stage.name](self, values)
-            self._add_stage(stage.name, every.get(stage.name, 1))
-        return values
+            values = self._add_program(waiting, values, passes=True)
+            waiting = []
+            values = stage.bind(self, state, values)
+            self._add_stage(stage.native, stage.every)
+        outputs = self._add_program(waiting, values).outputs
+        if outputs.target is not None:
+            self.place(target=outputs.target, target_rate=outputs.target_rate)
+            # Writing the targets of drives costs a call for each joint.
+            self._add_stage("targets", int(moves or setup.moves_drives))
+        if not setup.control.coupling.is_identity:
+            self._add_stage("constraint", COUPLING_STEPS)
+        self._add_stage("engine")
+        return outputs
 
-    def _add_program(self, stages: tuple[SimStage, ...], values: Values) -> Values:
-        """Add a program of stages; return ``values`` with the arrays that it writes.
-
-        State is changed in place. Other results have arrays of their own.
+    def _add_program(
+        self, pairs: list[tuple[Any, Pytree]], values: Values, passes: bool = False
+    ) -> Values:
+        """Add a program of stages and their states; return the values after it, which it
+        ``passes`` on to further stages.
         """
-        shape = self._buffers.before.shape
-        constants = mapped(_split, self._setup.constants)
-        inputs = leaves(values)
-        state = leaves(values.state)
-        layout = self._setup.layout._replace(model=Model())
-        histories = tuple(array.ndim == 3 for array in state)
-        traced = _trace(stages, layout, histories, structure(constants), structure(values))
-        # Arrays for the results: the state's own, and new ones for the others.
-        outputs = [np.zeros(shape, bool if is_mask else float) for is_mask in traced.program.masks]
-        for array, place in zip(state, traced.places, strict=False):  # the state comes first
-            if place >= len(inputs):
-                outputs[place - len(inputs)] = array
-        arrays = [*inputs, *outputs]
-        changed = filled(traced.changed, iter([arrays[place] for place in traced.places]))
-        after = values._replace(**dict(zip(_CHANGED, changed, strict=True)), noise=None)
-        if outputs:
-            program = ArrayProgram(traced.program, leaves(constants), len(inputs), shape)
-            pairs = tuple([(array, _row_size(array)) for array in inputs])
+        if not pairs:
+            return values
+        stages, states = zip(*pairs, strict=True)
+        made = StageProgram(stages, states, values, self._buffers.before.shape, passes)
+        if made.outputs:
             # Native code sets the addresses of the noise, which is another in each sim step.
             drawn = [id(block) for block in leaves(values.noise)]
-            noise = [at for at, array in enumerate(inputs) if id(array) in drawn]
+            noise = [at for at, array in enumerate(made.inputs) if id(array) in drawn]
             self._add_stage(
                 "program",
                 program=len(self._programs),
                 noise=(*noise, -1, -1)[:2],
             )
-            self._programs.append(self._native.bind(program.arguments, pairs, tuple(outputs)))
-            self._references += inputs, outputs
-        return after
+            rows = tuple([(array, _row_size(array)) for array in made.inputs])
+            arguments = made.program.arguments
+            self._programs.append(self._native.bind(arguments, rows, tuple(made.outputs)))
+            self._references.append(made)
+        return made.values
 
     def _add_stage(self, kind: str, every: int = 1, **fields: Any) -> None:
         self._stages.append(
             interface.Stage(kind=interface.STAGES.index(kind), every=every, **fields)
         )
 
-    def _add_force(self, values: Values) -> Values:
-        self._place(pose=values.seen.qpos, rate=values.seen.qvel)
-        return values
-
-    def _add_inertia(self, values: Values) -> Values:
-        refresh = self._setup.layout.model.refresh
-        state = self._buffers.state
-        self.tick.refresh = refresh.address
-        self._references.append(refresh)
-        self._place(age=state.age, gain=state.friction.gain, memory=state.friction.memory)
-        return values
-
-    def _add_mass_matrix(self, values: Values) -> Values:
-        _, pack, _, constants, _ = self._setup
-        tree, bodies = pack.rigid_tree.tables
-        self._place(pose=values.seen.qpos, rate=values.seen.qvel, tree=tree, bodies=bodies)
-        self._place(matrix=self._buffers.state.matrix, armature=constants.armature)
-        self._place(damping=constants.damping, **constants.coupling.native())
-        return values
-
-    def _add_controller(self, values: Values) -> Values:
-        controller: Any = self._setup.options.control
-        self.control = controller.bound(*values.seen, self._left)
-        self.control.set_state(self._buffers.state.law)
-        self.tick.control = self.control.address
-        outputs = values.outputs._replace(returned=self.control.effort)
-        return values._replace(limited=self.control.limited, outputs=outputs)
-
-    def _add_targets(self, values: Values) -> Values:
-        self._place(target=values.outputs.target, target_rate=values.outputs.target_rate)
-        return values
-
-    def _add_nothing(self, values: Values) -> Values:
-        return values
-
-
-_NATIVE: dict[str, Callable[[TickProgram, Values], Values]] = {
-    "passive force": TickProgram._add_force,
-    "inertia": TickProgram._add_inertia,
-    "mass matrix": TickProgram._add_mass_matrix,
-    "controller": TickProgram._add_controller,
-    "targets": TickProgram._add_targets,
-    "constraint": TickProgram._add_nothing,
-    "engine": TickProgram._add_nothing,
-}
-"""Stages that are not traced, with the method that adds their arrays."""
 
 _TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
 """Dtypes of arrays that are not float64."""
-
-
-_CHANGED = ("state", "seen", "outputs")
-"""Values that programs change."""
-
-
-class _Traced(NamedTuple):
-    """Program of some stages."""
-
-    program: Trace
-    changed: Pytree
-    """Structure of the values :data:`_CHANGED` after it."""
-    places: tuple[int, ...]
-    """Index of each of their arrays: inputs first, then results."""
-
-
-@lru_cache(maxsize=64)
-def _trace(
-    stages: tuple[SimStage, ...],
-    layout: Layout,
-    histories: tuple[bool, ...],
-    constants: Any,
-    inputs: Any,
-) -> _Traced:
-    """Return the program of stages.
-
-    ``constants`` and ``inputs`` are structures of the constants and of the values before it.
-    ``histories`` says which arrays of the state are histories, which a program changes in place.
-    """
-    first = len(leaves(constants))
-    count = len(leaves(inputs))
-    result_parts: list[Any] = []
-
-    def function(*symbols: Symbol) -> list[Any]:
-        remaining = iter(symbols)
-        k = filled(constants, remaining)
-        values = filled(inputs, remaining)
-        for stage in stages:
-            assert stage.function is not None
-            values = stage.function(layout, k, values)
-        changed = tuple([getattr(values, name) for name in _CHANGED])
-        numbers = {symbol: number for number, symbol in enumerate(symbols[first:])}
-        outputs = set(map(id, leaves(values.outputs)))
-        results = list[Any]()
-        places = list[int]()
-        for at, leaf in enumerate(leaves(changed)):
-            is_state = at < len(histories)
-            number = numbers.get(leaf)
-            if is_state and (number == at or histories[at]):
-                places.append(at)
-            # An output that is an input is copied, since the next sim step changes the input.
-            elif number is not None and not is_state and id(leaf) not in outputs:
-                places.append(number)
-            else:
-                places.append(count + len(results))
-                results.append(leaf)
-        result_parts[:] = structure(changed), tuple(places)
-        return results
-
-    program = trace(function, first, count)
-    return _Traced(program, *result_parts)
-
-
-def _split(array: Array) -> Any:
-    """Return an array (n, envs, dof) as a tuple of n arrays, and other arrays unchanged."""
-    if array.ndim == 3:
-        return tuple(array)
-    return array
 
 
 def _row_size(array: Rows) -> int:

@@ -10,24 +10,20 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.sim.engine.protocol import CompiledStep, EnginePack
-from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.control_step import COUPLING_STEPS, sim_step
 from batchpid.sim.loop.custom import controller_errors
 from batchpid.sim.loop.faults import is_near
-from batchpid.sim.loop.step_setup import Setup, moves_drives
-from batchpid.sim.loop.step_values import (
-    Constants,
-    Layout,
-    Measured,
-    Outputs,
-    Step,
-    StepState,
-    Values,
-)
+from batchpid.sim.loop.group_control import GroupControl
+from batchpid.stages.stage import States, stepped
+from batchpid.stages.values import Command, Measured, Outputs, Step, Values
+
+COUPLING_STEPS = 4
+"""Sim steps for which the constraint efforts of coupled joints keep their mass matrix within a
+tick.
+"""
 
 
 class NumPyExecutor:
-    """Executor of the sim steps of the robots of ``setup``, from the control's ``state`` on.
+    """Executor of the sim steps of the robots of ``setup``, from the states of its stages on.
 
     Attributes
     ----------
@@ -41,14 +37,13 @@ class NumPyExecutor:
         Whether an env may have failed in the last sim step.
     """
 
-    def __init__(self, setup: Setup, state: StepState) -> None:
+    def __init__(self, setup: GroupControl, states: States) -> None:
         self.setup = setup
-        self._state = state
-        self._first = 0
         self._engine = EngineSteps(setup)
         self.outputs = Outputs()
         self.before: Any = None
         self.failed = False
+        self.write_state(states)
         self.measure()
 
     def measure(self) -> None:
@@ -60,15 +55,13 @@ class NumPyExecutor:
         qpos: Float64 = self.measured.qpos
         return qpos
 
-    def read_state(self) -> StepState:
-        """Return the state of the control as NumPy arrays, which the next sim steps do not
-        change.
-        """
-        return self._state
+    def read_state(self) -> States:
+        """Return the states as NumPy arrays, which the next sim steps do not change."""
+        return self._states
 
-    def write_state(self, state: StepState) -> None:
-        """Replace the state of the control; it has the arrays of the state before."""
-        self._state = state
+    def write_state(self, states: States) -> None:
+        """Replace the states; they have the arrays of the states before."""
+        self._states = states
 
     def results(self) -> Outputs:
         """Return the results of the last sim step as NumPy arrays."""
@@ -89,42 +82,31 @@ class NumPyExecutor:
         Raises ControllerError if a controller in Python does.
         """
         setup = self.setup
-        constants = setup.constants
-        layout = setup.layout._replace(moves=moves)
-        self._first = begin
-        engine = {
-            "targets": self._write_targets,
-            "constraint": self._update_constraint,
-            "engine": self._step_engine,
-        }
+        control, pack = setup.control, setup.pack
+        if not moves:
+            command = command.resting()
+        every = moves or setup.moves_drives
         for index in range(begin, end):
-            step = Step(index, end, layout.left(index, end, constants.timestep))
+            step = Step(index, end, control.left(index, end))
             self.before = self.measured.qpos  # where a robot that fails now is suspended
-            values = Values(self._state, command, self.measured, step, self.measured)
-            with controller_errors(setup.controller, index + 1):
-                values = sim_step(layout, constants, values, engine)
-            self._state = values.state
-            self.outputs = values.outputs
-            self.measured = values.measured
+            measured = self.measured
+            values = Values(command, measured, measured, control.timestep, step, setup.model)
+            with controller_errors(control.controller, index + 1):
+                self.outputs = outputs = self._stepped(values).outputs
+            # Writing the targets of drives costs a call for each joint.
+            if outputs.target is not None and (every or index == begin):
+                pack.write_drive_target(outputs.target, outputs.target_rate)
+            if not control.coupling.is_identity and index % COUPLING_STEPS == 0:
+                pack.update_constraint()
+            self.measured, self.failed = self._engine.advance(outputs.qf)
             if self.failed:
                 return index + 1
         return end
 
-    def _write_targets(self, layout: Layout, constants: Constants, values: Values) -> Values:
-        """Write the targets of the drives where they move, since it costs a call for each joint."""
-        pack: Any = self.setup.pack
-        if values.step.index == self._first or moves_drives(layout, constants):
-            pack.write_drive_target(values.outputs.target, values.outputs.target_rate)
+    def _stepped(self, values: Values) -> Values:
+        """Advance the stages by a sim step; return the values after them."""
+        self._states, values = stepped(self.setup.stages, self._states, values)
         return values
-
-    def _update_constraint(self, layout: Layout, constants: Constants, values: Values) -> Values:
-        if values.step.index % COUPLING_STEPS == 0:
-            self.setup.pack.update_constraint()
-        return values
-
-    def _step_engine(self, layout: Layout, constants: Constants, values: Values) -> Values:
-        measured, self.failed = self._engine.advance(values.outputs.qf)
-        return values._replace(measured=measured)
 
 
 class EngineSteps:
@@ -132,13 +114,13 @@ class EngineSteps:
     each where the engine has it, else calls of Python.
     """
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: GroupControl) -> None:
         self._setup = setup
         self._pack: EnginePack = setup.pack
-        layout = setup.layout
-        self.reads_force = layout.gravity and not layout.measures
+        control = setup.control
+        self.reads_force = control.gravity and not control.measures
         """Whether a reading has the passive force, which is otherwise 0."""
-        self._parts = layout.gravity, layout.coriolis
+        self._parts = control.gravity, control.coriolis
         self._is_native = setup.pack.steps_natively
         self.native_force = False
         """Whether the native sim step reads the passive force."""
@@ -179,7 +161,7 @@ class EngineSteps:
                 parts = self._parts
             else:
                 parts = (False, False)
-            drives = self._setup.layout.control == "drive"
+            drives = self._setup.control.mode == "drive"
             self._bound = pack.calls
             self._step = pack.compiled_step(*parts, self._setup.options.speed_limit, drives)
         return self._step

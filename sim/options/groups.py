@@ -20,6 +20,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Rows
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.field_tables import Field, plain
+from batchpid.arrays.jax_settings import require_jax
 from batchpid.checks.validate import choice, instance, joint_speeds, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.physics import MujocoSolver, Physics
@@ -31,6 +32,7 @@ from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.quantities import own_command
 from batchpid.sim.tool_space import OperationalSpace
+from batchpid.stages import Stage, fit_stages
 
 EngineName = Literal["sapien", "mujoco"]
 DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
@@ -372,11 +374,10 @@ class Control(OptionGroup):
         Backend,
         option("snapshot"),
     ] = "numpy"
-    """Library of the law: ``"numpy"``, the default, or ``"jax"``, which compiles law and sim steps
-    of a tick, and a :class:`Controller`, into one XLA program for the CPU (docs/performance.md). It
-    needs native code, control "pid", "effort" or a :class:`Controller`, and has no coupled joints,
-    actuators, randomization and guard. The last bits of results differ between the two, and between
-    processors.
+    """Library of the control: ``"numpy"``, the default, or ``"jax"``, which compiles the stages of
+    a sim step, a :class:`Controller` among them, for the CPU: for a controller or stages in JAX. The
+    last bits of results differ between the two, and between processors. Programs of whole loops are
+    :func:`batchpid.sim.closed_loop`.
     """
     compensate: Annotated[
         Compensation,
@@ -393,6 +394,10 @@ class Control(OptionGroup):
     of one row, or one row per env. None, the default, selects the robot's actuators; control
     "drive" uses only their friction and armature. ``bp.Actuators()`` is ideal. The control gets
     measured positions and velocities. Observations hold the true ones, and the delivered effort.
+    """
+    stages: Annotated[Sequence[Stage], option("snapshot")] = ()
+    """Further stages of a sim step, such as a thermal limit, each a :class:`batchpid.stages.Stage`
+    with ``after``, the name of the stage before it (docs/stages.md); default none.
     """
     guard: Annotated[bool | bp.Guard | None, option("snapshot")] = None
     """Limits of setpoints, applied at every sim step: True for :meth:`batchpid.sim.Robot.guard`, or
@@ -423,7 +428,14 @@ class Control(OptionGroup):
         if tool not in (None, link):
             problem = "is for control 'osc'"
             raise InvalidArgumentError("tool", problem, value=tool, remedy="leave it out")
-        return self.changed(control=control, tool=link)
+        if self.backend == "jax":
+            require_jax()
+            platforms = os.environ.get("JAX_PLATFORMS") or "cpu"
+            if "cpu" not in platforms.split(","):
+                problem = f"'jax' needs JAX on the CPU, and JAX_PLATFORMS is {platforms!r}"
+                remedy = "add cpu to it, or use backend='numpy'"
+                raise InvalidArgumentError("backend", problem, remedy=remedy)
+        return self.changed(control=control, tool=link, stages=fit_stages(self.stages))
 
     @property
     def control_name(self) -> str:

@@ -20,7 +20,6 @@ from batchpid.arrays.array_types import Document, Kind, Rows
 from batchpid.arrays.choices import PerMassMatrix
 from batchpid.arrays.digest import digest
 from batchpid.arrays.field_tables import Field, declared, plain
-from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.records import frozen
 from batchpid.checks.validate import AxisKind, instance
 from batchpid.errors import InvalidArgumentError, RobotError
@@ -28,7 +27,6 @@ from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
-from batchpid.sim.engine.native import xla
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction
 from batchpid.sim.options.groups import (
     Control,
@@ -124,8 +122,6 @@ class RunnerOptions(RunnerKeywords):
         values["guard"] = fit_guard(
             self.guard, robot.joints, self.num_envs, self.control_name, self.sets_positions
         )
-        if self.backend == "jax":
-            self._check_program()
         values["actuators"] = self.check_actuators(self.actuators)
         if self.params is None:
             values["params"] = default_params(robot, self.control, self.loops)
@@ -138,34 +134,6 @@ class RunnerOptions(RunnerKeywords):
         """Description of the scenes, for the engine."""
         options = self.values_for("scene")
         return SceneSpec.of(self.robot, mjcf=self.mjcf, **options)
-
-    def _check_program(self) -> None:
-        """Raise InvalidArgumentError for an option that the program of backend "jax" does not
-        have.
-        """
-        require_jax()
-        engine = self.load_engine()
-        robot = self.robot
-        floats = not robot.fixed_base
-        # The program takes the passive force from the engine.
-        lacks_force = floats and "base_state" not in engine.capabilities
-        if "coriolis" not in self.compensate and "partial_force" not in engine.capabilities:
-            lacks_force = True
-        obstacle = engine.native_obstacle() or xla.obstacle()
-        if obstacle:
-            problem = f"'jax' needs native code and JAX on the CPU: {obstacle}"
-            remedy = "mend that, or use backend='numpy'"
-            raise InvalidArgumentError("backend", problem, remedy=remedy)
-        for argument, problem, is_lacking in (
-            ("control", "is 'drive'", self.control == "drive"),
-            ("compensate", "needs NumPy's force", lacks_force and "gravity" in self.compensate),
-            ("randomization", "is given", self.randomization is not None),
-            ("guard", "is given", self.guard is not None),
-            ("robot", "has coupled joints", not robot.coupling.is_identity),
-            ("robot", "floats, and has friction", floats and robot.friction.any()),
-        ):
-            if is_lacking:
-                raise _not_in_program(argument, problem)
 
     def _check_tree(self, argument: str, value: object, remedy: str) -> None:
         """Raise InvalidArgumentError for an option that needs a kinematic tree, if the robot has
@@ -291,8 +259,6 @@ class RunnerOptions(RunnerKeywords):
             fitted = prepared_actuators(self.randomization, fitted, self.robot, self.control)
         if fitted is None:
             return None
-        if self.backend == "jax":
-            raise _not_in_program("actuators", "are given")
         return frozen(fitted)
 
     def values_for(self, place: Place) -> Document:
@@ -391,15 +357,9 @@ def _plain(value: Any) -> object:
         name = getattr(value, "__qualname__", type(value).__qualname__)
         return f"{name} {getattr(value, 'version', '')}"
     if type(value) is tuple:
-        return list(value)
+        return list(map(_plain, value))
     if value is None or isinstance(value, str | int | float):
         return value
     if isinstance(value, Robot):
         return value.name
     return digest(value)
-
-
-def _not_in_program(argument: str, problem: str) -> InvalidArgumentError:
-    """Return the error for an option that the program of backend "jax" does not have."""
-    problem = f"{problem}, which backend 'jax' does not support"
-    return InvalidArgumentError(argument, problem, remedy="use backend='numpy'")

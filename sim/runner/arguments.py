@@ -17,11 +17,11 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.engine.model_pack import ORIGIN
 from batchpid.sim.engine.native.interface import FARTHEST
-from batchpid.sim.loop.arrays import Command
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot_model import base_start
 from batchpid.sim.runner.runner_state import Motion, RunnerState
 from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS
+from batchpid.stages.values import Command
 
 _SHORTEST = 1e-9
 """Smallest length of a quaternion: a shorter one has large rounding errors."""

@@ -22,12 +22,10 @@ from batchpid.arrays.trees import flatten
 from batchpid.checks.validate import env_mask
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.run_checks import SetpointCheck
-from batchpid.sim.loop.arrays import Arrays, Command
-from batchpid.sim.loop.custom import initial_state
-from batchpid.sim.loop.env_parts import effective
+from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.group_control import empty_states
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.loop.snapshot import Snapshot, join_rows
-from batchpid.sim.loop.step_setup import empty_state
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.runner.arguments import base_rows, joint_rows
@@ -35,6 +33,8 @@ from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.signals.rollout import ACTUATORS, PARAMS, RESET, RESTORE
 from batchpid.sim.workers.pool import Outcome
 from batchpid.sim.workers.requests import Request
+from batchpid.stages.stage import by_name
+from batchpid.stages.values import Command
 
 
 class Operation(Request):
@@ -296,9 +296,8 @@ def restored(options: RunnerOptions, snapshot: Snapshot, present: Snapshot) -> R
         # Delays of drawn actuators say how long the histories are.
         draws = randomization.draw(options.robot, snapshot.episodes(num_envs))
         acting = randomization.randomized("actuators", actuators, draws, options.robot)
-    law = initial_state(options, params)
-    stiction = options.has_stiction(acting)
-    control = empty_state(options, law, effective(acting), stiction, num_envs)
+    empty = empty_states(options, params, acting, options.has_stiction(acting))
+    control = by_name(*empty)
     rows = {name: table for name, table in present.rows.items() if "control/" not in name}
     snapshot.check_rows(rows | flatten({"control": control}))
     return Restore(replace(snapshot.copy(), params=params, actuators=actuators), draws)

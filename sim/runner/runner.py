@@ -26,8 +26,7 @@ from batchpid.arrays.array_types import Progress, Rows
 from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
-from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.backend import describe
+from batchpid.sim.loop.backend import describe, native_obstacle
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import DEFAULT_ENGINE
@@ -53,6 +52,7 @@ from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, WorkerPool
+from batchpid.stages.values import Command
 
 CHECKPOINT_STEPS = 8000
 """Least number of sim steps between checkpoints, from the last of which a lost worker is replayed."""
@@ -146,6 +146,8 @@ class Runner(SingleOwner):
     def __repr__(self) -> str:
         options = self.options
         state = "closed" if self.closed else f"at {self.time:g} s"
+        if options.stages and (reason := native_obstacle(options)):
+            state += f", law in NumPy or JAX ({reason})"
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {options.workers} workers,"
             f" control {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"

@@ -8,7 +8,6 @@ import pytest
 from robots import load_bundled
 
 from batchpid.sim import Robot, RunnerOptions
-from batchpid.sim.engine.native import obstacle
 from batchpid.sim.engine.protocol import load_engine
 
 
@@ -31,11 +30,9 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 
 
 @pytest.fixture
-def needs_programs() -> None:
-    """Skip a test of Runners with backend "jax", whose programs call native code."""
+def needs_jax() -> None:
+    """Skip a test of Runners with backend "jax" where JAX is missing."""
     pytest.importorskip("jax")
-    if obstacle():
-        pytest.skip("there is no native code")
 
 
 @pytest.fixture

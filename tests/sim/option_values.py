@@ -8,6 +8,7 @@ from types import UnionType
 from typing import Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+from thermal import Thermal
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
 import batchpid as bp
@@ -86,6 +87,7 @@ VALUES = {
     "actuators": [bp.Actuators(), MOTORS, bp.make_actuators(2, command_delay=2e-3)],
     "randomization": [Randomization(payload=Uniform(0, 1)), Randomization(payload=Uniform(0, 2))],
     "guard": [bp.make_guard(2, rate=0.5), bp.make_guard(2, rate=0.2)],
+    "stages": [[Thermal(2.0, 0.02)], [Thermal(3.0, 0.02)]],
     "contacts": [["hand"], ["arm", "hand"]],
     "wrenches": [["hand"], ["arm"]],
     "timeout": [60.0, 30.0],

@@ -1,4 +1,4 @@
-"""Every feature, in each engine, gives the same results on every path: native code, NumPy, XLA,
+"""Every feature, in each engine, gives the same results on every path: native code, NumPy, JAX,
 workers, snapshots, ...
 
 A case is a feature (options of a Runner, in :data:`FEATURES`) in an engine. Its program is a
@@ -24,9 +24,9 @@ from featured import robot_with
 from identical import assert_identical
 from option_values import ARM, MOTORS, box
 from robots import load_bundled
+from thermal import Thermal
 
 import batchpid as bp
-from batchpid.errors import InvalidArgumentError
 from batchpid.sim import (
     LogUniform,
     Normal,
@@ -184,7 +184,11 @@ FEATURES: dict[str, Feature] = {
     "own controller": Feature({"control": Damped()}, exact=True),
     "guard": Feature({"guard": GUARD}),
     "guarded drive": Feature({"control": "drive", "guard": GUARD}, exact=True),
+    "a thermal limit": Feature({"stages": [Thermal(2.0, 0.02)]}),
     "motors": Feature(motors(SIGNALS, LINE)),
+    "motors with a thermal limit": Feature(
+        {"stages": [Thermal(2.0, 0.02)], **motors(SIGNALS, SENSORS)}
+    ),
     "sensors": Feature(motors(SENSORS)),
     "noise": Feature(motors(NOISE), repeats=False),
     "friction": Feature(motors(FRICTION)),
@@ -524,16 +528,8 @@ def in_workers(case: tuple[str, str]) -> None:
     check_equal(result, reference(case))
 
 
-def in_xla(case: tuple[str, str]) -> None:
-    """The law in XLA is close to NumPy, and bit-identical in a worker; a feature that it lacks is
-    refused.
-    """
-    try:
-        make(case, backend="jax").close()
-    except InvalidArgumentError as error:
-        if "which backend 'jax' does not support" not in str(error):
-            raise
-        return
+def in_jax(case: tuple[str, str]) -> None:
+    """The control in JAX is close to NumPy, and bit-identical in a worker."""
     check_close(reference(case, "jax"), reference(case), 1e-5)
     with make(case, workers=1, backend="jax") as runner:
         check_equal(program(runner, case), reference(case, "jax"))
@@ -552,10 +548,10 @@ PATHS = (
     restored,
     again,
     in_workers,
-    in_xla,
+    in_jax,
     in_the_other_engine,
 )
-QUICK = {in_workers: 5, in_xla: 50}
+QUICK = {in_workers: 5, in_jax: 50}
 """Interval of the quick cases of a path; the others are slow. Other paths have every feature, in
 one engine, quick.
 """
@@ -582,11 +578,7 @@ def rows() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("path", "case"), [*rows()])
-def test_every_feature_is_the_same_on_every_path(
-    path: Any, case: tuple[str, str], request: pytest.FixtureRequest
-) -> None:
-    if path is in_xla:
-        request.getfixturevalue("needs_programs")
+def test_every_feature_is_the_same_on_every_path(path: Any, case: tuple[str, str]) -> None:
     path(case)
 
 

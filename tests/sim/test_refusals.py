@@ -16,6 +16,7 @@ from featured import robot_with
 from identical import assert_identical
 from option_values import ARM, box, label
 from robots import load_bundled
+from thermal import Thermal
 
 import batchpid as bp
 from batchpid.errors import BatchPIDError, InvalidArgumentError
@@ -36,6 +37,15 @@ from batchpid.sim import (
 from batchpid.sim.options.options import OPTIONS
 
 DOF, N = ARM.dof, 2
+
+
+class NowhereElse(Thermal):
+    """A stage behind one that is not there."""
+
+    name = "nowhere else"
+    after = "nowhere"
+
+
 FREE = robot_with("floating base")
 SAPIENS_OWN = dataclasses.replace(ARM, dissipation="sapien")
 ROW, ROWS, NAN = np.zeros(DOF), np.zeros((N, DOF)), np.array([[0.0, 0.0], [np.nan, 0.0]])
@@ -189,7 +199,9 @@ RUNNERS: list[tuple[dict[str, Any], str]] = [
     ({"worker": 1}, "worker"),
     ({"engine": "bullet"}, "engine"),
     ({"backend": "torch"}, "backend"),
-    ({"backend": "jax", "guard": True}, "guard"),
+    ({"stages": [np.zeros(DOF)]}, "stages"),
+    ({"stages": [Thermal(1.0, 1.0), Thermal(1.0, 1.0)]}, "stages"),
+    ({"stages": [NowhereElse(1.0, 1.0)]}, "stages"),
     ({"cluster": "ray", "workers": 2}, "workers"),
     ({"cluster": "slurm"}, "cluster"),
     ({"physics": MujocoSolver(), "engine": "sapien"}, "physics"),
@@ -249,7 +261,7 @@ def test_options_that_do_not_go_together_are_refused_by_name(
     options: dict[str, Any], argument: str, request: pytest.FixtureRequest
 ) -> None:
     if options.get("backend") == "jax":
-        request.getfixturevalue("needs_programs")
+        request.getfixturevalue("needs_jax")
     options = {"robot": ARM, "num_envs": N, **options}
     options.setdefault("workers", None if "cluster" in options else 0)
     assert argument in named(lambda: Runner(**options))

@@ -152,7 +152,7 @@ def test_a_snapshot_is_refused_or_goes_on_as_before_under_each_value_of_each_opt
     """The snapshot is made under the value before it, the last one for the first."""
     before, value = option_values(name)[index - 1], option_values(name)[index]
     if value == "jax":
-        request.getfixturevalue("needs_programs")
+        request.getfixturevalue("needs_jax")
     number, context = next(
         each for each in enumerate(CONTEXTS) if is_possible({**each[1], name: value})
     )

@@ -151,7 +151,7 @@ class MujocoStep(NativeStep):
         )
 
     def prepare(self) -> int:
-        """Return the address of the group, for a call of the extension or of XLA; the robots are in
+        """Return the address of the group, for a call of the extension; the robots are in
         their states.
         """
         if self._free is None:

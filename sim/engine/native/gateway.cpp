@@ -4,7 +4,6 @@
 // (sim/engine/sapien/calls.py), so that nothing of SAPIEN, PhysX or Eigen is needed to compile this file.
 
 #include "tick.h"
-#include "xla_call.h"
 
 using namespace batchpid;
 
@@ -224,19 +223,6 @@ PyObject *update(PyObject *, PyObject *const *arguments, Py_ssize_t) {
                     [&](auto const &at) { update_constraint(*of, rows, at[0], at[1], wanted.as<char>()); });
 }
 
-// xla_functions(): their addresses, by name.
-PyObject *xla_functions(PyObject *, PyObject *) {
-  PyObject *functions = PyDict_New();
-  auto const add = [&](char const *name, auto *function) {
-    PyObject *address = PyLong_FromVoidPtr(reinterpret_cast<void *>(function));
-    PyDict_SetItemString(functions, name, address);
-    Py_DECREF(address);
-  };
-  add("batchpid_sim_step", xla::batchpid_sim_step);
-  add("batchpid_mass_matrix", xla::batchpid_mass_matrix);
-  return functions;
-}
-
 PyMethodDef METHODS[] = {
     {"type_info", type_info, METH_O, nullptr},
     {"gateway", make_gateway, METH_VARARGS, nullptr},
@@ -254,7 +240,6 @@ PyMethodDef METHODS[] = {
     {"forces", method(forces), METH_FASTCALL, nullptr},
     {"refresh", method(refresh_friction), METH_FASTCALL, nullptr},
     {"update_constraint", method(update), METH_FASTCALL, nullptr},
-    {"xla_functions", xla_functions, METH_NOARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 

@@ -316,7 +316,7 @@ _NAMES = (
         "constraint.h",
         "refresh.h",
     ),
-    *("sim_step.h", "tick.h", "xla_call.h", "interface.py"),
+    *("sim_step.h", "tick.h", "interface.py"),
 )
 
 EXTENSIONS = {

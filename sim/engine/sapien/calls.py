@@ -265,7 +265,7 @@ class SapienStep(NativeStep):
         )
 
     def prepare(self) -> int:
-        """Return the address of the group, for a call of the extension or of XLA that does a sim
+        """Return the address of the group, for a call of the extension that does a sim
         step.
         """
         self._stepped[...] = True

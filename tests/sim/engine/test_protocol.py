@@ -214,10 +214,3 @@ def test_what_it_cannot_do_is_an_error_with_a_remedy():
     problem = "build: .*'build'.*'toy' does not have.*use the engine"
     with pytest.raises(InvalidArgumentError, match=problem):
         RunnerOptions(PANDA, N, build=print)
-
-
-@pytest.mark.usefixtures("toy")
-def test_its_sim_steps_are_no_part_of_a_program_of_xla():
-    pytest.importorskip("jax")
-    with pytest.raises(InvalidArgumentError, match=r"backend: .*a toy"):
-        runner(backend="jax")

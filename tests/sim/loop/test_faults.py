@@ -257,7 +257,7 @@ def test_the_other_63_of_64_envs_are_bit_identical(case):
 
 
 @pytest.mark.quick_rows(2)
-@pytest.mark.usefixtures("needs_programs", "engine")
+@pytest.mark.usefixtures("needs_jax", "engine")
 @pytest.mark.parametrize("control", ["pid", "effort"])
 def test_a_state_that_is_finite_and_far_away_is_a_fault_at_the_same_step_for_every_executor(
     control, monkeypatch

@@ -1,0 +1,93 @@
+"""Stages of a sim step, in their order: a control loop is a list of them.
+
+With setpoint r, joint positions q and velocities v, and passive force p::
+
+    sensors         y    = sensors(q), y' = sensors(v)
+    passive force   p    = p(y, y')                       where sensors measure
+    inertia         of the friction model                 every 64 sim steps of an env
+    matrix          M    = M(y) half way ahead            every 4 sim steps of a tick, 1 with the implicit law
+    setpoint        r    = r at this moment of the tick   where its rate is given
+    guard           r    = guard(r)                       limits of position, rate and acceleration
+    feedforward     f    = p + feedforward + modelled friction
+    law             u    = the caller's own controller
+    limits          of the efforts that the motors deliver
+    law             qf   = sat(PID(r, r', r'', y, y') + f), or the engine's drives
+    saturation      qf   = sat(u), sat(u + f)             of the caller's efforts
+    motors          qf   = motors(qf)
+    friction        qf   = qf - friction(qf, v)
+    last            qf and the motors' effort             for stages of the caller
+
+Each stage has a file. A stage of the caller's stands behind the one that it names:
+:class:`batchpid.stages.stage.Stage`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import is_dataclass
+from typing import Any
+
+import numpy as np
+
+from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.trees import mapped
+from batchpid.errors import InvalidArgumentError
+from batchpid.stages.control import Control
+from batchpid.stages.drive import Drive
+from batchpid.stages.effort import Effort, Own
+from batchpid.stages.feedforward import Feedforward, Passive
+from batchpid.stages.friction import Friction, Inertia
+from batchpid.stages.guard import Guard
+from batchpid.stages.last import Last
+from batchpid.stages.matrix import Matrix
+from batchpid.stages.motors import Limits, Motors
+from batchpid.stages.pid import PID
+from batchpid.stages.sensors import Sensors
+from batchpid.stages.setpoint import Setpoint
+from batchpid.stages.stage import Stage
+from batchpid.stages.values import Told, Values
+
+__all__ = ["STAGES", "Control", "Stage", "Told", "Values", "fit_stages", "stages_of"]
+
+STAGES: tuple[type[Stage], ...] = (
+    *(Sensors, Passive, Inertia, Matrix),
+    *(Setpoint, Guard, Feedforward, Own, Limits),
+    *(PID, Drive, Effort, Motors, Friction, Last),
+)
+"""Stages of batchpid, in order."""
+
+
+def stages_of(control: Control) -> tuple[Any, ...]:
+    """Return the stages of a control, those of the caller behind the ones that they name."""
+    kinds: list[Any] = list(STAGES)
+    for stage in control.further:
+        names = [kind.name for kind in kinds]
+        kinds.insert(len(names) - names[::-1].index(stage.after), stage)
+    made = [kind if isinstance(kind, Stage) else kind.of(control) for kind in kinds]
+    return tuple([stage for stage in made if stage is not None])
+
+
+def fit_stages(stages: Sequence[Stage]) -> tuple[Stage, ...]:
+    """Return stages of the caller's, with read-only copies of their constants.
+
+    Raises InvalidArgumentError for one that is not a dataclass of :class:`Stage`, has the name of
+    another, or stands behind one that is not there.
+    """
+    names = [kind.name for kind in STAGES]
+    fitted = list[Stage]()
+    for stage in stages if isinstance(stages, Sequence) else [stages]:
+        if not (isinstance(stage, Stage) and is_dataclass(stage)):
+            problem = f"has a {type(stage).__name__}"
+            remedy = "make it a frozen dataclass with the base batchpid.stages.Stage"
+            raise InvalidArgumentError("stages", problem, remedy=remedy)
+        if stage.name in names:
+            problem = f"has a second stage {stage.name!r}"
+            raise InvalidArgumentError("stages", problem, remedy="give each a name of its own")
+        if stage.after not in names:
+            problem = f"has {stage.name!r} after {stage.after!r}, which is no stage"
+            remedy = f"take one of {', '.join(dict.fromkeys(names))}"
+            raise InvalidArgumentError("stages", problem, remedy=remedy)
+        names.append(stage.name)
+        copies: Stage = mapped(lambda leaf: read_only(np.array(leaf)), stage)
+        fitted.append(copies)
+    return tuple(fitted)

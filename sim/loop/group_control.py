@@ -1,0 +1,266 @@
+"""Control of a group of envs: its stages, from options, params and robots; and the functions of the
+robots' model that they call.
+
+Mass matrices, passive force and noise of sensors are natively compiled where the engine's steps
+are, for every executor alike, since NumPy's results differ in the last bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from operator import itemgetter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import batchpid as bp
+from batchpid.arrays.array_types import Array, Float64
+from batchpid.arrays.elementwise import TURN
+from batchpid.arrays.trees import leaves, mapped
+from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
+from batchpid.motors.friction import Friction
+from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
+from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.parts import DISSIPATION, Joint
+from batchpid.sim.robot.robot_options import BAND, known_joints
+from batchpid.stages import Control, Stage, stages_of
+from batchpid.stages.friction import REFRESH_STEPS
+from batchpid.stages.program import StageProgram
+from batchpid.stages.stage import States, started
+from batchpid.stages.values import Command, Measured, Model, Outputs, Step, Values
+
+
+class GroupControl(NamedTuple):
+    """Control of the robots of a pack, which an executor runs."""
+
+    options: RunnerOptions
+    pack: EnginePack
+    control: Control
+    stages: tuple[Any, ...]
+    model: Model
+
+    @classmethod
+    def of(
+        cls,
+        options: RunnerOptions,
+        pack: EnginePack,
+        params: bp.PIDParams,
+        actuators: bp.Actuators | None,
+        controller: OwnController | None,
+    ) -> GroupControl:
+        """Return the control of the robots of ``pack``.
+
+        ``params`` and ``actuators`` include the draws of the randomization.
+        """
+        scene = pack.spec
+        first = pack.first_env - options.first_env
+        control = control_of(
+            options,
+            params,
+            actuators,
+            scene.joints,
+            pack.friction,
+            slice(first, first + pack.size),
+            controller,
+            DISSIPATION[scene.dissipation].modelled,
+        )
+        return cls(options, pack, control, stages_of(control), model_functions(pack, control))
+
+    @property
+    def moves_drives(self) -> bool:
+        """Whether targets of the engine's drives move within a tick whose setpoints rest."""
+        control = self.control
+        law = self.stage("law")
+        moving = control.guard, control.turns, getattr(law, "integral", None)
+        return any(part is not None for part in moving) or bool(control.further)
+
+    def stage(self, name: str) -> Any:
+        """Return a stage by name; None if it does not apply."""
+        return next((stage for stage in self.stages if stage.name == name), None)
+
+
+def control_of(
+    options: RunnerOptions,
+    params: bp.PIDParams,
+    actuators: bp.Actuators | None,
+    joints: Sequence[Joint],
+    friction: Friction,
+    envs: slice,
+    controller: OwnController | None,
+    share: float = 1.0,
+) -> Control:
+    """Return the control of the envs ``envs`` of a runner.
+
+    ``friction`` is that of the joints, and ``share`` the part of the description's friction that
+    engine and law know.
+    """
+    compensated = options.compensate.split("+")
+    known = known_joints(options.robot)
+    turns = np.array([joint.continuous / TURN for joint in joints])
+    modelled = np.array([joint.friction * share for joint in joints]) + known.coulomb
+    has_modelled = "friction" in compensated and options.sets_positions and modelled.any()
+    armature = None
+    damping = np.array([joint.damping for joint in joints])
+    if options.robot.actuators is not None:
+        armature = known.armature
+        damping = damping + known.viscous
+    return Control(
+        timestep=options.timestep,
+        envs=envs.stop - envs.start,
+        coupling=coupling_of(tuple(joints)),
+        params=params,
+        mode=options.control if isinstance(options.control, str) else "custom",
+        controller=controller,
+        actuators=actuators,
+        guard=None if options.guard is None else options.guard.for_envs(envs),
+        friction=friction,
+        gravity="gravity" in compensated,
+        coriolis="coriolis" in compensated,
+        modelled=modelled if has_modelled else None,
+        band=np.array([BAND[joint.unit] for joint in joints]),
+        turns=turns if turns.any() else None,
+        armature=armature,
+        damping=damping if damping.any() else None,
+        further=tuple([_for_envs(stage, options.num_envs, envs) for stage in options.stages]),
+    )
+
+
+def _for_envs(stage: Stage, num_envs: int, envs: slice) -> Stage:
+    """Return a stage of the caller's with the rows ``envs`` of constants that have one for each of
+    ``num_envs`` envs.
+    """
+
+    def rows(leaf: Array) -> Array:
+        has_rows = leaf.ndim >= 2 and leaf.shape[0] == num_envs
+        return leaf[envs] if has_rows else leaf
+
+    part: Stage = mapped(rows, stage)
+    return part
+
+
+def empty_states(
+    options: RunnerOptions,
+    params: bp.PIDParams,
+    actuators: bp.Actuators | None,
+    stiction: bool,
+) -> tuple[tuple[Any, ...], States]:
+    """Return the stages and states of all envs of a runner, without its robots; ``stiction`` says
+    whether joints have Coulomb friction.
+    """
+    joints = options.robot.joints
+    rows = np.zeros((options.num_envs, len(joints)))
+    controller = None if isinstance(options.control, str) else OwnController(options)
+    friction = Friction(coulomb=rows if stiction else None)
+    envs = slice(0, options.num_envs)
+    control = control_of(options, params, actuators, joints, friction, envs, controller)
+    stages = stages_of(control)
+    model = Model(
+        joint_mass_matrix=lambda qpos: np.eye(len(joints)) + 0.0 * qpos[:, :, None],
+        load=lambda: rows,
+    )
+    measured = Measured(rows, rows, rows)
+    values = Values(Command(None), measured, measured, options.timestep, model=model)
+    return stages, started(stages, values)
+
+
+def untraceable(options: RunnerOptions) -> str:
+    """Return which of the caller's stages cannot run in native code, and why; "" if all can."""
+    acting = options.params, options.actuators, options.has_stiction(options.actuators)
+    stages, _ = empty_states(options, *acting)
+    names = {stage.name for stage in options.stages}
+    row = np.zeros((options.num_envs, options.robot.dof))
+    reading = Measured(row, row, row)
+    step = Step(0, 1, np.zeros(()))
+    values = Values(Command(*[row] * 4), reading, reading, options.timestep, step)
+    values = values._replace(last=Outputs(row, row), forward=row, limits=(row, row))
+    values = values.told(qf=row, motor=row, saturated=row, guarded=row)
+    for stage in stages:
+        if stage.name in names:
+            state, _ = stage.init(values)
+            if any(leaf.shape != row.shape for leaf in leaves(state)):
+                return f"the state of stage {stage.name!r} is not (envs, joints)"
+            try:
+                StageProgram([stage], (state,), values, row.shape)
+            except (AttributeError, AssertionError, TypeError, ValueError) as error:
+                return f"stage {stage.name!r}: {error}"
+    return ""
+
+
+# -- functions of the model
+# --------------------------------------------------------------------------------------------------
+
+
+def model_functions(pack: EnginePack, control: Control) -> Model:
+    """Return the functions for NumPy arrays of the robots of ``pack``."""
+    native = pack.steps_natively
+    falls = not pack.spec.fixed_base  # then gravity does not load the joints
+
+    def joint_mass_matrix(qpos: Float64) -> Float64:
+        matrix = pack.joint_mass_matrix(qpos)
+        if pack.armature.any():
+            return matrix + pack.armature[:, None] * np.eye(pack.dof)
+        return matrix
+
+    model = Model(
+        mass_matrix=mass_matrix_of(pack, native),
+        joint_mass_matrix=joint_mass_matrix,
+        load=lambda: pack.passive_force(not falls, True),
+        noise=NoiseBlocks(),
+        envs=np.arange(pack.first_env, pack.first_env + pack.size),
+    )
+    if control.gravity:
+        force = passive_force_of(pack, native)
+        parts = control.gravity, control.coriolis
+        model = model._replace(
+            passive_force=lambda qpos, qvel: force(qpos, qvel, *parts, pack.read_base_motion())
+        )
+    if native and control.friction.coulomb is not None:
+        inputs = control.friction, control.drive, control.coupling, control.timestep
+        refresh = NativeRefresh(pack.joint_model, pack.size, pack.armature, *inputs, REFRESH_STEPS)
+        model = model._replace(refresh=refresh)
+    return model
+
+
+BLOCK = 64
+"""Sim steps of a block."""
+
+
+class NoiseBlocks:
+    """:func:`batchpid.motors.measurement_noise` at the step of a state, from blocks of consecutive
+    steps.
+    """
+
+    def __init__(self) -> None:
+        self._key: Any = None
+        self._first = 0
+        self._block: tuple[Array, Array] = (None, None)
+
+    def __call__(
+        self, k: MotorCoefficients, state: ActuatorState, like: Float64
+    ) -> tuple[Array, Array]:
+        """Return the noise of positions and velocities; None for a sensor without noise."""
+        noise: tuple[Array, Array] = mapped(itemgetter(0), self.from_step(k, state, like))
+        return noise
+
+    def from_step(
+        self, k: MotorCoefficients, state: ActuatorState, like: Float64
+    ) -> tuple[Array, Array]:
+        """Return the noise of the step of a state and the next ones (steps, M, dof), as far as it
+        has been drawn.
+
+        A reset replaces the key. While the key is the same, all envs advance by the same number of
+        steps.
+        """
+        if state.key is None:
+            return None, None
+        step = int(state.step[0])
+        if state.key is not self._key or not 0 <= step - self._first < BLOCK:
+            steps = state.step + np.arange(BLOCK, dtype=np.uint32)[:, None]
+            self._block = measurement_noise(k, state.key, steps, np.zeros_like(like), np)
+            self._key = state.key
+            self._first = step
+        rest: tuple[Array, Array] = mapped(itemgetter(slice(step - self._first, None)), self._block)
+        return rest

@@ -1,0 +1,109 @@
+"""Stages of the control in a Runner: those of the caller, compiled ones, and changes in flight. That
+each feature is the same on every path is in test_conformance.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from thermal import Thermal
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim import Runner
+from batchpid.stages import Stage
+
+
+class Recording:
+    """Controller in Python that keeps the velocities and the setpoints that it is given."""
+
+    def __init__(self):
+        self.seen = []
+
+    def init(self, robot, num_envs, timestep):
+        return None
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        self.seen.append(qvel)
+        return state, np.asarray(passive) + 2.0 * (setpoint - qpos)
+
+
+def test_a_controller_that_cannot_be_traced_is_an_error(panda, needs_jax):
+    runner = Runner(panda, 2, control=Recording(), backend="jax", workers=0)
+    with runner, pytest.raises(InvalidArgumentError, match=r"control.*traced"):
+        runner.step(np.zeros(panda.dof))
+
+
+class Integrator:
+    """Controller whose init makes its state by JAX."""
+
+    def init(self, robot, num_envs, timestep):
+        import jax
+
+        return {"sum": jax.numpy.zeros((num_envs, robot.dof))}
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        return {"sum": state["sum"] + (setpoint - qpos)}, passive
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_the_state_of_a_controller_has_the_precision_of_the_runner(panda, needs_jax, wide):
+    import jax
+
+    jax.config.update("jax_enable_x64", wide)
+    try:
+        with Runner(panda, 2, backend="jax", control=Integrator(), workers=0) as runner:
+            assert runner.snapshot().rows["control/law/sum"].dtype == np.float64
+    finally:
+        jax.config.update("jax_enable_x64", False)
+
+
+def test_jax_without_the_cpu_is_refused(panda, needs_jax, monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    with pytest.raises(InvalidArgumentError, match="JAX_PLATFORMS is 'cuda'; add cpu"):
+        Runner(panda, 2, backend="jax", workers=0)
+
+
+def test_a_sensor_that_is_late_in_flight_begins_with_the_present_velocity(panda):
+    """It began with velocity 0, whatever the robot did."""
+    control = Recording()
+    with Runner(panda, 2, control=control, workers=0) as runner:
+        before = runner.step(panda.target).qvel
+        assert np.abs(before).max() > 0.05
+        runner.actuators = bp.make_actuators(panda.dof, sensor_delay=5e-3)
+        control.seen.clear()
+        runner.step(panda.target)
+    for qvel in control.seen[:10]:
+        np.testing.assert_array_equal(qvel.astype(np.float32), before)
+
+
+def test_a_thermal_limit_keeps_motors_at_the_heat_that_they_hold_for_ever(panda):
+    with Runner(panda, 2, workers=0, stages=[Thermal(4.0, 0.05)]) as runner:
+        rollout = runner.rollout(np.broadcast_to(panda.target, (24, 2, panda.dof)))
+        heat = runner.snapshot().rows["control/thermal"]
+    assert np.abs(rollout.effort).max() > 4.0
+    assert rollout.saturated.any()
+    assert 0.99 < heat.max() < 1.01
+
+
+@dataclass(frozen=True)
+class Fan(Stage):
+    """A stage with an operation that programs do not have."""
+
+    name = "fan"
+    after = "motors"
+
+    def step(self, state, values):
+        xp = values.outputs.qf.__array_namespace__()
+        return state, values.told(qf=values.outputs.qf + 1e-3 * xp.arctan(values.measured.qvel))
+
+
+def test_a_stage_that_programs_cannot_have_runs_in_numpy_and_the_runner_says_so(panda):
+    with Runner(panda, 2, workers=0, stages=[Fan()]) as runner:
+        assert "stage 'fan': programs have no operation 'arctan'" in repr(runner)
+        assert "'fan'" in runner.backend
+        assert runner.step(panda.start).ok.all()
+    with Runner(panda, 2, workers=0, stages=[Thermal(8.0, 0.05)]) as runner:
+        assert "stage" not in repr(runner)
