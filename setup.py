@@ -81,15 +81,15 @@ class Build(build_ext):
 
 
 def write_passes():
-    """Write fused.h, the passes of the commonest laws, from the traces of the law."""
+    """Write the headers with the passes of the commonest laws and loops, from their traces."""
     sys.path.insert(0, str(ROOT))
-    from batchpid.native.fused import header
+    from batchpid.stages.passes import headers
 
-    file = ROOT / "batchpid" / "native" / "fused.h"
-    text = header()
-    # An older file would be compiled again.
-    if not file.is_file() or file.read_text() != text:
-        file.write_text(text)
+    for name, text in headers().items():
+        file = ROOT / "batchpid" / "native" / name
+        # An equal file keeps its time, or all would be compiled again.
+        if not file.is_file() or file.read_text() != text:
+            file.write_text(text)
 
 
 modules = [load(name) for name in MODULES] if os.environ.get("BATCHPID_NATIVE") != "0" else []
