@@ -5,7 +5,8 @@
 # make docs     the API reference and the guides, as pages in out/site
 # make bench    benchmarks and their baselines, on an idle machine (10 minutes); the last lines compare them
 # make bench-check  ratios of speeds against their floors: 3 minutes, on an idle machine
-# make figures  measure and redraw docs/performance.md (5 to 15 minutes, on an idle machine)
+# make figures  measure and redraw docs/performance.md, and draw the pictures of the guides (5 to 15 minutes, on an idle
+#               machine; the pictures alone: python docs/pictures.py)
 # make soak     the slow tests, each result as it comes (an hour)
 # make wheel    dist/: the sdist, and from it the wheel, tried in a clean environment; needs network and a C++ compiler
 #
@@ -83,6 +84,7 @@ figures: $(VENV)/.dev
 	$(call bench_case,jaco2,accurate)
 	$(call bench_case,jaco2,fast)
 	@$(RUN) bench/draw.py $(MEASURED)
+	@$(RUN) docs/pictures.py
 
 soak: $(VENV)/.dev
 	@$(RUN) -u -m pytest -m slow -vv --durations 20 --numprocesses 2 --dist worksteal $(ARGS)

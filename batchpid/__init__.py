@@ -42,6 +42,7 @@ from batchpid.io.documents import (
     loads_params,
     save_params,
 )
+from batchpid.io.packages import attributes_of
 from batchpid.law.bumpless import track
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams, make_params
@@ -88,3 +89,11 @@ __all__ = [
     "step_terms",
     "track",
 ]
+
+_MODULES = ("export", "metrics", "sim", "task_space", "trajectories")
+"""Public modules, which are imported when they are used."""
+__getattr__ = attributes_of(__name__, _MODULES)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, *_MODULES]

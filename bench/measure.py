@@ -151,7 +151,7 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     """
     share = max(1, workload.num_envs // workload.processes)
     robot = workload.simulated_robot()
-    options = RunnerOptions(robot, share, physics=workload.physics)
+    options = RunnerOptions(robot, share, engine="sapien", physics=workload.physics)
     layout = Arrays.layout(1, share, robot.dof, robot.dof, options.observed)
     shared = SharedArrays(layout)
     # In NumPy, with a call for each phase.

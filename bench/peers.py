@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import multiprocessing
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from baselines import single_threaded
 from tutorial import TutorialLoop
 from workload import TIMESTEP, Case, Workload
+
+from batchpid.sim import Robot
 
 
 def _async_vector(workload: Workload, count: int) -> Case:
@@ -66,39 +69,58 @@ def _tutorial_env(workload: Workload) -> Any:
     return TutorialEnv()
 
 
-def _mujoco_batch(workload: Workload) -> Case:
-    """Return ``mujoco.batch`` on the same URDF, with one thread for each worker.
+def batch_with_pid(
+    robot: Robot,
+    gains: Sequence[np.ndarray],
+    num_envs: int,
+    threads: int,
+    start: np.ndarray,
+    target: np.ndarray,
+) -> tuple[Any, np.ndarray, list[int]]:
+    """Return ``mujoco.batch`` on the URDF of a robot, the state of each env at ``start`` (dof,) with
+    the setpoint ``target`` (dof,), and the columns of the joints in its positions.
 
-    MuJoCo's actuator ``pid`` drives the joints with the same kp, ki and kd. Gravity is compensated
-    body by body. The sum of both stays within the URDF's effort limits. The scene has a ground. The
-    solver is Newton, and the integrator "implicitfast", which MuJoCo's documentation recommends.
+    MuJoCo's actuator ``pid`` drives the joints with the gains kp, ki and kd (dof,). Gravity is
+    compensated body by body. The sum of both stays within the URDF's effort limits. The scene has a
+    ground, if the robot has one. The solver is Newton, and the integrator "implicitfast", which
+    MuJoCo's documentation recommends.
     """
     import mujoco
     import mujoco.batch
 
     from batchpid.sim import to_urdf
 
-    robot, settings = workload.robot, workload.robot.settings
     spec = mujoco.MjSpec.from_string(to_urdf(robot).text)
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+    if robot.has_ground:
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
     for body in spec.bodies:
         body.gravcomp = 1
     for joint in spec.joints:
         joint.actgravcomp = True  # the effort limits, which MuJoCo reads from the URDF, include it
-    for name, kp, ki, kd in zip(
-        robot.joint_names, settings.kp, settings.ki, settings.kd, strict=True
-    ):
+    for name, kp, ki, kd in zip(robot.joint_names, *gains, strict=True):
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_pid(kp=kp, ki=ki, kv=kd, ctrlspec=mujoco.mjtCtrlInput.mjINPUT_POS)
     model, kind = spec.compile(), mujoco.mjtState.mjSTATE_INTEGRATION
     columns = [model.joint(name).qposadr[0] for name in robot.joint_names]
-    data, start = mujoco.MjData(model), np.empty(mujoco.mj_stateSize(model, kind))
-    data.qpos[columns], data.ctrl[:] = workload.start, workload.target
-    mujoco.mj_getState(model, data, start, kind)
-    batch = mujoco.batch.Batch(
-        model, workload.num_envs, nthread=workload.processes, persistent=True
+    data, state = mujoco.MjData(model), np.empty(mujoco.mj_stateSize(model, kind))
+    data.qpos[columns], data.ctrl[:] = start, target
+    mujoco.mj_getState(model, data, state, kind)
+    batch = mujoco.batch.Batch(model, num_envs, nthread=threads, persistent=True)
+    return batch, state, columns
+
+
+def _mujoco_batch(workload: Workload) -> Case:
+    """Return :func:`batch_with_pid` on the same URDF, with one thread for each worker."""
+    settings = workload.robot.settings
+    batch, start, columns = batch_with_pid(
+        workload.robot,
+        (settings.kp, settings.ki, settings.kd),
+        workload.num_envs,
+        workload.processes,
+        workload.start,
+        workload.target,
     )
 
     def reset() -> None:

@@ -30,7 +30,12 @@ def engine_share(pose, physics, most):
     bare, found = DriveLoop(workload, envs, pose, pose + 0.01), []
     setpoints = np.broadcast_to(pose, (ticks, envs, len(pose)))
     with Runner(
-        workload.robot, envs, workers=0, physics=physics, substeps=workload.substeps
+        workload.robot,
+        envs,
+        engine="sapien",
+        workers=0,
+        physics=physics,
+        substeps=workload.substeps,
     ) as runner:
         for _ in range(rounds + 1):
             runner.reset(qpos=pose + 0.01)

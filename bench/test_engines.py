@@ -73,8 +73,8 @@ def test_speed_over_sapien(benchmark, report, compare, most, name, num_envs, gai
     def measure():
         options: dict[str, Any] = {"params": params, "workers": 0, "substeps": SUBSTEPS}
         with (
-            Runner(robot, num_envs, physics="accurate", **options) as accurate,
-            Runner(robot, num_envs, physics="fast", **options) as fast,
+            Runner(robot, num_envs, engine="sapien", **options) as accurate,
+            Runner(robot, num_envs, engine="sapien", physics="fast", **options) as fast,
             Runner(robot, num_envs, engine="mujoco", **options) as mujoco,
         ):
             runners = accurate, fast, mujoco

@@ -60,7 +60,9 @@ def test_step_and_policy_at_once_are_faster_than_one_after_the_other(most, polic
     envs, workers, ticks = min(ENVS, most.envs), min(workers, most.workers), min(TICKS, most.ticks)
     with ExitStack() as stack:
         whole, *halves = (
-            stack.enter_context(Runner(Robot.load("panda"), count, workers=workers))
+            stack.enter_context(
+                Runner(Robot.load("panda"), count, engine="sapien", workers=workers)
+            )
             for count in (envs, envs // 2, envs // 2)
         )
         for _ in range(ATTEMPTS):

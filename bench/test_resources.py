@@ -29,7 +29,8 @@ def make_runner(workload, most):
 
     def make_runner(num_envs, **options):
         params, workers = workload.robot.params(), min(2, most.workers)
-        return Runner(workload.robot, num_envs, params=params, workers=workers, **options)
+        options = {"engine": "sapien", "workers": workers, **options}
+        return Runner(workload.robot, num_envs, params=params, **options)
 
     return make_runner
 

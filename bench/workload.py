@@ -98,6 +98,7 @@ class Workload:
         """Return a runner of the robots with the tutorial's gains."""
         robot = self.simulated_robot(options.get("engine", "sapien"))
         ours = {
+            "engine": "sapien",
             "physics": self.physics,
             "substeps": self.substeps,
             "timestep": TIMESTEP,

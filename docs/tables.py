@@ -10,6 +10,7 @@ import ast
 import inspect
 import math
 import re
+import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, fields
 from itertools import pairwise
@@ -21,10 +22,10 @@ from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.law.params import FIELDS as PARAMS
 from batchpid.motors.actuators import FIELDS as ACTUATORS
+from batchpid.sim.findings import OF_FILES, OF_ROBOTS, FindingKind
 from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.options.options import GROUPS, OPTIONS, RunnerKeywords
 from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
-from batchpid.sim.robot.findings import OF_FILES, OF_ROBOTS, FindingKind
 
 DOCS = Path(__file__).parent
 
@@ -65,6 +66,27 @@ def first_sentence(text: str) -> str:
     return re.match(r".*?(?<!e\.g)(?=\. |\.?$)", plain)[0].replace("|", "\\|")  # type: ignore[index]
 
 
+ADVANCED = (
+    *("wrenches", "build", "backend", "speed_limit", "on_invalid_input", "first_env"),
+    *("timeout", "cluster"),
+)
+"""Options of the Runner that few programs need."""
+
+
+def option_texts() -> Iterator[tuple[str, str]]:
+    """Yield the name and the text of each option of the Runner."""
+    for group in (RunnerKeywords, *GROUPS):
+        for (name,), text in attributes(group):
+            yield name, text
+
+
+def advanced() -> str:
+    """Return a paragraph about the advanced options."""
+    texts = dict(option_texts())
+    entries = [f"`{name}` ({first_sentence(texts[name])})" for name in ADVANCED]
+    return textwrap.fill(f"Few programs need the others: {'; '.join(entries)}.", 120)
+
+
 def options() -> str:
     """Return the table of the Runner's options, with their defaults and the places that keep
     them.
@@ -74,8 +96,9 @@ def options() -> str:
         declared(RunnerKeywords, Field),
     )
     rows = [("option", "range", "default", "kept in", "flag", "meaning"), ("---",) * 6]
-    texts = [text for group in (RunnerKeywords, *GROUPS) for text in attributes(group)]
-    for (name,), text in texts:
+    for name, text in option_texts():
+        if name in ADVANCED:
+            continue
         kept, flag = (
             OPTIONS[name].places,
             f"`--{'no-' * (defaults[name] is True)}{name}`" if OPTIONS[name].flag else "",
@@ -133,6 +156,7 @@ def tables() -> dict[tuple[str, str], str]:
             attributes(Randomization), PHYSICAL | START | EVENTS, ("seed", "per"), off=False
         ),
         ("runner.md", "options"): options(),
+        ("runner.md", "advanced"): advanced(),
         ("robots.md", "files"): findings(OF_FILES, "the file has", "what is simulated"),
         ("robots.md", "preflight"): findings(OF_ROBOTS, "what it says", "remedy"),
     }

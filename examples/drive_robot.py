@@ -67,7 +67,12 @@ def main(options: Options) -> None:
     start = np.clip(start, robot.lower, robot.upper)
 
     with Runner(
-        robot, options.num_envs, control=control, compensate=compensate, params=params
+        robot,
+        options.num_envs,
+        engine="sapien",
+        control=control,
+        compensate=compensate,
+        params=params,
     ) as runner:
         runner.reset(start)
         ticks = round(options.seconds / (runner.substeps * runner.timestep))

@@ -30,7 +30,7 @@ def build(scene, env):
 def main(num_envs=4):
     """Drop the boxes while the robots hold their start pose."""
     robot = Robot.load("panda")
-    with Runner(robot, num_envs, build=build) as runner:
+    with Runner(robot, num_envs, engine="sapien", build=build) as runner:
         print("time [s]   height of each box's lower side [m]")
         for tick in range(51):
             if tick % 5 == 0:

@@ -53,7 +53,7 @@ class PushVectorEnv(ToolReachVectorEnv):
         self.goal = np.zeros((num_envs, 2))
 
     def runner_options(self):
-        return super().runner_options() | {"build": build_box, "ground": True}
+        return super().runner_options() | {"engine": "sapien", "build": build_box, "ground": True}
 
     def spaces(self):
         return spaces.Box(-100.0, 100.0, (2 * self.robot.dof + 12,)), super().spaces()[1]

@@ -30,7 +30,13 @@ def final_errors(robot: Robot, control: str, compensate: str, seconds: float) ->
     """Return |setpoint - qpos| of every joint (dof,) after ``seconds`` at the tutorial's target."""
     gains = robot.tuned() if control == "pid" else None
     with Runner(
-        robot, 1, control=control, compensate=compensate, workers=0, params=gains
+        robot,
+        1,
+        engine="sapien",
+        control=control,
+        compensate=compensate,
+        workers=0,
+        params=gains,
     ) as runner:
         ticks = round(seconds / (runner.substeps * runner.timestep))
         rollout = runner.rollout(np.broadcast_to(robot.target, (ticks, robot.dof)))

@@ -7,23 +7,23 @@ own.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from batchpid.io.packages import attributes_of
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
+from batchpid.sim.findings import Finding, RepairWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import Controller, Ray
-from batchpid.sim.options.options import RunnerKeywords, RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
-from batchpid.sim.robot.findings import Finding, RepairWarning
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.rollout import Rollout, RunInfo
 from batchpid.sim.signals.quantities import CommandSpec, Observation
-from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.tool_space import OperationalSpace
 
 if TYPE_CHECKING:
@@ -56,7 +56,6 @@ __all__ = [
     "Rollout",
     "RunInfo",
     "Runner",
-    "RunnerKeywords",
     "RunnerOptions",
     "SetpointWarning",
     "Snapshot",
@@ -68,6 +67,8 @@ __all__ = [
     "write_recording",
 ]
 
+_MODULES = ("gym", "identification", "plots", "tuning", "view")
+"""Public modules, which are imported when they are used."""
 _LOADED_LATE = {
     "MujocoSolver": "batchpid.sim.engine.physics",
     "Physics": "batchpid.sim.engine.physics",
@@ -78,7 +79,8 @@ _LOADED_LATE = {
 }
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _LOADED_LATE:
-        raise AttributeError(f"module 'batchpid.sim' has no attribute {name!r}")
-    return getattr(importlib.import_module(_LOADED_LATE[name]), name)
+__getattr__ = attributes_of(__name__, _MODULES, _LOADED_LATE)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, *_MODULES]

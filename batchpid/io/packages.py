@@ -5,10 +5,11 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from signal import SIGINT
+from types import MappingProxyType
 from typing import Any
 
 
@@ -46,3 +47,24 @@ def imported(name: str) -> Any:
         return import_module(name)
     with uninterrupted():
         return import_module(name)
+
+
+def attributes_of(
+    package: str, modules: Sequence[str], places: Mapping[str, str] = MappingProxyType({})
+) -> Callable[[str], Any]:
+    """Return the function ``__getattr__`` of a package that imports its public ``modules``, and the
+    modules that define the names in ``places``, when they are used.
+    """
+
+    def get(name: str) -> Any:
+        if name in places:
+            return getattr(imported(places[name]), name)
+        problem = f"module {package!r} has no attribute {name!r}"
+        if name not in modules:
+            raise AttributeError(problem)
+        try:
+            return imported(f"{package}.{name}")
+        except ImportError as error:  # help() goes on without it
+            raise AttributeError(f"{problem}: {error}") from error
+
+    return get

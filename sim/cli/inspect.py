@@ -13,8 +13,8 @@ from typing import Annotated
 from batchpid.sim import Finding, Robot
 from batchpid.sim.cli.flags import Gains, flag
 from batchpid.sim.diagnosis.text import table
+from batchpid.sim.findings import summary
 from batchpid.sim.geometry.inertia import DENSITY
-from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.parts import HEADERS, joint_rows
 from batchpid.sim.tuning.gain_sets import GainSet, gain_set, gain_table
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,11 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.preflight import touching_links
-from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
-from batchpid.sim.robot.findings import KINDS, Finding, Findings
-from batchpid.sim.signals.rollout import Rollout
+from batchpid.sim.findings import KINDS, LIMIT_TOLERANCE, Finding, Findings
+
+if TYPE_CHECKING:
+    from batchpid.sim.robot.description import RobotDescription
+    from batchpid.sim.rollout import Rollout
 
 BAND = 0.02  # half width of the settling band, as a share of the move
 EXAMINED = 100  # envs at most

@@ -11,7 +11,7 @@ armature and viscous friction of the motors are counted, each where it is known.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -19,9 +19,9 @@ import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.errors import InvalidArgumentError, warn
 from batchpid.law.implicit import as_explicit
-from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.parts import DISSIPATION
-from batchpid.sim.robot.robot_options import known_joints
+
+if TYPE_CHECKING:
+    from batchpid.sim.robot.description import RobotDescription
 
 NEAR_BOUND = 0.5
 """Share of the stability range from which gains are reported: other poses may have less inertia."""
@@ -86,9 +86,9 @@ def _loop(
         loop["mass_matrix"] = eye[None]
     else:
         # The law knows the damping, too, as part of its matrix.
-        joints = known_joints(robot)
-        implicit = coupling.reduced_damping(robot.damping + joints.viscous)
-        model = matrix(joints.armature) + timestep * eye * implicit
+        known = robot.actuators or bp.Actuators()
+        implicit = coupling.reduced_damping(robot.damping + table(known.viscous)[0])
+        model = matrix(known.armature)[:1] + timestep * eye * implicit
         plant = matrix(motors.armature) + timestep * eye * damping[:, None]
         loop |= {"mass_matrix": plant, "model": strength[..., None] * model}
     loop["filter_time"] = column(params.derivative_filter_time)
@@ -163,7 +163,8 @@ class StabilityCheck:
 
     def check(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
         """Warn if ``params`` pass the bound."""
-        if not DISSIPATION[self._robot.dissipation].modelled:
+        # SAPIEN's own friction is not in the formula.
+        if self._robot.dissipation == "sapien":
             return
         motors = None
         if actuators is not None and not actuators.is_ideal:

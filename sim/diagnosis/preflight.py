@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,15 +22,15 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
-from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.geometry.inertia import triangle_excess
+from batchpid.sim.findings import KINDS, SEVERITIES, Finding, Findings
+from batchpid.sim.geometry.inertia import LEAST_MASS, triangle_excess
 from batchpid.sim.geometry.shapes import hull_share
-from batchpid.sim.robot.description import POSES, RobotDescription
-from batchpid.sim.robot.findings import KINDS, SEVERITIES, Finding, Findings
-from batchpid.sim.robot.tables import LEAST_MASS
-from batchpid.sim.robot.urdf import GIVE_RANGE
 
+if TYPE_CHECKING:
+    from batchpid.sim.robot.description import RobotDescription
+
+HELD_POSES = 50
+"""Poses in which joints should hold themselves."""
 LEAST_EXCESS = 0.01
 """Excess over the triangle inequality of principal moments from which it is reported; less is
 rounding.
@@ -56,10 +56,10 @@ def check(
     setpoint: ArrayLike | None,
     timestep: float,
     control: str,
-    engine: str | None,
+    of_engine: Iterable[Finding],
 ) -> Findings:
-    """Return the findings, most severe first; :meth:`batchpid.sim.Robot.check` describes the
-    arguments.
+    """Return the findings, most severe first, those of an engine included;
+    :meth:`batchpid.sim.Robot.check` describes the other arguments.
     """
     timestep = number("timestep", timestep, 1e-6, 0.1, "seconds")
     choice("control", control, ("pid", "drive", "effort"))
@@ -87,11 +87,7 @@ def check(
             remedy = place.remedy or kind.done
             where = place.joint, place.link, place.detail
             findings.append(Finding(kind.code, text, remedy, *where))
-    if engine is not None:
-        chosen = load_engine(engine)
-        ground = {"ground": robot.has_ground, "mjcf": robot.mjcf}
-        scene = SceneSpec.of(robot, timestep, chosen.physics["accurate"], **ground)
-        findings += [*chosen.refusals(scene), *chosen.shortfalls(scene)]
+    findings += of_engine
     return Findings(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
@@ -244,7 +240,7 @@ def _outside(plan: _Plan) -> Iterator[Place]:
 
 def _without_range(plan: _Plan) -> Iterator[Place]:
     """Yield joints that cannot move, apart from those of which a repair says so."""
-    reported = {repair.joint for repair in plan.robot.repairs if repair.remedy == GIVE_RANGE}
+    reported = {repair.joint for repair in plan.robot.repairs if repair.code == "limits"}
     for joint in plan.robot.joints:
         if joint.lower == joint.upper and not joint.continuous and joint.name not in reported:
             text = "lower and upper limit are equal: no motion"
@@ -257,7 +253,7 @@ def _weak(plan: _Plan) -> Iterator[Place]:
     """Yield joints that cannot be held, or not be moved, in some poses."""
     robot = plan.robot
     limits = robot.effort_limit
-    load = np.abs(robot.holding_efforts(robot.sample(POSES, seed=0)))
+    load = np.abs(robot.holding_efforts(robot.sample(HELD_POSES, seed=0)))
     share = (load + robot.friction >= limits).mean(0)
     for index in np.flatnonzero((share > 0) & (limits > 0)):
         joint = robot.joints[index]

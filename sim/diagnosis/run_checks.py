@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Rows
 from batchpid.errors import warn
-from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
+from batchpid.sim.findings import LIMIT_TOLERANCE
+
+if TYPE_CHECKING:
+    from batchpid.sim.robot.description import RobotDescription
 
 
 class SetpointWarning(UserWarning):

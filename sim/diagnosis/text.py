@@ -9,7 +9,7 @@ import numpy as np
 from tabulate import tabulate
 
 from batchpid.arrays.array_types import Rows
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
 
 MOST_CAUSES = 3
 """Causes that a report lists."""

@@ -23,7 +23,8 @@ from batchpid.io.packages import imported
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
+from batchpid.sim.robot.robot import Robot
 from batchpid.task_space.rigid_tree import RigidTree
 
 Capability = Literal["build", "partial_force", "base_state", "complete_state", "sapien_dissipation"]
@@ -341,7 +342,7 @@ MODULES = {
 """Module of each engine by name. Its constant ENGINE is the :class:`Engine`."""
 
 
-def load_engine(name: str = "sapien") -> Engine:
+def load_engine(name: str) -> Engine:
     """Return an engine.
 
     Raises
@@ -360,6 +361,15 @@ def load_engine(name: str = "sapien") -> Engine:
         raise InvalidArgumentError("engine", problem, value=name, remedy="use 'mujoco'")
     engine: Engine = imported(module).ENGINE
     return engine
+
+
+def engine_findings(robot: Robot, name: str, timestep: float) -> Iterator[Finding]:
+    """Yield what of ``robot`` an engine cannot run, or runs otherwise than the file says."""
+    engine = load_engine(name)
+    ground = {"ground": robot.has_ground, "mjcf": robot.mjcf}
+    scene = SceneSpec.of(robot, timestep, engine.physics["accurate"], **ground)
+    yield from engine.refusals(scene)
+    yield from engine.shortfalls(scene)
 
 
 def _require_mujoco() -> None:

@@ -15,6 +15,8 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+LEAST_MASS = 1e-9
+"""Mass [kg] of a row without mass: 0 stands for a mass that the file does not give."""
 DENSITY = 1000.0  # [kg/m^3] of water, with which SAPIEN computes the mass of shapes
 # Least principal moment over the largest of a tensor that had to be replaced; PhysX divides by it.
 SLENDER = 1e-3

@@ -27,7 +27,7 @@ from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checke
 from batchpid.sim.recording.recording_files import read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
+from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
 
 QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")

@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from importlib.util import find_spec
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, Self, get_args, get_type_hints
 
 from numpy.typing import ArrayLike
@@ -35,8 +34,8 @@ from batchpid.sim.tool_space import OperationalSpace
 from batchpid.stages import Stage, fit_stages
 
 EngineName = Literal["sapien", "mujoco"]
-DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
-"""SAPIEN where it is installed, which is on Linux with x86-64; elsewhere MuJoCo."""
+DEFAULT_ENGINE: EngineName = "mujoco"
+"""Engine of runners, commands, searches and comparisons that name none."""
 PhysicsPreset = Literal["accurate", "fast"]
 ControlMode = Literal["pid", "drive", "effort"]
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
@@ -115,11 +114,11 @@ class Scene(OptionGroup):
         option(
             "snapshot",
             "recording",
-            flag="Physics engine; mujoco is several times as fast, with other contacts.",
+            flag="Physics engine; sapien is several times as slow, with other contacts.",
         ),
     ] = DEFAULT_ENGINE
-    """Physics engine: ``"sapien"``, the reference and the default where it is installed, or
-    ``"mujoco"``, several times as fast (docs/performance.md).
+    """Physics engine: ``"mujoco"`` (the default), or ``"sapien"``, which is for Linux on x86-64 and
+    several times as slow (docs/performance.md).
     """
     physics: Annotated[
         PhysicsPreset | Physics | MujocoSolver,
@@ -167,7 +166,8 @@ class Scene(OptionGroup):
     ``obs.wrench``; default none. SAPIEN needs ``dissipation="urdf"``.
     """
     build: Annotated[Callable[[Any, int], Any] | None, option("snapshot", "scene")] = None
-    """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env.
+    """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env;
+    it needs ``engine="sapien"``.
     Visuals and lights are ignored, so code that was written for a screen runs unchanged. It may
     return the entities that :meth:`batchpid.sim.Runner.poses` reports. A reset returns the content
     to the poses that ``build`` gave it.

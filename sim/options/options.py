@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Annotated, Any, Concatenate, ParamSpec, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,6 @@ from batchpid.sim.signals.quantities import (
 )
 from batchpid.sim.tool_space import OperationalSpace
 
-P = ParamSpec("P")
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
 GROUPS = (Scene, Timing, Control, Faults, Workers)
@@ -336,15 +335,6 @@ def checked_option(name: str, value: object) -> Any:
     Raises InvalidArgumentError if a number is out of bounds, or the value is of another type.
     """
     return plain(name, KINDS[name], value)
-
-
-def arguments_of(
-    record: Callable[P, object],
-) -> Callable[[Callable[..., None]], Callable[Concatenate[object, P], None]]:
-    """Decorate an ``__init__`` that forwards its arguments to ``record``, so that editors show that
-    signature.
-    """
-    return lambda init: init
 
 
 def _plain(value: Any) -> object:

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -27,7 +27,9 @@ from batchpid.checks.validate import choice, file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 from batchpid.sim.signals.quantities import OBSERVED
-from batchpid.sim.signals.rollout import Rollout
+
+if TYPE_CHECKING:
+    from batchpid.sim.rollout import Rollout
 
 FORMATS = (".png", ".svg")
 """Suffixes of the files that :func:`save` writes."""

@@ -22,8 +22,8 @@ from batchpid.checks.validate import flag, instance
 from batchpid.errors import ClosedError, InvalidArgumentError, SingleOwner
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import RecordingError
+from batchpid.sim.rollout import RunInfo
 from batchpid.sim.signals.quantities import Observation
-from batchpid.sim.signals.rollout import RunInfo
 from batchpid.stages.values import Command
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import LIMIT_TOLERANCE, Finding
 from batchpid.sim.robot.merging import merge_links, place_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import (
@@ -59,9 +59,6 @@ def suggested_effort_limit(
     inertia = np.abs(mass_matrix).sum(2).max(0)
     efforts: Float64 = GRAVITY_MARGIN * still + SPEED * np.asarray(damping) + ACCELERATION * inertia
     return efforts
-
-
-LIMIT_TOLERANCE = 1e-6  # rad or m
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -19,9 +19,10 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import read_only
+from batchpid.sim.geometry.inertia import LEAST_MASS
 from batchpid.sim.geometry.shapes import inertia_of
 from batchpid.sim.robot.parts import Joint, Placement
-from batchpid.sim.robot.tables import LEAST_MASS, NO_TURN, ORIGIN, Body, Tables
+from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Tables
 from batchpid.task_space.frames import SpatialInertia, compose, matrix_of, rotate, total
 
 Separate = tuple[str, ...]

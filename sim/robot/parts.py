@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
 from batchpid.task_space.frames import SpatialInertia
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")

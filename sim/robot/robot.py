@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,8 +17,8 @@ from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.elementwise import read_only
 from batchpid.checks.validate import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
+from batchpid.sim.findings import Finding, Findings, report
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.findings import Findings, report
 from batchpid.sim.robot.mimics import couple
 from batchpid.sim.robot.parts import DISSIPATION, Joint, Settings
 from batchpid.sim.robot.robot_options import load_robot_actuators, setpoint_guard
@@ -179,7 +179,13 @@ class Robot(RobotDescription):
 
         if params is None and self.settings is not None and control == "pid":
             params = self.params()
-        return check(self, params, qpos, setpoint, timestep, control, engine)
+        of_engine: Iterable[Finding] = ()
+        if engine is not None:
+            # The one import that leads upwards: an engine knows robots, and is asked by its name.
+            from batchpid.sim.engine.protocol import engine_findings
+
+            of_engine = engine_findings(self, engine, timestep)
+        return check(self, params, qpos, setpoint, timestep, control, of_engine)
 
     def guard(
         self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None

@@ -14,8 +14,8 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.distances import Contacts
-from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.merging import merge_links, rigid_bodies
 from batchpid.sim.robot.parts import DisabledPair, Joint
 from batchpid.sim.robot.simulated_links import rigid_tree

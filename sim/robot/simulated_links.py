@@ -14,8 +14,8 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import read_only
+from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.shapes import Shape, half_extents
-from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.merging import Separate, link_inertias, merge_links, place_links
 from batchpid.sim.robot.parts import LinkMass
 from batchpid.sim.robot.tables import Tables

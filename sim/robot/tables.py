@@ -27,16 +27,15 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.motors import Actuators
+from batchpid.sim.findings import Finding
+from batchpid.sim.geometry.inertia import LEAST_MASS
 from batchpid.sim.geometry.shapes import Shape
-from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.parts import DisabledPair, FileDefaults, Joint, MjcfFile, Placement
 from batchpid.task_space.frames import SpatialInertia, matrix_of
 
 ORIGIN = read_only(np.zeros(3))
 NO_TURN = read_only(np.array([1.0, 0.0, 0.0, 0.0]))
 NO_INERTIA = read_only(np.zeros((3, 3)))
-LEAST_MASS = 1e-9
-"""Mass [kg] of a row without mass: 0 stands for a mass that the file does not give."""
 
 
 class Body(NamedTuple):

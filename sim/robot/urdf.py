@@ -18,10 +18,10 @@ from lxml import etree
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import is_name
 from batchpid.errors import RobotError
+from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
 from batchpid.sim.geometry.mesh_files import LARGEST, check_mesh, find_mesh
 from batchpid.sim.geometry.shapes import Shape
-from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.mjcf.model import unique
 from batchpid.sim.robot.mjcf.reader import read_mjcf
 from batchpid.sim.robot.parts import MOVING_TYPES, Joint, Mimic

@@ -14,11 +14,11 @@ from lxml import etree
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.export.differences import Exported
+from batchpid.sim.findings import summary
 from batchpid.sim.geometry.inertia import MOMENTS
 from batchpid.sim.geometry.mesh_files import find_mesh
 from batchpid.sim.geometry.shapes import Shape, mesh_file
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.merging import link_inertias
 from batchpid.sim.robot.tables import NO_TURN, Body
 from batchpid.sim.robot.urdf import UNUSED, is_mjcf, read_robot

@@ -15,8 +15,8 @@ from pathlib import Path
 from lxml import etree
 
 from batchpid.errors import RobotError
+from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.mesh_files import LARGEST, LFS_POINTER, parse_bytes
-from batchpid.sim.robot.findings import Finding
 
 SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
 MOST_PREFIXES = 100  # of namespaces that nobody declared

@@ -28,9 +28,9 @@ from batchpid.sim.loop.loop import Loop
 from batchpid.sim.loop.snapshot import Snapshot, join_rows
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
+from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE
 from batchpid.sim.runner.arguments import base_rows, joint_rows
 from batchpid.sim.runner.runner_state import RunnerState
-from batchpid.sim.signals.rollout import ACTUATORS, PARAMS, RESET, RESTORE
 from batchpid.sim.workers.pool import Outcome
 from batchpid.sim.workers.requests import Request
 from batchpid.stages.stage import by_name

@@ -5,9 +5,9 @@ from __future__ import annotations
 from batchpid.errors import warn
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.diagnosis.run_checks import SetpointCheck
+from batchpid.sim.findings import report_shortfalls
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.findings import report_shortfalls
 from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.pool import RecoveryWarning

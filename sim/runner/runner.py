@@ -9,14 +9,13 @@ editors and readers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from inspect import Signature, signature
 from operator import itemgetter
 from pathlib import Path
 from time import strftime
-from typing import Any, ClassVar, Protocol, get_args
+from typing import Any, Literal, Never, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,13 +23,28 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Progress, Rows
 from batchpid.checks.validate import check_keywords, choice, instance
-from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
+from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner
 from batchpid.io.files import package_versions
+from batchpid.sim.engine.physics import MujocoSolver, Physics
 from batchpid.sim.loop.backend import describe, native_obstacle
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.options.groups import DEFAULT_ENGINE
-from batchpid.sim.options.options import KINDS, OPTIONS, RunnerOptions, arguments_of, checked_option
+from batchpid.sim.options.groups import (
+    DEFAULT_ENGINE,
+    Backend,
+    Compensation,
+    Controller,
+    ControlMode,
+    EngineName,
+    FaultAction,
+    InvalidInputAction,
+    PhysicsPreset,
+    Ray,
+)
+from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.rollout import Rollout, RunInfo
 from batchpid.sim.runner.arguments import count_ticks, read_command
 from batchpid.sim.runner.operations import (
     Operation,
@@ -48,10 +62,10 @@ from batchpid.sim.runner.operations import (
 from batchpid.sim.runner.run_warnings import RunWarnings
 from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.signals.quantities import CommandSpec, Observation, empty_observation
-from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, WorkerPool
+from batchpid.stages import Stage
 from batchpid.stages.values import Command
 
 CHECKPOINT_STEPS = 8000
@@ -86,8 +100,30 @@ class Runner(SingleOwner):
 
     Parameters
     ----------
-    robot, num_envs, params, workers, timestep, ...
-        See :class:`batchpid.sim.RunnerKeywords`.
+    robot, num_envs
+        From :meth:`batchpid.sim.Robot.load`; number of robots, one in each scene.
+    params, control, tool, compensate
+        PID parameters, default those of the robot; law: "pid", "drive", "effort", "osc" for the
+        link ``tool``, or a :class:`batchpid.sim.Controller`; forces that are compensated.
+    timestep, substeps
+        Time step of simulation and control [s]; sim steps of a tick.
+    actuators, guard, stages
+        Motors and sensors, default the robot's; limits of setpoints; further stages of a sim step.
+    engine, physics, collisions, ground, build
+        Physics engine, "mujoco" or "sapien"; its solver settings; collision shapes; a ground at
+        height 0; content of SAPIEN's scenes.
+    contacts, wrenches
+        Links whose contact forces, and links whose wrenches are observed.
+    randomization
+        Distributions from which robots are drawn for each env and episode.
+    workers, first_env, timeout, cluster, backend
+        Processes that step the scenes, default one per core, 0 for this process; number of the
+        first env; time after which a worker counts as stuck [s]; machines; "numpy" or "jax".
+    on_fault, on_invalid_input, speed_limit
+        Failed envs "hold" or "reset"; inputs that are not finite "raise", or are contained by
+        failures ("contain"); joint speed at which an env fails.
+
+    docs/runner.md has their ranges, :class:`batchpid.sim.RunnerOptions` their texts.
 
     Raises
     ------
@@ -95,15 +131,70 @@ class Runner(SingleOwner):
         An argument is out of range; raised before any process starts.
     """
 
-    __signature__: ClassVar[Signature]
     instead = "make another Runner with the same options, and restore a runner.snapshot() in it"
 
-    @arguments_of(RunnerOptions)
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        check_keywords("Runner", options, OPTIONS)
-        if "engine" not in options and DEFAULT_ENGINE != "sapien":
-            warn(f"SAPIEN is not installed: the engine is {DEFAULT_ENGINE!r}", UserWarning)
-        self.options = checked = RunnerOptions(*arguments, **options)
+    def __init__(
+        self,
+        robot: Robot,
+        num_envs: int,
+        *,
+        params: bp.PIDParams | None = None,
+        workers: int | None = None,
+        timestep: float = 1 / 2000,
+        substeps: int = 20,
+        control: ControlMode | Literal["osc"] | Controller = "pid",
+        tool: str | None = None,
+        compensate: Compensation = "gravity+coriolis+friction",
+        actuators: bp.Actuators | None = None,
+        guard: bool | bp.Guard | None = None,
+        stages: Sequence[Stage] = (),
+        engine: EngineName = DEFAULT_ENGINE,
+        physics: PhysicsPreset | Physics | MujocoSolver = "accurate",
+        collisions: bool = True,
+        ground: bool | None = None,
+        contacts: Sequence[str] | None = None,
+        randomization: Randomization | None = None,
+        on_fault: FaultAction = "hold",
+        wrenches: Sequence[str] | None = None,
+        build: Callable[[Any, int], Any] | None = None,
+        backend: Backend = "numpy",
+        speed_limit: ArrayLike | None = None,
+        on_invalid_input: InvalidInputAction = "raise",
+        first_env: int = 0,
+        timeout: float = 60.0,
+        cluster: Literal["ray"] | Ray | None = None,
+        **unknown: Never,
+    ) -> None:
+        check_keywords("Runner", unknown, OPTIONS)
+        self.options = checked = RunnerOptions(
+            robot,
+            num_envs,
+            params=params,
+            workers=workers,
+            timestep=timestep,
+            substeps=substeps,
+            control=control,
+            tool=tool,
+            compensate=compensate,
+            actuators=actuators,
+            guard=guard,
+            stages=stages,
+            engine=engine,
+            physics=physics,
+            collisions=collisions,
+            ground=ground,
+            contacts=contacts,
+            randomization=randomization,
+            on_fault=on_fault,
+            wrenches=wrenches,
+            build=build,
+            backend=backend,
+            speed_limit=speed_limit,
+            on_invalid_input=on_invalid_input,
+            first_env=first_env,
+            timeout=timeout,
+            cluster=cluster,
+        )
         """Options, checked."""
         self.robot = checked.robot
         self.num_envs = checked.num_envs
@@ -746,9 +837,3 @@ class Runner(SingleOwner):
         """Return the number of ticks that one request may have: none beyond the next checkpoint."""
         left = CHECKPOINT_STEPS - self._state.steps_since_checkpoint % CHECKPOINT_STEPS
         return min(len(self._pool.arrays.observation.ok), -(-left // self.options.substeps))
-
-
-_PARAMETERS = signature(RunnerOptions).parameters.items()
-Runner.__signature__ = Signature(
-    [one.replace(annotation=get_args(KINDS[name])[0]) for name, one in _PARAMETERS]
-)

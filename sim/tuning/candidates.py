@@ -52,8 +52,8 @@ from batchpid.metrics import StepMetrics
 from batchpid.sim.diagnosis.causes import absolute_band
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.rollout import Rollout
 from batchpid.sim.runner.runner import Runner
-from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.tuning.evaluation import (
     arm_joints,
     following_error,

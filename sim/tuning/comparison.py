@@ -13,7 +13,7 @@ from batchpid.arrays.array_types import Document, Progress
 from batchpid.motors import DRIVEN
 from batchpid.sim.diagnosis.text import cause_lines, median_and_worst, overshoot_of_settled, table
 from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.options.groups import EngineName
+from batchpid.sim.options.groups import DEFAULT_ENGINE, EngineName
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.evaluation import (
@@ -21,7 +21,6 @@ from batchpid.sim.tuning.evaluation import (
     arm_joints,
     evaluate_gains,
     reseeded,
-    tuning_engine,
 )
 from batchpid.sim.tuning.gain_sets import GainSet, default_sets, gain_set
 from batchpid.sim.tuning.moves import random_moves, tutorial_move
@@ -181,7 +180,7 @@ def compare(
     if isinstance(engine, str):
         engine = (engine,)
     # The flag without a word is an empty tuple.
-    engine = engine or (tuning_engine(runner_options.get("build")),)
+    engine = engine or (DEFAULT_ENGINE,)
     titles = {name: load_engine(name).title for name in engine}
     named = gains or default_sets(robot)
     sets = [gain_set(robot, entry) if isinstance(entry, str) else entry for entry in named]

@@ -26,12 +26,11 @@ from batchpid.io import documents
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.diagnosis.causes import absolute_band
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
-from batchpid.sim.options.groups import EngineName
 from batchpid.sim.randomization.checks import check_robot
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.rollout import Rollout
 from batchpid.sim.runner.runner import Runner
-from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.tuning.moves import (
     Moves,
     shortest_durations,
@@ -69,15 +68,6 @@ class Evaluation(NamedTuple):
     """Largest error on the same moves as smooth motions [rad or m]: :func:`following_error`; None
     if not asked for.
     """
-
-
-def tuning_engine(build: object) -> EngineName:
-    """Return the default engine of searches and comparisons: MuJoCo, which is several times as
-    fast, unless scenes have content of the user's for SAPIEN.
-    """
-    if build is None:
-        return "mujoco"
-    return "sapien"
 
 
 def step_response_metrics(

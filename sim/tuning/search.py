@@ -30,12 +30,12 @@ from batchpid.arrays.array_types import Document, Float64, Progress
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import package_versions
-from batchpid.sim.options.groups import EngineName
+from batchpid.sim.options.groups import DEFAULT_ENGINE, EngineName
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.candidates import FACTORS, Candidates
 from batchpid.sim.tuning.comparison import Comparison, compare
-from batchpid.sim.tuning.evaluation import SUBSTEPS, reseeded, tuning_engine
+from batchpid.sim.tuning.evaluation import SUBSTEPS, reseeded
 from batchpid.sim.tuning.gain_sets import GainSet, gain_table
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
@@ -119,7 +119,7 @@ def tune(
     moves: Moves | None = None,
     randomization: Randomization | None = None,
     motors: bp.Actuators | None = None,
-    engine: EngineName | None = None,
+    engine: EngineName = DEFAULT_ENGINE,
     workers: int | None = None,
     progress: Progress[Any] | None = None,
     **runner_options: Any,
@@ -155,7 +155,7 @@ def tune(
         same for all candidates, and the worst move counts as much as the mean. The controller knows
         the robot's own actuators.
     engine
-        Physics engine. Default: mujoco, or sapien with a ``build``.
+        Physics engine.
     workers
         Processes that step the scenes; 0: this one. Default: one per available core.
     progress
@@ -186,7 +186,6 @@ def tune(
         remedy = "leave it out: the control knows the actuators of the robot"
         raise InvalidArgumentError("actuators", "cannot be combined with motors", remedy=remedy)
     build = runner_options.get("build")
-    engine = tuning_engine(build) if engine is None else engine
     # Options of all rollouts; the search adds fast ones where moves are free of contact.
     scene: Document = {"engine": engine, "workers": workers, **runner_options}
     options: Document = {"substeps": SUBSTEPS, **scene}

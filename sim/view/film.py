@@ -24,9 +24,9 @@ from batchpid.checks.validate import file_path, integer, number
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import replacing
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.shapes import Surface
-from batchpid.sim.signals.rollout import Rollout
+from batchpid.sim.rollout import Rollout
 from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
+from batchpid.sim.view.surfaces import Surface
 from batchpid.sim.view.view_data import Playback, rows_at
 from batchpid.task_space.frames import matrix_of, rotate
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from batchpid.errors import MissingDependencyError
 from batchpid.io.packages import uninterrupted
-from batchpid.sim.robot.findings import summary
-from batchpid.sim.signals.rollout import Rollout
+from batchpid.sim.findings import summary
+from batchpid.sim.rollout import Rollout
 from batchpid.sim.view.panel import Panel
 from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
 from batchpid.sim.view.view_data import HISTORY_SECONDS, ViewData

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from batchpid.errors import BatchPIDError
-from batchpid.sim.signals.rollout import Rollout
+from batchpid.sim.rollout import Rollout
 from batchpid.sim.view.view_data import LiveSimulation, ViewData
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.findings import Finding
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.view.surfaces import surfaces
 from batchpid.task_space.frames import placed

@@ -17,10 +17,10 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from batchpid.io.packages import imported
+from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.mesh_files import find_mesh, read_mesh
 from batchpid.sim.geometry.shapes import Shape, convex_hull
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.urdf import SHAPES, is_mjcf, read_origin, read_shape
 from batchpid.sim.robot.xml import parse_xml, read_numbers
 from batchpid.task_space.frames import matrix_of, rotate

@@ -18,9 +18,9 @@ from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.rollout import Rollout, RunInfo
 from batchpid.sim.runner.runner import Runner
 from batchpid.sim.signals.quantities import Observation
-from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.view.scene import MAX_ROBOTS
 
 HISTORY_SECONDS = 8.0

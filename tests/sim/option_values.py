@@ -12,7 +12,8 @@ from thermal import Thermal
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
 import batchpid as bp
-from batchpid.sim import MujocoSolver, Physics, Randomization, Robot, RunnerKeywords, Uniform
+from batchpid.sim import MujocoSolver, Physics, Randomization, Robot, Uniform
+from batchpid.sim.options.options import RunnerKeywords
 
 
 def label(value):

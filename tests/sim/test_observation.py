@@ -7,7 +7,7 @@ import pytest
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Fault, Rollout, Runner
-from batchpid.sim.signals.rollout import PARAMS, RESET
+from batchpid.sim.rollout import PARAMS, RESET
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_rollouts_of_other_runs_are_not_joined(panda):
     with pytest.raises(InvalidArgumentError, match=r"part 1 does not go on .* time; join all"):
         Rollout.join(parts)
     one, other = (successive(panda, lambda runner: None) for _ in range(2))
-    info = dataclasses.replace(other[1].info, params=panda.params(kp=5.0), engine="mujoco")
+    info = dataclasses.replace(other[1].info, params=panda.params(kp=5.0), engine="sapien")
     with pytest.raises(InvalidArgumentError, match="the one before it: engine, params"):
         Rollout.join([one[0], dataclasses.replace(other[1], info=info)])
     assert len(Rollout.join([one[0], other[1]]).time) == 6

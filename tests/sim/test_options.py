@@ -11,6 +11,7 @@ import sys
 from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -18,16 +19,16 @@ from option_values import DECLARED
 from robots import load_bundled
 
 import batchpid as bp
+import batchpid.sim
 from batchpid.errors import MissingDependencyError
 from batchpid.sim import (
     RunInfo,
     Runner,
-    RunnerKeywords,
     RunnerOptions,
 )
 from batchpid.sim.cli import parse
 from batchpid.sim.engine.protocol import SceneSpec
-from batchpid.sim.options.options import GROUPS
+from batchpid.sim.options.options import GROUPS, RunnerKeywords
 
 PANDA = load_bundled("panda")
 OWN = bp.make_actuators(PANDA.dof, coulomb=0.3, armature=0.05, command_delay=0.002)
@@ -35,13 +36,28 @@ GEARED = dataclasses.replace(PANDA, actuators=OWN)
 
 
 def test_every_keyword_is_an_option_and_is_shown_with_its_default():
-    robot, num_envs, *options = inspect.signature(Runner).parameters.values()
-    assert (robot.name, num_envs.name) == ("robot", "num_envs")
+    robot, num_envs, *options, unknown = inspect.signature(Runner).parameters.values()
+    assert (robot.name, num_envs.name, unknown.name) == ("robot", "num_envs", "unknown")
     defaults = {entry.name: entry.default for entry in fields(RunnerKeywords)}
+    kinds, declared = get_type_hints(Runner.__init__), get_type_hints(RunnerKeywords)
     assert {*DECLARED} == {"robot", "num_envs", *(parameter.name for parameter in options)}
     for parameter in options:
+        name = parameter.name
         assert parameter.kind is inspect.Parameter.KEYWORD_ONLY
-        assert parameter.default == defaults[parameter.name], parameter.name
+        assert parameter.default == defaults[name], name
+        assert kinds[name] == declared[name], name
+        assert re.search(rf"\b{name}\b", Runner.__doc__), name
+
+
+def test_public_names_and_modules_are_attributes_that_editors_list():
+    for package in (bp, batchpid.sim):
+        for name in dir(package):
+            assert getattr(package, name) is not None
+    assert {"Runner", "tuning", "plots"} <= {*dir(batchpid.sim)}
+    assert {"sim", "trajectories", "metrics", "export", "task_space"} <= {*dir(bp)}
+    for module, name in ((bp, "simulation"), (batchpid.sim, "runners")):
+        with pytest.raises(AttributeError, match=name):
+            getattr(module, name)
 
 
 def test_a_missing_jax_is_named_with_its_extra_before_a_worker_starts(monkeypatch):

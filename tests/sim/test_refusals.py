@@ -283,7 +283,6 @@ CALLS: list[tuple[str, dict[str, Any], str]] = [
     ("reset", {"seed": 0}, "seed"),
     ("reset", {"base_pose": np.zeros(7)}, "base_pose"),
     ("reset", {"base_twist": np.zeros(6)}, "base_twist"),
-    ("poses", {}, "build"),
     ("bodies", {"names": ["ball"]}, "names"),
     ("params", {"value": load_bundled("panda").params()}, "params"),
     ("actuators", {"value": bp.make_actuators(3, strength=0.9)}, "actuators"),

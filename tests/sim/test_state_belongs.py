@@ -31,6 +31,7 @@ BASE = {
     "substeps": 20,
     "speed_limit": 0.6,
     "ground": True,
+    "engine": "sapien",
     "build": VALUES["build"][0],
 }
 """In the run, env 1 becomes faster than the limit after the snapshot, and a box falls."""

@@ -44,7 +44,6 @@ for options, setpoint in cases:
     assert seen.ok.all()
 assert not tried
 assert "jax" not in sys.modules
-print("THE ENGINE WAS NAMED", file=sys.stderr, flush=True)
 """
 COMMANDS = """
 import os
@@ -56,7 +55,7 @@ os.chdir(tempfile.mkdtemp())
 for command in (
     "inspect panda",
     "rollout panda --seconds 0.5 --num-envs 2 --workers 0 --out run.h5",
-    "compare panda --moves 1 --workers 0 --seconds 0.2",
+    "compare panda --moves 1",
     "export panda --to mjcf --out panda.xml",
 ):
     sys.argv = ["batchpid", *command.split()]
@@ -79,8 +78,4 @@ def test_all_but_sapiens_own_works_without_it():
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    before, _, after = done.stderr.partition("THE ENGINE WAS NAMED")
-    missing = "SAPIEN is not installed: the engine is 'mujoco'"
-    assert missing not in before
-    assert missing in after + done.stdout
     assert "Traceback" not in done.stdout + done.stderr

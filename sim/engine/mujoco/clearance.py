@@ -28,8 +28,6 @@ Arrays = dict[str, NDArray[Any]]
 _NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _NEVER = 1 << 30
 """Age without a proof: NEVER in ``clearance.h``."""
-_MOST_NEAR = 16
-"""MOST_NEAR in ``clearance.h``."""
 _POINTERS = "body_geomnum", "body_contype", "body_conaffinity"
 _BEGINNING = 4096
 """Number of bytes at the start of ``mjModel`` that are searched for its options; ``mjModel`` is
@@ -204,16 +202,16 @@ class GroupClearance:
             "places": np.array([scene.geom_xpos.ctypes.data for scene in data], np.uint64),
             "turns": np.array([scene.geom_xmat.ctypes.data for scene in data], np.uint64),
             "last": aligned(blocks, dof, WIDTH),
-            "shares": aligned(blocks, 3, WIDTH),
-            **{name: aligned(blocks, ways, WIDTH) for name in ("moved", "rate", "near_rate")},
+            "shares": aligned(blocks, 2, WIDTH),
+            "moved": aligned(blocks, ways, WIDTH),
+            "rate": aligned(blocks, ways, WIDTH),
             "open": np.zeros((robots, bodies), np.int8),
-            "left": np.zeros((robots, pairs), np.uint16),
+            "left": np.zeros((robots, -(-pairs // WIDTH) * WIDTH), np.uint16),
             "wait": np.ones(robots, np.int32),
             "no_shapes": np.zeros(bodies, np.int32),
             "some_types": np.zeros(bodies, np.int32),
             "brief": np.zeros(robots, np.int8),
-            # No pair is near, and no proof is young enough: the first step checks all pairs.
-            "near": np.full((robots, _MOST_NEAR), -1, np.int32),
+            # No proof is young enough: the first step checks all pairs.
             "age": np.full(robots, _NEVER, np.int32),
         }
         if floats:

@@ -18,7 +18,7 @@ import numpy as np
 from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.findings import Notes
+from batchpid.sim.findings import Notes
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.mjcf.model import RobotInFile, compile_scene
 from batchpid.sim.robot.mjcf.reader import home

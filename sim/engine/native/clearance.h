@@ -38,15 +38,14 @@ struct Clearance {
   Lanes *last;                       // (blocks, dof): positions after the last sim step
   double *poses;                     // (robots, 7): of floating bases, or null
   Lanes *moved;                      // (blocks, ways): sum of |dq| since the last proof
-  std::uint16_t *left;               // (robots, pairs): clearances [m], as from `shortened`, or NOT_PROVED
-  Lanes *rate, *near_rate;           // (blocks, ways): largest arm over clearance of other pairs, and those in `near`
-  // (blocks, 3): shares of the clearances that are used since the last proof by `rate` and, since the pairs in `near` were
-  // checked, by `near_rate`; and that of the latter at which they have to be checked again.
+  std::uint16_t *left;               // (robots, pairs rounded up): clearances [m], as from `shortened`, or NOT_PROVED
+  Lanes *rate;                       // (blocks, ways): largest arm over clearance of all pairs [1/rad, 1/m]
+  // (blocks, 2): bound of the share that a clearance has lost since the last proof or check of all pairs, and the share
+  // that it may lose until the next.
   Lanes *shares;
   std::int32_t *wait;                // (robots,): sim steps to the next attempt to prove the open pairs; 0 without any
   std::int32_t *age;                 // (robots,): sim steps since the last proof
   char *brief;                       // (robots,): whether the last proof held for BRIEF sim steps or less
-  std::int32_t *near;                // (robots, MOST_NEAR): pairs that are checked one by one; -1 after the last
   char *open;                        // (robots, all bodies): whether the body has a pair without a proof
   std::int32_t const *no_shapes;     // (all bodies,): zeros
   std::int32_t *some_types;          // (all bodies,): masks of bodies in pairs without a proof; work space
@@ -58,14 +57,14 @@ struct Clearance {
 
 constexpr double MARGIN = 1e-4;        // [m], far above the rounding of positions and of MuJoCo's own distances
 constexpr double SHARE = 0.25;         // share of a clearance after whose use the clearance is computed again
+constexpr double LARGEST_SHARE = 0.75;  // of a clearance that may be used before a new proof
+constexpr double LEAST_CLEARANCE = 1e-30;  // [m], that has two bytes other than 0
 constexpr double TIGHT = 0.7;          // share of the true distance at which a lower bound is good enough
 constexpr int MOST_POINTS = 16;        // largest number of iterations of Gilbert's algorithm
 constexpr std::int32_t RETRY_STEPS = 50;  // sim steps between attempts to prove the open pairs
 constexpr std::int32_t NEVER = 1 << 30;   // age without a proof
 constexpr std::int32_t BRIEF = 1, PAUSE = 24;  // after a proof that held for BRIEF sim steps, no proof for PAUSE
 constexpr std::int32_t LEAST_STEPS = 4;   // least sim steps that a proof must last; nearer pairs are left to MuJoCo
-constexpr std::int32_t LONG_STEPS = 64;   // after a proof that held as long no pairs are checked one by one
-constexpr int MOST_NEAR = 16;
 
 // Shapes for which MuJoCo runs its collision detection in a sim step.
 enum class Looked { NONE, SOME, ALL };
@@ -88,6 +87,29 @@ inline double widened(std::uint16_t value) {
   float single = 0.0f;
   std::memcpy(&single, &bits, sizeof bits);
   return single;
+}
+
+// The same for WIDTH numbers.
+inline __attribute__((always_inline)) Lanes widened(std::uint16_t const *from) {
+  typedef std::uint16_t Halves __attribute__((vector_size(WIDTH * sizeof(std::uint16_t))));
+  typedef std::uint32_t Bits __attribute__((vector_size(WIDTH * sizeof(std::uint32_t))));
+  typedef float Singles __attribute__((vector_size(WIDTH * sizeof(float))));
+  Halves halves;
+  std::memcpy(&halves, from, sizeof halves);
+  Bits const bits = __builtin_convertvector(halves, Bits) << 16;
+  Singles singles;
+  std::memcpy(&singles, &bits, sizeof singles);
+  return __builtin_convertvector(singles, Lanes::Packed);
+}
+inline __attribute__((always_inline)) void write_shortened(Lanes positive, std::uint16_t *to) {
+  typedef std::uint16_t Halves __attribute__((vector_size(WIDTH * sizeof(std::uint16_t))));
+  typedef std::uint32_t Bits __attribute__((vector_size(WIDTH * sizeof(std::uint32_t))));
+  typedef float Singles __attribute__((vector_size(WIDTH * sizeof(float))));
+  Singles const singles = __builtin_convertvector(positive.of, Singles);
+  Bits bits;
+  std::memcpy(&bits, &singles, sizeof bits);
+  Halves const halves = __builtin_convertvector((bits - 1) >> 16, Halves);
+  std::memcpy(to, &halves, sizeof halves);
 }
 
 // One shape of one robot.
@@ -168,40 +190,20 @@ inline double distance_bound(PlacedShape const &a, PlacedShape const &b) {
   return best;
 }
 
-// The pairs that will use up their clearances first: those with the largest share used since the last proof.
-struct NearPairs {
-  double shares[MOST_NEAR];
-  std::int32_t pairs[MOST_NEAR];
-  int size = 0;
-
-  void add(std::int64_t pair, double share) {
-    if (size == MOST_NEAR && !(share > shares[MOST_NEAR - 1])) return;
-    int at = size < MOST_NEAR ? size++ : MOST_NEAR - 1;
-    for (; at > 0 && share > shares[at - 1]; --at) shares[at] = shares[at - 1], pairs[at] = pairs[at - 1];
-    shares[at] = share, pairs[at] = static_cast<std::int32_t>(pair);
-  }
-  // Write the numbers of the pairs in ascending order, and -1 after the last.
-  void write(std::int32_t *to) const {
-    std::copy(pairs, pairs + size, to);
-    std::sort(to, to + size);
-    std::fill(to + size, to + MOST_NEAR, -1);
-  }
-};
-
-// Return the largest share of the clearances of the near pairs of a robot that its motions have used.
-inline double near_share(Clearance const &clearance, std::int64_t row) {
+// Return the largest share of a clearance that the motions of a robot have used.
+FOR_EACH_PROCESSOR static double largest_share(Clearance const &clearance, std::int64_t row) {
   std::int64_t const ways = clearance.ways, blocks = (clearance.number + WIDTH - 1) / WIDTH;
-  Lanes const *moved = clearance.moved + row / WIDTH * ways;
-  std::int32_t const *near = clearance.near + row * MOST_NEAR;
-  double most = 0.0;
-  for (int at = 0; at < MOST_NEAR && near[at] >= 0; ++at) {
-    double used = 0.0;
+  std::uint16_t const *left = clearance.left + row * blocks * WIDTH;
+  Lanes most{};
+  for (std::int64_t block = 0; block < blocks; ++block) {
+    Lanes use{};
     for (std::int64_t way = 0; way < ways; ++way) {
-      used += clearance.arms[way * blocks + near[at] / WIDTH].of[near[at] % WIDTH] * moved[way].of[row % WIDTH];
+      use += clearance.arms[way * blocks + block] * Lanes(clearance.moved[row / WIDTH * ways + way].of[row % WIDTH]);
     }
-    most = std::max(most, used / widened(clearance.left[row * clearance.number + near[at]]));
+    Lanes const before = widened(left + block * WIDTH);
+    most = at_least(most, where_positive(before, use / before, 0.0));
   }
-  return most;
+  return largest(most);
 }
 
 // Recompute the clearances of one robot that are partly used up, and with `retry` also the clearances of open pairs.
@@ -209,63 +211,57 @@ inline double near_share(Clearance const &clearance, std::int64_t row) {
 FOR_EACH_PROCESSOR static bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
   std::int64_t const ways = clearance.ways, at = row / WIDTH * ways, k = row % WIDTH;
   std::int64_t const blocks = (clearance.number + WIDTH - 1) / WIDTH;
-  std::uint16_t *left = clearance.left + row * clearance.number;
-  std::int32_t *near = clearance.near + row * MOST_NEAR;
+  std::uint16_t *left = clearance.left + row * blocks * WIDTH;
   char *open = clearance.open + row * clearance.size;
   double const *places = clearance.places[row], *turns = clearance.turns[row];
   double const age = clearance.age[row];
-  thread_local std::vector<Lanes> use, inverse, near_inverse;
-  for (auto *table : {&use, &inverse, &near_inverse}) table->assign(static_cast<std::size_t>(blocks), Lanes{});
+  static thread_local std::vector<Lanes> room;
+  room.assign(static_cast<std::size_t>(2 * blocks), Lanes{});
+  Lanes *use = room.data(), *inverse = use + blocks;
   for (std::int64_t way = 0; way < ways; ++way) {
     Lanes const moved = clearance.moved[at + way].of[k];
     Lanes const *arms = clearance.arms + way * blocks;
     for (std::int64_t block = 0; block < blocks; ++block) use[block] += arms[block] * moved;
   }
-  auto const of = [](std::vector<Lanes> &table, std::int64_t pair) -> double & {
-    return reinterpret_cast<double *>(table.data())[pair];
-  };
-  NearPairs first;
   bool all = true;
   std::fill(open, open + clearance.size, char{0});
-  for (std::int64_t pair = 0; pair < clearance.number; ++pair) {
-    bool proved = left[pair] != NOT_PROVED;
-    if (proved || retry) {
-      double const used = of(use, pair);
-      double rest = widened(left[pair]) - used;
-      bool const anew = !proved || !(used < SHARE * rest);
-      if (anew) {
-        std::int64_t const a = clearance.pairs[2 * pair], b = clearance.pairs[2 * pair + 1];
-        rest = distance_bound({clearance, a, places + 3 * a, turns + 9 * a},
-                              {clearance, b, places + 3 * b, turns + 9 * b}) - MARGIN;
+  for (std::int64_t block = 0; block < blocks; ++block) {
+    std::uint16_t *own = left + block * WIDTH;
+    Lanes const before = widened(own), rests = before - use[block];
+    // Proofs that stay: most pairs.
+    Lanes const stays = below_mask(use[block], SHARE * rests) * below_mask(LEAST_CLEARANCE, rests);
+    write_shortened(at_least(rests, 0.0), own);
+    if (any_positive(1.0 - stays)) {
+      for (std::int64_t i = 0, pair = block * WIDTH; i < WIDTH && pair < clearance.number; ++i, ++pair) {
+        if (stays.of[i] > 0.0) continue;
+        bool const proved = before.of[i] > 0.0;
+        bool fades = true;
+        double rest = 0.0;
+        if (proved || retry) {
+          std::int64_t const a = clearance.pairs[2 * pair], b = clearance.pairs[2 * pair + 1];
+          rest = distance_bound({clearance, a, places + 3 * a, turns + 9 * a},
+                                {clearance, b, places + 3 * b, turns + 9 * b}) - MARGIN;
+          fades = (!proved || age < LEAST_STEPS) && !(LEAST_STEPS * use[block].of[i] < age * rest);
+        }
+        own[i] = fades ? NOT_PROVED : shortened(rest);
+        if (own[i] != NOT_PROVED) continue;
+        open[clearance.bodies[2 * pair]] = open[clearance.bodies[2 * pair + 1]] = 1;
+        all = false;
       }
-      bool const fades = anew && (!proved || age < LEAST_STEPS) && !(LEAST_STEPS * used < age * rest);
-      left[pair] = fades ? NOT_PROVED : shortened(rest);
-      proved = left[pair] != NOT_PROVED;
-      if (proved && age < LONG_STEPS) first.add(pair, used / rest);
     }
-    if (proved) {
-      of(inverse, pair) = 1.0 / widened(left[pair]);
-    } else {
-      open[clearance.bodies[2 * pair]] = open[clearance.bodies[2 * pair + 1]] = 1;
-      all = false;
-    }
+    Lanes const after = widened(own);
+    inverse[block] = where_positive(after, 1.0 / after, 0.0);
   }
-  first.write(near);
-  for (int i = 0; i < first.size; ++i) std::swap(of(inverse, near[i]), of(near_inverse, near[i]));
   for (std::int64_t way = 0; way < ways; ++way) {
     Lanes const *arms = clearance.arms + way * blocks;
-    Lanes most{}, near_most{};
-    for (std::int64_t block = 0; block < blocks; ++block) {
-      most = at_least(most, arms[block] * inverse[block]);
-      if (first.size > 0) near_most = at_least(near_most, arms[block] * near_inverse[block]);
-    }
+    Lanes most{};
+    for (std::int64_t block = 0; block < blocks; ++block) most = at_least(most, arms[block] * inverse[block]);
     clearance.rate[at + way].of[k] = largest(most);
-    clearance.near_rate[at + way].of[k] = largest(near_most);
     clearance.moved[at + way].of[k] = 0.0;
   }
-  Lanes *shares = clearance.shares + row / WIDTH * 3;
-  shares[0].of[k] = shares[1].of[k] = 0.0;
-  shares[2].of[k] = 1.0;
+  Lanes *shares = clearance.shares + row / WIDTH * 2;
+  shares[0].of[k] = 0.0;
+  shares[1].of[k] = 1.0;
   return all;
 }
 
@@ -282,17 +278,17 @@ inline void add_base_motion(double const *now, double *last, double *moved) {
   std::copy(now, now + 7, last);
 }
 
-// Masks of WIDTH robots: whether they are in the range of the arms, and whether the shares of their clearances hold.
+// Masks of WIDTH robots: whether they are in the range of the arms, and whether their proofs hold.
 struct Holding {
-  Lanes inside, proved, far;
+  Lanes inside, proved;
 };
 
 // Add the motion of a block of robots since the last sim step: positions (dof,), and the ways of floating bases, or null.
 FOR_EACH_PROCESSOR static void add_motion(Clearance const &clearance, std::int64_t block, Lanes const *qpos,
                                           Lanes const *base, Holding &holding) {
   std::int64_t const ways = clearance.ways, dof = base == nullptr ? ways : ways - 2, at = block * ways;
-  Lanes *last = clearance.last + block * dof, *shares = clearance.shares + 3 * block;
-  Lanes outside{}, used = shares[0], near_used = shares[1];
+  Lanes *last = clearance.last + block * dof, *shares = clearance.shares + 2 * block;
+  Lanes outside{}, used = shares[0];
   for (std::int64_t way = 0; way < ways; ++way) {
     Lanes moved;
     if (way < dof) {
@@ -305,16 +301,15 @@ FOR_EACH_PROCESSOR static void add_motion(Clearance const &clearance, std::int64
     }
     clearance.moved[at + way] += moved;
     used += clearance.rate[at + way] * moved;
-    near_used += clearance.near_rate[at + way] * moved;
   }
-  shares[0] = used, shares[1] = near_used;
-  holding = {1.0 - outside, below_mask(used, 1.0), below_mask(near_used, shares[2])};
+  shares[0] = used;
+  holding = {1.0 - outside, below_mask(used, shares[1])};
 }
 
 // Return the shapes that MuJoCo has to check of a robot, after a new proof if one is due; `place` writes its positions to
 // its mjData.
 template <class Place>
-Looked looked_at(Clearance const &clearance, std::int64_t row, Holding const &holding, Place place) {
+inline __attribute__((always_inline)) Looked looked_at(Clearance const &clearance, std::int64_t row, Holding const &holding, Place place) {
   std::int64_t const k = row % WIDTH;
   if (!(holding.inside.of[k] > 0.0)) return Looked::ALL;
   std::int32_t &wait = clearance.wait[row], &age = clearance.age[row];
@@ -322,12 +317,12 @@ Looked looked_at(Clearance const &clearance, std::int64_t row, Holding const &ho
   age = std::min(age + 1, NEVER);
   if (!retry && age > BRIEF && age <= BRIEF + PAUSE && clearance.brief[row] != 0) return Looked::ALL;
   bool proved = holding.proved.of[k] > 0.0;
-  if (proved && !(holding.far.of[k] > 0.0)) {
-    Lanes *shares = clearance.shares + row / WIDTH * 3;
-    double const most = near_share(clearance, row);
-    proved = most < 1.0;
-    shares[1].of[k] = 0.0;
-    shares[2].of[k] = 1.0 - most;
+  if (!proved) {
+    Lanes *shares = clearance.shares + row / WIDTH * 2;
+    double const most = largest_share(clearance, row);
+    proved = most < LARGEST_SHARE;
+    shares[0].of[k] = 0.0;
+    shares[1].of[k] = 1.0 - most;
   }
   if (retry || !proved) {
     if (!retry && age <= BRIEF) {

@@ -41,11 +41,13 @@ struct FreeRoom {
   Posed posed;
   std::vector<BodyMotion<Lanes>> motions;
   std::vector<Lanes> effort, acceleration, inverse, factor, cost, push, sign, active;
+  std::vector<double> efforts;  // (WIDTH, dof)
 
   explicit FreeRoom(std::int64_t dof) : posed(dof), motions(static_cast<std::size_t>(dof)) {
     auto const n = static_cast<std::size_t>(dof);
     for (auto *each : {&effort, &acceleration, &inverse, &cost, &push, &sign, &active}) each->resize(n);
     factor.resize(n * (n + 1) / 2);
+    efforts.resize(WIDTH * n);
   }
   // Return the memory of this thread.
   static FreeRoom &of(std::int64_t dof) {
@@ -140,14 +142,21 @@ inline __attribute__((always_inline)) Lanes solve_with_limits(FreeMotion const &
   return changed;
 }
 
-// Advance the robots of the mask `free` by the efforts in `room`. Return a mask of those that MuJoCo has to advance.
-FOR_EACH_PROCESSOR static bool advance_freely(FreeMotion const &of, std::int64_t block, FreeRoom &room, Lanes &free) {
+// Efforts of WIDTH robots, from row `first` of a table (rows, dof) on.
+struct Efforts {
+  double const *table;
+  std::int64_t first, rows;
+};
+
+// Advance the robots of the mask `free`, which loses those whose limits were not solved. Return whether all were.
+FOR_EACH_PROCESSOR static bool advance_freely(FreeMotion const &of, std::int64_t block, Efforts const &efforts,
+                                              FreeRoom &room, Lanes &free) {
   std::int64_t const dof = of.model->dof;
   Lanes *qpos = of.qpos + block * dof, *qvel = of.qvel + block * dof, *before = of.acceleration + block * dof;
   Lanes const *bias = of.bias + block * dof;
   Lanes *a = room.acceleration.data(), beyond{};
   for (std::int64_t j = 0; j < dof; ++j) {
-    a[j] = room.effort[j] - bias[j];
+    a[j] = gather(efforts.table, dof, j, efforts.first, efforts.rows) - bias[j];
     beyond += below_mask(qpos[j], of.low[j]) + below_mask(of.high[j], qpos[j]);
   }
   bool solved = true;

@@ -176,11 +176,11 @@ inline bool step_block(Group &group, Block const &block, double *qpos, double *q
 }
 
 // Do a sim step of a block of robots of which those without contact do not need MuJoCo.
-inline bool step_block_freely(Group &group, Block const &block, double *qpos, double *qvel, double *passive) {
+inline bool step_block_freely(Group &group, FreeRoom &room, Block const &block, double *qpos, double *qvel,
+                              double *passive) {
   Mujoco const &mujoco = *group.mujoco;
   FreeMotion const &free = *mujoco.free;
   std::int64_t const dof = group.dof, at = block.number * dof;
-  FreeRoom &room = FreeRoom::of(dof);
   Block unknown = block;
   bool written = false, is_free = false, good = true;
   for (std::int64_t row = block.first; row < block.end; ++row) {
@@ -200,11 +200,12 @@ inline bool step_block_freely(Group &group, Block const &block, double *qpos, do
     bool const own = free.contact[row] == Contact::NONE;
     is_free = is_free || own;
     mask.of[k] = own ? 1.0 : 0.0;
-    double const *effort = group.constraint == nullptr ? mujoco.qf + row * dof : joint_efforts(group, row);
-    for (std::int64_t j = 0; own && j < dof; ++j) room.effort[j].of[k] = effort[j];
+    if (own && group.constraint != nullptr) std::copy_n(joint_efforts(group, row), dof, room.efforts.data() + k * dof);
   }
   Lanes stepped = mask;
-  bool const solved = !is_free || advance_freely(free, block.number, room, stepped);
+  bool const is_asked = group.constraint == nullptr;
+  Efforts const efforts = is_asked ? Efforts{mujoco.qf, block.first, group.robots} : Efforts{room.efforts.data(), 0, WIDTH};
+  bool const solved = !is_free || advance_freely(free, block.number, efforts, room, stepped);
   for (std::int64_t row = block.first; row < block.end && good; ++row) {
     std::int64_t const k = row - block.first;
     if (!block.moves[k] || stepped.of[k] > 0.0) continue;
@@ -230,6 +231,7 @@ inline bool step_block_freely(Group &group, Block const &block, double *qpos, do
 // The same for the robots in MuJoCo. Return false, with a message, after an error of it.
 inline bool step_in_mujoco(Group &group, double const *effort, double *qpos, double *qvel, double *passive) {
   Mujoco const &mujoco = *group.mujoco;
+  FreeRoom *room = mujoco.free == nullptr ? nullptr : &FreeRoom::of(group.dof);
   bool good = true;
   StoppedClock const stopped(mujoco.clock);
   LogHandler const before = mujoco.set_log_handler(Messages::handle);
@@ -237,8 +239,8 @@ inline bool step_in_mujoco(Group &group, double const *effort, double *qpos, dou
   std::copy(effort, effort + group.robots * group.dof, mujoco.qf);
   for (std::int64_t number = 0; number * WIDTH < group.robots && good; ++number) {
     Block const block(group, number);
-    auto const step = mujoco.free != nullptr ? step_block_freely : step_block;
-    good = step(group, block, qpos, qvel, passive);
+    good = room != nullptr ? step_block_freely(group, *room, block, qpos, qvel, passive)
+                           : step_block(group, block, qpos, qvel, passive);
   }
   mujoco.set_log_handler(before);
   return good;

@@ -173,7 +173,7 @@ def _describe(part: object) -> Document:
             continue
         try:
             value = getattr(part, name)
-        except RuntimeError:  # a property of another kind of body
+        except (RuntimeError, SystemError):  # a property of another kind of body
             continue
         if isinstance(value, sapien.Pose):
             value = value.p, value.q

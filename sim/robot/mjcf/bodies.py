@@ -21,9 +21,9 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjModel
+from batchpid.sim.findings import Finding, Notes
 from batchpid.sim.geometry.inertia import possible_inertia
 from batchpid.sim.geometry.shapes import Shape, ShapeKind
-from batchpid.sim.robot.findings import Finding, Notes
 from batchpid.sim.robot.mjcf.model import RobotInFile, can_collide, label, unique
 from batchpid.sim.robot.mjcf.motors import Couplings, Motors
 from batchpid.sim.robot.parts import DisabledPair, Joint, Mimic

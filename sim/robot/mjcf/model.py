@@ -19,7 +19,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
-from batchpid.sim.robot.findings import Finding, Notes
+from batchpid.sim.findings import Finding, Notes
 
 PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 _PREFIXES = (

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import MjModel
-from batchpid.sim.robot.findings import Finding, Notes
+from batchpid.sim.findings import Finding, Notes
 from batchpid.sim.robot.mjcf.model import RobotInFile, label
 
 Couplings = dict[str, tuple[str, float, float]]

@@ -13,7 +13,7 @@ import numpy as np
 from batchpid.arrays.array_types import Document, Float64, MjModel
 from batchpid.arrays.elementwise import read_only
 from batchpid.motors import make_actuators
-from batchpid.sim.robot.findings import Finding, Notes
+from batchpid.sim.findings import Finding, Notes
 from batchpid.sim.robot.mjcf.bodies import TableReader, excluded_pairs
 from batchpid.sim.robot.mjcf.model import (
     PLANE,

@@ -14,7 +14,7 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 import batchpid as bp
 from batchpid.sim import Finding, Robot
-from batchpid.sim.robot.findings import KINDS, SEVERITIES
+from batchpid.sim.findings import KINDS, SEVERITIES
 
 BOX = '<collision><geometry><box size="{0} {0} {0}"/></geometry></collision>'
 COLLISION = BOX.format(0.1)

@@ -144,7 +144,14 @@ def test_reset_puts_followers_in_place_and_a_blocked_follower_holds_its_leader(p
     ]
     gripper = Robot.load(write(tmp_path, f'<robot name="gripper">{"".join(parts)}</robot>'))
     with Runner(
-        gripper, 1, control="effort", workers=0, physics=physics, ground=False, build=add_post
+        gripper,
+        1,
+        engine="sapien",
+        control="effort",
+        workers=0,
+        physics=physics,
+        ground=False,
+        build=add_post,
     ) as runner:
         np.testing.assert_array_equal(runner.reset([0.01, 5.0]).qpos[0], np.float32([0.01, 0.01]))
         rollout = runner.rollout(np.tile([10.0, 0.0], (50, 1)))

@@ -89,13 +89,13 @@ def test_poses_of_links_are_watched_by_name(tmp_path):
 
     poses, loaded = [], load(tmp_path, arm())
     for links in (None, fixed_links(loaded)):
-        options = {"params": loaded.params(kp=5.0), "wrenches": links}
+        options = {"engine": "sapien", "params": loaded.params(kp=5.0), "wrenches": links}
         with Runner(loaded, 1, build=build, workers=0, **options) as runner:
             runner.reset(qpos=np.array([0.3, -0.4]))
             poses.append(runner.poses()[0])
     np.testing.assert_allclose(*poses, atol=2e-6)
     with pytest.raises(InvalidArgumentError, match="names of the robot"):
-        Runner(loaded, 1, params=loaded.params(kp=5.0), build=lambda scene, env: "lens", workers=0)
+        Runner(loaded, 1, build=lambda scene, env: "lens", workers=0, **options)
 
 
 PAIRS = [("arm", "side"), ("tip", "side"), ("arm", "back"), ("tip", "back"), ("side", "back")]

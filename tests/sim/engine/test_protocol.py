@@ -160,7 +160,7 @@ ENGINE = engines.Engine(
 @pytest.fixture
 def toy(monkeypatch):
     """Make the toy the engine of all runners of this process."""
-    monkeypatch.setitem(engines.MODULES, "sapien", __name__)
+    monkeypatch.setitem(engines.MODULES, "mujoco", __name__)
 
 
 def runner(**options):

@@ -52,7 +52,8 @@ def balls_on_the_arm(scene, env):
 
 
 def run(build, num_envs=4, ticks=30, **options):
-    with Runner(ROBOT, num_envs, params=ROBOT.params(), build=build, **options) as runner:
+    options = {"engine": "sapien", "params": ROBOT.params(), "build": build, **options}
+    with Runner(ROBOT, num_envs, **options) as runner:
         rollout = runner.rollout(np.broadcast_to(ROBOT.start, (ticks, ROBOT.dof)))
         return rollout, runner.poses()
 
@@ -60,7 +61,12 @@ def run(build, num_envs=4, ticks=30, **options):
 @pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_content_falls_and_a_reset_puts_it_back(workers):
     with Runner(
-        ROBOT, 2, params=ROBOT.params(), workers=workers, build=box_beside_the_robot
+        ROBOT,
+        2,
+        engine="sapien",
+        params=ROBOT.params(),
+        workers=workers,
+        build=box_beside_the_robot,
     ) as runner:
         before = runner.poses()
         np.testing.assert_allclose(
@@ -133,7 +139,8 @@ def body_of(**properties):
     "properties", [{}, {"size": (0.1, 0.2)}, {"friction": (0.3, 0.4)}, {"mass": (1, 2)}]
 )
 def test_an_env_goes_on_only_where_build_makes_the_same_content(properties):
-    with Runner(ROBOT, 3, workers=0, params=ROBOT.params(), build=body_of(**properties)) as runner:
+    options = {"engine": "sapien", "workers": 0, "params": ROBOT.params()}
+    with Runner(ROBOT, 3, build=body_of(**properties), **options) as runner:
         runner.step(ROBOT.start)
         snapshot = runner.snapshot()
         runner.restore(snapshot.for_envs([1, 0, 2]))

@@ -54,7 +54,8 @@ def push(robot, efforts, seconds, physics="accurate", qvel=0.0, qpos=0.0, subste
     efforts = np.atleast_1d(efforts)
     setpoint = np.zeros((len(efforts), robot.dof))
     setpoint[:, 0] = efforts
-    options = {"control": "effort", "compensate": "none", "ground": False, "workers": 0} | options
+    options = {"engine": "sapien", "ground": False, "workers": 0} | options
+    options = {"control": "effort", "compensate": "none"} | options
     with Runner(robot, len(efforts), physics=physics, substeps=substeps, **options) as runner:
         runner.reset(np.zeros_like(setpoint) + qpos, qvel=np.zeros_like(setpoint) + qvel)
         ticks = round(seconds / (substeps * DT))

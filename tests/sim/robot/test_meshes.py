@@ -145,7 +145,7 @@ def test_a_mesh_that_only_the_engine_refuses_is_an_error_of_the_runner(tmp_path)
     (tmp_path / "odd.obj").write_bytes(obj().replace(b"1.0", b"1e-7"))
     loaded = Robot.load(write(tmp_path, arm("odd.obj")))
     with pytest.raises(RobotError, match=r"link 'arm'.*collision shape from .*odd\.obj; repair"):
-        Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0))
+        Runner(loaded, 1, engine="sapien", workers=0, params=loaded.params(kp=1.0))
 
 
 SCENE = """<mujoco><asset><mesh name="m" file="d.obj"/></asset><worldbody>

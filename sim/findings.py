@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 from batchpid.errors import RobotError, warn
 
+LIMIT_TOLERANCE = 1e-6
+"""Excess of a position over a joint limit that counts as rounding [rad or m]."""
 SEVERITIES = ("warning", "note")  # probably an error; good to know
 
 

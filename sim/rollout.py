@@ -16,7 +16,8 @@ from batchpid.arrays.digest import digest
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
-from batchpid.sim.robot.findings import Findings
+from batchpid.sim.diagnosis.causes import unsettled_findings
+from batchpid.sim.findings import Findings
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.quantities import (
     QUANTITIES,
@@ -378,9 +379,6 @@ class Rollout:
         InvalidArgumentError
             The robot is not known, or has other joints than the run.
         """
-        # Rooms above load where they are used.
-        from batchpid.sim.diagnosis.causes import unsettled_findings
-
         if robot is None:
             robot = self.info.description
         if robot is None:
