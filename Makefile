@@ -25,8 +25,8 @@ ARGS :=
 
 # Sources of the native extensions. BUILD builds those that are older than their sources.
 NATIVE := setup.py batchpid/native/extensions.py batchpid/sim/engine/native/interface.py \
-	$(filter-out $(wildcard batchpid/native/fused_*.h),$(foreach folder,batchpid/native batchpid/sim/engine/native,$(wildcard $(folder)/*.cpp $(folder)/*.h))) \
-	$(wildcard batchpid/native/*.py batchpid/law/*.py batchpid/stages/*.py)
+	$(filter-out %/passes.h,$(foreach folder,batchpid/native batchpid/sim/engine/native,$(wildcard $(folder)/*.cpp $(folder)/*.h))) \
+	$(wildcard batchpid/native/*.py batchpid/law/*.py)
 BUILD := $(STEP) "compiling native extensions" env -u BATCHPID_NATIVE $(RUN) -u -W ignore setup.py build_ext --inplace
 
 # Compiled modules are kept, whatever the caller's setting: the tests start hundreds of processes that import them.

@@ -81,15 +81,15 @@ class Build(build_ext):
 
 
 def write_passes():
-    """Write the headers with the passes of the commonest laws and loops, from their traces."""
+    """Write passes.h, one pass for each of the commonest laws, from their traces."""
     sys.path.insert(0, str(ROOT))
-    from batchpid.stages.passes import headers
+    from batchpid.native.passes import header
 
-    for name, text in headers().items():
-        file = ROOT / "batchpid" / "native" / name
-        # An equal file keeps its time, or all would be compiled again.
-        if not file.is_file() or file.read_text() != text:
-            file.write_text(text)
+    file = ROOT / "batchpid" / "native" / "passes.h"
+    text = header()
+    # An equal file keeps its time, or all would be compiled again.
+    if not file.is_file() or file.read_text() != text:
+        file.write_text(text)
 
 
 modules = [load(name) for name in MODULES] if os.environ.get("BATCHPID_NATIVE") != "0" else []

@@ -43,8 +43,12 @@ class StageProgram:
         shape: tuple[int, int],
         passes: bool = False,
     ) -> None:
-        constants, states, traced = traced_stages(stages, states, values, passes)
+        constants = mapped(_split, running(stages))
+        # Programs have no keys of noise, counts, or state of a controller.
+        states = mapped(_number, tuple(states))
         state, self.inputs = leaves(states), leaves((states, values))
+        histories = tuple([array.ndim == 3 for array in state])
+        traced = _trace(histories, passes, *map(structure, (constants, states, values)))
         masks = traced.program.masks
         self.outputs = [np.zeros(shape, bool if is_mask else float) for is_mask in masks]
         for array, place in zip(state, traced.places, strict=False):  # the state comes first
@@ -60,7 +64,7 @@ class StageProgram:
         self.program(*self.inputs, out=self.outputs)
 
 
-class TracedStages(NamedTuple):
+class _Traced(NamedTuple):
     """Program of some stages."""
 
     program: Trace
@@ -70,20 +74,6 @@ class TracedStages(NamedTuple):
     """Index of each of their arrays: inputs first, then results."""
 
 
-def traced_stages(
-    stages: Sequence[Any], states: States, values: Values, passes: bool = False
-) -> tuple[Pytree, States, TracedStages]:
-    """Return the constants of a program of stages, those of their states that it reads, and the
-    program; errors as in :class:`StageProgram`.
-    """
-    constants = mapped(_split, running(stages))
-    # Programs have no keys of noise, counts, or state of a controller.
-    numbers: States = mapped(_number, tuple(states))
-    histories = tuple([array.ndim == 3 for array in leaves(numbers)])
-    traced = _trace(histories, passes, *map(structure, (constants, numbers, values)))
-    return constants, numbers, traced
-
-
 @lru_cache(maxsize=64)
 def _trace(
     histories: tuple[bool, ...],
@@ -91,7 +81,7 @@ def _trace(
     constants: Any,
     states: Any,
     values: Any,
-) -> TracedStages:
+) -> _Traced:
     """Return the program of stages.
 
     The last three are structures of the stages, their states and the values before them.
@@ -121,7 +111,7 @@ def _trace(
         return results
 
     program = trace_trees(function, constants, states, values)
-    return TracedStages(program, *parts)
+    return _Traced(program, *parts)
 
 
 def _number(array: Array) -> Any:

@@ -3,7 +3,6 @@
 // It calls functions that SAPIEN's shared library exports. Their addresses and the objects' pointers come from Python
 // (sim/engine/sapien/calls.py), so that nothing of SAPIEN, PhysX or Eigen is needed to compile this file.
 
-#include "batchpid/native/fused_loops.h"
 #include "tick.h"
 
 using namespace batchpid;
@@ -125,7 +124,7 @@ PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
 // numbers in each row of a table (0: it is (rows, columns), -1: one number), and arrays.
 PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto bound = std::make_unique<BoundProgram>();
-  bound->program = make_program(arguments[0], detail::FUSED_LOOPS, std::size(detail::FUSED_LOOPS));
+  bound->program = make_program(arguments[0]);
   if (bound->program == nullptr) return nullptr;
   Program const &program = *bound->program;
   Index const numbers = program.rows * program.columns;

@@ -10,14 +10,7 @@ from __future__ import annotations
 import ctypes
 from typing import Any
 
-from batchpid.native.extensions import (
-    PASSES_VECTORIZED,
-    PROGRAMS,
-    RIGID_BODIES,
-    ROUNDED,
-    VECTORIZED_ONLY,
-    Extension,
-)
+from batchpid.native.extensions import PROGRAMS, RIGID_BODIES, ROUNDED, VECTORIZED_ONLY, Extension
 
 SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation7getQposEv",
@@ -327,12 +320,7 @@ _NAMES = (
 EXTENSIONS = {
     "_gateway": Extension(
         "batchpid.sim.engine.native._gateway",
-        (
-            *(f"batchpid/sim/engine/native/{name}" for name in _NAMES),
-            "batchpid/native/fused_loops.h",
-            *RIGID_BODIES,
-            *PROGRAMS,
-        ),
-        (*ROUNDED, *VECTORIZED_ONLY, PASSES_VECTORIZED, "-pthread", "-Wno-psabi"),
+        (*(f"batchpid/sim/engine/native/{name}" for name in _NAMES), *RIGID_BODIES, *PROGRAMS),
+        (*ROUNDED, *VECTORIZED_ONLY, "-pthread", "-Wno-psabi"),
     ),
 }
