@@ -45,11 +45,11 @@ class _ActuatorsFields(NamedTuple):
         None
     )
     effort_limit: Annotated[Array, Field("N m or N", math.inf, group="motor")] = None
-    coulomb: Annotated[Array, Field("N m or N", group="joint")] = None
-    static: Annotated[Array, Field("N m or N", group="joint")] = None
+    coulomb: Annotated[Array, Field("N m or N", low=-math.inf, group="joint")] = None
+    static: Annotated[Array, Field("N m or N", low=-math.inf, group="joint")] = None
     stribeck: Annotated[Array, Field("rad/s or m/s", group="joint")] = None
     load_friction: Annotated[Array, Field("1", high=1.0, group="joint")] = None
-    viscous: Annotated[Array, Field("N m s/rad or N s/m", group="joint")] = None
+    viscous: Annotated[Array, Field("N m s/rad or N s/m", low=-math.inf, group="joint")] = None
     armature: Annotated[Array, Field("kg m^2 or kg", group="joint")] = None
     position_offset: Annotated[Array, Field("rad or m", low=-math.inf, group="sensor")] = None
     backlash: Annotated[Array, Field("rad or m", group="sensor")] = None
@@ -190,8 +190,9 @@ def make_actuators(
     effort_limit
         Largest effort that the motor delivers, >= 0 [N m or N].
     coulomb, viscous
-        Friction >= 0 of the joint [N m or N; N m s/rad or N s/m], in addition to the description's,
-        by the model of :mod:`batchpid.motors.friction`.
+        Friction of the joint [N m or N; N m s/rad or N s/m], in addition to the description's, by
+        the model of :mod:`batchpid.motors.friction`. Negative where the description's is too large;
+        a robot refuses sums below 0.
     static
         Friction that holds the joint at rest, where that is more than while it moves [N m or N]: >=
         ``coulomb``, also in addition to the description's. 0: as much as while it moves.

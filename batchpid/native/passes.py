@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from batchpid.law.pid import init
 from batchpid.native.compiled import law_trace
 from batchpid.native.tracing import Segment
 
-BESIDE_P: tuple[dict[str, float], ...] = (
+BESIDE_P: tuple[dict[str, Any], ...] = (
     {},
     {"ki": 1.0},
     {"kd": 1.0},

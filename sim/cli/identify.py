@@ -78,7 +78,15 @@ def identify_logs(
         ),
     ] = None,
     prefix: Annotated[str, flag("Prefix of the joints' names in the logs.")] = "",
-    no_payload: Annotated[bool, flag("The tool carries no payload.")] = False,
+    no_payload: Annotated[bool, flag("The robot carries no payload.")] = False,
+    payload_link: Annotated[
+        str | None,
+        flag(
+            "Link that carries the payload. Default: the last one with a mass behind the last moving"
+            " link, or the tool, whichever explains the logs better.",
+            "LINK",
+        ),
+    ] = None,
     extras: Annotated[
         tuple[str, ...],
         flag(
@@ -98,7 +106,7 @@ def identify_logs(
     """Identify a robot's motors from logs of its motion, from this robot or another simulator.
 
     Finds armature, damping, friction, strength and bias of each joint, the delays of efforts and
-    setpoints and the payload at the tool, by fitting simulated motions; writes them for --actuators
+    setpoints, a lag of setpoints and a payload, by fitting simulated motions; writes them for --actuators
     of other commands. A log has a header and SI units: "time, setpoint:JOINT ..., qpos:JOINT ...",
     with the gains that drove the robot as --gains FILE, or "time, effort:JOINT ..., qpos:JOINT
     ...". The fit simulates a rigid-body model with a Runner's control and motors.
@@ -113,6 +121,7 @@ def identify_logs(
         logs,
         None if gains is None else _gains(robot, gains),
         payload=not no_payload,
+        payload_link=payload_link,
         reading=Reading(hold, degrees, topic, command_topic, prefix),
         compensate=compensate,
         timestep=timestep,
@@ -124,7 +133,7 @@ def identify_logs(
         return result
     print(result.report())
     problem = "are explained to less than half of the error of the robot as described"
-    remedy = f"{result.advice}; --force writes the file nevertheless"
+    remedy = "--force writes the file nevertheless"
     raise InvalidArgumentError("logs", f"{problem}, and no file is written", remedy=remedy)
 
 

@@ -1,416 +1,187 @@
-r"""Fit: nonlinear least squares of simulated against measured positions, and its intervals.
+r"""Fit: Levenberg-Marquardt steps within bounds, with derivatives along the covariance's axes.
 
-A log of efforts is simulated in windows, each from a free initial state, whose effect is projected
-out of residuals and derivatives (H. G. Bock, "Recent advances in parameter identification
-techniques for ODE", 1983). A log of setpoints is simulated as a whole. Residuals over their size,
-with the loss of SciPy's "soft_l1" against outliers, and the unknowns' distances from the prior are
-minimised by ``scipy.optimize.least_squares``. All candidates of an evaluation - the present point,
-one change of each unknown and of each initial state - are simulated in one batch.
+Residuals over their size, with the loss ``2 C^2 (sqrt(1 + (r / C)^2) - 1)`` against outliers, and
+the unknowns' distances from the prior are minimised. With the weighted residuals r and their
+derivatives J, a step s solves::
 
-Intervals are a jackknife over parts of the logs, combined with the curvature. With derivatives J
-and weighted residuals r of all rows, prior precision P and H = J^T J + P, the estimate without the
-part g of the rows is, to first order::
+    min |J s + r|^2 + damping |diag(J) s|^2,     low <= point + s <= high
 
-    x_g = x + (H - J_g^T J_g)^-1 J_g^T r_g
-
-(B. Efron, "The jackknife, the bootstrap and other resampling plans", SIAM 1982). The parts are ten
-stretches of equal length of all logs, so that residuals that are correlated in time and differences
-between the logs count. The variance is the larger of the jackknife's and
-s^2 H^-1, with the mean square s^2 of the residuals, and the square of the step that is left,
-H^-1 J^T r: a fit that stops early, or leans on its prior, is off by it.
+(D. W. Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", 1963; bounds
+by "bounded-variable least squares"). Joints that stick and slide make residuals that are not smooth:
+differences by single unknowns are off by some percent, which looks like information along directions
+that the data do not show. Hence the changes of an evaluation are the axes of the present covariance,
+each about a standard deviation long.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-import batchpid as bp
-from batchpid.arrays.array_types import Bool, Float64
-from batchpid.arrays.trees import structure
-from batchpid.sim.identification.regression import LogData
-from batchpid.sim.identification.simulator import Stretch, simulate
-from batchpid.sim.identification.unknowns import Unknown, Unknowns
+from batchpid.arrays.array_types import Float64
+from batchpid.sim.identification.problem import Problem
 
-WINDOW = 0.3
-"""Length of a window of a log of efforts [s]."""
-PAST = 0.1
-"""Time before a window whose commands may still act in it [s]."""
-SETTLE = 0.3
-"""Time after the start of a log under the PID law in which the initial state is forgotten [s]: it
-is not fitted.
-"""
-HELD_OUT = 0.25
-"""Share of each log, at its end, that is held out."""
-MOST_WINDOWS = 500
-"""Largest number of windows; if there are more, evenly spaced ones are used."""
-MOST_ROWS = 40_000
-"""Largest number of rows of all logs; if there are more, evenly spaced ones are used."""
-ENVS = 2048
-"""Most simulations at once."""
-STEP = 1e-3
-"""Change of an unknown's coordinate for a finite difference."""
-STATE_STEPS = 1e-3, 1e-2
-"""Changes of initial positions and velocities."""
-FARTHEST = 3.0
-"""Bound of the residuals [rad or m], reached where a simulation diverges."""
-RESOLUTION = 1e-5
-"""Least size of residuals [rad or m]: encoders show no less."""
 OUTLIER = 2.0
-"""Ratio of a residual to its size above which its weight in the loss decreases."""
+"""Ratio C of a residual to its size above which its weight in the loss decreases."""
+FIRST_CHANGE = 1e-3
+"""Change of each unknown for the first derivatives."""
+LEAST_CHANGE, MOST_CHANGE = 1e-3, 0.1
+"""Bounds of the largest change of an unknown on an axis, over its value or typical size."""
 ROUNDS = 4
-"""Largest number of fits; each scales the residuals by the size that the last one left."""
+"""Largest number of weights; each is the size of the residuals that the last one left."""
 SETTLED = 0.5
-"""Ratio of that size to the one before from which no further fit follows."""
-SHORT = 2e-3
-"""Delay of setpoints below which it counts as none [s]."""
-PARTS = 10
-"""Number of parts of the logs for the jackknife."""
-INTERVAL = 2.0
-"""Half width of a 95 % interval, over the standard deviation."""
-LEAST = 2.5e-3
-"""Least standard deviation over the value: the fit ends at changes of a thousandth."""
-SHOWN = 0.7
-"""Ratio of the standard deviation to the prior's from which an unknown counts as not identified."""
+"""Ratio of that size to the one before from which the weight stays."""
+TOLERANCE = 1e-4
+"""Expected decrease over the cost at which a fit ends."""
+DAMPING = 1e-2
+"""Damping at the start."""
+MOST_DAMPING = 1e6
+"""Damping at which no step lowers the cost."""
 
 
-class Window(NamedTuple):
-    """Stretch of a log to simulate, and the rows of the log that it is compared with."""
+class Iterate(NamedTuple):
+    """A point with residuals and their changes."""
 
-    log: int
-    stretch: Stretch
-    measured: Float64
-    """Positions (rows, joints)."""
-    time: Float64
-    """Times (rows,) [s]."""
-    fitted: Any
-    """Fitted rows; the others are held out (rows,) bool."""
-
-
-class Fit(NamedTuple):
-    """A fit of the unknowns that the logs show."""
-
-    problem: Problem
-    hidden: list[Unknown]
-    """Unknowns that the logs do not identify; they have the values of the description."""
     point: Float64
-    """Coordinates of the unknowns."""
+    changes: Float64
+    """Changes of the point (n, unknowns)."""
+    evaluation: list[Float64]
+
+
+class Solution(NamedTuple):
+    """End of a fit."""
+
+    point: Float64
     size: Float64
     """Size of the residuals that the fit was weighted with (joints,)."""
     converged: bool
-    deviation: Float64
-    """Standard deviations (unknowns,) of the values, in their units."""
-    root: Float64
-    """Root L of their covariance L L^T (unknowns, unknowns)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """Windows of logs, the simulation of each log, and the unknowns."""
-
-    data: Sequence[LogData]
-    windows: Sequence[Window]
-    unknowns: Unknowns
-    run: Callable[..., Any] = map
-    """Map over groups of windows: ``map``, or that of worker processes."""
-
-    def evaluate(
-        self,
-        point: Float64,
-        changes: Float64 | None = None,
-        free_states: bool = True,
-        held_out: bool = False,
-    ) -> list[Float64]:
-        """Return the residuals of each window at a point (unknowns,), and their changes by
-        ``changes`` (n, unknowns) of the point: (rows, joints, 1 + n).
-
-        Initial states of windows of efforts are projected out if they are free. Windows without
-        fitted rows are evaluated if ``held_out``, and are empty otherwise.
-        """
-        joints = self.windows[0].measured.shape[1]
-        free = free_states and self.data[0].drive.params is None
-        shifts = np.diag(np.repeat(STATE_STEPS, joints * free))
-        # Rows: the point, each change of it, a change of each initial state.
-        moved = point[None] if changes is None else np.vstack([point, point + changes])
-        count = len(moved)
-        points = np.vstack([moved, np.tile(point, (len(shifts), 1))])
-        states = np.zeros((len(points), 2, joints))
-        states[count:] = shifts.reshape(-1, 2, joints)
-        # Windows of the same robot and law are simulated at once.
-        alike = defaultdict[Any, list[int]](list)
-        for number, window in enumerate(self.windows):
-            part = self.data[window.log]
-            if held_out or window.fitted.any():
-                alike[id(part.plant), structure(part.drive.params)].append(number)
-        many = max(1, ENVS // len(points))
-        groups = []
-        for numbers in alike.values():
-            groups += [numbers[first : first + many] for first in range(0, len(numbers), many)]
-        tasks = [self._task(group, points, states) for group in groups]
-        tables = [np.zeros((0, joints, count))] * len(self.windows)
-        for group, positions in zip(groups, self.run(_simulated, tasks), strict=True):
-            for number, table in zip(group, positions, strict=True):
-                errors = np.clip(self.windows[number].measured - table, -FARTHEST, FARTHEST)
-                errors[1:] -= errors[0]
-                tables[number] = _projected(np.moveaxis(errors, 0, 2), count)
-        return tables
-
-    def _task(self, group: list[int], points: Float64, states: Float64) -> Any:
-        """Return the arguments of :func:`simulate` for a group of windows, each at all points."""
-        parts = [self.data[self.windows[number].log] for number in group]
-        stretches = [self.windows[number].stretch for number in group]
-        drive = parts[0].drive
-        if drive.params is not None:
-            # A column of rows: other options are equal in all logs of a group.
-            rows: Any = zip(*[part.drive.params for part in parts * len(points)], strict=True)
-            leaves: Any = [
-                np.concatenate(row) if isinstance(row[0], np.ndarray) else row[0] for row in rows
-            ]
-            drive = drive._replace(params=bp.PIDParams(*leaves))
-        points, states = (np.repeat(table, len(group), axis=0) for table in (points, states))
-        robots = self.unknowns.candidates(self.unknowns.values(points))
-        return parts[0].plant, drive, robots, states, stretches
-
-    def weighted(self, evaluation: Sequence[Float64], size: Float64) -> Float64:
-        """Return residuals and their changes (n, 1 + changes) of the fitted rows over their
-        ``size``.
-        """
-        pairs = zip(self.windows, evaluation, strict=True)
-        tables = [table[window.fitted] / size[:, None] for window, table in pairs if len(table)]
-        table = np.concatenate(tables)
-        return table.reshape(-1, table.shape[2])
-
-    def system(self, point: Float64, evaluation: Any, size: Float64) -> tuple[Float64, Float64]:
-        """Return residuals and derivatives (n, unknowns), by changes of STEP, of the fitted rows
-        over their ``size``, then of the prior.
-        """
-        table = self.weighted(evaluation, size)
-        mean, spread = self.unknowns.prior
-        residual = np.append(table[:, 0], (point - mean) / spread)
-        return residual, np.vstack([table[:, 1:] / STEP, np.diag(1 / spread)])
-
-    def size(self, evaluation: Sequence[Float64]) -> Float64:
-        """Return the size of fitted residuals (joints,): the root mean square, the largest tenth of
-        each joint cut.
-        """
-        joints = self.windows[0].measured.shape[1]
-        errors = self.weighted(evaluation, np.ones(joints))[:, 0].reshape(-1, joints)
-        errors = np.minimum(np.abs(errors), np.quantile(np.abs(errors), 0.9, axis=0))
-        size: Float64 = np.sqrt((errors**2).mean(0)) + RESOLUTION
-        return size
-
-    def error(self, point: Float64) -> Float64:
-        """Return the root mean square (joints,) of the position error at the held-out rows,
-        simulated from the logged state; at all rows if none is held out.
-        """
-        evaluation = self.evaluate(point, free_states=False, held_out=True)
-        errors = np.concatenate(evaluation)[..., 0]
-        held_out = ~np.concatenate([window.fitted for window in self.windows])
-        if held_out.any():
-            errors = errors[held_out]
-        size: Float64 = np.sqrt((errors**2).mean(0))
-        return size
-
-
-def fit(
-    problems: Sequence[Problem], evaluations: int, progress: Callable[[], object] | None = None
-) -> Fit:
-    """Fit from the start with the least error: all unknowns once, then only those that the logs
-    show.
-    """
-
-    def start_error(problem: Problem) -> float:
-        return float(np.linalg.norm(problem.size(problem.evaluate(problem.unknowns.start))))
-
-    problem = min(problems, key=start_error)
-    unknowns = problem.unknowns
-    solution = solve(problem, unknowns.start, None, evaluations, progress)
-    *uncertainty, shown = intervals(problem, *solution[:2])
-    if not shown.all():
-        point, size, _ = solution
-        values = unknowns.values(point)[shown]
-        problem = replace(problem, unknowns=unknowns.only(shown))
-        start = problem.unknowns.points(values)
-        solution = solve(problem, start, size, evaluations, progress)
-        *uncertainty, _ = intervals(problem, *solution[:2])
-    # Worker processes end with the fit.
-    hidden = list(unknowns.only(~shown).entries)
-    return Fit(replace(problem, run=map), hidden, *solution, *uncertainty)
 
 
 def solve(
     problem: Problem,
     point: Float64,
-    size: Float64 | None,
-    evaluations: int,
+    size: Float64 | None = None,
+    evaluations: int = 60,
     progress: Callable[[], object] | None = None,
-) -> tuple[Float64, Float64, bool]:
-    """Return the fit from a ``point``, the size of residuals that it was weighted with, and whether
-    it has converged; it begins with a ``size`` (joints,), or that at the point.
+) -> Solution:
+    """Return the fit from a ``point``; it begins with a ``size`` (joints,) of the residuals, or the
+    one at the point.
 
     The size of residuals that are left may be far smaller, which would give the prior too much
-    weight: further fits follow until it stays.
+    weight: it is taken anew until it stays.
     """
-    from scipy.optimize import least_squares
-
-    # Residuals and derivatives at a point come from one evaluation.
-    @lru_cache(maxsize=1)
-    def evaluated(*point: float) -> list[Float64]:
+    low, high = problem.unknowns.bounds
+    point = np.clip(point, low, high)
+    place = iterate(problem, point, FIRST_CHANGE * np.eye(len(point)))
+    weight = problem.size(place.evaluation) if size is None else size
+    damping = DAMPING
+    rounds = 1
+    settled = False
+    for _ in range(evaluations - 1):
         if progress is not None:
             progress()
-        return problem.evaluate(np.array(point), STEP * np.eye(len(point)))
-
-    def residual(point: Float64, size: Float64) -> Float64:
-        return problem.system(point, evaluated(*point), size)[0]
-
-    def derivative(point: Float64, size: Float64) -> Float64:
-        return problem.system(point, evaluated(*point), size)[1]
-
-    if size is None:
-        size = problem.size(evaluated(*point))
-    for _ in range(ROUNDS):
-        weight = size
-        optimum = least_squares(
-            residual,
-            point,
-            derivative,
-            x_scale="jac",
-            loss="soft_l1",
-            f_scale=OUTLIER,
-            ftol=1e-4,
-            xtol=1e-4,
-            gtol=1e-8,
-            max_nfev=evaluations,
-            args=(weight,),
-        )
-        point = optimum.x
-        evaluations -= optimum.nfev
-        size = problem.size(evaluated(*point))
-        if evaluations < 1 or np.median(size / weight) > SETTLED:
+        before = cost(problem, place, weight)
+        triangle = triangle_of(problem, place, weight)
+        step, expected = bounded_step(triangle, damping, low - place.point, high - place.point)
+        further = place.point + step
+        square = max(float(triangle[:, 0] @ triangle[:, 0]) / rows_of(problem), 1e-6)
+        axes, _ = axes_of(triangle[:, 1:].T @ triangle[:, 1:] / square, np.maximum(abs(further), 1))
+        trial = iterate(problem, further, _inward(further, axes, low, high))
+        gain = before - cost(problem, trial, weight)
+        if gain > 0:
+            place = trial
+            damping = max(damping * (0.1 if gain > 0.5 * expected else 0.5), 1e-9)
+        else:
+            damping *= 10
+        settled = expected < TOLERANCE * before or damping > MOST_DAMPING
+        size = problem.size(place.evaluation)
+        shrunk = rounds < ROUNDS and bool(np.median(size / weight) < SETTLED)
+        if shrunk and (settled or gain > 0):
+            weight = size
+            rounds += 1
+            damping = min(damping, DAMPING)
+            settled = False
+        elif settled:
             break
-    return point, weight, optimum.status > 0
+    return Solution(place.point, weight, settled)
 
 
-def intervals(problem: Problem, point: Float64, size: Float64) -> tuple[Float64, Float64, Bool]:
-    """Return deviations, root of the covariance, and the mask of unknowns that the logs show
+def iterate(problem: Problem, point: Float64, changes: Float64) -> Iterate:
+    """Return the evaluation of a point and of ``changes`` (n, unknowns) of it."""
+    return Iterate(point, changes, problem.evaluate(point, changes))
+
+
+def linearised(problem: Problem, place: Iterate, size: Float64) -> Float64:
+    """Return residuals over their ``size`` and derivatives by the unknowns (rows, 1 + unknowns),
+    with the weights of the loss.
+    """
+    table = problem.weighted(place.evaluation, size)
+    table *= (1 + (table[:, :1] / OUTLIER) ** 2) ** -0.25
+    slopes = table[:, 1:] @ np.linalg.pinv(place.changes, rcond=1e-12).T
+    return np.column_stack([table[:, 0], slopes])
+
+
+def axes_of(hessian: Float64, scale: Float64) -> tuple[Float64, Float64]:
+    """Return the axes (rows) of the covariance and their standard deviations.
+
+    An axis is a standard deviation long, within the bounds of its largest change over ``scale``
     (unknowns,).
-
-    Derivatives are by the values over their sizes, not by coordinates: near 0 a coordinate hardly
-    changes its value.
     """
-    unknowns = problem.unknowns
-    values = unknowns.values(point)
-    scale = np.maximum(np.abs(values) / unknowns.sizes, 1.0)
-    prior = unknowns.spread * scale
-    further = unknowns.points(values + np.diag(0.01 * scale * unknowns.sizes))
-    table = downweighted(problem.weighted(problem.evaluate(point, further - point), size))
-    residual = table[:, 0]
-    matrix = table[:, 1:] / (0.01 * scale)
-    square = float(residual @ residual) / max(len(residual) - len(point), 1)
-    hessian = matrix.T @ matrix + np.diag(square / prior**2)
-    root = np.linalg.inv(np.linalg.cholesky(hessian)).T
-    inverse = root @ root.T
-    # Changes of the estimate without each part.
-    shifts = []
-    for part in np.array_split(table, PARTS):
-        block = part[:, 1:] / (0.01 * scale)
-        shifts.append(np.linalg.solve(hessian - block.T @ block, block.T @ part[:, 0]))
-    jackknife = (PARTS - 1) * np.var(shifts, axis=0)
-    curvature = square * np.diagonal(inverse)
-    variance = np.maximum(jackknife, curvature) + (inverse @ matrix.T @ residual) ** 2
-    deviation = np.sqrt(np.minimum(variance, prior**2)) * unknowns.sizes
-    deviation = np.maximum(deviation, LEAST * np.abs(values))
-    # Correlations come from the curvature.
-    ratio = deviation / np.sqrt(np.diagonal(inverse))
-    root = ratio[:, None] * root
-    # A short delay of setpoints is left out: the delay of efforts explains the rest.
-    late = np.array([entry.kind == "setpoint_delay" for entry in unknowns.entries])
-    shown = (np.sqrt(curvature) < SHOWN * prior) & ~(late & (values < SHORT))
-    return deviation, root, shown
+    known, turn = np.linalg.eigh(hessian)
+    spans = 1 / np.sqrt(np.maximum(known, 1e-30))
+    axes = (turn * spans).T
+    largest = np.abs(axes / scale).max(1, keepdims=True)
+    return axes * np.clip(largest, LEAST_CHANGE, MOST_CHANGE) / largest, spans
 
 
-def downweighted(table: Float64) -> Float64:
-    """Return rows of residuals and their changes with the weights of the loss."""
-    return table * (1 + (table[:, :1] / OUTLIER) ** 2) ** -0.25
+def cost(problem: Problem, place: Iterate, size: Float64) -> float:
+    """Return half the loss of all residuals, the prior's distances included."""
+    residual = problem.weighted(place.evaluation, size)[:, 0]
+    loss = 2 * OUTLIER**2 * (np.sqrt(1 + (residual / OUTLIER) ** 2) - 1).sum()
+    mean, spread = problem.unknowns.prior
+    return 0.5 * float(loss + (((place.point - mean) / spread) ** 2).sum())
 
 
-def _simulated(task: Any) -> list[Float64]:
-    return simulate(*task)
+def triangle_of(problem: Problem, place: Iterate, size: Float64) -> Any:
+    """Return the triangle of residuals and derivatives, the prior's rows included."""
+    mean, spread = problem.unknowns.prior
+    prior = np.column_stack([(place.point - mean) / spread, np.diag(1 / spread)])
+    return np.linalg.qr(np.vstack([linearised(problem, place, size), prior]), mode="r")
 
 
-def _projected(table: Float64, count: int) -> Float64:
-    """Return the first ``count`` columns of a table (rows, joints, columns) without what the others
-    explain.
-    """
-    columns = table.reshape(-1, table.shape[2])
-    basis = columns[:, count:]
-    rest = columns[:, :count]
-    if basis.shape[1]:
-        q, _ = np.linalg.qr(basis / (np.linalg.norm(basis, axis=0) + 1e-12))
-        rest = rest - q @ (q.T @ rest)
-    return rest.reshape(*table.shape[:2], count)
+def bounded_step(
+    triangle: Float64,
+    damping: float,
+    low: Float64,
+    high: Float64,
+) -> tuple[Float64, float]:
+    """Return the damped step within bounds, and the decrease of the cost that it promises."""
+    from scipy.optimize import lsq_linear
+
+    residual, slopes = triangle[:, 0], triangle[:, 1:]
+    ridge = np.diag(np.sqrt(damping) * np.linalg.norm(slopes, axis=0))
+    rows = np.vstack([slopes, ridge])
+    target = -np.append(residual, np.zeros(len(ridge)))
+    # Bounds that meet would have no interior.
+    step = lsq_linear(rows, target, (low, high + 1e-9), "bvls").x
+    decrease = target @ target - ((rows @ step - target) ** 2).sum()
+    return np.clip(step, low, high), 0.5 * float(decrease)
 
 
-def windows_of(data: Sequence[LogData]) -> list[Window]:
-    """Return the windows of logs, one for each log of setpoints. A window begins where the held-out
-    part begins.
-    """
-    windows = list[Window]()
-    every = 1 + sum(len(part.log.time) for part in data) // MOST_ROWS
-    for number, part in enumerate(data):
-        dt = part.drive.timestep
-        total = len(part.motion.qpos) - 1
-        share = {None: 1 - HELD_OUT, False: 1.0, True: 0.0}[part.log.held_out]
-        split = round(share * total)
-        length = total
-        starts = [0]
-        if part.drive.params is None:
-            # Windows of the fitted part, then of the held-out part; the filter begins at the edge.
-            edge = round(0.05 / dt)
-            first = max(split + 1, edge)
-            length = min(round(WINDOW / dt), max(total - first, split - edge))
-            starts = [*range(edge, split - length + 1, length)]
-            starts += range(first, total - length + 1, length)
-        for start in starts:
-            windows.append(_window(number, part, start, start + length, split, every))
-    return windows[:: 1 + len(windows) // MOST_WINDOWS]
+def _inward(
+    point: Float64,
+    axes: Float64,
+    low: Float64,
+    high: Float64,
+) -> Float64:
+    """Return the changes (n, unknowns) along ``axes``, forward or, from a bound, backward."""
+    ahead, back = (np.clip(point + sign * axes, low, high) - point for sign in (1, -1))
+    is_short = np.linalg.norm(ahead, axis=1) < np.linalg.norm(back, axis=1)
+    return np.where(is_short[:, None], back, ahead)
 
 
-def _window(
-    number: int,
-    data: LogData,
-    first: int,
-    last: int,
-    split: int,
-    every: int,
-) -> Window:
-    """Return the window between two sim steps of a log's grid, of one row of ``every``; rows are
-    held out from the step ``split`` on.
-    """
-    log, motion, _, drive = data
-    dt = drive.timestep
-    settle = 0.0
-    if drive.params is not None:
-        settle = min(SETTLE, 0.2 * log.seconds) / dt
-    place = (log.time - log.time[0]) / dt
-    rows = np.flatnonzero((place > first + settle + 1e-6) & (place <= last + 1e-6))[::every]
-    place = place[rows]
-    # Rows lie before the ends of their sim steps.
-    step = np.maximum(np.ceil(place - 1e-6).astype(int), first + 1)
-    before = np.maximum(step - place, 0.0) * dt
-    past = round(PAST / dt)
-    command = motion.command[np.maximum(np.arange(first - past, last), 0)]
-    begin = motion.qpos[first], motion.qvel[first]
-    stretch = Stretch(*begin, command, past, step - first - 1, before)
-    return Window(
-        number,
-        stretch,
-        log.qpos[rows],
-        log.time[rows],
-        place <= split + 1e-6,
-    )
+def rows_of(problem: Problem) -> int:
+    """Return the number of fitted residuals."""
+    return sum(int(window.fitted.sum()) * window.measured.shape[1] for window in problem.windows)

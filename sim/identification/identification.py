@@ -8,6 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib.util import find_spec
+from itertools import product
 from multiprocessing import get_context
 from typing import Any
 
@@ -18,9 +19,9 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import choice, flag, instance, integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, warn
-from batchpid.sim.identification.fit import Problem, fit, windows_of
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
 from batchpid.sim.identification.logs import Reading, read_logs
+from batchpid.sim.identification.problem import Problem, windows_of
 from batchpid.sim.identification.regression import (
     Guess,
     LogData,
@@ -31,7 +32,15 @@ from batchpid.sim.identification.regression import (
 )
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import Dynamics, LogControl, Plant
-from batchpid.sim.identification.unknowns import BASIC, EXTRAS, KINDS, Unknowns
+from batchpid.sim.identification.trials import fit, with_effects
+from batchpid.sim.identification.unknowns import (
+    BASIC,
+    EXTRAS,
+    KINDS,
+    SENDER,
+    Unknowns,
+    kinds_of,
+)
 from batchpid.sim.options.groups import Compensation
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
@@ -43,6 +52,8 @@ FOLLOWS = 0.01
 """A joint is stuck if the standard deviation of its positions is at most this share of its
 setpoints'.
 """
+SATURATIONS = (0.03, 0.2, 1.0)
+"""Starts of the error at which the law saturates, over the 95 % quantile of the setpoint's error."""
 DETOUR = 0.1
 """Decrease of the regression's cost from which the compensation counts as exact, not through the
 motors.
@@ -57,6 +68,7 @@ def identify(
     compensate: Compensation | None = None,
     timestep: float | None = None,
     payload: bool = True,
+    payload_link: str | None = None,
     extras: Sequence[str] = (),
     reading: Reading | None = None,
     evaluations: int = 60,
@@ -80,7 +92,10 @@ def identify(
         Time step of the control that drove the robot [s]. Default: as the recordings say, else
         1/2000.
     payload
-        Find a payload at the tool, too.
+        Find a payload, too.
+    payload_link
+        Link that carries it, at its center of mass. Default: the last link with a mass that is
+        fixed behind the last moving one, or the tool, whichever explains the logs better.
     extras
         Further unknowns: "load_friction", "stribeck" (friction at rest and the speed at which it
         has fallen), "offset" (of the encoder), "mass" (factors of the links' masses); and of the
@@ -111,19 +126,39 @@ def identify(
         raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
     kinds = [choice("extras", name, EXTRAS) for name in dict.fromkeys(extras)]
+    evaluations = integer("evaluations", evaluations, 2, 1000)
+    places: list[str | None] = [None]
     if flag("payload", payload):
         kinds.append("payload")
-    evaluations = integer("evaluations", evaluations, 2, 1000)
+        places = _payload_links(robot, payload_link)
     read = _read(robot, logs, params, reading)
     moves, still = _moving(robot, read)
     robot, data = _prepared(robot, read, moves, params, compensate, timestep)
-    data, guesses = _regress(robot, data)
-    unknowns = [_unknowns(robot, data, guess, kinds) for guess in guesses]
+    data, guesses = _regress(robot, data, bool({"kd", "gain"}.intersection(kinds)))
     windows = windows_of(data)
     with ExitStack() as stack:
         run = _map(stack, integer("workers", workers, 0, 1000))
-        problems = [Problem(data, windows, start, run) for start in unknowns]
-        return Identification(fit(problems, evaluations, progress), still)
+        starts = dict[Any, list[Problem]]()
+        for place, share in product(places, SATURATIONS if "saturation" in kinds else (0.7,)):
+            for guess in guesses:
+                unknowns = _unknowns(robot, data, guess, kinds, place, share)
+                starts.setdefault((place, share), []).append(Problem(data, windows, unknowns, run))
+        found = with_effects(fit(starts, evaluations, progress), evaluations, progress)
+    # Worker processes end with the fit.
+    return Identification(found._replace(problem=replace(found.problem, run=map)), still)
+
+
+def _payload_links(robot: Robot, name: str | None) -> list[str | None]:
+    """Return the links where a payload may be: the one with a ``name``, or the last link with a
+    mass that is fixed behind the tool, and the tool.
+    """
+    tree = robot.rigid_tree
+    if name is not None:
+        return [choice("payload_link", name, tree.links)]
+    body = tree.link_bodies[tree.index(tree.tool)]
+    links = zip(tree.links, tree.link_bodies, tree.mass, strict=True)
+    fixed = [link for link, of_body, mass in links if of_body == body and mass > 0]
+    return list(dict.fromkeys([*fixed[-1:], tree.tool]))
 
 
 def _read(
@@ -223,7 +258,8 @@ def _prepared(
 
 def _resting(robot: Robot, start: Float64) -> Robot:
     """Return ``robot`` with the start pose ``start`` (dof,)."""
-    return replace(robot, settings=None, defaults=FileDefaults(start))
+    reading = robot.reading._replace(defaults=FileDefaults(start))
+    return replace(robot, settings=None, reading=reading)
 
 
 def _option(
@@ -272,11 +308,14 @@ def _of_joints(params: bp.PIDParams, robot: Robot, log: Log) -> bp.PIDParams:
     return params.for_joints(list(log.joints))
 
 
-def _regress(robot: Robot, data: list[LogData]) -> tuple[list[LogData], list[Guess]]:
+def _regress(
+    robot: Robot, data: list[LogData], law_unknown: bool
+) -> tuple[list[LogData], list[Guess]]:
     """Return the logs, marked whether the compensation passes through the motors, and the guesses
     of the regression.
 
-    Raises InvalidArgumentError where a log makes far more sense in another reading.
+    Setpoints may seem late where gains are unknown. Raises InvalidArgumentError where a log makes
+    far more sense in another reading.
     """
     guesses = regress(_fitted(data))
     if data[0].drive.compensate != "none":
@@ -287,7 +326,7 @@ def _regress(robot: Robot, data: list[LogData]) -> tuple[list[LogData], list[Gue
             data = exact
             guesses = others
     words = better_reading(robot, _fitted(data)[0], guesses[0])
-    if words:
+    if words and not (law_unknown and words.endswith("late")):
         remedy = "correct the log or its options"
         raise InvalidArgumentError("logs", f"make sense with {words}", remedy=remedy)
     return data, guesses
@@ -303,18 +342,21 @@ def _unknowns(
     data: list[LogData],
     guess: Guess,
     extras: Sequence[str],
+    payload_link: str | None,
+    share: float,
 ) -> Unknowns:
-    """Return the unknowns with starts from the regression, and typical sizes from the motion."""
+    """Return the unknowns with starts from the regression, and typical sizes from the motion; the
+    law's limit starts at a ``share`` of the setpoint's error.
+    """
     data = _fitted(data)
     log, _, plant, drive = data[0]
     starts = dict(guess.values)
     kinds = list(BASIC)
     if drive.params is not None:
-        kinds.append("setpoint_delay")
+        kinds += SENDER
+        starts["setpoint_lag"] = np.zeros(1)
     for name in extras:
-        if name == "stribeck":
-            kinds.append("static")
-        kinds.append(name)
+        kinds += kinds_of(name)
         if KINDS[kinds[-1]].target == "law" and drive.params is None:
             problem = "is of a law, and the logs hold efforts"
             remedy = "leave it out, or give the params of the law"
@@ -330,7 +372,7 @@ def _unknowns(
     motion = Motion(*map(np.concatenate, zip(*(part.motion for part in data), strict=True)))
     # The mean inertia of the links, on 200 poses of the motion.
     poses = np.ascontiguousarray(motion.qpos[:: 1 + len(motion.qpos) // 200])
-    dynamics = Dynamics(plant, [()] * len(poses), poses, np.zeros_like(poses))
+    dynamics = Dynamics(plant, {}, poses, np.zeros_like(poses))
     links = np.diagonal(dynamics.matrix, axis1=1, axis2=2).mean(0)
     speed = np.maximum(np.sqrt((motion.qvel**2).mean(0)), 1e-3)
     acceleration = np.maximum(np.sqrt((motion.qacc**2).mean(0)), 0.1)
@@ -343,9 +385,10 @@ def _unknowns(
         "friction": 0.3 * np.maximum(friction, 0.05 * effort),
         "speed": 0.1 * speed,
         "top_speed": np.quantile(np.abs(motion.qvel), 0.99, axis=0),
-        "error": 0.7 * np.quantile(np.abs(motion.command - motion.qpos), 0.95, axis=0),
+        "error": share * np.quantile(np.abs(motion.command - motion.qpos), 0.95, axis=0),
     }
-    return Unknowns.of(robot, log.joints, kinds, starts, sizes, plant.heavy_links)
+    unknowns = Unknowns(robot, log.joints, sizes, plant.heavy_links)
+    return unknowns.adding(kinds, starts, payload_link)
 
 
 def _map(stack: ExitStack, workers: int) -> Callable[..., Any]:

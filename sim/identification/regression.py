@@ -214,7 +214,7 @@ def _force(
     """Return the efforts (rows, joints) that the links need to move so, without motors."""
     dynamics = Dynamics(
         part.plant,
-        [()] * len(qpos),
+        {},
         np.array(qpos),
         np.array(qvel),
     )
@@ -229,9 +229,10 @@ def _commanded(part: LogData) -> Float64:
     if drive.params is None:
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
-    ideal = PlantCandidates(Actuators(), {}, SETPOINT_DELAYS, [()] * count)
+    none = np.zeros(count)
+    ideal = PlantCandidates(Actuators(), {}, none, none, {})
     q, v = (np.repeat(table[:, None], count, axis=1) for table in motion[:2])
-    dynamics = Dynamics(part.plant, ideal.masses, q[0], v[0])
+    dynamics = Dynamics(part.plant, {}, q[0], v[0])
     qpos, qvel = q[0].copy(), v[0].copy()
     control = SimulatedControl(drive, ideal, dynamics, qpos, qvel)
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)

@@ -17,9 +17,11 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.sim.identification.fit import INTERVAL, STEP, Fit, Problem, downweighted
+from batchpid.sim.identification.intervals import INTERVAL
+from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.simulator import LogControl, changed_params
-from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknown, Unknowns
+from batchpid.sim.identification.trials import Fit
+from batchpid.sim.identification.unknowns import KINDS, Unknown, Unknowns, least_value
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import load_robot_actuators
 from batchpid.sim.robot.urdf_export import to_urdf
@@ -29,10 +31,8 @@ if TYPE_CHECKING:
 
 KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
-LEAST_SHARE = 0.1
-"""Least share of the remaining squared error that an effect has to explain to be named."""
-ALIKE = 0.5
-"""Share of the best explanation from which another link is as likely."""
+NEAR = 1e-6
+"""Distance from a bound, over the typical size, at which a value is there."""
 EXPLAINS = 0.5
 """Share of the position error of the robot as described that a file may leave."""
 
@@ -51,22 +51,22 @@ class Identification:
         logs, simulated from the logged state: of the robot as described and as identified.
         """
         problem = self.fit.problem
-        return self._described.error(np.zeros(0)), problem.error(self.fit.point)
+        described = self._described.errors(np.zeros(0), free_states=False)
+        return described[0], problem.errors(self._point, free_states=False)[0]
 
     @property
     def _described(self) -> Problem:
         """The problem without unknowns."""
         return replace(self.fit.problem, unknowns=replace(self.unknowns, entries=()))
 
-    @cached_property
-    def advice(self) -> str:
-        """Sentence on an effect that would lower the error most, or on its absence."""
-        return advice(self.fit)
-
     @property
     def unknowns(self) -> Unknowns:
-        """Unknowns that the logs show."""
+        """Unknowns of the fit; those that the logs do not show have their likeliest values."""
         return self.fit.problem.unknowns
+
+    @property
+    def _point(self) -> Float64:
+        return self.fit.solution.point
 
     @property
     def robot(self) -> Robot:
@@ -86,7 +86,7 @@ class Identification:
     @property
     def values(self) -> Float64:
         """Values of the unknowns (unknowns,), in addition to the robot's description."""
-        return self.unknowns.values(self.fit.point)
+        return self.unknowns.values(self._point)
 
     @property
     def held_out_error(self) -> tuple[float, float]:
@@ -103,12 +103,41 @@ class Identification:
     @property
     def converged(self) -> bool:
         """False if the fit has stopped at the largest number of evaluations."""
-        return self.fit.converged
+        return self.fit.solution.converged
 
     @property
-    def not_identified(self) -> list[str]:
-        """Unknowns that the logs do not identify, e.g. "elbow: strength"."""
-        return [f"{self._place(entry) or 'robot'}: {entry.kind}" for entry in self.fit.hidden]
+    def effects(self) -> dict[str, float]:
+        """Effects that were added because they lower the held-out error, and the share of it that
+        each left.
+        """
+        return dict(self.fit.effects)
+
+    @property
+    def not_shown(self) -> dict[str, list[str]]:
+        """Unknowns that the logs do not show, e.g. "elbow: strength", and for each those that it
+        cannot be told from.
+        """
+        shown, alike = self.fit.certainty.shown, self.fit.certainty.alike
+        names = [self._name(entry) for entry in self.unknowns.entries]
+        groups = dict[str, list[str]]()
+        for row in np.flatnonzero(~shown).tolist():
+            others = np.flatnonzero(alike[row]).tolist()
+            groups[names[row]] = [names[other] for other in others if other != row]
+        return groups
+
+    @property
+    def not_needed(self) -> list[str]:
+        """Kinds of unknowns of the setpoints that were left out: without them the held-out error is
+        about the same.
+        """
+        return [entry.kind for entry in self.fit.dropped]
+
+    @property
+    def at_bounds(self) -> list[str]:
+        """Unknowns whose value, with the description's, is at its bound."""
+        low, high = self.unknowns.bounds
+        is_held = (self._point <= low + NEAR) | (self._point >= high - NEAR)
+        return [self._name(entry) for entry in self.unknowns.only(is_held).entries]
 
     def interval(
         self, kind: str, joint: int | str | None = None
@@ -126,35 +155,35 @@ class Identification:
         InvalidArgumentError
             There is no such unknown.
         """
-        entries = [*self.unknowns.entries, *self.fit.hidden]
-        names = [(entry.kind, entry.link or entry.joint) for entry in entries]
-        if (kind, joint) not in names:
+        places = [(entry.kind, entry.place) for entry in self.unknowns.entries]
+        dropped = [(entry.kind, entry.place) for entry in self.fit.dropped]
+        if (kind, joint) not in places + dropped:
             problem = f"is no unknown of {joint!r}"
-            remedy = f"there are {sorted({entry.kind for entry in entries})}"
+            remedy = f"there are {sorted({name for name, _ in places + dropped})}"
             raise InvalidArgumentError("kind", problem, value=kind, remedy=remedy)
-        rows = dict(zip(names, self._rows, strict=False))
-        return rows.get((kind, joint))
+        if (kind, joint) in dropped:
+            return None
+        row = places.index((kind, joint))
+        return self._rows[row] if self.fit.certainty.shown[row] else None
 
     @property
     def _rows(self) -> list[tuple[float, float, float]]:
-        """Estimate and ends of the interval of each unknown."""
-        rows = list[Any]()
-        halves = INTERVAL * self.fit.deviation
-        for entry, value, half in zip(self.unknowns.entries, self.values, halves, strict=True):
-            low = max(value - half, 0.0) if KINDS[entry.kind].positive else value - half
-            described = 0.0
-            if entry.kind in DESCRIBED and entry.joint is not None:
-                table = getattr(self.robot, DESCRIBED[entry.kind])
-                described = table[self.joints[entry.joint]]
-            row = value, low, value + half
-            rows.append(tuple(float(described + number) for number in row))
-        return rows
+        """Estimate and ends of the interval of each unknown, with the description's values."""
+        described = self.unknowns.described
+        halves = INTERVAL * self.fit.certainty.deviation
+        least = [entry.least for entry in self.unknowns.entries]
+        lows = np.maximum(self.values - halves, least)
+        rows = np.array([self.values, lows, self.values + halves]) + described
+        return [tuple(row) for row in rows.T.tolist()]
 
     def _place(self, entry: Unknown) -> str | None:
-        """Return the joint or link of an unknown."""
+        """Return the joint of an unknown, or the link of a mass."""
         if entry.joint is None:
-            return entry.link
+            return entry.link if entry.kind == "mass" else None
         return self.robot.joint_names[self.joints[entry.joint]]
+
+    def _name(self, entry: Unknown) -> str:
+        return f"{self._place(entry) or 'robot'}: {entry.kind}"
 
     def actuators(self) -> bp.Actuators:
         """Return the identified actuators; joints that are not in the logs are ideal.
@@ -172,7 +201,7 @@ class Identification:
         region = {
             "unknowns": [[entry.kind, self._place(entry)] for entry in self.unknowns.entries],
             "estimate": self.values.tolist(),
-            "root": self.fit.root.tolist(),
+            "root": self.fit.certainty.root.tolist(),
         }
         about = self.document() | {KEY: region}
         bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
@@ -186,17 +215,21 @@ class Identification:
         link or "robot", and the errors.
         """
         intervals: Document = {}
-        for entry, row in zip(self.unknowns.entries, self._rows, strict=True):
-            intervals.setdefault(self._place(entry) or "robot", {})[entry.kind] = list(row)
+        shown = self.fit.certainty.shown.tolist()
+        for entry, row, is_shown in zip(self.unknowns.entries, self._rows, shown, strict=True):
+            if is_shown:
+                intervals.setdefault(self._place(entry) or "robot", {})[entry.kind] = list(row)
         return {
             "intervals": intervals,
-            "not_shown": self.not_identified,
+            "not_shown": self.not_shown,
+            "not_needed": self.not_needed,
+            "at_bounds": self.at_bounds,
+            "effects": self.effects,
             "did_not_move_hence_ideal": list(self.still),
             "held_out_error": list(self.held_out_error),
             "converged": self.converged,
             "compensation_through_motors": self.drive.through,
             "identified_from": [part.log.source for part in self.fit.problem.data],
-            "advice": self.advice,
         }
 
     def corrected_urdf(self) -> str:
@@ -209,7 +242,7 @@ class Identification:
             Masses are not among the unknowns (extras=["mass"]).
         """
         pairs = zip(self.unknowns.entries, self.values.tolist(), strict=True)
-        factors = {entry.link: value for entry, value in pairs if entry.link is not None}
+        factors = {str(entry.link): value for entry, value in pairs if entry.kind == "mass"}
         if not factors:
             remedy = "identify with extras=['mass']"
             raise InvalidArgumentError("corrected_urdf", "no mass was found", remedy=remedy)
@@ -231,7 +264,7 @@ class Identification:
         windows = [window for window in self.fit.problem.windows if window.log == 0]
         tables = []
         for problem in (self._described, self.fit.problem):
-            point = self.fit.point[: len(problem.unknowns.entries)]
+            point = self._point[: len(problem.unknowns.entries)]
             first = replace(problem, windows=windows)
             tables.append(first.evaluate(point, free_states=False, held_out=True))
         errors = []
@@ -261,12 +294,18 @@ class Identification:
         joints = zip(self.joints, self.errors[1], strict=True)
         errors = [f"{self.robot.joint_names[joint]} {error:.2g}" for joint, error in joints]
         lines.append(f"by joint: {', '.join(errors)}")
-        if self.not_identified:
-            names = ", ".join(self.not_identified)
-            lines.append(f"not shown by these logs or not needed, hence as described: {names}")
+        for name, share in self.effects.items():
+            lines.append(f"with {name}, which lowers the held-out error by {1 - share:.0%}")
+        for name, others in self.not_shown.items():
+            words = f", which cannot be told from {', '.join(others)}" if others else ""
+            lines.append(f"not shown by these logs: {name}{words}")
+        if self.not_needed:
+            lines.append(f"not needed by these logs: {', '.join(self.not_needed)}")
+        if self.at_bounds:
+            lines.append(f"at its bound: {', '.join(self.at_bounds)}")
         if not self.converged:
             lines.append("the fit has not converged: the values are the best so far")
-        return "\n".join([*lines, self.advice])
+        return "\n".join(lines)
 
 
 def _cell(
@@ -297,54 +336,6 @@ def _of_all_joints(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
     return fields
 
 
-def advice(fit: Fit) -> str:
-    """Return a sentence on the effect that would explain most of the remaining error of a fit, by
-    its derivatives: each further effect is added alone to the unknowns of the fit.
-    """
-    problem = fit.problem
-    unknowns = problem.unknowns
-    entries = unknowns.entries
-    present = {entry.kind for entry in entries}
-    kinds = [kind for kind in ("mass", "offset", "load_friction") if kind not in present]
-    links = problem.data[0].plant.heavy_links
-    starts = {"load_friction": np.zeros(len(unknowns.joints))}
-    further = Unknowns.of(unknowns.robot, unknowns.joints, kinds, starts, {}, links).entries
-    wide = replace(unknowns, entries=(*entries, *further))
-    values = np.append(unknowns.values(fit.point), [entry.start for entry in further])
-    problem = replace(problem, unknowns=wide)
-    point = wide.points(values)
-    evaluation = problem.evaluate(point, STEP * np.eye(len(point)))
-    residual, matrix = problem.system(point, evaluation, fit.size)
-    # Without the prior of the further unknowns: any size of an effect is as likely.
-    rows = len(residual) - len(further)
-    table = downweighted(np.column_stack([residual, matrix])[:rows])
-    triangle: Any = np.linalg.qr(table, mode="r")
-    target = -triangle[:, 0]
-    names = np.array([entry.link or entry.kind for entry in wide.entries])
-    is_factor = np.array([kind.neutral == 1.0 for kind in wide.kinds])
-    effects = []
-    for name in dict.fromkeys(names[len(entries) :].tolist()):
-        columns = names == name
-        columns[: len(entries)] = True
-        slopes = triangle[:, 1:][:, columns]
-        change, *_ = np.linalg.lstsq(slopes, target, rcond=1e-10)
-        share = 1 - float(((target - slopes @ change) ** 2).sum() / (target @ target))
-        factors = (values[columns] + change)[is_factor[columns]]
-        effects.append((share, float(np.abs(factors - 1).sum()), name, change[-1]))
-    share, _, name, _ = max(effects, default=(0.0, 0.0, "", 0.0))
-    if share < LEAST_SHARE:
-        return "no further effect that was tried would explain a tenth of the remaining error"
-    words = "would explain {:.0f} % of the squared error (extras: {})"
-    if name in KINDS:
-        return f"{name} {words.format(100 * share, name)}"
-    # A heavier link looks like a lighter other one with weaker motors: take factors near 1.
-    alike = [effect for effect in effects if effect[0] > ALIKE * share and effect[2] not in KINDS]
-    share, _, name, size = min(alike, key=lambda effect: effect[1])
-    more = "heavier" if size > 0 else "lighter"
-    words = words.format(100 * share, "mass")
-    return f"link {name} {more} than described {words}, or the strengths: weigh it"
-
-
 def draw_motors(
     path: str | os.PathLike[str],
     robot: Robot,
@@ -373,15 +364,15 @@ def draw_motors(
         entries = []
         for kind, place in region["unknowns"]:
             joint = robot.joint_names.index(place) if KINDS[kind].per == "joint" else None
-            entries.append(Unknown(kind, joint, 0.0, 1.0))
-        normal = np.random.default_rng(seed).normal(size=(count, len(entries)))
-        values = region["estimate"] + normal @ np.transpose(region["root"])
+            least = max(least_value(robot, kind, joint or 0), 1e-3 * KINDS[kind].neutral)
+            entries.append(Unknown(kind, joint, 0.0, 1.0, least))
+        root = np.array(region["root"], float)
+        normal = np.random.default_rng(seed).normal(size=(count, root.shape[1]))
+        values = region["estimate"] + normal @ root.T
     except (KeyError, IndexError, TypeError, ValueError) as bad:
         problem = f"is missing or cannot be read ({bad})"
         remedy = "write the file with `batchpid identify` of this robot"
         raise InvalidArgumentError(f"{path}: {KEY}", problem, remedy=remedy) from None
-    unknowns = Unknowns(robot, tuple(range(robot.dof)), tuple(entries))
-    for column, kind in enumerate(unknowns.kinds):
-        if kind.positive:
-            values[:, column] = values[:, column].clip(1e-3 * kind.neutral, kind.most)
+    unknowns = Unknowns(robot, tuple(range(robot.dof)), {}, (), tuple(entries))
+    values = np.clip(values, *unknowns.bounds)
     return nominal.replace(**_of_all_joints(unknowns, values))

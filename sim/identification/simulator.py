@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,11 +42,17 @@ from batchpid.task_space.rigid_tree import RigidTree
 
 DIVERGED = 1e4
 """Position beyond which a simulation has diverged [rad or m]."""
-PAYLOAD = ""
-"""Name of the payload among masses of links: no link has it."""
-Masses = tuple[tuple[str, float], ...]
-"""Factors of the masses of some links, and the mass of the payload [kg] under PAYLOAD."""
 _NONE = Friction()
+
+
+class MassChange(NamedTuple):
+    """Change of the masses of a robot."""
+
+    link: str
+    is_payload: bool
+    """True for a payload at the link's center of mass [kg], False for a factor of the mass and the
+    inertia of the link and those fixed to it.
+    """
 
 
 class LogControl(NamedTuple):
@@ -76,7 +81,10 @@ class PlantCandidates(NamedTuple):
     """
     setpoint_delay: Float64
     """Delay of the setpoints (n,) [s]."""
-    masses: Sequence[Masses]
+    setpoint_lag: Float64
+    """Time constant of their first-order lag (n,) [s]."""
+    masses: Mapping[MassChange, Float64]
+    """Payloads and factors (n,)."""
 
 
 class Stretch(NamedTuple):
@@ -113,7 +121,6 @@ class Plant:
         tree = robot.rigid_tree.fixed_at(coupling.positions(robot.start), moves)
         self.tree = replace(tree, coupling=Coupling.of(tree.dof, followers))
         """Rigid tree of the logged joints and their followers."""
-        self.tool = robot.rigid_tree.tool
         # A slice is not copied, as it is for indices.
         self.columns: Any = number[logged] if followers else slice(None)
         """Joints of the tree that are logged."""
@@ -137,70 +144,86 @@ class Plant:
 
 
 @lru_cache(maxsize=100)
-def _with_masses(tree: RigidTree, tool: str, masses: Masses) -> RigidTree:
-    """Return a tree with other masses: a factor holds for all links of a body, the payload is at
-    the tool's center of mass.
-    """
-    bodies = np.array(tree.link_bodies)
+def _heavier(tree: RigidTree, change: MassChange) -> RigidTree:
+    """Return a tree with a payload of 1 kg, or links of double mass."""
+    link = tree.index(change.link)
     mass = np.array(tree.mass)
-    inertia = np.array(tree.inertia)
-    for link, value in masses:
-        if link == PAYLOAD:
-            mass[tree.index(tool)] += value
-        else:
-            members = bodies == bodies[tree.index(link)]
-            mass[members] *= value
-            inertia[members] *= value
-    return replace(tree, mass=mass, inertia=inertia)
+    if change.is_payload:
+        mass[link] += 1.0
+        return replace(tree, mass=mass)
+    bodies = np.array(tree.link_bodies)
+    factor = np.where(bodies == bodies[link], 2.0, 1.0)
+    return replace(tree, mass=factor * mass, inertia=factor[:, None, None] * tree.inertia)
+
+
+class _Poses:
+    """Mass matrices and forces of equal robots."""
+
+    def __init__(self, tree: RigidTree, rows: int) -> None:
+        self.tree = tree
+        self.qpos = np.zeros((rows, tree.dof))
+        self.qvel = np.zeros_like(self.qpos)
+        wanted = "mass_matrix", "bias"
+        self._native = native_rows.bound(tree, wanted, self.qpos, self.qvel, 0)
+
+    def at(self, qpos: Float64, qvel: Float64, columns: Any) -> tuple[Float64, Float64]:
+        """Return mass matrices (rows, dof, dof) and forces (rows, dof) at ``qpos`` and ``qvel``
+        (rows, columns); the next call changes them.
+        """
+        self.qpos[:, columns] = qpos
+        self.qvel[:, columns] = qvel
+        if self.tree.coupling.shares:
+            self.qpos[...] = self.tree.positions(self.qpos)
+            self.qvel[...] = self.tree.rates(self.qvel)
+        if self._native is None:
+            matrix = ts.mass_matrix(self.tree, self.qpos)
+            return matrix, ts.bias(self.tree, self.qpos, self.qvel)
+        self._native[0]()
+        matrix, force = self._native[1]
+        return matrix, force
 
 
 class Dynamics:
     """Mass matrices (n, joints, joints) and forces (n, joints) of n robots at the poses of two
     arrays (n, joints).
+
+    Both are linear in masses: with those of the description M, and M_i with an i-th change of one
+    unit, they are M + sum of m_i (M_i - M).
     """
 
     def __init__(
         self,
         plant: Plant,
-        masses: Sequence[Masses],
+        masses: Mapping[MassChange, Float64],
         qpos: Float64,
         qvel: Float64,
     ) -> None:
-        rows, joints = qpos.shape
-        self.matrix = np.empty((rows, joints, joints))
-        self.force = np.empty((rows, joints))
+        rows = len(qpos)
         self._state = qpos, qvel
         self._columns = plant.columns
-        self._parts = list[Any]()
-        # Robots of equal masses follow one another: one part for each kind.
-        last = 0
-        for kind, robots in groupby(masses):
-            first = last
-            last += len(list(robots))
-            tree = _with_masses(plant.tree, plant.tool, kind)
-            q = np.zeros((last - first, tree.dof))
-            v = np.zeros_like(q)
-            native = native_rows.bound(tree, ("mass_matrix", "bias"), q, v, 0)
-            self._parts.append((slice(first, last), tree, q, v, native))
+        self._described = _Poses(plant.tree, rows)
+        self._changed = list[tuple[Float64, _Poses]]()
+        for change, value in masses.items():
+            amount = value - (not change.is_payload)
+            if amount.any():
+                self._changed.append((amount, _Poses(_heavier(plant.tree, change), rows)))
+        self.matrix: Float64 = np.empty((*qpos.shape, qpos.shape[1]))
+        self.force = np.empty_like(qpos)
         self.update()
 
     def update(self) -> None:
         """Compute the matrices and forces at the present poses."""
         columns = self._columns
-        qpos, qvel = self._state
-        for rows, tree, q, v, native in self._parts:
-            q[:, columns] = qpos[rows]
-            v[:, columns] = qvel[rows]
-            if tree.coupling.shares:
-                q[...] = tree.positions(q)
-                v[...] = tree.rates(v)
-            if native is None:
-                matrix, force = ts.mass_matrix(tree, q), ts.bias(tree, q, v)
-            else:
-                native[0]()
-                matrix, force = native[1]
-            self.matrix[rows] = matrix[:, columns][:, :, columns]
-            self.force[rows] = force[:, columns]
+        matrix, force = self._described.at(*self._state, columns)
+        sums = matrix, force
+        for amount, poses in self._changed:
+            heavier = poses.at(*self._state, columns)
+            sums = (
+                sums[0] + amount[:, None, None] * (heavier[0] - matrix),
+                sums[1] + amount[:, None] * (heavier[1] - force),
+            )
+        self.matrix[...] = sums[0][:, columns][:, :, columns]
+        self.force[...] = sums[1][:, columns]
 
 
 class SimulatedControl:
@@ -343,7 +366,7 @@ def simulate(
     described = None
     if drive.compensate != "none":
         speed = np.zeros_like(v) if drive.compensate == "gravity" else v
-        described = Dynamics(plant, [()] * len(q), measured, speed)
+        described = Dynamics(plant, {}, measured, speed)
     efforts = None
     if drive.params is None and past:
         efforts = commands[past - 1 :: -1][:past][:, stretch_of]
@@ -356,6 +379,9 @@ def simulate(
     share = (late - whole)[:, None]
     # Inertias that are added to the mass matrix: armature, and damping, which is implicit.
     added = control.armature + dt * control.friction.viscous
+    # Setpoints follow those of the log with a first-order lag, r += dt / (dt + T) (command - r).
+    follow = (dt / (dt + robots.setpoint_lag))[:, None]
+    lagged = np.array(commands[past, stretch_of])
     # Positions and velocities are stored at the steps of rows: a long log has many others.
     stored = set(np.concatenate([stretch.step for stretch in stretches]).tolist())
     track = dict[int, Float64]()
@@ -367,6 +393,9 @@ def simulate(
             command = commands[np.maximum(newest, 0), stretch_of]
             if share.any():
                 command += share * (commands[np.maximum(newest - 1, 0), stretch_of] - command)
+            if (follow < 1.0).any():
+                lagged += follow * (command - lagged)
+                command = lagged
             # What the robot compensates is added to the command, or cancels forces exactly.
             force = dynamics.force
             if described is not None and drive.through:
@@ -388,7 +417,8 @@ def simulate(
         rows = np.array([track[step][:, number::many] for step in stretch.step.tolist()])
         qpos = rows[:, 0] - stretch.before[:, None, None] * rows[:, 1]
         qpos = np.where(np.abs(qpos) < DIVERGED, qpos, np.inf)
-        positions.append(qpos.swapaxes(0, 1))
+        # Arrays from worker processes are contiguous: the same bits need the same layout here.
+        positions.append(np.ascontiguousarray(qpos.swapaxes(0, 1)))
     return positions
 
 

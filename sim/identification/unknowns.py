@@ -1,9 +1,8 @@
-"""Unknowns of a fit: objects with a start, a typical size and a prior, and the candidates at their
-values.
+"""Unknowns of a fit: objects with a start, a typical size, bounds and a prior, and the candidates
+at their values.
 
-A positive unknown x of typical size s has the coordinate c with x / s = (c + sqrt(c^2 + 4 r^2)) / 2
-in place of a bound: x / s itself, but for values near zero. Efforts are linear in most unknowns, so
-that a logarithm would bend the valleys between them. The coordinate of the others is x / s.
+A point has the values over their typical sizes. Bounds hold for the sum with the robot's
+description: what adds to its friction and damping may be negative.
 """
 
 from __future__ import annotations
@@ -18,13 +17,8 @@ import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.motors.actuators import Actuators
-from batchpid.sim.identification.simulator import PAYLOAD, PlantCandidates
+from batchpid.sim.identification.simulator import MassChange, PlantCandidates
 from batchpid.sim.robot.robot import Robot
-
-ROUND = 0.03
-"""Value of a positive unknown, over its typical size, at which its coordinate is 0."""
-LEAST_START = 0.02
-"""Least start of a positive unknown, over its typical size: at zero there is no slope."""
 
 
 class Kind(NamedTuple):
@@ -55,7 +49,8 @@ KINDS = {
     "bias": Kind("motor", "joint", "effort", 10.0, field="bias", positive=False),
     "delay": Kind("motor", "robot", 2e-3, 3.0, field="command_delay", most=0.1),
     "setpoint_delay": Kind("setpoint", "robot", 5e-3, 10.0, most=0.2),
-    "payload": Kind("robot", "robot", 0.1, 4.0),
+    "setpoint_lag": Kind("setpoint", "robot", 5e-3, 10.0, most=0.5),
+    "payload": Kind("robot", "robot", 0.1, 10.0),
     "load_friction": Kind("motor", "joint", 0.05, 2.0, field="load_friction", most=0.9),
     "static": Kind("motor", "joint", "friction", 2.0, field="static"),
     "stribeck": Kind("motor", "joint", "speed", 2.0, field="stribeck"),
@@ -64,19 +59,27 @@ KINDS = {
     "kd": Kind("law", "joint", 1.0, 2.0, 1.0),
     "saturation": Kind("law", "joint", "error", 2.0, np.inf),
     "slew": Kind("law", "joint", "top_speed", 2.0, np.inf),
-    "mass": Kind("robot", "link", 1.0, 0.05, 1.0),
+    "mass": Kind("robot", "link", 1.0, 0.3, 1.0),
 }
 """Kinds of unknowns. "effort_scale" is the scale of measured efforts, "static" the friction at rest
 in addition to "friction", "stribeck" the speed at which half of it is left. "gain" is a factor of
 all gains of the law, "kd" of kd alone, "saturation" the law's effort limit over its kp [rad or m],
-"slew" the limit of the setpoints' rate, "mass" a factor of a link's mass and inertia.
+"slew" the limit of the setpoints' rate, "mass" a factor of a link's mass and inertia. The delay and
+the first-order lag of setpoints belong to their sender.
 """
 BASIC = ("armature", "damping", "friction", "strength", "bias", "delay")
 """Kinds that every fit has."""
 EXTRAS = ("load_friction", "stribeck", "offset", "mass", "gain", "kd", "saturation", "slew")
 """Kinds that a fit has on request; "stribeck" brings "static" with it."""
+SENDER = ("setpoint_delay", "setpoint_lag")
+"""Kinds that every fit of setpoints has in addition."""
 DESCRIBED = {"damping": "damping", "friction": "friction"}
 """Kinds that add to a value of the robot's description, and the name there."""
+
+
+def kinds_of(effect: str) -> list[str]:
+    """Return the kinds of unknowns of an effect that a fit has on request."""
+    return ["static", effect] if effect == "stribeck" else [effect]
 
 
 class Unknown(NamedTuple):
@@ -89,53 +92,73 @@ class Unknown(NamedTuple):
     """
     start: float
     size: float
+    least: float
+    """Least value."""
     link: str | None = None
+    """Link of a mass or of the payload."""
+
+    @property
+    def place(self) -> int | str | None:
+        """Joint, or link of a mass."""
+        return self.link if self.kind == "mass" else self.joint
+
+
+def least_value(robot: Robot, kind: str, joint: int) -> float:
+    """Return the least value of an unknown of a joint of ``robot``; with the description's it is
+    zero.
+    """
+    if kind in DESCRIBED:
+        return -float(getattr(robot, DESCRIBED[kind])[joint])
+    return 0.0 if KINDS[kind].positive else -np.inf
 
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Unknowns of the logged ``joints`` of ``robot``; points are their coordinates (unknowns,).
+    """Unknowns of the logged ``joints`` of ``robot``; points are values over typical sizes
+    (unknowns,).
 
     Values are in addition to the robot's description.
     """
 
     robot: Robot
     joints: tuple[int, ...]
-    entries: tuple[Unknown, ...]
+    typical: Mapping[str, Float64]
+    """Typical values (joints,) by name."""
+    links: Sequence[str]
+    """Links whose masses can be unknown."""
+    entries: tuple[Unknown, ...] = ()
 
-    @classmethod
-    def of(
-        cls,
-        robot: Robot,
-        joints: tuple[int, ...],
+    def adding(
+        self,
         kinds: Sequence[str],
         starts: Mapping[str, Float64],
-        sizes: Mapping[str, Float64],
-        links: Sequence[str],
+        payload_link: str | None = None,
     ) -> Unknowns:
-        """Return the unknowns of ``kinds``.
+        """Return these and the unknowns of ``kinds``.
 
-        ``starts`` (joints,) or (1,) are values of some kinds, with the description's, others begin
-        at their typical size. ``sizes`` (joints,) are typical values by name.
+        ``starts`` (joints,) or (1,) are values of some kinds, with the description's; others begin
+        at their typical size.
         """
-        entries = list[Unknown]()
+        entries = list(self.entries)
         for name in kinds:
             kind = KINDS[name]
             if kind.per == "link":
-                entries += [Unknown(name, None, 1.0, 1.0, link) for link in links]
+                entries += [Unknown(name, None, 1.0, 1.0, 0.0, link) for link in self.links]
                 continue
-            for joint in range(len(joints)) if kind.per == "joint" else (None,):
+            for joint in range(len(self.joints)) if kind.per == "joint" else (None,):
                 column = joint or 0
-                size = sizes[kind.size][column] if isinstance(kind.size, str) else kind.size
+                size = kind.size
+                if isinstance(size, str):
+                    size = float(self.typical[size][column])
+                least = least_value(self.robot, name, self.joints[column])
                 start = size * kind.positive
                 if name in starts:
-                    start = starts[name][column]
+                    start = float(starts[name][column])
                 if name in DESCRIBED:
-                    start -= getattr(robot, DESCRIBED[name])[joints[column]]
-                if kind.positive:
-                    start = max(start, LEAST_START * size)
-                entries.append(Unknown(name, joint, float(start), float(size)))
-        return cls(robot, joints, tuple(entries))
+                    start += least
+                link = payload_link if name == "payload" else None
+                entries.append(Unknown(name, joint, max(start, least), size, least, link))
+        return replace(self, entries=tuple(entries))
 
     @cached_property
     def kinds(self) -> list[Kind]:
@@ -148,60 +171,42 @@ class Unknowns:
         return np.array([entry.size for entry in self.entries])
 
     @cached_property
-    def spread(self) -> Float64:
-        """Standard deviations of the prior over the sizes (unknowns,)."""
-        return np.array([kind.spread for kind in self.kinds])
-
-    @cached_property
-    def positive(self) -> Bool:
-        """Mask (unknowns,) of the unknowns that are positive."""
-        return np.array([kind.positive for kind in self.kinds], bool)
-
-    @cached_property
-    def _late(self) -> Float64:
-        """Parts (unknowns, unknowns) of values in coordinates of others.
-
-        The coordinate of a delay of setpoints holds for the sum with that of efforts: logs show the
-        sum far better than its parts, and a fit follows a valley that is straight.
-        """
-        names = np.array([entry.kind for entry in self.entries], dtype=object)
-        return np.outer(names == "delay", (names == "setpoint_delay") / self.sizes)
+    def bounds(self) -> tuple[Float64, Float64]:
+        """Least and largest point."""
+        least = np.array([entry.least for entry in self.entries])
+        return least / self.sizes, np.array([kind.most for kind in self.kinds]) / self.sizes
 
     @property
     def start(self) -> Float64:
         """Point at the start of a fit."""
-        return self.points(np.array([entry.start for entry in self.entries]))
+        return np.array([entry.start for entry in self.entries]) / self.sizes
 
     @property
     def prior(self) -> tuple[Float64, Float64]:
-        """Means and standard deviations (unknowns,) of the prior, coordinates.
+        """Means and standard deviations (unknowns,) of the prior of a point.
 
         The mean is that of ideal motors for strengths, factors and signed unknowns, else the start.
         """
-        pairs = zip(self.kinds, self.entries, strict=True)
-        means = np.array([1.0 if kind.neutral == 1.0 else entry.start for kind, entry in pairs])
-        mean = self._coordinates(means * self.positive)
-        return mean, self.spread * np.maximum(mean, 1.0)
+        means = []
+        for kind, entry in zip(self.kinds, self.entries, strict=True):
+            means.append(1.0 if kind.neutral == 1.0 else entry.start * kind.positive)
+        mean = np.array(means) / self.sizes
+        return mean, self.spread(mean)
 
-    def _coordinates(self, values: Float64) -> Float64:
-        """Return the coordinates of values (..., unknowns), one by one."""
-        shares = values / self.sizes
-        least = np.maximum(shares, 0.1 * ROUND)
-        return np.where(self.positive, least - ROUND**2 / least, shares)
-
-    def points(self, values: Float64) -> Float64:
-        """Return the points (..., unknowns) of ``values`` (..., unknowns)."""
-        return self._coordinates(values) + values @ self._late
+    def spread(self, point: Float64) -> Float64:
+        """Return the standard deviations (unknowns,) of the prior around a ``point``."""
+        return np.array([kind.spread for kind in self.kinds]) * np.maximum(np.abs(point), 1.0)
 
     def values(self, points: Float64) -> Float64:
         """Return the values (..., unknowns) at ``points`` (..., unknowns)."""
-        most = [kind.most for kind in self.kinds]
+        return points * self.sizes
 
-        def alone(points: Float64) -> Float64:
-            rounded = 0.5 * (points + np.sqrt(points**2 + 4 * ROUND**2))
-            return np.minimum(self.sizes * np.where(self.positive, rounded, points), most)
-
-        return alone(points - alone(points) @ self._late)
+    @cached_property
+    def described(self) -> Float64:
+        """Values of the robot's description (unknowns,), which add to those here."""
+        return np.array(
+            [-entry.least if entry.kind in DESCRIBED else 0.0 for entry in self.entries]
+        )
 
     def tables(self, values: Float64, *targets: str) -> dict[str, Float64]:
         """Return the ``values`` (n, unknowns) of kinds that change one of ``targets`` as tables (n,
@@ -224,12 +229,15 @@ class Unknowns:
         fields = self.tables(values, "motor", "sensor")
         if "command_delay" in fields:
             fields["max_delay"] = fields["command_delay"].max(keepdims=True)
-        late = self.tables(values, "setpoint").get("setpoint_delay", np.zeros((len(values), 1)))
-        robots = [at for at, kind in enumerate(self.kinds) if kind.target == "robot"]
-        names = [self.entries[at].link or PAYLOAD for at in robots]
-        masses = [tuple(zip(names, row, strict=True)) for row in values[:, robots].tolist()]
+        none = np.zeros((len(values), 1))
+        sender = self.tables(values, "setpoint")
+        late, lag = (sender.get(name, none)[:, 0] for name in SENDER)
+        masses = {}
+        for column, entry in enumerate(self.entries):
+            if entry.link is not None:
+                masses[MassChange(entry.link, entry.kind == "payload")] = values[:, column]
         law = self.tables(values, "law")
-        return PlantCandidates(Actuators(**fields), law, late[:, 0], masses)
+        return PlantCandidates(Actuators(**fields), law, late, lag, masses)
 
     def only(self, mask: Bool) -> Unknowns:
         """Return the unknowns of a mask (unknowns,); the others have their neutral value."""

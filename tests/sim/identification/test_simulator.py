@@ -9,8 +9,8 @@ from arms import DT, FALLING, STEPS, TRUTH, gains, load, motion, run
 import batchpid as bp
 from batchpid.sim import Robot
 from batchpid.sim.identification.simulator import (
-    PAYLOAD,
     LogControl,
+    MassChange,
     Plant,
     PlantCandidates,
     Stretch,
@@ -29,7 +29,7 @@ MOTORS = {
 }
 
 
-def candidates(count=1, law=None, delay=0.0, masses=(), **actuators) -> PlantCandidates:
+def candidates(count=1, law=None, delay=0.0, lag=0.0, masses=None, **actuators) -> PlantCandidates:
     """Return equal candidates."""
     made = bp.make_actuators(
         2, **{name: value for name, value in actuators.items() if value is not None}
@@ -40,9 +40,8 @@ def candidates(count=1, law=None, delay=0.0, masses=(), **actuators) -> PlantCan
         if leaf is not None
     }
     spread |= {} if made.max_delay is None else {"max_delay": made.max_delay}
-    return PlantCandidates(
-        bp.Actuators(**spread), law or {}, np.full(count, delay), (tuple(masses),) * count
-    )
+    late = (np.full(count, time) for time in (delay, lag))
+    return PlantCandidates(bp.Actuators(**spread), law or {}, *late, masses or {})
 
 
 def stretch_of(commands, start) -> Stretch:
@@ -115,14 +114,22 @@ def test_masses_are_those_of_another_description(tmp_path):
     heavy = heavy.replace('iyy="0.01"', 'iyy="0.015"').replace('izz="0.002"', 'izz="0.003"')
     drive = LogControl(DT, gains(), "none")
     table = simulated(
-        robot, setpoints, drive, candidates(masses=[("fore", 1.5)], **TRUTH), setpoints[0]
+        robot,
+        setpoints,
+        drive,
+        candidates(masses={MassChange("fore", False): np.array([1.5])}, **TRUTH),
+        setpoints[0],
     )
     other = load(tmp_path, heavy)
     np.testing.assert_allclose(
         table, simulated(other, setpoints, drive, candidates(**TRUTH), setpoints[0]), atol=1e-9
     )
     loaded = simulated(
-        robot, setpoints, drive, candidates(masses=[(PAYLOAD, 0.5)], **TRUTH), setpoints[0]
+        robot,
+        setpoints,
+        drive,
+        candidates(masses={MassChange("fore", True): np.array([0.5])}, **TRUTH),
+        setpoints[0],
     )
     assert np.abs(loaded - table).max() < np.abs(loaded - run(robot, setpoints).qpos[:, 0]).max()
 

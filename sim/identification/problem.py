@@ -1,0 +1,244 @@
+r"""Problem of a fit: simulated against measured positions of all windows of logs.
+
+A log of efforts is simulated in windows, each from a free initial state, whose effect is projected
+out of residuals and derivatives (H. G. Bock, "Recent advances in parameter identification
+techniques for ODE", 1983). A log of setpoints is simulated as a whole. All candidates of an
+evaluation - the present point, changes of it, and a change of each initial state - are simulated
+in one batch.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import batchpid as bp
+from batchpid.arrays.array_types import Float64
+from batchpid.arrays.trees import structure
+from batchpid.sim.identification.regression import LogData
+from batchpid.sim.identification.simulator import Stretch, simulate
+from batchpid.sim.identification.unknowns import Unknowns
+
+WINDOW = 0.3
+"""Length of a window of a log of efforts [s]."""
+PAST = 0.1
+"""Time before a window whose commands may still act in it [s]."""
+SETTLE = 0.3
+"""Time after the start of a log under the PID law in which the initial state is forgotten [s]: it
+is not fitted.
+"""
+HELD_OUT = 0.25
+"""Share of each log, at its end, that is held out."""
+MOST_WINDOWS = 500
+"""Largest number of windows; if there are more, evenly spaced ones are used."""
+MOST_ROWS = 40_000
+"""Largest number of rows of all logs; if there are more, evenly spaced ones are used."""
+ENVS = 2048
+"""Most simulations at once."""
+STATE_STEPS = 1e-3, 1e-2
+"""Changes of initial positions and velocities."""
+FARTHEST = 3.0
+"""Bound of the residuals [rad or m], reached where a simulation diverges."""
+RESOLUTION = 1e-5
+"""Least size of residuals [rad or m]: encoders show no less."""
+
+
+class Window(NamedTuple):
+    """Stretch of a log to simulate, and the rows of the log that it is compared with."""
+
+    log: int
+    stretch: Stretch
+    measured: Float64
+    """Positions (rows, joints)."""
+    time: Float64
+    """Times (rows,) [s]."""
+    fitted: Any
+    """Fitted rows; the others are held out (rows,) bool."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Windows of logs, the simulation of each log, and the unknowns."""
+
+    data: Sequence[LogData]
+    windows: Sequence[Window]
+    unknowns: Unknowns
+    run: Callable[..., Any] = map
+    """Map over groups of windows: ``map``, or that of worker processes."""
+
+    def evaluate(
+        self,
+        point: Float64,
+        changes: Float64 | None = None,
+        free_states: bool = True,
+        held_out: bool = False,
+    ) -> list[Float64]:
+        """Return the residuals of each window at a point (unknowns,), and their changes by
+        ``changes`` (n, unknowns) of the point: (rows, joints, 1 + n).
+
+        Initial states of windows of efforts are projected out if they are free. Windows without
+        fitted rows are evaluated if ``held_out``, and are empty otherwise.
+        """
+        joints = self.windows[0].measured.shape[1]
+        free = free_states and self.data[0].drive.params is None
+        shifts = np.diag(np.repeat(STATE_STEPS, joints * free))
+        # Rows: the point, each change of it, a change of each initial state.
+        moved = point[None] if changes is None else np.vstack([point, point + changes])
+        count = len(moved)
+        points = np.vstack([moved, np.tile(point, (len(shifts), 1))])
+        states = np.zeros((len(points), 2, joints))
+        states[count:] = shifts.reshape(-1, 2, joints)
+        # Windows of the same robot and law are simulated at once.
+        alike = defaultdict[Any, list[int]](list)
+        for number, window in enumerate(self.windows):
+            part = self.data[window.log]
+            if held_out or window.fitted.any():
+                alike[id(part.plant), structure(part.drive.params)].append(number)
+        many = max(1, ENVS // len(points))
+        groups = []
+        for numbers in alike.values():
+            groups += [numbers[first : first + many] for first in range(0, len(numbers), many)]
+        tasks = [self._task(group, points, states) for group in groups]
+        tables = [np.zeros((0, joints, count))] * len(self.windows)
+        for group, positions in zip(groups, self.run(_simulated, tasks), strict=True):
+            for number, table in zip(group, positions, strict=True):
+                errors = np.clip(self.windows[number].measured - table, -FARTHEST, FARTHEST)
+                errors[1:] -= errors[0]
+                tables[number] = _projected(np.moveaxis(errors, 0, 2), count)
+        return tables
+
+    def _task(self, group: list[int], points: Float64, states: Float64) -> Any:
+        """Return the arguments of :func:`simulate` for a group of windows, each at all points."""
+        parts = [self.data[self.windows[number].log] for number in group]
+        stretches = [self.windows[number].stretch for number in group]
+        drive = parts[0].drive
+        if drive.params is not None:
+            # A column of rows: other options are equal in all logs of a group.
+            rows: Any = zip(*[part.drive.params for part in parts * len(points)], strict=True)
+            leaves: Any = [
+                np.concatenate(row) if isinstance(row[0], np.ndarray) else row[0] for row in rows
+            ]
+            drive = drive._replace(params=bp.PIDParams(*leaves))
+        points, states = (np.repeat(table, len(group), axis=0) for table in (points, states))
+        robots = self.unknowns.candidates(self.unknowns.values(points))
+        return parts[0].plant, drive, robots, states, stretches
+
+    def weighted(self, evaluation: Sequence[Float64], size: Float64) -> Float64:
+        """Return residuals and their changes (n, 1 + changes) of the fitted rows over their
+        ``size``.
+        """
+        pairs = zip(self.windows, evaluation, strict=True)
+        tables = [table[window.fitted] / size[:, None] for window, table in pairs if len(table)]
+        table = np.concatenate(tables)
+        return table.reshape(-1, table.shape[2])
+
+    def size(self, evaluation: Sequence[Float64]) -> Float64:
+        """Return the size of fitted residuals (joints,): the root mean square, the largest tenth of
+        each joint cut.
+        """
+        joints = self.windows[0].measured.shape[1]
+        errors = self.weighted(evaluation, np.ones(joints))[:, 0].reshape(-1, joints)
+        errors = np.minimum(np.abs(errors), np.quantile(np.abs(errors), 0.9, axis=0))
+        size: Float64 = np.sqrt((errors**2).mean(0)) + RESOLUTION
+        return size
+
+    def errors(
+        self,
+        point: Float64,
+        changes: Float64 | None = None,
+        free_states: bool = True,
+    ) -> Float64:
+        """Return the root mean squares (1 + n, joints) of the position error at the held-out rows,
+        at a point and at ``changes`` (n, unknowns) of it; at all rows if none is held out.
+
+        Windows of efforts begin at the logged state, or at the best one if states are free.
+        """
+        evaluation = self.evaluate(point, changes, free_states, held_out=True)
+        table = np.concatenate(evaluation)
+        held_out = ~np.concatenate([window.fitted for window in self.windows])
+        if held_out.any():
+            table = table[held_out]
+        table[..., 1:] += table[..., :1]
+        size: Float64 = np.sqrt((table**2).mean(0)).T
+        return size
+
+
+def _simulated(task: Any) -> list[Float64]:
+    return simulate(*task)
+
+
+def _projected(table: Float64, count: int) -> Float64:
+    """Return the first ``count`` columns of a table (rows, joints, columns) without what the others
+    explain.
+    """
+    columns = table.reshape(-1, table.shape[2])
+    basis = columns[:, count:]
+    rest = columns[:, :count]
+    if basis.shape[1]:
+        q, _ = np.linalg.qr(basis / (np.linalg.norm(basis, axis=0) + 1e-12))
+        rest = rest - q @ (q.T @ rest)
+    return rest.reshape(*table.shape[:2], count)
+
+
+def windows_of(data: Sequence[LogData]) -> list[Window]:
+    """Return the windows of logs, one for each log of setpoints. A window begins where the held-out
+    part begins.
+    """
+    windows = list[Window]()
+    every = 1 + sum(len(part.log.time) for part in data) // MOST_ROWS
+    for number, part in enumerate(data):
+        dt = part.drive.timestep
+        total = len(part.motion.qpos) - 1
+        share = {None: 1 - HELD_OUT, False: 1.0, True: 0.0}[part.log.held_out]
+        split = round(share * total)
+        length = total
+        starts = [0]
+        if part.drive.params is None:
+            # Windows of the fitted part, then of the held-out part; the filter begins at the edge.
+            edge = round(0.05 / dt)
+            first = max(split + 1, edge)
+            length = min(round(WINDOW / dt), max(total - first, split - edge))
+            starts = [*range(edge, split - length + 1, length)]
+            starts += range(first, total - length + 1, length)
+        for start in starts:
+            windows.append(_window(number, part, start, start + length, split, every))
+    return windows[:: 1 + len(windows) // MOST_WINDOWS]
+
+
+def _window(
+    number: int,
+    data: LogData,
+    first: int,
+    last: int,
+    split: int,
+    every: int,
+) -> Window:
+    """Return the window between two sim steps of a log's grid, of one row of ``every``; rows are
+    held out from the step ``split`` on.
+    """
+    log, motion, _, drive = data
+    dt = drive.timestep
+    settle = 0.0
+    if drive.params is not None:
+        settle = min(SETTLE, 0.2 * log.seconds) / dt
+    place = (log.time - log.time[0]) / dt
+    rows = np.flatnonzero((place > first + settle + 1e-6) & (place <= last + 1e-6))[::every]
+    place = place[rows]
+    # Rows lie before the ends of their sim steps.
+    step = np.maximum(np.ceil(place - 1e-6).astype(int), first + 1)
+    before = np.maximum(step - place, 0.0) * dt
+    past = round(PAST / dt)
+    command = motion.command[np.maximum(np.arange(first - past, last), 0)]
+    begin = motion.qpos[first], motion.qvel[first]
+    stretch = Stretch(*begin, command, past, step - first - 1, before)
+    return Window(
+        number,
+        stretch,
+        log.qpos[rows],
+        log.time[rows],
+        place <= split + 1e-6,
+    )
