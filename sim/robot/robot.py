@@ -60,6 +60,8 @@ GRAVITY_MARGIN = 2.0  # of the effort that holds the joint still
 SPEED = 3.0  # [rad/s or m/s], at which the joint's damping is overcome
 ACCELERATION = 30.0  # [rad/s^2 or m/s^2] of all joints at once
 POSES = 50
+TARGET_SHARES = (1.0, -1.0, 0.5, -0.5, 0.2, -0.2)
+"""Shares of the first move that are tried for one without contact."""
 
 
 def suggested_effort_limit(
@@ -236,16 +238,28 @@ class Robot:
     def target(self) -> Float64:
         """Pose (dof,) [rad or m] for a first move, within the limits.
 
-        The target of the bundled settings, else a quarter of the way from the start to the farther
-        limit of each joint, at most 0.5 rad or m.
+        The target of the bundled settings. Else a quarter of the way from the start to the farther
+        limit of each joint, at most 0.5 rad or m; a part of it, or of the way back, where links
+        would touch each other or the ground.
         """
         if self.settings is not None:
             return self.settings.target.copy()
+        return self._free_target.copy()
+
+    @cached_property
+    def _free_target(self) -> Float64:
         # Toward the farther limit, so that the move is inside.
         above = self.upper - self.start
         below = self.lower - self.start
-        distance = np.where(above >= -below, above, below)
-        return self.coupled(self.start + np.clip(0.25 * distance, -0.5, 0.5))
+        move = np.clip(0.25 * np.where(above >= -below, above, below), -0.5, 0.5)
+        model = self.dynamics(ground=self.fixed_base and self.has_ground)
+        for share in TARGET_SHARES:
+            ways = share * np.linspace(0.2, 1.0, 5)[:, None] * move
+            poses = self.coupled(np.clip(self.start + ways, self.lower, self.upper))
+            if not model.in_contact(poses).any():
+                return poses[-1]
+        # Links touch at the start already, which is a finding.
+        return self.coupled(self.start + move)
 
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's
