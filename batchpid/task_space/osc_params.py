@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -223,7 +223,7 @@ def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...
     builders = {group: LeafBuilder(len(names), names) for group, names in columns.items()}
     rows: Document = {}
     for name, field in FIELDS.items():
-        value = options.get(name, field.default)
+        value: Any = options.get(name, field.default)
         if isinstance(field.neutral, bool) and value is not None:
             # Bools as 1.0 and 0.0.
             value = read_array(name, value, "b").astype(float)

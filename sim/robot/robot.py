@@ -42,7 +42,7 @@ from batchpid.sim.robot.parts import (
 from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.sim.robot.robot_options import load_robot_actuators, setpoint_guard
 from batchpid.sim.robot.self_collision import SELF_COLLISION, SelfContact, read_srdf, self_contact
-from batchpid.sim.robot.simulated_links import link_masses, rigid_tree
+from batchpid.sim.robot.simulated_links import body_tree, link_masses
 from batchpid.sim.robot.tables import Body, Tables
 from batchpid.sim.robot.urdf import read_robot
 from batchpid.task_space.rigid_tree import RigidTree
@@ -257,7 +257,8 @@ class Robot:
             ways = share * np.linspace(0.2, 1.0, 5)[:, None] * move
             poses = self.coupled(np.clip(self.start + ways, self.lower, self.upper))
             if not model.in_contact(poses).any():
-                return poses[-1]
+                free: Float64 = poses[-1]
+                return free
         # Links touch at the start already, which is a finding.
         return self.coupled(self.start + move)
 
@@ -307,8 +308,8 @@ class Robot:
             [[-np.inf], [np.inf]],
             [self.lower, self.upper],
         )
-        limits = {"lower": low, "upper": high}
-        return rigid_tree(self.tables, coupling=self.coupling, fixed_base=self.fixed_base, **limits)
+        tree = body_tree(self.tables, self.fixed_base)
+        return replace(tree, coupling=self.coupling, lower=low, upper=high)
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof),
@@ -667,7 +668,7 @@ def _model(robot: Robot, ground: bool) -> RobotModel:
     ignored = frozenset(map(frozenset, robot.ignored_pairs))
     # Merged, since the engines simulate merged links, too.
     simulated = merge_links(robot.tables)
-    return RobotModel(rigid_tree(simulated), robot.coupling, simulated, ignored, ground)
+    return RobotModel(body_tree(simulated), robot.coupling, simulated, ignored, ground)
 
 
 def _find(name_or_path: str | Path) -> Path:
