@@ -20,6 +20,7 @@ Params say how to control, a state is carried from step to step, and every array
   :func:`spectral_radius`.
 - A simulator's drive with integral action: :func:`drive_target`.
 - Limits of setpoints: :func:`make_guard` and :mod:`batchpid.motors.guard`.
+- Chunks of a slow policy: :func:`make_plan` and :mod:`batchpid.plan`.
 - Real motors and sensors: :func:`make_actuators` and :mod:`batchpid.motors`.
 - Control of a tool: :mod:`batchpid.task_space`.
 - In modules: setpoints in :mod:`batchpid.trajectories`, figures of merit in
@@ -29,7 +30,7 @@ Params say how to control, a state is carried from step to step, and every array
 Requires NumPy alone; JAX and PyYAML are imported on first use.
 """
 
-from batchpid import motors
+from batchpid import motors, plan
 from batchpid.controller import BatchPID
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.gains import presets
@@ -50,6 +51,7 @@ from batchpid.law.pid import advance, drive_target, init, reset, step, step_term
 from batchpid.law.state import PIDState, Terms
 from batchpid.motors import Actuators, load_actuators, make_actuators, save_actuators
 from batchpid.motors.guard import Guard, make_guard
+from batchpid.plan import Plan, load_plan, make_plan, save_plan
 
 __version__ = "0.1.0"
 """Version of the package; pyproject.toml reads it here."""
@@ -64,6 +66,7 @@ __all__ = [
     "MissingDependencyError",
     "PIDParams",
     "PIDState",
+    "Plan",
     "Terms",
     "advance",
     "design_gains",
@@ -74,15 +77,19 @@ __all__ = [
     "load_about",
     "load_actuators",
     "load_params",
+    "load_plan",
     "loads_params",
     "make_actuators",
     "make_guard",
     "make_params",
+    "make_plan",
     "motors",
+    "plan",
     "presets",
     "reset",
     "save_actuators",
     "save_params",
+    "save_plan",
     "spectral_radius",
     "stability_bound",
     "step",

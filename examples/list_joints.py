@@ -18,7 +18,7 @@ def main(robot: tyro.conf.Positional[str] = "panda", stiffness: float = 0.0) -> 
         stiffness: Stiffness of the internal drive [N m/rad or N/m].
     """
     loaded = Robot.load(robot)
-    for joint in loaded.all_joints:
+    for joint in loaded.tables.joints:
         drive = stiffness if joint.moves else 0.0
         print(
             f"name: {joint.name}  type: {joint.type}  damping: {joint.damping:g}  stiffness:"

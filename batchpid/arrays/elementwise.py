@@ -134,6 +134,15 @@ def read_history(history: Array, places: Array) -> Array:
     return history.take(places)
 
 
+@_recorded("take_row")
+def take_rows(table: Array, rows: Array) -> Array:
+    """Return the numbers of ``table`` (..., rows, joints) in row ``rows`` (..., joints) of each
+    joint; the numbers of the rows are floats.
+    """
+    xp = namespace(table, rows)
+    return xp.take_along_axis(table, rows[..., None, :].astype(int), -2)[..., 0, :]
+
+
 def replace_envs(state: T, fresh: T, mask: Array) -> T:
     """Return ``state``, a tree of arrays (envs, ...), with the envs of ``mask`` (envs,) bool as in
     ``fresh``, which has the same structure.

@@ -22,6 +22,7 @@ from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.trees import is_leaf, leaves, parts, structure
 from batchpid.checks.validate import choice, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
+from batchpid.export.c_plan import plan_functions
 from batchpid.export.c_rigid_body import rigid_body
 from batchpid.export.c_step import Dialect, comment, helpers, statements
 from batchpid.export.differences import Exported, check_one_env
@@ -33,6 +34,7 @@ from batchpid.law.state import PIDState
 from batchpid.motors import guard as guard_model
 from batchpid.motors.guard import Guard, GuardState
 from batchpid.native.tracing import trace_trees
+from batchpid.plan import Plan
 from batchpid.task_space.rigid_tree import RigidTree
 
 RATES = {
@@ -52,6 +54,7 @@ def to_c(
     inputs: Sequence[str] | None = None,
     prefix: str = "batchpid",
     tree: RigidTree | None = None,
+    plan: Plan | None = None,
 ) -> Exported:
     """Return a C header with the law of one robot; its numbers have the params' dtype.
 
@@ -74,6 +77,9 @@ def to_c(
     tree
         Of the robot (:meth:`batchpid.sim.Robot.kinematic_tree`): adds ``PREFIX_mass_matrix``,
         ``PREFIX_bias`` and ``PREFIX_gravity``.
+    plan
+        Of one env, in the params' dtype: adds ``PREFIX_plan_init``, ``PREFIX_add_chunk`` and
+        ``PREFIX_sample``.
 
     Raises
     ------
@@ -81,7 +87,7 @@ def to_c(
         Params for several envs, options that exclude each other, names that C does not allow, or a
         tree with other joints.
     """
-    return Exported(Header(params, dt, joint_names, guard, inputs, prefix, tree).text())
+    return Exported(Header(params, dt, joint_names, guard, inputs, prefix, tree, plan).text())
 
 
 class Header:
@@ -98,12 +104,14 @@ class Header:
         inputs: Sequence[str] | None,
         prefix: str,
         tree: RigidTree | None,
+        plan: Plan | None,
     ) -> None:
         check_one_env(params)
         self.params = params
         self.dt = time_step("dt", dt)
         self.guard = guard
         self.tree = tree
+        self.plan = plan
         joints = params.num_joints
         self.joints = [f"joint {at}" for at in range(joints)]
         if joint_names is not None:
@@ -119,6 +127,11 @@ class Header:
             guard.check(1, self.joints)
         if tree is not None:
             self._check_tree(tree)
+        if plan is not None:
+            plan.check(1, self.joints)
+            if plan.dtype != params.dtype:
+                problem = f"is {plan.dtype}, but the params are {params.dtype}"
+                raise InvalidArgumentError("plan", problem, remedy="use one dtype")
         self.names = Dialect(prefix, np.dtype(params.dtype), joints)
         if params.gain_units is None:
             matrix = []
@@ -151,6 +164,8 @@ class Header:
                 inputs = ("measurement_rate", "feedforward")
             else:
                 inputs = ("feedforward",)
+            if self.plan is not None:
+                inputs = (*inputs, "setpoint_rate")
         chosen = {choice("inputs", name, RATES) for name in inputs}
         if measures and "measurement_rate" not in chosen:
             remedy = "add it, or use params.replace(measurement_rate='difference')"
@@ -243,6 +258,8 @@ class Header:
         functions = "".join(helpers(self.names, body))
         if self.tree is not None:
             functions += rigid_body(self.names, self.tree)
+        if self.plan is not None:
+            functions += plan_functions(self.names, self.plan, functions)
         # A class of C++ wraps the same functions.
         passed = "".join(f", {name}" for name in self.inputs)
         pointers = "".join(f"const {t} *{name}, " for name in self.inputs)

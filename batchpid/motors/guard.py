@@ -129,7 +129,7 @@ def advance(
     guard: Guard,
     state: GuardState,
     setpoint: Array,
-    dt: float,
+    dt: Array,
 ) -> tuple[GuardState, Array]:
     """Advance the guard by ``dt`` [s]; return the state, with the guarded ``setpoint``, and a mask
     of the changes.
@@ -144,12 +144,13 @@ def advance(
     # A copy: the state keeps it, and the caller may change the setpoint.
     requested = clip(setpoint.copy(), guard.lower, guard.upper, xp)
     # On a continuous joint the short way round.
-    arriving = rate = wrap(requested - state.setpoint, guard.turns, xp) / dt
+    per_dt = 1.0 / dt
+    arriving = rate = wrap(requested - state.setpoint, guard.turns, xp) * per_dt
     if guard.acceleration is not None:
         # The rest is not made up for at once, but at the rate from which the joint can still stop.
         rest = wrap(state.requested - state.setpoint, guard.turns, xp)
         distance = xp.abs(rest)
-        rate = rate - xp.sign(rest) * (distance / dt - _stop(guard, distance, dt, xp))
+        rate = rate - xp.sign(rest) * (distance * per_dt - _stop(guard, distance, dt, xp))
     if guard.rate is not None:
         rate = clip(rate, -guard.rate, guard.rate, xp)
     if guard.acceleration is not None:
@@ -170,12 +171,13 @@ def advance(
 def _stop(
     guard: Guard,
     distance: Array,
-    dt: float,
+    dt: Array,
     xp: ArrayModule,
 ) -> Array:
     """Return the largest rate that stops within ``distance``; infinite where that is infinite."""
     finite = xp.isfinite(guard.acceleration)
     a = xp.where(finite, guard.acceleration, 1.0)
-    steps = xp.ceil(xp.sqrt(0.25 + 2 * distance / (a * dt**2)) - 0.5)
+    per_dt = 1.0 / dt
+    steps = xp.ceil(xp.sqrt(0.25 + distance * (2.0 / a * (per_dt * per_dt))) - 0.5)
     steps = xp.where(finite, xp.minimum(xp.maximum(steps, 1.0), MOST_STEPS), 1.0)
-    return distance / (steps * dt) + (steps - 1) * (0.5 * dt * a)
+    return distance * per_dt / steps + (steps - 1) * (0.5 * dt * a)

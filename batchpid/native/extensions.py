@@ -108,6 +108,7 @@ OPERATIONS = (
     "push",
     "take",
     "gather",
+    "take_row",
 )
 """Operations of programs, as Code in program.h."""
 ROW_WISE = ("row_minimum", "matrix_vector", "push", "take", "gather")

@@ -95,7 +95,7 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments, Fused const *t
   bool fits = program->inputs >= 0 && given <= program->registers;
   for (Operation const &each : program->operations) {
     bool const writes_input = each.code == PUSH && each.out == each.operands[0] && each.out >= count;
-    fits = fits && known(each.out) && (each.out >= given || writes_input) && each.code >= ADD && each.code <= GATHER &&
+    fits = fits && known(each.out) && (each.out >= given || writes_input) && each.code >= ADD && each.code <= TAKE_ROW &&
            std::all_of(each.operands, each.operands + 3, known);
   }
   fits = fits && std::all_of(program->results.begin(), program->results.end(), known);
@@ -149,9 +149,11 @@ inline bool tables_fit(Program const &program, Index rows, std::vector<Input> co
   for (auto const &[code, out, operands] : program.operations) {
     Index const size = size_of(operands[0]), columns = program.columns;
     bool const is_alone = operands[2] == operands[0];  // operands that are not there are copies of the first
-    if ((size > 0) != (code == MATRIX_VECTOR || code == PUSH || code == TAKE)) return false;
+    bool const reads_table = code == MATRIX_VECTOR || code == PUSH || code == TAKE || code == TAKE_ROW;
+    if ((size > 0) != reads_table) return false;
     if (size_of(operands[1]) || (!is_alone && size_of(operands[2]))) return false;
     if (code == MATRIX_VECTOR && size != columns * columns) return false;
+    if (code == TAKE_ROW && size % columns != 0) return false;
     if (code == PUSH && size % ((is_alone ? 1 : 2) * columns) != 0) return false;
     if (code != TAKE && code != GATHER) continue;
     if (program.single || operands[1] >= constants) return false;

@@ -39,6 +39,7 @@ enum Code : std::int32_t {
   PUSH,               // history, in place: b, or b and c, as its latest sample; the oldest one is lost
   TAKE,               // numbers of a table, at the places b in the whole of it
   GATHER,             // columns b of each row of a
+  TAKE_ROW,           // numbers of a table, in row b of the rows of each env and column
 };
 
 struct Operation {
@@ -209,6 +210,13 @@ BATCHPID_INLINE void apply(Program const &program, Code code, Index first, Index
       break;
     case TAKE:
       for (Index i = 0; i < n; ++i) out[i] = x.data[static_cast<Index>(y.data[y.step ? i : i % program.chunk])];
+      break;
+    case TAKE_ROW:
+      for (Index i = 0; i < n; ++i) {  // a place beyond the table, or NaN, is one in it
+        T const row = y.data[y.step ? i : i % program.chunk], last = static_cast<T>(x.step / columns - 1);
+        auto const place = static_cast<Index>(row > 0 ? std::min(row, last) : T(0));
+        out[i] = x.data[(first + i) / columns * x.step + place * columns + (first + i) % columns];
+      }
       break;
     case GATHER:
       for (Index row = 0; row < n; row += columns) {

@@ -28,7 +28,7 @@ ENDINGS = {
 }
 """End of the default file name of each target."""
 USED = {
-    "c": ("gains", "limits", "dynamics"),
+    "c": ("gains", "limits", "dynamics", "plan"),
     "ros2_control": ("gains", "limits"),
     "mjcf": ("gains", "limits"),
     "urdf": (),
@@ -89,6 +89,10 @@ def export(
     dynamics: Annotated[
         bool, flag("In C, add the robot's mass matrix, gravity and bias as functions.")
     ] = False,
+    plan: Annotated[
+        Path | None,
+        flag("In C, add a plan for chunks of a policy, from a file of `batchpid.save_plan`."),
+    ] = None,
 ) -> ExportedFile:
     """Write a robot's gains, or the robot itself, as a file for another program.
 
@@ -98,7 +102,7 @@ def export(
     batchpid's law or the robot's file are printed, one line each.
     """
     # A flag without effect is refused by name.
-    chosen = {"gains": gains, "limits": limits, "dynamics": dynamics}
+    chosen = {"gains": gains, "limits": limits, "dynamics": dynamics, "plan": plan}
     unused = [name for name, value in chosen.items() if value and name not in USED[to]]
     if unused:
         raise InvalidArgumentError(
@@ -113,7 +117,7 @@ def export(
     if to == "mjcf":
         exported = _mjcf(robot, params, timestep, limits)
     elif to == "c":
-        exported = _c_header(robot, params, timestep, limits, prefix, dynamics)
+        exported = _c_header(robot, params, timestep, limits, prefix, dynamics, plan)
     else:
         exported = _controllers(robot, params, timestep, limits, prefix)
     return ExportedFile(to, lambda folder: exported)
@@ -138,9 +142,11 @@ def _c_header(
     limits: bool,
     prefix: str,
     dynamics: bool,
+    plan: Path | None,
 ) -> Exported:
     """Return the C header."""
     from batchpid.export import to_c
+    from batchpid.plan import load_plan
 
     exported = to_c(
         params,
@@ -149,6 +155,7 @@ def _c_header(
         guard=robot.guard() if limits else None,
         prefix=prefix,
         tree=robot.kinematic_tree() if dynamics else None,
+        plan=None if plan is None else load_plan(plan, robot.joint_names)[0],
     )
     return _with_followers(robot, exported, "separate joints in the file; ignore their efforts")
 

@@ -63,7 +63,7 @@ class Inspection:
         # Joints in the order of qpos, then links by mass: the data sheet has both.
         joints = list(robot.joints)
         if self.all:
-            joints += [joint for joint in robot.all_joints if not joint.moves]
+            joints += [joint for joint in robot.tables.joints if not joint.moves]
         lines.append("\n" + table(list(joint_rows(joints)), HEADERS, "lllrrrrrl"))
         rows = []
         for name, link in masses.items():
@@ -119,7 +119,7 @@ def inspect_robot(
 
 def limbs(robot: Robot) -> int:
     """Return how many chains of :data:`LIMB` or more joints leave the root link."""
-    above = {joint.child_link: joint for joint in robot.all_joints}
+    above = {joint.child_link: joint for joint in robot.tables.joints}
     sizes = Counter[str]()
     # Of each joint, the first moving joint on the way from the root.
     for joint in robot.joints:

@@ -22,7 +22,7 @@ from batchpid.sim.diagnosis.preflight import touching_links
 from batchpid.sim.findings import KINDS, LIMIT_TOLERANCE, Finding, Findings
 
 if TYPE_CHECKING:
-    from batchpid.sim.robot.description import RobotDescription
+    from batchpid.sim.robot.robot import Robot
     from batchpid.sim.rollout import Rollout
 
 BAND = 0.02  # half width of the settling band, as a share of the move
@@ -31,12 +31,12 @@ TAIL = 0.2  # last share of the run, by which joints are judged
 TOUCH = 3e-3  # distance below which links touch, within the accuracy of meshes [m]
 
 
-def absolute_band(robot: RobotDescription) -> Float64:
+def absolute_band(robot: Robot) -> Float64:
     """Return the least half width of the settling band, per joint (dof,) [rad or m]."""
     return np.array([1e-4 if joint.type == "prismatic" else 1e-3 for joint in robot.joints])
 
 
-def settled_envs(rollout: Rollout, robot: RobotDescription) -> Bool:
+def settled_envs(rollout: Rollout, robot: Robot) -> Bool:
     """Return the envs of a ``rollout`` of ``robot`` that have not failed and whose joints all
     settle (envs,).
     """
@@ -44,7 +44,7 @@ def settled_envs(rollout: Rollout, robot: RobotDescription) -> Bool:
     return settled
 
 
-def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
+def unsettled_findings(rollout: Rollout, robot: Robot) -> Findings:
     """Return the causes for which joints of a ``rollout`` of ``robot`` do not settle, in the order
     of :data:`RULES`.
 
@@ -108,7 +108,7 @@ def _finding(
 class _Run:
     """Arrays of a run, and figures of its end (envs, dof)."""
 
-    def __init__(self, rollout: Rollout, robot: RobotDescription) -> None:
+    def __init__(self, rollout: Rollout, robot: Robot) -> None:
         self.rollout = rollout
         self.robot = robot
         self.info = rollout.info
@@ -184,7 +184,7 @@ class _Run:
         if not self.robot.fixed_base:
             return np.zeros_like(ends)
         poses = np.nan_to_num(ends.reshape(-1, self.robot.dof))
-        return self.robot.holding_efforts(poses).reshape(ends.shape)
+        return self.robot.dynamics().holding_efforts(poses).reshape(ends.shape)
 
     @cached_property
     def is_at_rest(self) -> Bool:

@@ -21,7 +21,7 @@ from batchpid.errors import InvalidArgumentError, warn
 from batchpid.law.implicit import as_explicit
 
 if TYPE_CHECKING:
-    from batchpid.sim.robot.description import RobotDescription
+    from batchpid.sim.robot.robot import Robot
 
 NEAR_BOUND = 0.5
 """Share of the stability range from which gains are reported: other poses may have less inertia."""
@@ -45,7 +45,7 @@ class StabilityReport(NamedTuple):
 
 
 def _loop(
-    robot: RobotDescription,
+    robot: Robot,
     params: bp.PIDParams,
     qpos: Float64,
     timestep: float,
@@ -98,7 +98,7 @@ def _loop(
 
 
 def stability_report(
-    robot: RobotDescription,
+    robot: Robot,
     params: bp.PIDParams,
     qpos: Float64,
     timestep: float,
@@ -156,7 +156,7 @@ class StabilityCheck:
         The bound is taken at the robot's start pose with this time step [s].
     """
 
-    def __init__(self, robot: RobotDescription, timestep: float) -> None:
+    def __init__(self, robot: Robot, timestep: float) -> None:
         self._robot = robot
         self._timestep = timestep
         self._has_warned = False

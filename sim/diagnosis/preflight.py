@@ -22,12 +22,12 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
-from batchpid.sim.findings import KINDS, SEVERITIES, Finding, Findings
+from batchpid.sim.findings import KINDS, LIMIT_TOLERANCE, SEVERITIES, Finding, Findings
 from batchpid.sim.geometry.inertia import LEAST_MASS, triangle_excess
 from batchpid.sim.geometry.shapes import hull_share
 
 if TYPE_CHECKING:
-    from batchpid.sim.robot.description import RobotDescription
+    from batchpid.sim.robot.robot import Robot
 
 HELD_POSES = 50
 """Poses in which joints should hold themselves."""
@@ -50,7 +50,7 @@ limit".
 
 
 def check(
-    robot: RobotDescription,
+    robot: Robot,
     params: bp.PIDParams | None,
     qpos: ArrayLike | None,
     setpoint: ArrayLike | None,
@@ -79,7 +79,7 @@ def check(
         # Gains of a drive are not sampled, and its errors do not wrap.
         params = params if control == "pid" else None
     plan = _Plan(robot, start, goal, params, timestep)
-    findings = [*robot.repairs, *robot.srdf.findings]
+    findings = [*robot.repairs, *robot.reading.srdf.findings]
     for oddity in ODDITIES:
         kind = KINDS[oddity.code]
         for place in oddity.places(plan):
@@ -114,7 +114,7 @@ class Oddity(NamedTuple):
 class _Plan:
     """Robot, and what it is to do."""
 
-    robot: RobotDescription
+    robot: Robot
     start: Float64
     goal: Float64 | None
     params: bp.PIDParams | None
@@ -125,7 +125,7 @@ class _Plan:
         """Length [m] of the longest chain of joints, slides extended."""
         robot = self.robot
         length: dict[str, float] = defaultdict(float)
-        for joint, link in zip(robot.all_joints, robot.links[1:], strict=True):  # parents first
+        for joint, link in zip(robot.tables.joints, robot.links[1:], strict=True):  # parents first
             ends = (joint.lower, joint.upper) if joint.type == "prismatic" else ()
             travel = max((abs(end) for end in ends if np.isfinite(end)), default=0.0)
             offset = float(np.linalg.norm(link.position)) + travel
@@ -134,7 +134,7 @@ class _Plan:
 
 
 def touching_links(
-    robot: RobotDescription,
+    robot: Robot,
     qpos: Float64,
     ground: bool,
     distance: float,
@@ -164,7 +164,7 @@ def _odd_sizes(plan: _Plan) -> Iterator[Place]:
 
 def _odd_angles(plan: _Plan) -> Iterator[Place]:
     """Yield hinges with limits or mimic offsets of many turns."""
-    for joint in plan.robot.all_joints:
+    for joint in plan.robot.tables.joints:
         offset = 0.0 if joint.mimic is None else joint.mimic.offset
         angles = {"lower": joint.lower, "upper": joint.upper, "mimic offset": offset}
         large = [
@@ -190,11 +190,11 @@ def _massless(plan: _Plan) -> Iterator[Place]:
     """Yield links whose mass is that of their shapes, and bodies that carry no mass at all."""
     robot = plan.robot
     bodies = {name: place.link for name, place in robot.bodies.items()}
-    root = bodies[robot.all_joints[0].parent_link]
+    root = bodies[robot.tables.joints[0].parent_link]
     masses = robot.link_masses
     loaded = {bodies[name] for name, mass in masses.items() if mass.mass > LEAST_MASS}
     # Bodies with mass in them, or in the links that they carry.
-    for joint in reversed(robot.all_joints):
+    for joint in reversed(robot.tables.joints):
         if bodies[joint.child_link] in loaded:
             loaded.add(bodies[joint.parent_link])
     for name, mass in masses.items():
@@ -232,8 +232,9 @@ def _outside(plan: _Plan) -> Iterator[Place]:
     """Yield joints whose start position or setpoint is outside the limits."""
     for name, qpos in (("start pose", plan.start), ("setpoint", plan.goal)):
         if qpos is not None:
-            for _, index, value in plan.robot.limit_violations(qpos):
-                joint = plan.robot.joints[index]
+            for joint, value in zip(plan.robot.joints, qpos.tolist(), strict=True):
+                if joint.lower - LIMIT_TOLERANCE <= value <= joint.upper + LIMIT_TOLERANCE:
+                    continue
                 limits = f"limits [{joint.lower:g}, {joint.upper:g}]"
                 yield Place(joint.name, detail=f"{name} {value:g} {joint.unit}, {limits}")
 
@@ -253,7 +254,7 @@ def _weak(plan: _Plan) -> Iterator[Place]:
     """Yield joints that cannot be held, or not be moved, in some poses."""
     robot = plan.robot
     limits = robot.effort_limit
-    load = np.abs(robot.holding_efforts(robot.sample(HELD_POSES, seed=0)))
+    load = np.abs(robot.dynamics().holding_efforts(robot.sample(HELD_POSES, seed=0)))
     share = (load + robot.friction >= limits).mean(0)
     for index in np.flatnonzero((share > 0) & (limits > 0)):
         joint = robot.joints[index]

@@ -12,7 +12,7 @@ from batchpid.errors import warn
 from batchpid.sim.findings import LIMIT_TOLERANCE
 
 if TYPE_CHECKING:
-    from batchpid.sim.robot.description import RobotDescription
+    from batchpid.sim.robot.robot import Robot
 
 
 class SetpointWarning(UserWarning):
@@ -24,7 +24,7 @@ class SetpointCheck:
     joint.
     """
 
-    def __init__(self, robot: RobotDescription) -> None:
+    def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._low = robot.lower - LIMIT_TOLERANCE
         self._high = robot.upper + LIMIT_TOLERANCE

@@ -6,6 +6,7 @@ A variation changes a robot's inertias, and the friction and damping of its join
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,10 +18,10 @@ from batchpid.arrays.array_types import Float64
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.geometry.distances import Contacts
-from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.merging import merge_links
+from batchpid.sim.robot.merging import merge_links, place_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.simulated_links import BodyParts, rigid_tree, varied_bodies
 from batchpid.sim.robot.tables import Tables
 from batchpid.task_space.frames import SpatialInertia, spatial_matrix, total
@@ -67,7 +68,7 @@ class SceneSpec:
     @classmethod
     def of(
         cls,
-        robot: RobotDescription,
+        robot: Robot,
         timestep: float,
         physics: object,
         **options: Any,
@@ -94,12 +95,21 @@ class SceneSpec:
         """Rigid tree of the simulated bodies, all joints independent."""
         return rigid_tree(self.simulated, gravity=self.gravity, fixed_base=self.fixed_base)
 
-    @property
+    @cached_property
     def separate(self) -> tuple[str, ...]:
-        """Links that are not merged into their parents, since the wrench between them is
-        measured.
+        """Links that begin a body although a fixed joint holds them: those with a wrench sensor,
+        and links with shapes in a body of which another link has a contact sensor, for its own.
         """
-        return self.wrenches or ()
+        wrenches = self.wrenches or ()
+        places = place_links(self.tables, wrenches)
+        owners = defaultdict[str, set[str]](set)
+        for shape in self.tables.shapes:
+            owners[places[shape.owner].link].add(shape.owner)
+        divided = list[str]()
+        for link in self.contacts or ():
+            if owners[places[link].link] - {link}:
+                divided += [link, *sorted(owners[places[link].link])]
+        return tuple(dict.fromkeys((*wrenches, *divided)))
 
     def contact_model(self, ground: bool) -> Contacts:
         """Return distances of the robot's links, even of one simulated without shapes; ``ground``

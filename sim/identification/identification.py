@@ -258,7 +258,8 @@ def _prepared(
 
 def _resting(robot: Robot, start: Float64) -> Robot:
     """Return ``robot`` with the start pose ``start`` (dof,)."""
-    return replace(robot, settings=None, defaults=FileDefaults(start))
+    reading = robot.reading._replace(defaults=FileDefaults(start))
+    return replace(robot, settings=None, reading=reading)
 
 
 def _option(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Float64
@@ -88,6 +89,14 @@ class DisabledPair(NamedTuple):
         return frozenset((self.first, self.second))
 
 
+class Srdf(NamedTuple):
+    """Pairs that an .srdf disables and enables, and findings about it."""
+
+    disabled: tuple[DisabledPair, ...] = ()
+    enabled: frozenset[frozenset[str]] = frozenset()
+    findings: tuple[Finding, ...] = ()
+
+
 class LinkMass(NamedTuple):
     """Simulated mass of a link of the URDF.
 
@@ -146,6 +155,21 @@ class FileDefaults:
     ki: Float64 | None = None
     kd: Float64 | None = None
     integral_limit: Float64 | None = None
+
+
+class Reading(NamedTuple):
+    """How a file was read, and what it says besides bodies, shapes and joints.
+
+    ``package_dirs`` are the folders in which meshes are looked up first. ``defaults`` come from an
+    MJCF file. ``base_start`` is the pose (7,) at which the file places a floating base, None if it
+    does not.
+    """
+
+    self_collision: str
+    srdf: Srdf
+    package_dirs: tuple[Path, ...]
+    defaults: FileDefaults | None
+    base_start: tuple[float, ...] | None
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,14 @@ class RobotModel:
         """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
         return np.asarray(ts.inverse_dynamics(self.tree, qpos, qvel, qacc), np.float64)
 
+    def holding_efforts(self, qpos: Rows) -> Float64:
+        """Return the efforts (n, dof) [N m or N] that hold ``qpos`` against gravity; leaders hold
+        followers.
+        """
+        still = np.zeros_like(qpos)
+        efforts: Float64 = self._coupling.efforts(self.inverse_dynamics(qpos, still, still))
+        return efforts
+
     def forward_dynamics(self, qpos: Rows, qvel: Rows, effort: Rows) -> Float64:
         """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity
         included.
@@ -145,13 +153,13 @@ def base_start(robot: Any, qpos: Float64, ground: bool) -> Float64:
     If the file does not place the base, it is upright at the origin. On a ``ground`` at height 0
     the lowest point is then on the ground, and otherwise not below.
     """
-    pose = np.array(robot.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64)
+    pose = np.array(robot.reading.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64)
     model = robot.dynamics()
     # The ground is met by any link, the base included.
     height = model.contacts.height(np.nan_to_num(qpos), base_too=True)
     if not np.isfinite(height):
         return pose
-    if robot.base_start is not None:
+    if robot.reading.base_start is not None:
         lowest = pose[2] + model.contacts.height(robot.start, base_too=True)
         pose[2] = (max(lowest, 0.0) if ground else lowest) - height
     elif ground:

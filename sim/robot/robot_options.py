@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +14,11 @@ from batchpid.arrays.records import frozen
 from batchpid.checks.validate import entries, instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN, JOINT_SIDE
-from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import Joint
+
+if TYPE_CHECKING:
+    from batchpid.sim.robot.robot import Robot
 
 BAND = {"rad": 1e-4, "m": 2e-5}
 """Half width, by the joint's unit, of the band in which the compensation of friction is less than
@@ -45,7 +47,7 @@ class KnownJoints(NamedTuple):
     """Reflected inertia of the motors [kg m^2 or kg]."""
 
 
-def known_joints(robot: RobotDescription) -> KnownJoints:
+def known_joints(robot: Robot) -> KnownJoints:
     """Return friction, damping and armature of the robot's own actuators, which its controller
     knows.
     """
@@ -60,9 +62,7 @@ def known_joints(robot: RobotDescription) -> KnownJoints:
     return KnownJoints(FRICTION_SHARE * coulomb, viscous, armature)
 
 
-def load_robot_actuators(
-    source: bp.Actuators | str | Path, robot: RobotDescription
-) -> bp.Actuators:
+def load_robot_actuators(source: bp.Actuators | str | Path, robot: Robot) -> bp.Actuators:
     """Return actuators of ``robot``, given or in a file.
 
     Raises
@@ -79,7 +79,7 @@ def load_robot_actuators(
 
 def fit_actuators(
     actuators: bp.Actuators,
-    robot: RobotDescription,
+    robot: Robot,
     num_envs: int,
     control: object,
 ) -> bp.Actuators:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.distances import Contacts
 from batchpid.sim.robot.merging import merge_links, rigid_bodies
-from batchpid.sim.robot.parts import DisabledPair, Joint
+from batchpid.sim.robot.parts import DisabledPair, Joint, Srdf
 from batchpid.sim.robot.simulated_links import rigid_tree
 from batchpid.sim.robot.xml import parse_xml
 
@@ -31,14 +31,6 @@ PhysX pushes links apart that just touch at the start.
 """
 SAMPLES = 200
 """Number of sampled poses; MoveIt's."""
-
-
-class Srdf(NamedTuple):
-    """Pairs that an .srdf disables and enables, and findings about it."""
-
-    disabled: tuple[DisabledPair, ...] = ()
-    enabled: frozenset[frozenset[str]] = frozenset()
-    findings: tuple[Finding, ...] = ()
 
 
 class SelfContact(NamedTuple):
@@ -102,32 +94,32 @@ def disabled_pairs(
 
 
 def self_contact(robot: Any) -> SelfContact:
-    """Return the pairs of links of a :class:`.description.RobotDescription` that do not collide,
+    """Return the pairs of links of a :class:`batchpid.sim.Robot` that do not collide,
     under its option ``self_collision`` and its .srdf.
 
     Deterministic: the poses are seeded. Raises RobotError for a mesh that cannot be read.
     """
     solid = list(dict.fromkeys(shape.owner for shape in robot.tables.shapes))
-    bodies = rigid_bodies(robot.all_joints)
+    bodies = rigid_bodies(robot.tables.joints)
     simulated = merge_links(robot.tables)
     tree = rigid_tree(simulated, fixed_base=robot.fixed_base)
     contacts = Contacts(tree, simulated.shapes, frozenset(), ground=False)
     computed: tuple[DisabledPair, ...] = ()
-    if robot.self_collision == "none":
+    if robot.reading.self_collision == "none":
         computed = tuple(DisabledPair(*pair, "User") for pair in combinations(solid, 2))
-    elif robot.self_collision == "auto" and len({bodies[link] for link in solid}) > 1:
+    elif robot.reading.self_collision == "auto" and len({bodies[link] for link in solid}) > 1:
         # The first pose is the start; the others judge how often a pair touches.
         rest, *close = [
             {frozenset(near[:2]) for near in contacts.near(qpos, GAP)}
             for qpos in (robot.start, *robot.sample(SAMPLES, seed=0))
         ]
-        computed = disabled_pairs(solid, _adjacent_links(robot.all_joints, solid), rest, close)
+        computed = disabled_pairs(solid, _adjacent_links(robot.tables.joints, solid), rest, close)
     # The .srdf comes last, so that its reason holds.
-    listed = {pair.links: pair for pair in (*computed, *robot.srdf.disabled)}
+    listed = {pair.links: pair for pair in (*computed, *robot.reading.srdf.disabled)}
     pairs = (
         pair
         for links, pair in listed.items()
-        if links not in robot.srdf.enabled and links <= set(solid)
+        if links not in robot.reading.srdf.enabled and links <= set(solid)
     )
     return SelfContact(
         pairs=tuple(pairs),

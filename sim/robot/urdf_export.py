@@ -18,8 +18,8 @@ from batchpid.sim.findings import summary
 from batchpid.sim.geometry.inertia import MOMENTS
 from batchpid.sim.geometry.mesh_files import find_mesh
 from batchpid.sim.geometry.shapes import Shape, mesh_file
-from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.merging import link_inertias
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.tables import NO_TURN, Body
 from batchpid.sim.robot.urdf import UNUSED, is_mjcf, read_robot
 from batchpid.sim.robot.xml import parse_xml
@@ -30,7 +30,7 @@ COPIED = {*UNUSED, "safety_controller"}
 
 
 def to_urdf(
-    robot: RobotDescription,
+    robot: Robot,
     folder: Path | None = None,
     mass_factors: Mapping[str, float] | None = None,
 ) -> Exported:
@@ -54,7 +54,7 @@ def to_urdf(
     RobotError
         The file cannot be read, or has changed since the robot was loaded.
     """
-    path, packages = robot.path, robot.package_dirs
+    path, packages = robot.path, robot.reading.package_dirs
     if read_robot(path, robot.fixed_base, packages, "skip").tables != robot.tables:
         raise RobotError(f"{path}: has changed since the robot was loaded; load it again")
     root = _write(robot, mass_factors or {})
@@ -73,7 +73,7 @@ def to_urdf(
     return Exported(f'<?xml version="1.0"?>\n{text}\n', tuple(differences))
 
 
-def _write(robot: RobotDescription, mass_factors: Mapping[str, float]) -> etree._Element:
+def _write(robot: Robot, mass_factors: Mapping[str, float]) -> etree._Element:
     """Return the ``<robot>`` of the tables."""
     root = etree.Element("robot", name=robot.name)
     tree = robot.rigid_tree

@@ -124,9 +124,9 @@ def arm_joints(robot: Robot) -> NDArray[np.bool_]:
     arm.
     """
     # From each leaf link to the root, every joint carries that leaf.
-    above = {joint.child_link: joint for joint in robot.all_joints}
+    above = {joint.child_link: joint for joint in robot.tables.joints}
     leaves = Counter[str]()
-    for link in set(above) - {joint.parent_link for joint in robot.all_joints}:
+    for link in set(above) - {joint.parent_link for joint in robot.tables.joints}:
         while link in above:
             leaves[above[link].name] += 1
             link = above[link].parent_link

@@ -20,7 +20,7 @@ from batchpid.io.packages import imported
 from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.mesh_files import find_mesh, read_mesh
 from batchpid.sim.geometry.shapes import Shape, convex_hull
-from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.urdf import SHAPES, is_mjcf, read_origin, read_shape
 from batchpid.sim.robot.xml import parse_xml, read_numbers
 from batchpid.task_space.frames import matrix_of, rotate
@@ -57,7 +57,7 @@ class Surface(NamedTuple):
 
 
 def surfaces(
-    robot: RobotDescription, deviation: float = DEVIATION, findings: list[Finding] | None = None
+    robot: Robot, deviation: float = DEVIATION, findings: list[Finding] | None = None
 ) -> list[Surface]:
     """Return the surfaces of ``robot``, one for each link and colour; ``deviation`` [m] as in
     :func:`segments_of`.
@@ -105,7 +105,7 @@ def surfaces(
     return result or _rods(robot)
 
 
-def _read_visuals(robot: RobotDescription) -> dict[str, list[tuple[Shape | None, Rgba | None]]]:
+def _read_visuals(robot: Robot) -> dict[str, list[tuple[Shape | None, Rgba | None]]]:
     """Return shape and colour of the ``<visual>`` elements of each link of a URDF, None for those
     without; MJCF files are drawn by the collision shapes.
     """
@@ -137,7 +137,7 @@ def _read_visuals(robot: RobotDescription) -> dict[str, list[tuple[Shape | None,
     return visuals
 
 
-def _rods(robot: RobotDescription) -> list[Surface]:
+def _rods(robot: Robot) -> list[Surface]:
     """Return a rod from the frame of each link to each joint on it, from the last links to their
     centers of mass.
     """
@@ -174,11 +174,11 @@ def segments_of(radius: float, deviation: float) -> int:
     return min(MOST, max(FEWEST, math.ceil(math.pi / math.acos(1 - deviation / radius))))
 
 
-def _read_mesh(name: str, robot: RobotDescription) -> Any:
+def _read_mesh(name: str, robot: Robot) -> Any:
     """Return the result of ``trimesh`` for a mesh file of the robot, in metres. Raises
     OSError with the name and the reason.
     """
-    path = find_mesh(name, robot.path, robot.package_dirs)
+    path = find_mesh(name, robot.path, robot.reading.package_dirs)
     if path is None:
         raise OSError(name, "not found")
     try:
@@ -190,7 +190,7 @@ def _read_mesh(name: str, robot: RobotDescription) -> Any:
     return loaded
 
 
-def _mesh(shape: Shape | None, robot: RobotDescription, deviation: float) -> Any:
+def _mesh(shape: Shape | None, robot: Robot, deviation: float) -> Any:
     """Return the ``trimesh.Trimesh`` of a shape in its link's frame, or None without one.
 
     Raises OSError with the name of a mesh that cannot be read, and the reason.

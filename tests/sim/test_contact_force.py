@@ -69,6 +69,21 @@ def test_contact_forces_of_a_standing_robot_carry_its_weight(stool, engine):
     assert (forces[4] == 0).all()
 
 
+def test_a_link_senses_its_own_contacts_and_not_those_of_the_links_beside_it(tmp_path, engine):
+    """A toe in the air on a foot on the ground, and a sensor without shapes; all on fixed joints."""
+    toe = """<link name="toe"><inertial><mass value="0.01"/><inertia ixx="1e-5" iyy="1e-5" izz="1e-5"/>
+      </inertial><collision><geometry><sphere radius="0.02"/></geometry></collision></link>
+      <joint name="t" type="fixed"><parent link="foot0"/><child link="toe"/><origin xyz="0.1 0 0.1"/></joint>
+      <link name="imu"/><joint name="i" type="fixed"><parent link="trunk"/><child link="imu"/></joint>"""
+    path = tmp_path / "stool.urdf"
+    path.write_text(STOOL.replace("</robot>", f"{toe}</robot>"))
+    robot = Robot.load(path, fixed_base=False)
+    rollout = stand(robot, engine, contacts=["toe", "foot0", "imu"])
+    assert rollout.touching[-1, 0].tolist() == [False, True, False]
+    assert not rollout.contact_force[-1, 0, [0, 2]].any()
+    assert rollout.contact_force[-1, 0, 1, 2] > 0.2 * WEIGHT
+
+
 def test_a_wrench_holds_the_links_behind_it(stool, engine):
     """Foot on the ground: its weight, the contact force, and the wrench of the leg cancel."""
     rollout = stand(stool, engine, wrenches=["foot1", "leg1"])

@@ -25,13 +25,13 @@ from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_sp
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
 from batchpid.sim.geometry.inertia import nearest_physical
-from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_model import base_start
 from batchpid.task_space.frames import SpatialInertia
 
 
 def to_mjcf(
-    robot: RobotDescription,
+    robot: Robot,
     params: PIDParams | None,
     dt: float,
     *,
@@ -141,7 +141,7 @@ def _set_inertia(body: Any, inertia: SpatialInertia) -> bool:
 
 def _set_joints(
     scene: MjSpec,
-    robot: RobotDescription,
+    robot: Robot,
     law: Law,
     friction: Friction,
 ) -> None:
@@ -172,7 +172,7 @@ def _set_joints(
 
 def _start(
     model: MjModel,
-    robot: RobotDescription,
+    robot: Robot,
     has_law: bool,
     has_rate: Bool,
 ) -> dict[str, str]:

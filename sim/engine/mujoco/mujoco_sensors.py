@@ -41,8 +41,7 @@ def add_link_sensors(
     frames of their bodies.
     """
     kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
-    # Links that are merged into one body share its sensor.
-    for link in dict.fromkeys(contact_bodies(spec)):
+    for link in contact_bodies(spec):
         for part in _parts(scene.body(names[link]), {*names.values()}):
             sensor = scene.add_sensor(
                 type=kinds.mjSENS_CONTACT, objtype=objects.mjOBJ_BODY, objname=part.name

@@ -18,6 +18,7 @@ from batchpid.arrays.elementwise import (
     read_history,
     row_minimum,
     take_columns,
+    take_rows,
 )
 from batchpid.motors import delay
 from batchpid.native import array_program
@@ -94,13 +95,21 @@ def test_every_operation_on_inputs_of_every_shape(shape, dtype, seed, data):
         assert_identical(program(*inputs), every_operation(*wide))
 
 
-def test_histories_and_columns():
+def rows_of(table, rows):
+    return [take_rows(table, rows)]
+
+
+def test_histories_rows_and_columns():
     rng, shape = np.random.default_rng(0), (5, 9)
     a, b, history = *rng.normal(size=(2, *shape)), rng.normal(size=(5, 4, 18))
     places, columns = rng.integers(history.size, size=shape), rng.integers(9, size=9)
     traced = trace(history_operations, 1, 3)
     (expected,) = history_operations(places, history, a, b)
     assert_identical(ArrayProgram(traced, [places], 3, shape)(history, a, b), [expected])
+    # Rows beyond the table are its first and last one.
+    table, rows = rng.normal(size=(5, 4, 9)), rng.uniform(-2, 6, shape)
+    (found,) = ArrayProgram(trace(rows_of, 0, 2), (), 2, shape)(table, rows)
+    assert_identical([found], rows_of(table, np.clip(rows, 0, 3)))
     found = ArrayProgram(trace(columns_of, 1, 2), [columns], 2, shape)(a, b)
     assert_identical(found, columns_of(columns, a, b))
 
@@ -110,6 +119,7 @@ def test_no_operation_is_left_out():
     every_operation(*(Symbol(namespace) for _ in range(4)))
     history_operations(*(Symbol(namespace) for _ in range(4)))
     columns_of(*(Symbol(namespace) for _ in range(3)))
+    rows_of(*(Symbol(namespace) for _ in range(2)))
     noted = {name for name, _, _ in namespace.noted}
     numbers = np.frombuffer(trace(every_operation, 0, 4).operations, np.int32).reshape(-1, 5)[:, 0]
     assert noted | {OPERATIONS[number] for number in numbers} == set(OPERATIONS)

@@ -520,7 +520,7 @@ def test_a_floating_robot_starts_where_its_file_places_its_root_body(load, name,
     leg = '<joint name="a" axis="0 1 0" range="-1 1" damping="1"/><geom size=".05" mass=".1"/>'
     text = f"<mujoco>{OPTION}<worldbody>{ground}{body}{leg}</body></body></worldbody>{key}</mujoco>"
     robot = load(text, fixed_base=False)
-    assert [*robot.bodies] == ["t", "l"]
+    assert [*robot.tables.links] == ["t", "l"]
     for engine in ("mujoco", "sapien"):
         with Runner(robot, 1, workers=0, engine=engine, physics="accurate") as runner:
             start = runner.observe().base_pose[0]

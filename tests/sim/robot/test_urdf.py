@@ -237,7 +237,6 @@ def test_building_writes_no_file(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
     named = Robot.load(path)
     assert named.joint_names == ("Ellbogengelenk für die Übung",)
-    assert named.srdf is not None
     with Runner(named, 1, workers=0, params=named.params(kp=1.0), ground=False):
         pass
 

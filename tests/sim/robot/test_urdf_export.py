@@ -18,7 +18,11 @@ def written_again(loaded, folder):
 
 def assert_same(one, other):
     """Names, joints with all numbers, and the numbers of links and shapes but for rounding."""
-    assert (one.name, one.joints, one.all_joints) == (other.name, other.joints, other.all_joints)
+    assert (one.name, one.joints, one.tables.joints) == (
+        other.name,
+        other.joints,
+        other.tables.joints,
+    )
     for rows in ("bodies", "shapes"):
         for ours, theirs in zip(
             getattr(one.tables, rows), getattr(other.tables, rows), strict=True

@@ -1,0 +1,208 @@
+"""Parameters of plans: build, validate, save.
+
+A file in YAML or JSON has the options of the whole plan, and one entry per joint
+(:class:`batchpid.io.documents.RecordFile`)::
+
+    format: batchpid-plan-1
+    period: 0.03333333333333333
+    horizon: 16
+    blend: align
+    interpolation: cubic
+    latest: [1]
+    joints:
+      shoulder: {fade: 1.0, rate: 2.0, acceleration: 15.0}
+      gripper: {fade: 1.0}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from batchpid.arrays.array_types import Array, Document, DType
+from batchpid.arrays.choices import NamedChoice
+from batchpid.arrays.field_tables import Field, declared
+from batchpid.arrays.records import LeafBuilder, Record, with_fields
+from batchpid.checks.validate import choice, integer, positive
+from batchpid.errors import InvalidArgumentError
+from batchpid.io.documents import RecordFile
+from batchpid.motors.guard import FIELDS as GUARD_FIELDS
+
+LONGEST_HORIZON = 1000
+"""Most rows of a chunk."""
+SPARE_ROWS = 3
+"""Knots besides the rows of a chunk: the point where it was joined, and two at rest behind it."""
+
+
+class Linear(NamedChoice):
+    """Straight lines between the knots."""
+
+
+class Held(NamedChoice):
+    """Each knot is held until the next one."""
+
+
+INTERPOLATIONS = {"cubic": None, "linear": Linear(), "hold": Held()}
+BLENDS = {"align": "fade", "newest": "", "ensemble": "weight", "average": "share"}
+"""Blends, with the option that each of them has."""
+
+
+class _PlanFields(NamedTuple):
+    period: Array
+    """P [s]."""
+    last: Array
+    """Number of the last knot that has a next one, horizon + 1."""
+    blended: Array
+    """1.0 on the joints whose chunks are blended, 0.0 on those that take the newest value."""
+    fade: Annotated[Array, Field("s", above=True, default=1.0)] = None
+    weight: Annotated[Array, Field("1", low=-9.0, high=9.0, default=0.01)] = None
+    forgotten: Array = None
+    """1 - exp(-m) of an ensemble."""
+    share: Annotated[Array, Field("1", above=True, high=0.999, default=0.7)] = None
+    taper: Annotated[Array, Field("s")] = None
+    rate: Annotated[Array, GUARD_FIELDS["rate"]] = None
+    """V [rad/s or m/s]."""
+    acceleration: Annotated[Array, GUARD_FIELDS["acceleration"]] = None
+    """A [rad/s^2 or m/s^2]."""
+    interpolation: NamedChoice | None = None
+    """Linear() or Held(); off: cubic."""
+
+
+FIELDS = declared(_PlanFields, Field)
+"""Options of a joint."""
+
+
+class Plan(Record, _PlanFields):
+    """Parameters of a plan, (1, joints) or (envs, joints); None is off. Build one with
+    :func:`make_plan`.
+    """
+
+    __slots__ = ()
+    NAME = "plan"
+    FIELDS = FIELDS
+
+    @property
+    def horizon(self) -> int:
+        """Most rows of a chunk."""
+        return int(self.last[0, 0]) + 2 - SPARE_ROWS
+
+    def options(self) -> Document:
+        """Return the options that are on, as arguments of :func:`make_plan` that build this plan
+        again.
+        """
+        leaves = self.leaves()
+        blends = [blend for blend, option in BLENDS.items() if option in leaves]
+        kind = type(self.interpolation)
+        return {
+            "period": float(self.period[0, 0]),
+            "horizon": self.horizon,
+            "blend": blends[0] if blends else "newest",
+            "interpolation": next(n for n, one in INTERPOLATIONS.items() if type(one) is kind),
+            "latest": np.flatnonzero(self.blended[0] == 0).tolist(),
+            "dtype": np.dtype(self.dtype),
+            **{name: leaf for name, leaf in leaves.items() if name in FIELDS},
+        }
+
+
+@with_fields(*FIELDS)
+def make_plan(
+    joints: int,
+    *,
+    period: float,
+    horizon: int,
+    blend: str = "align",
+    interpolation: str = "cubic",
+    latest: Sequence[int] = (),
+    joint_names: Sequence[str] | None = None,
+    dtype: DType = None,
+    **options: Array,
+) -> Plan:
+    """Build a validated :class:`Plan`; a number of a joint may be a scalar, (joints,) or (envs,
+    joints).
+
+    Parameters
+    ----------
+    joints
+        Number of joints.
+    period
+        Time between two rows of a chunk [s].
+    horizon
+        Most rows of a chunk.
+    blend
+        What a chunk does to the plan that is being executed:
+
+        - "align": the chunk is moved to it, by an offset that fades to 0. A chunk of one row is
+          taken as it is.
+        - "newest": the chunk replaces the plan.
+        - "ensemble": the mean of all chunks for the same time, with weights exp(-m i), where i is 0
+          for the oldest one.
+        - "average": share of the new chunk plus (1 - share) of the present plan.
+    fade
+        Of "align": time over which the offset fades [s]; default 1.
+    weight
+        Of "ensemble": m; default 0.01.
+    share
+        Of "average": share of the new chunk; default 0.7.
+    taper
+        Of "ensemble" and "average": time before its end over which a chunk loses its weight [s];
+        default 0.
+    interpolation
+        "cubic", with rates that are central differences of the blended rows; "linear", or "hold".
+    latest
+        Indices of the joints that take the newest value without a blend, such as a gripper.
+    rate, acceleration
+        Limits > 0 of the setpoint's rate and acceleration [rad/s or m/s, and per second], by
+        :mod:`batchpid.motors.guard`; default none.
+    joint_names
+        Used in error messages.
+    dtype
+        float32 or float64; default float64.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Naming the option, joint, env and value; also for an option of another blend.
+    """
+    build = LeafBuilder(joints, joint_names, dtype, options.values())
+    option = BLENDS[choice("blend", blend, BLENDS)]
+    # A blend has its option, and the last two share one.
+    others = {name for name in BLENDS.values() if name != option}
+    if option not in ("weight", "share"):
+        others.add("taper")
+    for name in others:
+        if options.get(name) is not None:
+            remedy = "leave it out, or choose another blend"
+            raise InvalidArgumentError(name, f"has no effect with blend {blend!r}", remedy=remedy)
+    if option and options.get(option) is None:
+        options[option] = FIELDS[option].default
+    leaves = build.options(FIELDS, options)
+    # An ensemble stays one where m is 0.
+    if option == "weight":
+        leaves["weight"] = build.array("weight", options["weight"], FIELDS["weight"])
+        leaves["forgotten"] = 1.0 - np.exp(-leaves["weight"])
+    horizon = integer("horizon", horizon, 1, LONGEST_HORIZON)
+    newest = [integer("latest", joint, 0, build.joints - 1) for joint in latest]
+    leaves |= {
+        "period": build.rows("period", np.array(positive("period", period, "s"))),
+        "last": build.rows("horizon", np.array(horizon + SPARE_ROWS - 2.0)),
+        "blended": 1.0 - np.isin(np.arange(build.joints), newest)[None],
+    }
+    return Plan(
+        interpolation=INTERPOLATIONS[choice("interpolation", interpolation, INTERPOLATIONS)],
+        **{name: build.freeze(leaf) for name, leaf in leaves.items()},
+    )
+
+
+PLANS = RecordFile(
+    "batchpid-plan-1",
+    Plan,
+    make_plan,
+    ("period", "horizon", "blend", "interpolation", "latest", "dtype"),
+    FIELDS,
+)
+dumps_plan = PLANS.dumps
+loads_plan = PLANS.loads
+save_plan = PLANS.save
+load_plan = PLANS.load

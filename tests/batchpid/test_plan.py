@@ -1,0 +1,265 @@
+"""Plans: chunks of a slow policy become setpoints, by the formulas of ACT, LeRobot and linear
+interpolation, without a step at a seam, within their limits; the same in NumPy, JAX and C.
+"""
+
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from c_programs import COMPILERS, compiled
+
+import batchpid as bp
+from batchpid.export import to_c
+
+PERIOD, DT = 1 / 30, 1 / 2000
+PLANS = {
+    "align": {"fade": [0.5, 1.0, 0.3], "latest": [2]},
+    "newest": {},
+    "ensemble": {"weight": 0.1, "taper": 0.2, "latest": [0]},
+    "average": {"share": 0.6, "rate": 2.0, "acceleration": 15.0},
+    "linear": {"blend": "newest", "interpolation": "linear", "acceleration": [15.0, 9.0, np.inf]},
+    "hold": {"blend": "newest", "interpolation": "hold"},
+}
+
+
+def made(name, joints=3, horizon=8, **options):
+    chosen = {"blend": name, "period": PERIOD, "horizon": horizon} | PLANS.get(name, {})
+    return bp.make_plan(joints, **chosen | options)
+
+
+def run(plan, times, chunks, start=0.0):
+    """Return setpoints, rates and accelerations (3, times, joints) and the last state; ``chunks``
+    are pairs (chunk, time) by the index of the sample that they follow.
+    """
+    state, rows = bp.plan.init(plan, np.zeros((1, plan.num_joints)) + start), []
+    for index, t in enumerate(times):
+        state, *row = bp.plan.sample(plan, state, t)
+        rows.append(np.concatenate(row))
+        for chunk, time in chunks.get(index, ()):
+            state = bp.plan.add(plan, state, np.asarray(chunk)[None], time)
+    return np.moveaxis(np.array(rows), 1, 0), state
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_ensembles_are_those_of_act_and_averages_those_of_lerobot(seed):
+    rng = np.random.default_rng(seed)
+    weight, share, horizon = rng.uniform(0, 1), rng.uniform(0.2, 0.9), int(rng.integers(2, 9))
+    chunks = {k: [(rng.normal(size=(horizon, 3)), (k + 1) * PERIOD)] for k in range(30)}
+    kept = {k: chunk for k, chunk in chunks.items() if k == 0 or rng.random() < 0.6}
+    acts, averages = np.zeros((29, 3)), np.zeros((29, 3))
+    for k in range(29):
+        rows = [entry[0][0][k - at] for at, entry in kept.items() if 0 <= k - at < horizon]
+        weights = np.exp(-weight * np.arange(len(rows)))
+        if rows:
+            acts[k] = weights @ rows / weights.sum()
+            averages[k] = rows[0]
+        for row in rows[1:]:
+            averages[k] = (1 - share) * averages[k] + share * row
+        if not rows:
+            acts[k], averages[k] = acts[k - 1], averages[k - 1]
+    times = PERIOD * np.arange(30)
+    for plan, expected in (
+        (made("ensemble", horizon=horizon, weight=weight, taper=None, latest=()), acts),
+        (made("average", horizon=horizon, share=share, rate=None, acceleration=None), averages),
+    ):
+        (setpoint, _, _), _ = run(plan, times, kept)
+        np.testing.assert_allclose(setpoint[1:], expected, atol=1e-6)
+
+
+def test_single_rows_in_straight_lines_are_a_linear_interpolator():
+    actions = np.random.default_rng(0).normal(size=(20, 3))
+    plan = made("newest", interpolation="linear")
+    times = PERIOD / 3 * np.arange(61)
+    chunks = {3 * k: [(actions[k : k + 1], PERIOD * k)] for k in range(20)}
+    (setpoint, _, _), _ = run(plan, times, chunks)
+    before = np.vstack([np.zeros((1, 3)), actions[:-1]])
+    thirds = np.arange(1, 4)[None, :, None] / 3
+    expected = before[:, None] + thirds * (actions - before)[:, None]
+    np.testing.assert_allclose(setpoint[1:], expected.reshape(60, 3), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["align", "newest", "ensemble", "average"])
+def test_a_seam_has_no_step_and_no_dip(name):
+    def reference(t):
+        return 0.5 * np.sin(2.0 * t + np.arange(3))
+
+    plan = made(name, horizon=16, rate=None, acceleration=None)
+    state = bp.plan.init(plan, reference(0.0)[None])
+    for index in range(6000):
+        t = index * DT
+        if index % 400 == 0:
+            before = bp.plan.sample(plan, state, t)
+            chunk = reference(t + PERIOD * np.arange(16)[:, None])
+            state = bp.plan.add(plan, before[0], chunk[None], t)
+            after = bp.plan.sample(plan, state, t)
+            np.testing.assert_allclose(after[1:3], before[1:3], atol=1e-9)
+        state, _, rate, _ = bp.plan.sample(plan, state, t)
+        speed = np.cos(2.0 * t + np.arange(3))
+        fast = (np.abs(speed) > 0.3) & (t > 1.0)
+        if name != "align":  # it follows late for a second
+            assert (np.abs(rate[0])[fast] > 0.95 * np.abs(speed)[fast]).all()
+    assert state.starved.max() == 0
+
+
+@pytest.mark.parametrize("frequency", [60, 30])
+def test_single_rows_are_followed_within_the_limits_without_a_stop(frequency):
+    plan = made("newest", joints=1, period=1 / frequency, rate=3.0, acceleration=15.0)
+    chunks = {
+        int(k / frequency / DT): [(np.full((1, 1), 0.02 * (k + 1)), k / frequency)]
+        for k in range(frequency)
+    }
+    times = DT * np.arange(1, 2001)
+    (setpoint, rate, _), _ = run(plan, times, chunks)
+    assert np.abs(np.diff(setpoint[:, 0], 2)).max() <= 15.0 * DT**2 * (1 + 1e-6)
+    assert (rate[20:, 0] > 0).all()
+    assert abs(setpoint[-1, 0] - 0.02 * frequency) < 0.02
+
+
+def test_thirty_knots_end_where_they_are_to_within_the_limits():
+    knots = np.random.default_rng(1).normal(0, 0.15, (30, 3)).cumsum(0)
+    plan = made("newest", horizon=30, period=4 / 30, rate=2.0, acceleration=15.0)
+    (setpoint, rate, _), state = run(plan, DT * np.arange(10_000), {0: [(knots, 4 / 30)]})
+    assert np.abs(rate).max() <= 2.0 + 1e-9
+    assert np.abs(np.diff(setpoint, 2, axis=0)).max() <= 15.0 * DT**2 * (1 + 1e-6)
+    np.testing.assert_allclose(setpoint[-1], knots[-1], atol=1e-3)
+    assert state.starved.min() > 0
+
+
+def test_without_a_chunk_it_stops_within_the_limits_and_resumes_without_a_step():
+    plan = made("newest", joints=1, horizon=16, rate=1.0, acceleration=9.0)
+    ramp = 0.8 * PERIOD * np.arange(16)[:, None]
+    times = DT * np.arange(5000)
+    # The second chunk comes one second after the end of the first one.
+    end = int(15 * PERIOD / DT)
+    chunks = {0: [(ramp, 0.0)], end + 2000: [(ramp + 0.3, times[end + 2000])]}
+    (setpoint, rate, _), _ = run(plan, times, chunks)
+    stop = end + np.argmax(rate[end:, 0] <= 0)
+    assert 0 < (stop - end) * DT <= rate[end, 0] / 9.0 + DT
+    np.testing.assert_allclose(setpoint[end + 1999], ramp[-1], atol=1e-9)
+    assert np.abs(np.diff(setpoint[:, 0])).max() <= 1.0 * DT * (1 + 1e-9)
+
+
+def stream(seed, plan, steps):
+    """Yield irregular samples (None, t) and chunks (chunk, time) of two envs."""
+    rng, t = np.random.default_rng(seed), np.zeros(2)
+    for _ in range(steps):
+        if rng.random() < 0.05:
+            rows = int(rng.integers(1, plan.horizon + 1))
+            chunk = 0.05 * np.cumsum(rng.normal(size=(2, rows, plan.num_joints)), axis=1)
+            yield chunk.astype(plan.dtype), (t - rng.uniform(-0.02, 0.15)).astype(plan.dtype)
+        t = t + rng.exponential(1e-3, 2) * (rng.random() < 0.95)
+        yield None, t.astype(plan.dtype)
+
+
+def samples(plan, entries, add, sample, state):
+    rows = []
+    for chunk, t in entries:
+        if chunk is None:
+            state, *row = sample(plan, state, t)
+            rows.append(np.array(row))
+        else:
+            state = add(plan, state, chunk, t)
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_jax_agrees_with_times_of_each_env(name, x64):
+    plan = made(name)
+    entries, start = list(stream(2, plan, 150)), np.zeros((2, 3))
+    found = samples(plan, entries, bp.plan.add, bp.plan.sample, bp.plan.init(plan, start))
+    jitted = jax.jit(bp.plan.add), jax.jit(bp.plan.sample)
+    state = bp.plan.init(plan, jnp.asarray(start))
+    np.testing.assert_allclose(samples(plan, entries, *jitted, state), found, atol=1e-8)
+    # One robot a time, under vmap; samples in a scan.
+    each = (
+        jax.jit(jax.vmap(bp.plan.add, (None, 0, 0, 0))),
+        jax.jit(jax.vmap(bp.plan.sample, (None, 0, 0))),
+    )
+    state = jax.vmap(lambda qpos: bp.plan.init(plan, qpos))(start[:, None])
+    single = [(None if chunk is None else chunk[:, None], t[:, None]) for chunk, t in entries]
+    alone = samples(plan, single, *each, state)[:, :, :, 0]
+    np.testing.assert_allclose(alone, found, atol=1e-8)
+    times = jnp.array([t for chunk, t in entries if chunk is None])
+
+    def step(state, t):
+        state, *row = bp.plan.sample(plan, state, t)
+        return state, jnp.array(row)
+
+    _, scanned = jax.lax.scan(step, bp.plan.init(plan, jnp.asarray(start)), times)
+    assert scanned.shape == found.shape
+
+
+PROGRAM = """#include <stdio.h>
+{header}
+int main(void) {{
+  batchpid_plan plan;
+  {t} zero[{n}] = {{0}}, head[2], chunk[64 * {n}], setpoint[{n}], rate[{n}];
+  batchpid_plan_init(&plan, zero, 0);
+  while (fread(head, sizeof head, 1, stdin) == 1) {{
+    if (head[0] > 0) {{
+      if (fread(chunk, sizeof({t}) * {n}, (size_t)head[0], stdin) != (size_t)head[0]) return 1;
+      batchpid_add_chunk(&plan, chunk, (int)head[0], head[1]);
+    }} else {{
+      batchpid_sample(&plan, head[1], setpoint, rate);
+      fwrite(setpoint, sizeof setpoint, 1, stdout);
+      fwrite(rate, sizeof rate, 1, stdout);
+    }}
+  }}
+  return 0;
+}}
+"""
+
+
+@pytest.mark.skipif(not COMPILERS, reason="no C compiler")
+@pytest.mark.parametrize("steps", [1500, pytest.param(1_000_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("name", PLANS)
+def test_c_computes_the_same_bits(name, dtype, steps, tmp_path):
+    plan = made(name, dtype=dtype)
+    header = to_c(bp.make_params(3, 1.0, kd=0.1, dtype=dtype), DT, plan=plan).text
+    kind = "double" if dtype == np.float64 else "float"
+    binary = compiled(tmp_path, PROGRAM.format(header=header, t=kind, n=3), "-std=c99", "-O2")
+    entries = [
+        (chunk if chunk is None else chunk[:1], t[:1]) for chunk, t in stream(3, plan, steps)
+    ]
+    state = bp.plan.init(plan, np.zeros((1, 3), dtype))
+    found = samples(plan, entries, bp.plan.add, bp.plan.sample, state)[:, :2, 0]
+    parts = []
+    for chunk, t in entries:
+        parts += [
+            [0 if chunk is None else chunk.shape[1], t[0]],
+            [] if chunk is None else chunk.ravel(),
+        ]
+    data = np.concatenate(parts).astype(dtype).tobytes()
+    ran = subprocess.run([binary], input=data, capture_output=True, check=True)
+    np.testing.assert_array_equal(np.frombuffer(ran.stdout, dtype).reshape(-1, 2, 3), found)
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_a_file_keeps_a_plan(name, tmp_path):
+    plan = made(name)
+    bp.save_plan(tmp_path / "plan.yaml", plan, ["a", "b", "c"])
+    read, joints = bp.load_plan(tmp_path / "plan.yaml")
+    assert (joints, str(read)) == (["a", "b", "c"], str(plan))
+    jax.tree.map(np.testing.assert_array_equal, read, plan)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"fade": 1.0, "blend": "newest"}, "fade: has no effect with blend 'newest'"),
+        ({"taper": 0.1}, "taper: has no effect with blend 'align'"),
+        ({"latest": [3]}, "latest"),
+        ({"acceleration": 0.0}, "acceleration"),
+        ({"period": 0.0}, "period"),
+        ({"horizon": 0}, "horizon"),
+    ],
+)
+def test_what_is_refused(options, words):
+    with pytest.raises(bp.InvalidArgumentError, match=words):
+        made("align", **options)
+    plan = made("align")
+    with pytest.raises(bp.InvalidArgumentError, match="chunk"):
+        bp.plan.add(plan, bp.plan.init(plan, np.zeros((1, 3))), np.zeros((1, 9, 3)), 0.0)
