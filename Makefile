@@ -1,4 +1,4 @@
-# make demo    64 robots in MuJoCo under one batch PID: a table, and a picture in out/demo.png
+# make demo    64 robots under one batch PID in SAPIEN and MuJoCo: both rates; a table, and a picture in out/demo.png
 # make test     all tests but the slow ones, and every benchmark on a tiny workload
 # make test-isa the tests with other instruction sets of NumPy, OpenBLAS and XLA (two runs)
 # make check    linter, formatter, types, layers of imports and docs: what CI runs before the tests
@@ -36,6 +36,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.base
+	@$(RUN) examples/two_engines.py
 	@$(RUN) -m batchpid demo --engine mujoco --picture out/demo.png --force $(ARGS)
 	@echo "the command: . $(VENV)/bin/activate, then batchpid --help"
 

@@ -89,17 +89,17 @@ class FreeMotions:
         }
         least, most, width, *_ = scene.jnt_solimp[joints[0]]
         time, ratio = scene.jnt_solref[joints[0]]
-        self._numbers = {
+        self._structure = FreeMotion(
             # The reference acceleration of a limit: "Computation" in MuJoCo's documentation.
-            "stiffness": 1 / (most * time * ratio) ** 2,
-            "rate_gain": 2 / (most * time),
-            "least": least,
-            "most": most,
-            "width": width,
-            "timestep": scene.opt.timestep,
-            "has_pairs": len(touching_pairs(scene)) > 0,
-            "robots": size,
-        }
+            stiffness=1 / (most * time * ratio) ** 2,
+            rate_gain=2 / (most * time),
+            least=least,
+            most=most,
+            width=width,
+            timestep=scene.opt.timestep,
+            has_pairs=len(touching_pairs(scene)) > 0,
+            robots=size,
+        )
 
     def use(self, models: Sequence[MjModel]) -> None:
         """Take the constants of the robots' models (M,), which may have changed."""
@@ -110,10 +110,11 @@ class FreeMotions:
             "weight": [model.dof_invweight0[at] for model in kinds],
             "gravity": [model.opt.gravity for model in kinds],
         }
-        tables = {name: table(np.array(rows), self.size) for name, rows in columns.items()}
-        self._arrays |= tables
-        addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
-        self._structure = FreeMotion(model=self._rigid.address, **addresses, **self._numbers)
+        self._arrays |= {name: table(np.array(rows), self.size) for name, rows in columns.items()}
+        # In place, since native code has the address.
+        self._structure.model = self._rigid.address
+        for name, array in self._arrays.items():
+            setattr(self._structure, name, array.ctypes.data)
         self.contact[...] = _UNKNOWN
 
     @property
@@ -128,7 +129,8 @@ class FreeMotions:
     def read(self) -> tuple[Float64, Float64, Float64]:
         """Return positions, velocities and last accelerations (M, dof)."""
         qpos, qvel, acceleration = (
-            array.swapaxes(1, 2).reshape(-1, array.shape[1])[: self.size] for array in self._states
+            np.array(array.swapaxes(1, 2).reshape(-1, array.shape[1])[: self.size])
+            for array in self._states
         )
         return qpos, qvel, acceleration
 
