@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
     from batchpid.sim.engine.physics import MujocoSolver, Physics
     from batchpid.sim.findings import Finding, RepairWarning
+    from batchpid.sim.loop.closed_loop import closed_loop
     from batchpid.sim.loop.faults import Fault, FaultWarning
     from batchpid.sim.loop.snapshot import Snapshot
     from batchpid.sim.options.groups import Controller, Ray
@@ -63,6 +64,7 @@ __all__ = [
     "Snapshot",
     "StabilityWarning",
     "Uniform",
+    "closed_loop",
     "read_recording",
     "to_mjcf",
     "to_urdf",
@@ -98,6 +100,7 @@ _PLACES = {
     "Snapshot": "batchpid.sim.loop.snapshot",
     "StabilityWarning": "batchpid.sim.diagnosis.loop_stability",
     "Uniform": "batchpid.sim.randomization.distributions",
+    "closed_loop": "batchpid.sim.loop.closed_loop",
     "read_recording": "batchpid.sim.recording.recording_files",
     "to_mjcf": "batchpid.sim.engine.mujoco.mjcf_export",
     "to_urdf": "batchpid.sim.robot.urdf_export",
