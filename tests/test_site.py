@@ -104,7 +104,7 @@ def test_the_tables_of_fields_are_those_of_the_code():
 
 
 LONGER = {
-    "README.md": 195,
+    "README.md": 205,
     "tutorial.md": 205,
     "choosing-gains.md": 165,
     "law.md": 165,
