@@ -294,8 +294,9 @@ def test_commands_of_a_bag_act_from_their_own_stamps_on(tmp_path, hold, seed):
             messages.append((topic, time, dict.fromkeys(JOINTS, value)))
     path = bag(tmp_path / "bag", sorted(messages, key=lambda message: message[1]))
     reading = Reading(command_topic="/commands", hold=hold)
-    with pytest.warns(LogWarning, match="is silent from .* the log is divided"):
+    with pytest.warns(LogWarning) as notes:
         logs = read_logs(load(tmp_path), [path], "setpoint", reading=reading)
+    assert any("the log is divided" in str(note.message) for note in notes)
     assert len(logs) == 2
     origin = max(times[0] for times in stamps.values())
     for log in logs:
