@@ -7,7 +7,7 @@ import pytest
 from robots import load_bundled
 
 from batchpid.sim import Runner
-from batchpid.trajectories import minimum_jerk, trapezoidal
+from batchpid.trajectories import minimum_jerk
 
 N, DT = 2, 0.01
 
@@ -54,12 +54,6 @@ def test_default_gains_follow_a_trajectory(name, engine, gains):
     assert error["steps"] > 0.1
     assert error["rates"] < 0.002
     assert error["accelerations"] < 0.002
-
-
-def test_a_trapezoid_is_followed_too():
-    panda = load_bundled("panda")
-    start, move = moves(panda, profile=trapezoidal, max_acceleration=4.0)
-    assert np.abs(follow(panda, start, move).qpos - move.position).max() < 0.003
 
 
 @pytest.mark.quick_rows(5)
