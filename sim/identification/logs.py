@@ -126,6 +126,7 @@ def logs_of_rollout(
         within = rollout.changes[1:]
     obstacles = {
         f"is of the joints {', '.join(info.joint_names)}": info.joint_names != robot.joint_names,
+        "was made with a plan": info.plan is not None,
         "was made with setpoints that are not of joints": info.own_command is not None,
         f"was made under control {info.control!r}": info.control not in (None, "pid", "effort"),
         f"holds {recorded}s": kind not in (None, recorded),

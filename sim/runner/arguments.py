@@ -5,14 +5,14 @@ to.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.checks.validate import array, entries, read_array, within
+from batchpid.checks.validate import array, at_least, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.engine.model_pack import ORIGIN
@@ -72,6 +72,45 @@ def read_command(
     return accelerated(command, state.motion, seconds)
 
 
+def read_chunks(
+    options: RunnerOptions,
+    inputs: Mapping[str, ArrayLike | None],
+    latency: ArrayLike,
+    ticks: int | None = None,
+) -> tuple[Float64, Float64]:
+    """Return the chunks (ticks, envs, rows, dof) of one tick, or of ``ticks``, and their latency
+    (ticks, envs) [s], as copies.
+
+    A setpoint without an axis of rows is a chunk of one row.
+
+    Raises InvalidArgumentError for more rows than the horizon of the plan, a negative latency, or
+    rates beside the setpoints.
+    """
+    assert options.plan is not None
+    (name, value), *rates = inputs.items()
+    for rate, given in rates[:2]:
+        if given is not None:
+            problem = "has no effect with a plan, which makes the rates"
+            raise InvalidArgumentError(rate, problem, remedy="leave it out")
+    joints = options.robot.joint_names
+    rows = read_array(name, cast(ArrayLike, value))
+    # One row for all envs, one for each, or several for each.
+    axes = rows.ndim - (ticks is not None)
+    while 0 < axes < 3:
+        rows, axes = rows[..., None, :], axes + 1
+    count = rows.shape[-2] if rows.ndim else 1
+    if count > options.plan.horizon:
+        problem = f"has {count} rows, and the plan a horizon of {options.plan.horizon}"
+        raise InvalidArgumentError(name, problem, remedy="make a plan of a longer horizon")
+    table = (ticks or 1, options.num_envs)
+    finite = options.on_invalid_input == "raise"
+    chunks = array(name, rows, (*table, count, len(joints)), joints, finite=finite)
+    envs = tuple([f"env {env}" for env in range(options.num_envs)])
+    ages = array("latency", latency, table, envs, finite=False, kind="entry")
+    at_least("latency", ages, 0.0, envs, infinite=True, kind="entry")
+    return options.robot.coupling.positions(chunks).copy(), ages.copy()
+
+
 def accelerated(command: Command, motion: Motion, seconds: float) -> Command:
     """Return ``command`` (ticks, envs, ...) with the mean accelerations in ticks of ``seconds``
     with rates.
@@ -106,7 +145,8 @@ def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
     rows = read_array("setpoints", setpoints)
     num_envs = options.num_envs
     size = len(options.command_columns[0][1])
-    if rows.ndim not in (2, 3) or len(rows) == 0:
+    axes = (2, 3) if options.plan is None else (2, 3, 4)
+    if rows.ndim not in axes or len(rows) == 0:
         raise InvalidArgumentError(
             "setpoints",
             f"must have shape (ticks, {num_envs}, {size}) or (ticks, {size})",

@@ -193,6 +193,27 @@ class SetActuators(Operation):
 
 
 @dataclass(frozen=True)
+class AddChunk(Operation):
+    """Add a chunk (envs, rows, dof) that is ``latency`` (envs,) [s] old to the plans; infinite for
+    no chunk.
+    """
+
+    chunk: Float64
+    latency: Float64
+
+    def goal(self, before: Float64) -> Float64:
+        """Return the last row of each env (envs, dof), NaN where a row is not finite, or ``before``
+        without a chunk.
+        """
+        is_finite = np.isfinite(self.chunk).all(1)
+        goal = np.where(is_finite, self.chunk[:, -1], np.nan)
+        return np.where(np.isfinite(self.latency)[:, None], goal, before)
+
+    def apply(self, loop: Loop) -> None:
+        loop.add_chunk(self.chunk, self.latency)
+
+
+@dataclass(frozen=True)
 class ReadRows(Operation):
     """Read the state of every env."""
 
