@@ -12,12 +12,12 @@ from batchpid.trajectories import minimum_jerk
 N, DT = 2, 0.01
 
 
-def moves(robot, count=N, seed=0, profile=minimum_jerk, **limits):
+def moves(robot, count=N, seed=0):
     """Return starts (count, dof) and smooth moves from there at half the velocity limits."""
     low, high = np.maximum(robot.lower, -2.5), np.minimum(robot.upper, 2.5)
     share = np.random.default_rng(seed).uniform(0.4, 0.6, (2, count, robot.dof))
     start, target = robot.coupled(low + share * (high - low))
-    move = profile(start, target, DT, max_velocity=0.5 * robot.velocity_limit, **limits)
+    move = minimum_jerk(start, target, DT, max_velocity=0.5 * robot.velocity_limit)
     return start, move.hold(0.2)
 
 
