@@ -1,8 +1,8 @@
 """Many robots in SAPIEN or MuJoCo: load a URDF or MJCF file, run N copies under explicit joint
 control.
 
-Importing it does not load an engine; the first :class:`Runner` or :meth:`Robot.dynamics` loads its
-own.
+Importing it loads nothing: a name loads its module when it is used, and the first :class:`Runner` or
+:meth:`Robot.dynamics` its engine.
 """
 
 from __future__ import annotations
@@ -10,27 +10,31 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from batchpid.io.packages import attributes_of
-from batchpid.sim.diagnosis.loop_stability import StabilityWarning
-from batchpid.sim.diagnosis.run_checks import SetpointWarning
-from batchpid.sim.findings import Finding, RepairWarning
-from batchpid.sim.loop.faults import Fault, FaultWarning
-from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.options.groups import Controller, Ray
-from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
-from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.recording.recorder import Recorder
-from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
-from batchpid.sim.robot.robot import Robot
-from batchpid.sim.rollout import Rollout, RunInfo
-from batchpid.sim.signals.quantities import CommandSpec, Observation
-from batchpid.sim.tool_space import OperationalSpace
 
 if TYPE_CHECKING:
+    from batchpid.sim.diagnosis.loop_stability import StabilityWarning
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
     from batchpid.sim.engine.physics import MujocoSolver, Physics
+    from batchpid.sim.findings import Finding, RepairWarning
+    from batchpid.sim.loop.closed_loop import closed_loop
+    from batchpid.sim.loop.faults import Fault, FaultWarning
+    from batchpid.sim.loop.snapshot import Snapshot
+    from batchpid.sim.options.groups import Controller, Ray
+    from batchpid.sim.options.options import RunnerOptions
+    from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
+    from batchpid.sim.randomization.randomization import Randomization
+    from batchpid.sim.recording.recorder import Recorder
+    from batchpid.sim.recording.recording_files import (
+        RecordingError,
+        read_recording,
+        write_recording,
+    )
+    from batchpid.sim.robot.robot import Robot
     from batchpid.sim.robot.urdf_export import to_urdf
+    from batchpid.sim.rollout import Rollout, RunInfo
     from batchpid.sim.runner.runner import Runner
+    from batchpid.sim.signals.quantities import CommandSpec, Observation
+    from batchpid.sim.tool_space import OperationalSpace
     from batchpid.sim.workers.pool import RecoveryWarning
 
 __all__ = [
@@ -57,10 +61,10 @@ __all__ = [
     "RunInfo",
     "Runner",
     "RunnerOptions",
-    "SetpointWarning",
     "Snapshot",
     "StabilityWarning",
     "Uniform",
+    "closed_loop",
     "read_recording",
     "to_mjcf",
     "to_urdf",
@@ -69,17 +73,43 @@ __all__ = [
 
 _MODULES = ("gym", "identification", "plots", "tuning", "view")
 """Public modules, which are imported when they are used."""
-_LOADED_LATE = {
+_PLACES = {
+    "Choice": "batchpid.sim.randomization.distributions",
+    "CommandSpec": "batchpid.sim.signals.quantities",
+    "Controller": "batchpid.sim.options.groups",
+    "Fault": "batchpid.sim.loop.faults",
+    "FaultWarning": "batchpid.sim.loop.faults",
+    "Finding": "batchpid.sim.findings",
+    "LogUniform": "batchpid.sim.randomization.distributions",
     "MujocoSolver": "batchpid.sim.engine.physics",
+    "Normal": "batchpid.sim.randomization.distributions",
+    "Observation": "batchpid.sim.signals.quantities",
+    "OperationalSpace": "batchpid.sim.tool_space",
     "Physics": "batchpid.sim.engine.physics",
-    "Runner": "batchpid.sim.runner.runner",
+    "Randomization": "batchpid.sim.randomization.randomization",
+    "Ray": "batchpid.sim.options.groups",
+    "Recorder": "batchpid.sim.recording.recorder",
+    "RecordingError": "batchpid.sim.recording.recording_files",
     "RecoveryWarning": "batchpid.sim.workers.pool",
+    "RepairWarning": "batchpid.sim.findings",
+    "Robot": "batchpid.sim.robot.robot",
+    "Rollout": "batchpid.sim.rollout",
+    "RunInfo": "batchpid.sim.rollout",
+    "Runner": "batchpid.sim.runner.runner",
+    "RunnerOptions": "batchpid.sim.options.options",
+    "Snapshot": "batchpid.sim.loop.snapshot",
+    "StabilityWarning": "batchpid.sim.diagnosis.loop_stability",
+    "Uniform": "batchpid.sim.randomization.distributions",
+    "closed_loop": "batchpid.sim.loop.closed_loop",
+    "read_recording": "batchpid.sim.recording.recording_files",
     "to_mjcf": "batchpid.sim.engine.mujoco.mjcf_export",
     "to_urdf": "batchpid.sim.robot.urdf_export",
+    "write_recording": "batchpid.sim.recording.recording_files",
 }
+"""Modules of the public names."""
 
 
-__getattr__ = attributes_of(__name__, _MODULES, _LOADED_LATE)
+__getattr__ = attributes_of(__name__, _MODULES, _PLACES)
 
 
 def __dir__() -> list[str]:

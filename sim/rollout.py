@@ -57,9 +57,16 @@ _CHANGES = {
 _OF_PARTS = ("start", "faults", "rates", "begun", "complete", "description", "urdf")
 """Fields that differ from part to part of a run."""
 _OF_ROBOT = (
-    *("joint_names", "units", "lower", "upper", "effort_limit"),
-    *("digest", "dissipation", "fixed_base"),
-)  # fields of RunInfo that are attributes of a robot
+    "joint_names",
+    "units",
+    "lower",
+    "upper",
+    "effort_limit",
+    "digest",
+    "dissipation",
+    "fixed_base",
+)
+"""Fields of :class:`RunInfo` that are attributes of a robot."""
 _OF_ENVS = ("params", "actuators", "start", "episodes")  # fields with a row for each env
 
 
@@ -98,6 +105,10 @@ class RunInfo:
     """Link of the tool that setpoints move; None where they are not poses."""
     own_command: CommandSpec | None = None
     """Names and units of setpoints that are not one number for each joint."""
+    plan: str | None = None
+    """Blend of the plan that made setpoints of chunks, whose last rows are recorded; None without
+    a plan.
+    """
     compensate: str | None = None
     """Efforts added by the runner: "gravity+coriolis+friction", "gravity+coriolis", "gravity" or
     "none".
@@ -172,7 +183,7 @@ class RunInfo:
         """Quantities of :data:`RECORDED` that this run has."""
         links = {"contacts": self.contacts, "wrenches": self.wrenches}
         commands = {name: RECORDED[name] for name in ("setpoint", *OPTIONAL)}
-        return commands | observed(self.fixed_base, self.tool, **links)
+        return commands | observed(self.fixed_base, self.tool, self.plan, **links)
 
     def units_of(self, name: str) -> tuple[str, ...]:
         """Return the unit of each column of the quantity ``name`` of :data:`RECORDED`; none if it

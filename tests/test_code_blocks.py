@@ -37,7 +37,8 @@ from tiny_urdf import write
 import batchpid as bp
 import batchpid.sim
 from batchpid.sim import Robot, Runner
-from batchpid.sim.cli import COMMANDS, main, parse
+from batchpid.sim.cli import main, parse
+from batchpid.sim.cli.commands import COMMANDS
 
 TEXTS = sorted({*PAGES, *ROOT.glob("*.md"), ROOT / "assets/README.md"})
 MJCF = """<mujoco>

@@ -7,6 +7,7 @@ With setpoint r, joint positions q and velocities v, and passive force p::
     inertia         of the friction model                 every 64 sim steps of an env
     matrix          M    = M(y) half way ahead            every 4 sim steps of a tick, 1 with the implicit law
     setpoint        r    = r at this moment of the tick   where its rate is given
+    plan            r    = plan(t)                        of chunks of a policy
     guard           r    = guard(r)                       limits of position, rate and acceleration
     feedforward     f    = p + feedforward + modelled friction
     law             u    = the caller's own controller
@@ -42,6 +43,7 @@ from batchpid.stages.last import Last
 from batchpid.stages.matrix import Matrix
 from batchpid.stages.motors import Limits, Motors
 from batchpid.stages.pid import PID
+from batchpid.stages.plan import Plan
 from batchpid.stages.sensors import Sensors
 from batchpid.stages.setpoint import Setpoint
 from batchpid.stages.stage import Stage
@@ -51,7 +53,7 @@ __all__ = ["STAGES", "Control", "Stage", "Told", "Values", "fit_stages", "stages
 
 STAGES: tuple[type[Stage], ...] = (
     *(Sensors, Passive, Inertia, Matrix),
-    *(Setpoint, Guard, Feedforward, Own, Limits),
+    *(Setpoint, Plan, Guard, Feedforward, Own, Limits),
     *(PID, Drive, Effort, Motors, Friction, Last),
 )
 """Stages of batchpid, in order."""

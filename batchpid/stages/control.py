@@ -14,6 +14,7 @@ from batchpid.motors.actuators import FIELDS, Actuators
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.motors.guard import Guard
+from batchpid.plan.plans import Plan
 
 
 class Control(NamedTuple):
@@ -30,6 +31,7 @@ class Control(NamedTuple):
     """The caller's own controller in mode "custom"."""
     actuators: Actuators | None = None
     guard: Guard | None = None
+    plan: Plan | None = None
     friction: Friction = Friction()
     """Friction and damping of the joints, simulated here."""
     gravity: bool = False

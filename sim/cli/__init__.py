@@ -3,7 +3,8 @@ is the help.
 
 The result writes itself. ``report()`` is printed, and the output files come from ``save(path)`` and
 ``figure()``; ``status`` is the exit status (without it: 0). To add a command, write such a function
-and list it in :data:`COMMANDS`.
+and list it in :data:`SUMMARIES`, and in ``COMMANDS`` of the module of commands, which the overview
+does not import.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
-from inspect import getdoc
 from typing import Any
 
 import tyro
@@ -21,10 +21,21 @@ import tyro
 import batchpid
 from batchpid.checks.validate import choice
 from batchpid.errors import BatchPIDError
-from batchpid.sim.cli.commands import COMMANDS, execute
-from batchpid.sim.cli.flags import check
 
 INPUT_ERROR = 2
+SUMMARIES = {
+    "demo": "Move 64 arms to a setpoint.",
+    "rollout": "Move N of any robot to a setpoint or along a trajectory.",
+    "tune": "Tune the gains of any robot.",
+    "compare": "Compare sets of gains on the same moves.",
+    "excite": "Make the motion to record for identification.",
+    "identify": "Identify a robot's motors from logs of its motion.",
+    "export": "Write a robot's gains, or the robot itself, for another program.",
+    "inspect": "List findings about a robot, its joints and masses.",
+    "plot": "Draw a recorded run, or film it.",
+    "view": "Show moving robots in the browser.",
+}
+"""Every command, with its line in the overview."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -70,13 +81,14 @@ def parse(arguments: Sequence[str]) -> tuple[str, object]:
     # A command is parsed alone, so that a message names its help.
     if arguments and not arguments[0].startswith("-"):
         name, *words = arguments
-        choice("command", name, COMMANDS)
+        choice("command", name, SUMMARIES)
+        from batchpid.sim.cli.commands import COMMANDS
+
         record = COMMANDS[name].record()
         return name, tyro.cli(record, prog=f"batchpid {name}", args=words, config=config)
     app = tyro.extras.SubcommandApp()
-    for name, command in COMMANDS.items():
-        about = getdoc(command.function) or ""
-        app.command(name=name, help=about.partition("\n\n")[0].replace("\n", " "))(_nothing)
+    for name, summary in SUMMARIES.items():
+        app.command(name=name, help=summary)(_nothing)
     about = "Joint-level PID control for many robots at once, in SAPIEN or MuJoCo."
     app.cli(prog="batchpid", description=about, args=arguments, config=config)
     raise SystemExit(0)
@@ -93,8 +105,9 @@ def _run(arguments: list[str]) -> int:
             name, flags = parse(arguments)
         except SystemExit as end:  # after --help, or a message about unknown flags
             return int(end.code or 0)
-        check(flags)
-        return execute(COMMANDS[name], vars(flags))
+        from batchpid.sim.cli.commands import run
+
+        return run(name, flags)
 
 
 def _fail(status: int, message: str) -> int:

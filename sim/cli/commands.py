@@ -132,8 +132,11 @@ COMMANDS = {
 }
 
 
-def execute(command: CommandFunction, values: Document) -> int:
-    """Run a command with the values of its flags, and return its exit status."""
+def run(name: str, record: object) -> int:
+    """Run a command with the record of its flags, and return its exit status."""
+    flags.check(record)
+    command = COMMANDS[name]
+    values = vars(record)
     # A run may take hours: its output files are checked first.
     paths = _output_paths(command, values)
     arguments = _arguments(command, values)

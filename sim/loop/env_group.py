@@ -75,7 +75,7 @@ class EnvGroup:
         self._last = Table(arrays, *last, self._faults.rows)
         reads_base = "base_state" in options.load_engine().capabilities and pack.spec.mjcf is None
         is_read = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
-        has_parts = bool(self._sensors.values or self._pushes.counts)
+        has_parts = bool(self._sensors.values or self._pushes.counts or options.plan)
         self._observes_natively = is_read and not has_parts
         setup = self._setup()
         self._prepare(setup, started(setup.stages, self._values(setup)))
@@ -137,6 +137,14 @@ class EnvGroup:
         if actuators is not None or self.acting.actuators is not None:
             self._put_actuators(actuators)
             self._adopt()
+
+    def add_chunk(self, chunk: Float64, latency: Float64) -> None:
+        """Add a chunk (M, rows, dof) that is ``latency`` (M,) [s] old to the plan."""
+        executor = self._executor
+        stages, states = executor.setup.stages, list(executor.read_state())
+        place = [stage.name for stage in stages].index("plan")
+        states[place] = stages[place].add(states[place], chunk, latency)
+        executor.write_state(tuple(states))
 
     def _put_actuators(self, actuators: bp.Actuators | None, rows: list[int] | None = None) -> None:
         """Put actuators into effect, for the robots ``rows`` or all."""
@@ -302,6 +310,9 @@ class EnvGroup:
             pose, twist = np.split(self.pack.read_base(), [7], axis=1)
             observation.base_pose[...] = pose
             observation.base_twist[...] = twist
+        if observation.starved is not None:
+            stages, states = self._executor.setup.stages, self._executor.read_state()
+            observation.starved[...] = by_name(stages, states)["plan"].starved[:, 0]
         for name, values in self._sensors.values.items():
             getattr(observation, name)[...] = values
         self._faults.observe(rows)

@@ -74,7 +74,7 @@ class GroupControl(NamedTuple):
         """Whether targets of the engine's drives move within a tick whose setpoints rest."""
         control = self.control
         law = self.stage("law")
-        moving = control.guard, control.turns, getattr(law, "integral", None)
+        moving = control.guard, control.plan, control.turns, getattr(law, "integral", None)
         return any(part is not None for part in moving) or bool(control.further)
 
     def stage(self, name: str) -> Any:
@@ -89,7 +89,7 @@ def control_of(
     joints: Sequence[Joint],
     friction: Friction,
     envs: slice,
-    controller: OwnController | None,
+    controller: Any,
     share: float = 1.0,
 ) -> Control:
     """Return the control of the envs ``envs`` of a runner.
@@ -116,6 +116,7 @@ def control_of(
         controller=controller,
         actuators=actuators,
         guard=None if options.guard is None else options.guard.for_envs(envs),
+        plan=None if options.plan is None else options.plan.for_envs(envs),
         friction=friction,
         gravity="gravity" in compensated,
         coriolis="coriolis" in compensated,

@@ -189,6 +189,11 @@ class Loop:
         for group in self.groups:
             group.set_actuators(None if actuators is None else actuators.for_envs(group.envs))
 
+    def add_chunk(self, chunk: NDArray[np.float64], latency: NDArray[np.float64]) -> None:
+        """Add a chunk (envs, rows, dof) that is ``latency`` (envs,) [s] old to the plans."""
+        for group in self.groups:
+            group.add_chunk(chunk[group.envs], latency[group.envs])
+
     def run(self, ticks: int, substeps: int, given: tuple[bool, ...]) -> float:
         """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the
         seconds it took.

@@ -399,6 +399,10 @@ class Control(OptionGroup):
     """Further stages of a sim step, such as a thermal limit, each a :class:`batchpid.stages.Stage`
     with ``after``, the name of the stage before it (docs/stages.md); default none.
     """
+    plan: Annotated[bp.Plan | None, option("snapshot", recording="plan_blend")] = None
+    """Plan of the chunks of a slow policy: :func:`batchpid.make_plan`. :meth:`Runner.step` then
+    takes chunks, and ``obs.starved`` counts the sim steps without a row ahead. Default none.
+    """
     guard: Annotated[bool | bp.Guard | None, option("snapshot")] = None
     """Limits of setpoints, applied at every sim step: True for :meth:`batchpid.sim.Robot.guard`, or
     :func:`batchpid.make_guard`; default none. ``obs.guarded`` is True where a setpoint was
@@ -443,6 +447,13 @@ class Control(OptionGroup):
         if isinstance(self.control, str):
             return self.control
         return type(self.control).__name__
+
+    @property
+    def plan_blend(self) -> str | None:
+        """Blend of the plan; None without a plan."""
+        if self.plan is None:
+            return None
+        return str(self.plan.options()["blend"])
 
     @property
     def sets_positions(self) -> bool:

@@ -121,6 +121,7 @@ class RunnerOptions(RunnerKeywords):
         values["guard"] = fit_guard(
             self.guard, robot.joints, self.num_envs, self.control_name, self.sets_positions
         )
+        values["plan"] = self._checked_plan()
         values["actuators"] = self.check_actuators(self.actuators)
         if self.params is None:
             values["params"] = default_params(robot, self.control, self.loops)
@@ -143,6 +144,18 @@ class RunnerOptions(RunnerKeywords):
             problem = f"needs a kinematic tree, and {names} of the file closes a loop of links"
             raise InvalidArgumentError(argument, problem, value=value, remedy=remedy)
 
+    def _checked_plan(self) -> bp.Plan | None:
+        """Return the plan, as a read-only copy, if it fits the robot and the control."""
+        if self.plan is None:
+            return None
+        if not self.sets_positions:
+            problem = "makes positions of joints, which this control does not take"
+            remedy = "use control 'pid' or 'drive'"
+            raise InvalidArgumentError("plan", problem, value=self.control_name, remedy=remedy)
+        plan = instance("plan", self.plan, bp.Plan, "build it with make_plan")
+        plan.check(self.num_envs, self.robot.joint_names)
+        return frozen(plan)
+
     @property
     def mjcf(self) -> MjcfFile | None:
         """MJCF file that the engine simulates as it is; None for others, and in SAPIEN."""
@@ -158,7 +171,12 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def observed(self) -> dict[str, Quantity]:
         """Quantities that the loop observes."""
-        return observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
+        return observed(
+            self.robot.fixed_base,
+            contacts=self.contacts,
+            plan=self.plan_blend,
+            wrenches=self.wrenches,
+        )
 
     @cached_property
     def own_command(self) -> CommandSpec | None:

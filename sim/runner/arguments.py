@@ -5,16 +5,15 @@ to.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.checks.validate import array, entries, read_array, within
+from batchpid.checks.validate import array, at_least, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.engine.model_pack import ORIGIN
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.options.options import RunnerOptions
@@ -30,7 +29,6 @@ _SHORTEST = 1e-9
 def read_command(
     options: RunnerOptions,
     state: RunnerState,
-    limits: SetpointCheck | None,
     inputs: Mapping[str, ArrayLike | None],
     seconds: float,
     ticks: int | None = None,
@@ -40,7 +38,7 @@ def read_command(
 
     ``inputs`` are its arrays by the names of their arguments, in the order of :class:`Command`.
     Positions of followers are computed from their leaders; the loop passes efforts on to the
-    leaders. ``limits`` warns of setpoints.
+    leaders.
     """
     _, rate, acceleration, _ = inputs.values()
     if acceleration is not None:
@@ -49,7 +47,8 @@ def read_command(
     finite = options.on_invalid_input == "raise"
     rows = list[Any]()
     for (name, value), (kind, names) in zip(inputs.items(), options.command_columns, strict=True):
-        if value is None and rows:  # the setpoint, which is first, must be given
+        # The setpoint, which is first, must be given.
+        if value is None and rows:
             rows.append(None)
             continue
         entries: Any = value
@@ -63,13 +62,49 @@ def read_command(
     if coupling is not None:
         rows[0] = coupling.positions(rows[0])
         rows[1:3] = [None if table is None else coupling.rates(table) for table in rows[1:3]]
-    if limits is not None:
-        limits.check("setpoint", rows[0])
-    # No constructor of a named tuple, which is a call of Python in the path of a tick.
-    command = tuple.__new__(Command, rows)
+    command = Command(*rows)
     if rate is None or state.motion is None or state.params.gain_units is None:
         return command
     return accelerated(command, state.motion, seconds)
+
+
+def read_chunks(
+    options: RunnerOptions,
+    inputs: Mapping[str, ArrayLike | None],
+    latency: ArrayLike,
+    ticks: int | None = None,
+) -> tuple[Float64, Float64]:
+    """Return the chunks (ticks, envs, rows, dof) of one tick, or of ``ticks``, and their latency
+    (ticks, envs) [s], as copies.
+
+    A setpoint without an axis of rows is a chunk of one row.
+
+    Raises InvalidArgumentError for more rows than the horizon of the plan, a negative latency, or
+    rates beside the setpoints.
+    """
+    assert options.plan is not None
+    (name, value), *rates = inputs.items()
+    for rate, given in rates[:2]:
+        if given is not None:
+            problem = "has no effect with a plan, which makes the rates"
+            raise InvalidArgumentError(rate, problem, remedy="leave it out")
+    joints = options.robot.joint_names
+    rows = read_array(name, cast(ArrayLike, value))
+    # One row for all envs, one for each, or several for each.
+    axes = rows.ndim - (ticks is not None)
+    while 0 < axes < 3:
+        rows, axes = rows[..., None, :], axes + 1
+    count = rows.shape[-2] if rows.ndim else 1
+    if count > options.plan.horizon:
+        problem = f"has {count} rows, and the plan a horizon of {options.plan.horizon}"
+        raise InvalidArgumentError(name, problem, remedy="make a plan of a longer horizon")
+    table = (ticks or 1, options.num_envs)
+    finite = options.on_invalid_input == "raise"
+    chunks = array(name, rows, (*table, count, len(joints)), joints, finite=finite)
+    envs = tuple([f"env {env}" for env in range(options.num_envs)])
+    ages = array("latency", latency, table, envs, finite=False, kind="entry")
+    at_least("latency", ages, 0.0, envs, infinite=True, kind="entry")
+    return options.robot.coupling.positions(chunks).copy(), ages.copy()
 
 
 def accelerated(command: Command, motion: Motion, seconds: float) -> Command:
@@ -85,10 +120,12 @@ def accelerated(command: Command, motion: Motion, seconds: float) -> Command:
     position, velocity = motion
     if velocity is None:
         velocity = np.zeros_like(rate[0])
-    with np.errstate(invalid="ignore"):  # non-finite rates become faults
+    # Rates that are not finite become faults.
+    with np.errstate(invalid="ignore"):
         moved = np.diff(setpoint, axis=0, prepend=position[None])
         change = np.diff(rate, axis=0, prepend=velocity[None])
-        ahead = moved - seconds * rate  # of increments 0, else minus half the change
+        # 0 for increments, else minus half the change.
+        ahead = moved - seconds * rate
         fits = np.abs(ahead + 0.5 * seconds * change) < 4 * np.abs(ahead)
         if acceleration is None:
             acceleration = 0.0
@@ -106,7 +143,8 @@ def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
     rows = read_array("setpoints", setpoints)
     num_envs = options.num_envs
     size = len(options.command_columns[0][1])
-    if rows.ndim not in (2, 3) or len(rows) == 0:
+    axes = (2, 3) if options.plan is None else (2, 3, 4)
+    if rows.ndim not in axes or len(rows) == 0:
         raise InvalidArgumentError(
             "setpoints",
             f"must have shape (ticks, {num_envs}, {size}) or (ticks, {size})",

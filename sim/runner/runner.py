@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Progress, Rows
+from batchpid.arrays.array_types import Float64, Progress, Rows
 from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner
 from batchpid.io.files import package_versions
@@ -45,8 +45,9 @@ from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.rollout import Rollout, RunInfo
-from batchpid.sim.runner.arguments import count_ticks, read_command
+from batchpid.sim.runner.arguments import count_ticks, read_chunks, read_command
 from batchpid.sim.runner.operations import (
+    AddChunk,
     Operation,
     ReadPoses,
     ReadRows,
@@ -107,8 +108,9 @@ class Runner(SingleOwner):
         link ``tool``, or a :class:`batchpid.sim.Controller`; forces that are compensated.
     timestep, substeps
         Time step of simulation and control [s]; sim steps of a tick.
-    actuators, guard, stages
-        Motors and sensors, default the robot's; limits of setpoints; further stages of a sim step.
+    actuators, plan, guard, stages
+        Motors and sensors, default the robot's; plan of a slow policy; limits of setpoints; further
+        stages of a sim step.
     engine, physics, collisions, ground, build
         Physics engine, "mujoco" or "sapien"; its solver settings; collision shapes; a ground at
         height 0; content of SAPIEN's scenes.
@@ -146,6 +148,7 @@ class Runner(SingleOwner):
         tool: str | None = None,
         compensate: Compensation = "gravity+coriolis+friction",
         actuators: bp.Actuators | None = None,
+        plan: bp.Plan | None = None,
         guard: bool | bp.Guard | None = None,
         stages: Sequence[Stage] = (),
         engine: EngineName = DEFAULT_ENGINE,
@@ -177,6 +180,7 @@ class Runner(SingleOwner):
             tool=tool,
             compensate=compensate,
             actuators=actuators,
+            plan=plan,
             guard=guard,
             stages=stages,
             engine=engine,
@@ -222,7 +226,7 @@ class Runner(SingleOwner):
         checks = self._warnings
         seed = None if options.randomization is None else 0
         base = {"base_pose": None, "base_twist": None}
-        start = Reset.read(options, self._state, checks.limits, (None, None), None, seed, base)
+        start = Reset.read(options, self._state, (None, None), None, seed, base)
         self._call.begin()
         try:
             self._call.waits = True
@@ -286,19 +290,19 @@ class Runner(SingleOwner):
             :meth:`rollout` and :meth:`restore`.
         """
         self._ready()
-        limits = self._warnings.limits
         base = {"base_pose": base_pose, "base_twist": base_twist}
-        start = Reset.read(self.options, self._state, limits, (qpos, qvel), mask, seed, base)
+        start = Reset.read(self.options, self._state, (qpos, qvel), mask, seed, base)
         self._execute(start)
         return self.observe()
 
     def step(
         self,
-        setpoint: ArrayLike,
+        setpoint: ArrayLike | None,
         *,
         setpoint_rate: ArrayLike | None = None,
         setpoint_acceleration: ArrayLike | None = None,
         feedforward: ArrayLike | None = None,
+        latency: ArrayLike = 0.0,
         substeps: int | None = None,
     ) -> Observation:
         """Run one tick: ``substeps`` sim steps under ``setpoint``.
@@ -308,7 +312,10 @@ class Runner(SingleOwner):
         setpoint
             (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. A
             follower's value (:attr:`batchpid.sim.Robot.coupling`) is replaced by the coupling's
-            value for the leader's setpoint; an effort acts on the leader. A
+            value for the leader's setpoint; an effort acts on the leader. With the option ``plan``
+            a chunk (envs, rows, dof), where the above is one of one row; its rows are for the
+            beginning of this tick less ``latency``, and later in steps of the plan's period; None for
+            no chunk. A
             :class:`batchpid.sim.Controller` that defines its command takes (size,) or (envs, size):
             :attr:`command`.
         setpoint_rate
@@ -326,22 +333,25 @@ class Runner(SingleOwner):
         feedforward
             Joint effort (dof,) or (envs, dof) [N m or N] added to the passive force before
             saturation.
+        latency
+            Age of the chunk, a number or (envs,) [s]; infinite for envs that get none.
         substeps
             Sim steps of this tick; default the runner's.
         """
         if self._sent is not None or self._pool.closed:
             self._ready()
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
-        self._execute(self._tick(command, substeps))
+        self._execute(self._tick(command, latency, substeps))
         return self._pool.present.observation.copied(self._derived)
 
     def send(
         self,
-        setpoint: ArrayLike,
+        setpoint: ArrayLike | None,
         *,
         setpoint_rate: ArrayLike | None = None,
         setpoint_acceleration: ArrayLike | None = None,
         feedforward: ArrayLike | None = None,
+        latency: ArrayLike = 0.0,
         substeps: int | None = None,
     ) -> None:
         """Begin a tick and return, while the workers run it; :meth:`recv` returns its observation.
@@ -358,7 +368,7 @@ class Runner(SingleOwner):
         """
         self._ready()
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
-        run = self._tick(command, substeps)
+        run = self._tick(command, latency, substeps)
         self._prepare_ticks()
         self._call.begin()
         try:
@@ -398,6 +408,7 @@ class Runner(SingleOwner):
         setpoint_rates: ArrayLike | None = None,
         setpoint_accelerations: ArrayLike | None = None,
         feedforwards: ArrayLike | None = None,
+        latency: ArrayLike = 0.0,
         progress: Progress[int] | None = None,
     ) -> Rollout:
         """Run one tick for each row of ``setpoints`` and record every observation.
@@ -406,9 +417,11 @@ class Runner(SingleOwner):
         ----------
         setpoints
             (ticks, envs, dof), or (ticks, dof) for all envs [rad or m]; for another command (ticks,
-            envs, size).
+            envs, size); with a plan also (ticks, envs, rows, dof).
         setpoint_rates, setpoint_accelerations, feedforwards
             Also with the ticks first: see :meth:`step`.
+        latency
+            A number, (envs,) or (ticks, envs): see :meth:`step`.
         progress
             Wraps the range of ticks, e.g. ``tqdm.tqdm``.
         """
@@ -420,10 +433,16 @@ class Runner(SingleOwner):
             "feedforwards": feedforwards,
         }
         options = self.options
-        limits = self._warnings.setpoint_limits
         ticks = count_ticks(options, setpoints)
+        chunks = list[AddChunk]()
+        if options.plan is not None:
+            chunks = list(map(AddChunk, *read_chunks(options, arrays, latency, ticks)))
+            goals = [self._goal]
+            for chunk in chunks:
+                goals.append(chunk.goal(goals[-1]))
+            arrays["setpoints"] = np.array(goals[1:])
         seconds = options.substeps * options.timestep
-        command = read_command(options, self._state, limits, arrays, seconds, ticks)
+        command = read_command(options, self._state, arrays, seconds, ticks)
         seen = empty_observation(ticks, self.num_envs, options.robot.dof, observed=options.observed)
         info = self.info
         steps = self._state.steps + options.substeps * np.arange(1.0, ticks + 1)
@@ -438,6 +457,9 @@ class Runner(SingleOwner):
             if number == done:
                 # One request has several ticks.
                 done = min(ticks, number + self._max_ticks())
+                if chunks:
+                    done = number + 1
+                    self._add_chunk(chunks[number])
                 part = slice(number, done)
                 rows = command.map(itemgetter(part))
                 self._execute(Run(done - number, options.substeps, rows))
@@ -651,9 +673,8 @@ class Runner(SingleOwner):
     def close(self) -> None:
         """End the workers and free the scenes. May be called again, as after an interrupt."""
         self._pool.closed = True
-        if not (
-            self._call.in_use and self._pool.is_local
-        ):  # its scenes are in use until the call ends
+        # The scenes of a loop in this process are in use until the call ends.
+        if not (self._call.in_use and self._pool.is_local):
             self._pool.close()
 
     @property
@@ -707,9 +728,21 @@ class Runner(SingleOwner):
             raise ClosedError(f"this Runner is closed{reason}; make a new one")
         self._call.check()
 
-    def _tick(self, arrays: tuple[ArrayLike | None, ...], substeps: int | None) -> Run:
-        """Return the operation for the arguments of :meth:`step`, checked."""
+    def _tick(
+        self,
+        arrays: tuple[ArrayLike | None, ...],
+        latency: ArrayLike,
+        substeps: int | None,
+    ) -> Run:
+        """Return the operation for the arguments of :meth:`step`, checked; a chunk enters the plan."""
         inputs = dict(zip(Command._fields, arrays, strict=True))
+        chunk = None
+        if self.options.plan is not None:
+            if inputs["setpoint"] is None:
+                inputs["setpoint"], latency = self._goal, np.inf
+            chunks, ages = read_chunks(self.options, inputs, latency)
+            chunk = AddChunk(chunks[0], ages[0])
+            inputs["setpoint"] = chunk.goal(self._goal)
         if substeps is None:
             count = self.substeps
         else:
@@ -718,10 +751,22 @@ class Runner(SingleOwner):
             problem = f"is not the runner's {self.substeps}"
             remedy = "all ticks of a recording have the same length"
             raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
-        limits = self._warnings.setpoint_limits
         seconds = count * self.timestep
-        command = read_command(self.options, self._state, limits, inputs, seconds)
+        command = read_command(self.options, self._state, inputs, seconds)
+        if chunk is not None:
+            self._add_chunk(chunk)
         return Run(1, count, command)
+
+    @property
+    def _goal(self) -> Float64:
+        """Last row of the chunks so far (envs, dof)."""
+        assert self._state.motion is not None
+        return self._state.motion[0]
+
+    def _add_chunk(self, chunk: AddChunk) -> None:
+        """Add a chunk to the plans, if it is for an env."""
+        if np.isfinite(chunk.latency).any():
+            self._execute(chunk)
 
     def _read(self, operation: Operation) -> Any:
         """Return the result of an operation that reads from the loops of all envs."""

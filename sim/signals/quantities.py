@@ -119,7 +119,7 @@ class Quantity(NamedTuple):
     columns: Mapping[str, str] | None = None
     """Names and units of columns; {} for one value. None: a column for each joint."""
     part: str = ""
-    """What a run must have for this quantity: "base", a floating one, "tool", or an option that
+    """What a run must have for this quantity: "base", a floating one, "tool", "plan", or an option that
     lists links, each with a row.
     """
     links: tuple[str, ...] | None = None
@@ -160,6 +160,9 @@ class Observation(NamedTuple):
     floats, and ``base_twist`` (envs, 6) the velocity of that link's origin and its angular velocity
     [m/s, rad/s], along the axes of the world; else None.
 
+    ``starved`` (envs,) is the number of sim steps since the reset for which a plan had no row
+    ahead; None without a plan.
+
     ``contact_force`` (envs, links, 3) is the net force of all contacts on each link of the option
     ``contacts`` [N], along the axes of the world, as the mean over the sim steps of the tick, and
     ``touching`` (envs, links) whether it had a contact in one of them. ``wrench`` (envs, links, 6)
@@ -182,6 +185,9 @@ class Observation(NamedTuple):
     ] = None
     base_twist: Annotated[
         Float32 | None, Quantity(np.float32, "twist of the base", "m/s|rad/s", TWIST_UNITS, "base")
+    ] = None
+    starved: Annotated[
+        Float32 | None, Quantity(np.float32, "sim steps without a row ahead", "1", {}, "plan")
     ] = None
     contact_force: Annotated[
         Float32 | None,
@@ -206,12 +212,11 @@ class Observation(NamedTuple):
     def copied(self, derived: Mapping[str, Callable[[Observation], Rows]]) -> Observation:
         """Return a copy with arrays of its own, and with ``derived`` quantities, by name."""
         rows = list[Any]()
-        # No comprehension and no constructor, which are calls of Python in the path of a tick.
         for values in self:
             rows.append(None if values is None else values.copy())
         for name, derive in derived.items():
             rows[_INDICES[name]] = derive(self)
-        return tuple.__new__(Observation, rows)
+        return Observation(*rows)
 
     @staticmethod
     def join(parts: Sequence[Observation]) -> Observation:
@@ -235,10 +240,16 @@ QUANTITIES: dict[str, Quantity] = {name: hint.__metadata__[0] for name, hint in 
 def observed(
     fixed_base: bool | None = None,
     tool: str | None = None,
+    plan: str | None = None,
     **links: tuple[str, ...] | None,
 ) -> dict[str, Quantity]:
     """Return the quantities of a run, by name; ``links`` are the options that list some."""
-    parts = {"": True, "base": fixed_base is False, "tool": tool is not None}
+    parts = {
+        "": True,
+        "base": fixed_base is False,
+        "tool": tool is not None,
+        "plan": plan is not None,
+    }
     present = {}
     for name, quantity in QUANTITIES.items():
         rows = links.get(quantity.part)

@@ -146,6 +146,7 @@ PUSHES = {
     "gravity": {"x": Uniform(-1, 1), "z": Uniform(-1, 1)},
 }
 GUARD = bp.make_guard(2, rate=0.5, acceleration=20.0)
+PLAN = bp.make_plan(2, period=0.02, horizon=4, blend="average", acceleration=30.0)
 SAPIEN, MUJOCO = ENGINES[:1], ENGINES[1:]
 
 
@@ -183,6 +184,8 @@ FEATURES: dict[str, Feature] = {
     "implicit osc": Feature(osc(discretization="implicit", point=[0, 0, 0.1], limit_margin=0.2)),
     "own controller": Feature({"control": Damped()}, exact=True),
     "guard": Feature({"guard": GUARD}),
+    "plan": Feature({"plan": PLAN}),
+    "plan of a drive": Feature({"control": "drive", "plan": PLAN, "guard": GUARD}, exact=True),
     "guarded drive": Feature({"control": "drive", "guard": GUARD}, exact=True),
     "a thermal limit": Feature({"stages": [Thermal(2.0, 0.02)]}),
     "motors": Feature(motors(SIGNALS, LINE)),
@@ -321,6 +324,8 @@ def commands(case: tuple[str, str], runner: Runner) -> dict[str, np.ndarray]:
             "setpoint_rates": 0.1 * np.tile(slope[..., :1], size),
             "feedforwards": 0.1 * extra,
         }
+    if runner.options.plan is not None:  # it makes the rates
+        del given["setpoint_rates"]
     if FEATURES[case[0]].accelerations:
         given["setpoint_accelerations"] = slope
     if envs > FAILING:

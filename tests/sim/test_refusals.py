@@ -221,6 +221,8 @@ RUNNERS: list[tuple[dict[str, Any], str]] = [
     ({"guard": True, "control": "effort"}, "guard"),
     ({"guard": True, "control": Hold(command=CommandSpec(("x",)))}, "guard"),
     ({"guard": bp.make_guard(1, rate=1.0)}, "guard"),
+    ({"plan": bp.make_plan(1, period=0.1, horizon=2)}, "plan"),
+    ({"plan": bp.make_plan(2, period=0.1, horizon=2), "control": "effort"}, "plan"),
     ({"control": print}, "control"),
     ({"control": Hold(command="xy")}, "control"),
     ({"control": Hold(command=("x", "x"))}, "control"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from batchpid.sim.cli import COMMANDS
+from batchpid.sim.cli.commands import COMMANDS
 
 SHORT = ("--num-envs", 1, "--seconds", 0.02)
 WORDS = {

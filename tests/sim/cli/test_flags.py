@@ -16,8 +16,7 @@ import pytest
 import tyro
 from commands_that_write import WORDS, output, output_flags
 
-from batchpid.sim.cli import COMMANDS
-from batchpid.sim.cli.commands import bar
+from batchpid.sim.cli.commands import COMMANDS, bar
 
 HAVE = {
     "--gains": {"rollout", "compare", "identify", "export", "inspect", "view"},

@@ -10,7 +10,8 @@ import pytest
 from commands_that_write import SHORT, WORDS, output, output_flags
 from tiny_urdf import one_joint
 
-from batchpid.sim.cli import COMMANDS, parse
+from batchpid.sim.cli import parse
+from batchpid.sim.cli.commands import COMMANDS
 
 MJCF = "<mujoco><worldbody><body><joint name='a'/><geom size='.1'/></body></worldbody></mujoco>"
 
