@@ -51,6 +51,7 @@ GONE = (
     r"\bremotized\b",
     r"\bRenderError\b",
     r"\brender_problem\b",
+    r"\bSetpointWarning\b",
     r"\bshow_window\b",
     r"\bsurvey_table\b|\bsurvey_summary\b",
     r"\bToolCandidates\b|\bToolMoves\b",
