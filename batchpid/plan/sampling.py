@@ -137,10 +137,18 @@ def add(
         join=state.join[..., None, :],
         time=state.time[..., None, :],
     )
-    several = begin, offset, slope, first
-    whole = [leaf[..., None, :] for leaf in several]
     options = mapped(lambda leaf: leaf[..., None, :], plan)
-    blended, weights = blend(options, wide, chunk, *whole, steps, rows)
+    blended, weights = blend(
+        options,
+        wide,
+        chunk,
+        begin[..., None, :],
+        offset[..., None, :],
+        slope[..., None, :],
+        first[..., None, :],
+        steps,
+        rows,
+    )
     # Central differences, one-sided at the ends of the chunk.
     path = blended
     if rows == 1:
