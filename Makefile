@@ -25,7 +25,7 @@ ARGS :=
 
 # Sources of the native extensions. BUILD builds those that are older than their sources.
 NATIVE := setup.py batchpid/native/extensions.py batchpid/sim/engine/native/interface.py \
-	$(filter-out %/fused.h,$(foreach folder,batchpid/native batchpid/sim/engine/native,$(wildcard $(folder)/*.cpp $(folder)/*.h))) \
+	$(filter-out %/passes.h,$(foreach folder,batchpid/native batchpid/sim/engine/native,$(wildcard $(folder)/*.cpp $(folder)/*.h))) \
 	$(wildcard batchpid/native/*.py batchpid/law/*.py)
 BUILD := $(STEP) "compiling native extensions" env -u BATCHPID_NATIVE $(RUN) -u -W ignore setup.py build_ext --inplace
 
@@ -98,7 +98,7 @@ wheel: | $(RUN)
 	@$(WHEEL)/bin/pip install --quiet --disable-pip-version-check build
 	@BATCHPID_REQUIRE_NATIVE=1 $(WHEEL)/bin/python -m build --outdir dist .
 	@$(WHEEL)/bin/pip install --quiet --disable-pip-version-check dist/*.whl
-	@cd $(WHEEL) && bin/batchpid demo --num-envs 2 --seconds 1.5 --force | grep "native calls into SAPIEN"
+	@cd $(WHEEL) && bin/batchpid demo --engine sapien --num-envs 2 --seconds 1.5 --force | grep "native calls into SAPIEN"
 	@ls dist
 
 clean:

@@ -81,13 +81,13 @@ class Build(build_ext):
 
 
 def write_passes():
-    """Write fused.h, the passes of the commonest laws, from the traces of the law."""
+    """Write passes.h, one pass for each of the commonest laws, from their traces."""
     sys.path.insert(0, str(ROOT))
-    from batchpid.native.fused import header
+    from batchpid.native.passes import header
 
-    file = ROOT / "batchpid" / "native" / "fused.h"
+    file = ROOT / "batchpid" / "native" / "passes.h"
     text = header()
-    # An older file would be compiled again.
+    # An equal file keeps its time, or all would be compiled again.
     if not file.is_file() or file.read_text() != text:
         file.write_text(text)
 

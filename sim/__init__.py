@@ -13,10 +13,10 @@ from batchpid.io.packages import attributes_of
 
 if TYPE_CHECKING:
     from batchpid.sim.diagnosis.loop_stability import StabilityWarning
-    from batchpid.sim.diagnosis.run_checks import SetpointWarning
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
     from batchpid.sim.engine.physics import MujocoSolver, Physics
     from batchpid.sim.findings import Finding, RepairWarning
+    from batchpid.sim.loop.closed_loop import closed_loop
     from batchpid.sim.loop.faults import Fault, FaultWarning
     from batchpid.sim.loop.snapshot import Snapshot
     from batchpid.sim.options.groups import Controller, Ray
@@ -61,10 +61,10 @@ __all__ = [
     "RunInfo",
     "Runner",
     "RunnerOptions",
-    "SetpointWarning",
     "Snapshot",
     "StabilityWarning",
     "Uniform",
+    "closed_loop",
     "read_recording",
     "to_mjcf",
     "to_urdf",
@@ -97,10 +97,10 @@ _PLACES = {
     "RunInfo": "batchpid.sim.rollout",
     "Runner": "batchpid.sim.runner.runner",
     "RunnerOptions": "batchpid.sim.options.options",
-    "SetpointWarning": "batchpid.sim.diagnosis.run_checks",
     "Snapshot": "batchpid.sim.loop.snapshot",
     "StabilityWarning": "batchpid.sim.diagnosis.loop_stability",
     "Uniform": "batchpid.sim.randomization.distributions",
+    "closed_loop": "batchpid.sim.loop.closed_loop",
     "read_recording": "batchpid.sim.recording.recording_files",
     "to_mjcf": "batchpid.sim.engine.mujoco.mjcf_export",
     "to_urdf": "batchpid.sim.robot.urdf_export",

@@ -124,12 +124,10 @@ MOST_SUMMED = 128
 _FILES = ("make_program.h", "extension.h", "program.h", "extensions.py")
 PROGRAMS = tuple(f"batchpid/native/{name}" for name in _FILES)
 """Headers and tables of programs, for extensions that include them."""
-PASSES_VECTORIZED = "-fno-tree-pre"
-"""Flag without which GCC does not vectorize a pass with two limits (fused.h)."""
 PROGRAM = Extension(
     "batchpid.native._program",
-    ("batchpid/native/program.cpp", "batchpid/native/fused.h", *PROGRAMS),
-    (*ROUNDED, PASSES_VECTORIZED, "-pthread"),
+    ("batchpid/native/program.cpp", "batchpid/native/passes.h", *PROGRAMS),
+    (*ROUNDED, "-pthread"),
 )
 
 KINEMATICS = ("qpos", "qvel", "tool", "pose", "jacobian", "jacobian_rate", "mass_matrix", "bias")

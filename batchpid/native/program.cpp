@@ -1,7 +1,7 @@
 // Programs of operations on arrays (program.h) as a module of Python.
 
-#include "fused.h"
 #include "make_program.h"
+#include "passes.h"
 
 #include <atomic>
 #include <system_error>
@@ -167,7 +167,7 @@ void run_all(Program const &program, Input const *inputs, Output const *outputs,
 
 // program(...): see make_program.h.
 PyObject *make(PyObject *, PyObject *arguments) {
-  auto program = make_program(arguments, FUSED, std::size(FUSED));
+  auto program = make_program(arguments, PASSES, std::size(PASSES));
   if (program == nullptr) return nullptr;
   return capsule_of(std::move(program));
 }

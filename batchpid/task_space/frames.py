@@ -24,7 +24,12 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 def cross(a: Array, b: Array) -> Array:
     """Return the cross product of (..., 3) and (..., 3)."""
-    return a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]
+    xp = namespace(a, b)
+    if xp is np:
+        return a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]
+    # A list of indices would be a gather, which XLA does not fuse.
+    (a0, a1, a2), (b0, b1, b2) = ([rows[..., axis] for axis in range(3)] for rows in (a, b))
+    return xp.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
 
 
 def rotate(turn: Array, vector: Array) -> Array:

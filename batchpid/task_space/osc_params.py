@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Array, Document, Float64
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.choices import CHOICES, NamedChoice
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field, declared
-from batchpid.arrays.records import Record, array_summary, checked_ends, frozen, with_fields
-from batchpid.checks.validate import AxisKind, array, choice, entries, instance, read_array
+from batchpid.arrays.records import (
+    LeafBuilder,
+    Record,
+    array_summary,
+    checked_ends,
+    frozen,
+    with_fields,
+)
+from batchpid.checks.validate import choice, entries, instance, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.tree_dynamics import check_masses
@@ -213,11 +220,17 @@ def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...
 
     Raises InvalidArgumentError for an option that is given, and has no effect.
     """
-    values: Document = {name: options.get(name, field.default) for name, field in FIELDS.items()}
-    rows: Document = {
-        name: None if value is None else _rows(name, value, columns[FIELDS[name].group])
-        for name, value in values.items()
-    }
+    builders = {group: LeafBuilder(len(names), names) for group, names in columns.items()}
+    rows: Document = {}
+    for name, field in FIELDS.items():
+        value: Any = options.get(name, field.default)
+        if isinstance(field.neutral, bool) and value is not None:
+            # Bools as 1.0 and 0.0.
+            value = read_array(name, value, "b").astype(float)
+            field = Field()
+        if field.group in ("norm", "s0") and np.ndim(value) == 1:  # one number for each env
+            value = np.reshape(value, (-1, 1))
+        rows[name] = builders[FIELDS[name].group].array(name, value, field)
     # An option without effect is nearly always a misunderstanding.
     for name, (other, is_given, reason) in WITHOUT_EFFECT.items():
         is_unused = (rows[other] is not None) == is_given
@@ -225,29 +238,6 @@ def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...
             remedy = "leave it out, or correct the other option"
             raise InvalidArgumentError(name, f"has no effect: {reason}", remedy=remedy)
     return rows
-
-
-def _rows(name: str, value: ArrayLike, columns: tuple[str, ...]) -> Float64:
-    """Return ``value`` as rows (1 | envs, columns) within the bounds of its field; bools as 1.0 and
-    0.0.
-    """
-    field = FIELDS[name]
-    if isinstance(field.neutral, bool):
-        return array(name, read_array(name, value, "b").astype(float), *_shape(value, columns))
-    numbers = read_array(name, value)
-    if len(columns) == 1 and numbers.ndim == 1:  # one number per env
-        numbers = numbers[:, None]
-    kind: AxisKind = "joint" if field.group == "joint" else "entry"
-    shape = _shape(numbers, columns)
-    rows = array(name, numbers, *shape, finite=False, kind=kind)
-    field.checked(name, rows, columns, kind=kind)
-    return rows
-
-
-def _shape(value: ArrayLike, columns: tuple[str, ...]) -> tuple[tuple[int, int], tuple[str, ...]]:
-    """Return the shape of rows that ``value`` gives, and the names of the columns."""
-    rows = np.shape(value)
-    return (rows[0] if len(rows) == 2 else 1, len(columns)), columns
 
 
 def _checked(params: OSCParams) -> OSCParams:

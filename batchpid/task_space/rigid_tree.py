@@ -10,7 +10,7 @@ the base, which is fixed or floats.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from itertools import compress
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.elementwise import namespace, read_only
-from batchpid.checks.validate import array, at_least, choice, entries, names, read_array
+from batchpid.checks.validate import array, at_least, choice, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.task_space.frames import (
@@ -35,7 +35,6 @@ from batchpid.task_space.frames import (
     wxyz_of,
 )
 
-JOINT_TYPES = ("fixed", "revolute", "prismatic")
 GRAVITY = (0.0, 0.0, -9.81)
 """Gravity of a tree, and in the engines, unless another one is given [m/s^2]."""
 MAKE_TREE = "pass robot.kinematic_tree()"
@@ -87,8 +86,8 @@ class RigidTree:
     Raises
     ------
     InvalidArgumentError
-        A name repeats, a shape is wrong, a parent does not come first, or an inertia is not
-        positive.
+        Armature, limits or gravity have a wrong shape or sign. The other fields are those of a
+        robot's file, which its reader has checked.
     """
 
     links: tuple[str, ...]
@@ -137,62 +136,29 @@ class RigidTree:
     """
 
     def __post_init__(self) -> None:
-        # Names and types come first: they give the sizes of all other arrays.
-        links = tuple(names("links", list(self.links)))
-        count = len(links)
-        types = tuple(choice("joint_types", one, JOINT_TYPES) for one in self.joint_types)
-        if len(types) != count or types[:1] != ("fixed",):
-            remedy = f"give {count}: the type of the joint above each link, 'fixed' for the base"
-            raise InvalidArgumentError("joint_types", "does not fit the links", remedy=remedy)
-        moving = tuple(
-            names("joint_names", list(self.joint_names), sum(one != "fixed" for one in types))
-        )
-        # Parents first, so that one pass from the base outwards serves every recursion.
-        parent = np.array(_array("parent", self.parent, links), np.intp)
-        first = (parent < np.arange(count)) & (parent >= np.minimum(np.arange(count), 1) - 1)
-        entries("parent", parent, first, "must come before its child", links, kind="entry")
+        moving = self.joint_names
         # One copy of each table, in float64: later writes by the caller change nothing.
-        columns = {
-            "position": (3,),
-            "wxyz": (4,),
-            "axis": (3,),
-            "mass": (),
-            "center": (3,),
-            "inertia": (3, 3),
-        }
-        tables = {
-            name: _array(name, getattr(self, name), links, *columns[name]) for name in columns
-        }
-        # Gravity belongs to the world, and to no link or joint.
-        tables["gravity"] = _array("gravity", self.gravity, "xyz")
+        columns = ("position", "wxyz", "axis", "mass", "center", "inertia")
+        tables = {name: np.array(getattr(self, name), np.float64) for name in columns}
+        tables["wxyz"] /= np.linalg.norm(tables["wxyz"], axis=1)[:, None]
+        lengths = np.linalg.norm(tables["axis"], axis=1)
+        tables["axis"] /= np.where(lengths > 0, lengths, 1.0)[:, None]
+        # Options of users: the reader of a robot's file has checked the others.
+        tables["gravity"] = gravity = np.array(read_array("gravity", self.gravity), np.float64)
+        if gravity.shape != (3,) or not np.isfinite(gravity).all():
+            remedy = "give the acceleration of free fall along x, y and z"
+            raise InvalidArgumentError("gravity", "is no vector", value=gravity, remedy=remedy)
         for name in ("armature", "lower", "upper"):
             # A number holds for all joints; an infinite limit means none.
             number = getattr(self, name)
             tables[name] = array(name, number, (len(moving),), moving, finite=False).copy()
-        at_least("mass", tables["mass"], 0.0, links, kind="entry")
         at_least("armature", tables["armature"], 0.0, moving)
-        # A quaternion must be a unit one; an axis only needs a direction.
-        norms = np.linalg.norm(tables["wxyz"], axis=1)
-        unit = np.abs(norms - 1) < 1e-6
-        entries("wxyz", norms, unit, "is not a unit quaternion", links, kind="entry")
-        tables["wxyz"] /= norms[:, None]
-        lengths = np.linalg.norm(tables["axis"], axis=1)
-        pointing = (lengths > 0) | (np.array(types) == "fixed")
-        entries("axis", lengths, pointing, "has no direction", links, kind="entry")
-        tables["axis"] /= np.where(lengths > 0, lengths, 1.0)[:, None]
-        coupling = Coupling.of(len(moving)) if self.coupling is None else self.coupling
-        _array("coupling", coupling.leader, moving)
+        parent = np.array(self.parent, np.intp)
         for table in (parent, *tables.values()):
             table.setflags(write=False)
-        # The class is frozen, so the checked tables go past its setter.
-        vars(self).update(
-            tables,
-            links=links,
-            joint_types=types,
-            joint_names=moving,
-            parent=parent,
-            coupling=coupling,
-        )
+        coupling = Coupling.of(len(moving)) if self.coupling is None else self.coupling
+        # The class is frozen, so the tables go past its setter.
+        vars(self).update(tables, parent=parent, coupling=coupling)
 
     @property
     def dof(self) -> int:
@@ -455,22 +421,3 @@ def _along_x(axis: Float64) -> Float64:
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     across /= np.linalg.norm(across)
     return np.column_stack([axis, across, np.cross(axis, across)])
-
-
-def _array(
-    name: str,
-    value: ArrayLike,
-    rows: Sequence[str],
-    *columns: int,
-) -> Float64:
-    """Return a copy of ``value`` (rows, columns) as float64, finite."""
-    table = np.array(read_array(name, value), np.float64)
-    shape = len(rows), *columns
-    if table.shape != shape:
-        problem = f"has shape {table.shape}, not {shape}"
-        raise InvalidArgumentError(
-            name, problem, remedy="give one row for each link, or one entry for each joint"
-        )
-    finite = np.isfinite(table).reshape(len(rows), -1).all(1)
-    entries(name, table, finite, "is not finite", rows, kind="entry")
-    return table

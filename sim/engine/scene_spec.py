@@ -22,7 +22,7 @@ from batchpid.sim.robot.merging import merge_links, place_links
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.simulated_links import BodyParts, rigid_tree, varied_bodies
+from batchpid.sim.robot.simulated_links import BodyParts, body_tree, varied_bodies
 from batchpid.sim.robot.tables import Tables
 from batchpid.task_space.frames import SpatialInertia, spatial_matrix, total
 from batchpid.task_space.rigid_tree import GRAVITY, RigidTree
@@ -93,7 +93,7 @@ class SceneSpec:
     @cached_property
     def rigid_tree(self) -> RigidTree:
         """Rigid tree of the simulated bodies, all joints independent."""
-        return rigid_tree(self.simulated, gravity=self.gravity, fixed_base=self.fixed_base)
+        return body_tree(self.simulated, self.fixed_base, self.gravity)
 
     @cached_property
     def separate(self) -> tuple[str, ...]:

@@ -7,11 +7,16 @@ others are ignored. A bag is a bag of ROS 1 or ROS 2 or an MCAP file with messag
 ``sensor_msgs/JointState``, which hold values of joints by name, in any order. In the topic of
 measurements efforts are measured efforts. In the topic of commands positions are setpoints, and
 efforts are commanded efforts.
+
+Commands keep their own stamps: one that holds acts until the next one. A bag has rows only where
+all topics have messages; it is divided where one is silent for more than three of its periods, and
+refused where the stamps of its topics are of different clocks.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import replace
@@ -22,9 +27,9 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import file_path
-from batchpid.errors import MissingDependencyError, warn
-from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
-from batchpid.sim.recording.recording_files import read_recording
+from batchpid.errors import BatchPIDError, MissingDependencyError, warn
+from batchpid.sim.identification.log import GAP, CommandKind, Log, LogWarning, checked
+from batchpid.sim.recording.recording_files import RecordingError, read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
@@ -33,7 +38,28 @@ QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
 HDF5 = (".h5", ".hdf5")
 SECONDS = {"time": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9}
+UNITS = {
+    "deg": np.pi / 180,
+    "mrad": 1e-3,
+    "mm": 1e-3,
+    "mNm": 1e-3,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "ns": 1e-9,
+}
+"""Units of columns, over those of SI."""
+MEANINGS = {
+    "setpoint": r"cmd|goal|target|desired|ref|setpoint",
+    "measured_effort": r"tau|torque|effort|eff\b|nm",
+    "qpos": r"pos|angle|qpos|\bq\b",
+}
+"""Words in the names of columns by which a pattern is proposed, the clearest first."""
 JOINT_STATE = "sensor_msgs/msg/JointState"
+SILENT_PERIODS, LEAST_SILENCE = 3, 10_000_000
+"""Silence of a topic that divides a log: in median periods of its messages, and at least [ns]."""
+CLOCK_OFFSET = 0.05
+"""Difference of two topics' times from stamp to receipt from which their clocks differ [s]."""
+A_LOG = "a log is a .csv file with the columns time, qpos:JOINT and setpoint:JOINT or effort:JOINT"
 
 
 class Reading(NamedTuple):
@@ -49,6 +75,11 @@ class Reading(NamedTuple):
     """Topic of the commands in a ROS bag; None: the measured efforts are used."""
     prefix: str = ""
     """Prefix of the joints' names in a file, which the robot's do not have."""
+    columns: tuple[str, ...] = ()
+    """Columns of a CSV file under other names, as "QUANTITY: PATTERN UNIT". In the pattern {joint}
+    stands for the joint's name, and "-" before it turns the sign; the unit is one of :data:`UNITS`
+    or a factor, and can be left out. "QUANTITY:JOINT: COLUMN UNIT" is for one joint.
+    """
 
 
 def read_logs(
@@ -93,16 +124,71 @@ def _read(
 ) -> list[Log]:
     suffix = path.suffix.lower()
     if suffix in HDF5:
-        return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
-    lines = None
+        try:
+            rollout = read_recording(path)
+        except RecordingError as bad:
+            raise RecordingError(f"{bad}; {A_LOG}, or a recording of a Runner") from bad
+        return logs_of_rollout(robot, rollout, kind, source=str(path))
     if path.exists() and (suffix in BAGS or path.is_dir()):
-        columns = _read_bag(robot, path, reading)
-    else:
-        file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
-        columns, numbers = read_csv(path, (*QUANTITIES, "time"))
-        lines = np.array(numbers)
-    log = _build(robot, str(path), columns, kind, reading)
-    return checked(robot, replace(log, lines=lines))
+        columns, commands, cuts = _read_bag(robot, path, reading)
+        return checked(robot, _build(robot, str(path), columns, commands, kind, reading), cuts)
+    file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
+    columns, numbers = read_csv(path, (*QUANTITIES, "time"))
+    columns = _renamed(robot, str(path), columns, reading.columns)
+    log = _build(robot, str(path), columns, columns, kind, reading)
+    return checked(robot, replace(log, lines=np.array(numbers)))
+
+
+def _renamed(
+    robot: Robot,
+    source: str,
+    columns: dict[str, Float64],
+    patterns: Iterable[str],
+) -> dict[str, Float64]:
+    """Return the columns with those that match ``patterns`` under the names and in the units of a
+    log.
+    """
+    renamed = dict(columns)
+    for text in patterns:
+        name, _, right = text.partition(": ")
+        pattern, *unit = right.split() or [""]
+        try:
+            scale = UNITS.get(unit[0]) or float(unit[0]) if unit else 1.0
+        except ValueError:
+            remedy = f"use one of {', '.join(UNITS)}, or a factor"
+            raise error(f"columns {text!r}", "has an unknown unit", remedy, unit[0]) from None
+        if pattern.startswith("-"):
+            scale = -scale
+            pattern = pattern[1:]
+        names = {pattern: name}
+        if "{joint}" in pattern:
+            joints = robot.joint_names
+            names = {pattern.replace("{joint}", joint): f"{name}:{joint}" for joint in joints}
+        present = names.keys() & columns.keys()
+        if not present:
+            problem = f"has no column of the pattern {text!r}"
+            raise error(source, problem, f"its columns are {', '.join(columns)}")
+        for column in present:
+            renamed[names[column]] = scale * columns[column]
+    return renamed
+
+
+def _proposed(robot: Robot, columns: Iterable[str]) -> str:
+    """Return the patterns that the names of columns suggest, as a remedy; "" for none."""
+    patterns = dict[str, None]()
+    for column in columns:
+        joints = [joint for joint in robot.joint_names if joint in column]
+        # The name of one joint may be part of another's.
+        pattern = column.replace(max(joints, key=len), "{joint}") if joints else column
+        words = pattern.replace("{joint}", " ").lower()
+        unit = next((unit for unit in UNITS if re.search(rf"(?i)[_. \[]{unit}\b", column)), "")
+        if not joints and re.search(r"time|stamp", words):
+            patterns[f"time: {column} {unit}".strip()] = None
+        for quantity, meaning in MEANINGS.items():
+            if joints and re.search(meaning, words.replace("_", " ")):
+                patterns[f"{quantity}: {pattern} {unit}".strip()] = None
+                break
+    return " ".join(f'"{pattern}"' for pattern in patterns)
 
 
 def logs_of_rollout(
@@ -172,17 +258,22 @@ def _build(
     robot: Robot,
     source: str,
     columns: dict[str, Float64],
+    commands: dict[str, Float64],
     kind: CommandKind | None,
     reading: Reading,
 ) -> Log:
-    """Return the log that the columns of a file hold."""
+    """Return the log that the columns of a file hold; ``commands`` are columns with their own
+    times.
+    """
     unit = next((name for name in SECONDS if name in columns), None)
     if unit is None:
         problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
         remedy = "begin the header with time, in seconds, or time_ms, time_us, time_ns"
+        if proposed := _proposed(robot, columns):
+            remedy = f"name its columns (--columns {proposed})"
         raise error(source, problem, remedy)
     time = SECONDS[unit] * columns[unit]
-    by = columns_by_joint(robot, source, columns, QUANTITIES, reading.prefix)
+    by = columns_by_joint(robot, source, columns | commands, QUANTITIES, reading.prefix)
     if by["feedforward"]:
         remedy = "log the complete efforts, without the columns of the feedforward"
         raise error(source, "has a feedforward, which a fit does not simulate", remedy)
@@ -201,6 +292,8 @@ def _build(
         for name in names or ["JOINT"]:
             if name not in by[quantity]:
                 remedy = "positions and commands are needed; a joint without both rests"
+                if not names and (proposed := _proposed(robot, columns)):
+                    remedy = f"name its columns (--columns {proposed})"
                 raise error(f"{source}: column {quantity}:{name}", "is missing", remedy)
         tables[quantity] = np.stack([by[quantity][name] for name in names], axis=1)
         if reading.degrees and quantity != "effort":
@@ -208,65 +301,157 @@ def _build(
     measured = measured and kind == "effort"
     table = tables[kind]
     hold = reading.hold
-    return Log(
-        source, tuple(joints), kind, time, tables["qpos"], time, table, hold, measured=measured
-    )
+    command_time = SECONDS[unit] * commands[unit]
+    log = Log(source, tuple(joints), kind, time, tables["qpos"], command_time, table, hold)
+    return replace(log, measured=measured)
 
 
-def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
-    """Return the columns of a bag by name, in seconds since the first row.
+def _read_bag(
+    robot: Robot, path: Path, reading: Reading
+) -> tuple[dict[str, Float64], dict[str, Float64], list[int]]:
+    """Return the columns of positions and those of commands in a bag by name, in seconds since the
+    first row, and the rows before which a topic was silent.
 
     Messages are merged by the names of joints: each joint has the samples of all messages that name
-    it. Rows are at the stamps of the joint with most positions, as long as all columns have values.
+    it. Rows are at the stamps of the joint with most positions.
     """
+    samples = _samples(path, reading)
+    # Other devices publish joints of their own.
+    others = set[str]()
+    for column in list(samples):
+        joint = column.partition(":")[2].removeprefix(reading.prefix)
+        if joint not in robot.joint_names:
+            others.add(joint)
+            del samples[column]
+    quantities = ("setpoint:", "effort:") if reading.command_topic else ("measured_effort:",)
+    moved = {column: stamps for column, stamps in samples.items() if column.startswith("qpos:")}
+    driven = {column: stamps for column, stamps in samples.items() if column.startswith(quantities)}
+    topics = {reading.topic: moved}
+    if reading.command_topic:
+        topics[reading.command_topic] = driven
+    for topic, columns in topics.items():
+        if not columns:
+            problem = f"has no values of the robot's joints in the topic {topic!r}"
+            remedy = f"its topics of {JOINT_STATE}: {', '.join(_topics(path)) or 'none'}; other"
+            remedy += f" joints: {', '.join(sorted(others)) or 'none'}"
+            raise error(str(path), problem, remedy)
+    if others:
+        left_out = ", ".join(sorted(others))
+        warn(f"{path}: {left_out}: no joint of the robot, left out", LogWarning)
+    # Nanoseconds since 1970 have more digits than a float.
+    origin = min(min(rows) for rows in samples.values())
+    tables = dict[str, Float64]()
+    for column, rows in samples.items():
+        tables[column] = np.array([(stamp - origin, rows[stamp]) for stamp in sorted(rows)]).T
+    used = {column: tables[column][0] for column in (*moved, *driven)}
+    first = max(stamps[0] for stamps in used.values())
+    last = min(stamps[-1] for stamps in used.values())
+    if first >= last:
+        remedy = "record all topics at the same time"
+        raise error(str(path), f"has no time in which {', '.join(used)} all have values", remedy)
+    times = max((used[column] for column in moved), key=len)
+    cuts = list[float]()
+    outside = (first - times[0]) / 1e9, (times[-1] - last) / 1e9
+    if max(outside) > GAP:
+        words = f"first {max(outside[0], 0):.3f} s and last {max(outside[1], 0):.3f} s"
+        warn(f"{path}: {words} without values of all columns: left out", LogWarning)
+    times = times[(times >= first) & (times <= last)]
+    for begin, end, silent in _silences(used, first, last):
+        words = f"is silent from {(begin - first) / 1e9:.3f} to {(end - first) / 1e9:.3f} s"
+        warn(f"{path}: {', '.join(silent)} {words}: the log is divided there", LogWarning)
+        times = times[(times <= begin) | (times >= end)]
+        cuts.append(end)
+    positions = {"time": (times - first) / 1e9}
+    for column in moved:
+        positions[column] = np.interp(times, *tables[column])
+    # Commands act from their own stamps on.
+    stamps = np.unique(np.concatenate([[first, last], *(used[column] for column in driven)]))
+    stamps = stamps[(stamps >= first) & (stamps <= last)]
+    commands = {"time": (stamps - first) / 1e9}
+    for column in driven:
+        known, values = tables[column]
+        commands[column] = np.interp(stamps, known, values)
+        if reading.hold:
+            commands[column] = values[np.searchsorted(known, stamps, "right") - 1]
+    return positions, commands, np.searchsorted(times, cuts).tolist()
+
+
+def _silences(
+    used: dict[str, Float64], first: float, last: float
+) -> list[tuple[float, float, list[str]]]:
+    """Return begin, end and columns of the silences between two stamps."""
+    silences = defaultdict[tuple[float, float], list[str]](list)
+    for column, stamps in used.items():
+        steps = np.diff(stamps)
+        longest = max(SILENT_PERIODS * float(np.median(steps)), LEAST_SILENCE)
+        for row in np.flatnonzero(steps > longest):
+            begin, end = stamps[row : row + 2].tolist()
+            if begin < last and end > first:
+                silences[begin, end].append(column)
+    return [(begin, end, columns) for (begin, end), columns in sorted(silences.items())]
+
+
+def _samples(path: Path, reading: Reading) -> dict[str, dict[int, float]]:
+    """Return the values of the columns of a bag by stamp [ns]."""
+    topics = {reading.topic: ("qpos:", "measured_effort:")}
+    if reading.command_topic:
+        topics[reading.command_topic] = ("setpoint:", "effort:")
+    samples = defaultdict[str, dict[int, float]](dict)
+    delays = defaultdict[tuple[str, bool], list[int]](list)
+    try:
+        with _reader(path) as reader:
+            states = [line for line in reader.connections if line.topic in topics]
+            states = [line for line in states if line.msgtype == JOINT_STATE]
+            # Without a connection the reader would return all messages.
+            for line, received, raw in reader.messages(connections=states) if states else ():
+                message: Any = reader.deserialize(raw, line.msgtype)
+                header = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                stamp = header or received
+                delays[line.topic, header > 0].append(received - stamp)
+                lists = message.position, message.effort
+                # A driver without such a value leaves the list empty.
+                for quantity, values in zip(topics[line.topic], lists, strict=False):
+                    for name, value in zip(message.name, values, strict=False):
+                        samples[f"{quantity}{name}"][stamp] = float(value)
+    except BatchPIDError:
+        raise
+    except Exception as bad:  # a damaged file can make the library raise anything
+        raise error(str(path), f"cannot be read: {bad}", "correct or record it again") from None
+    _check_clocks(path, {key: float(np.median(times)) / 1e9 for key, times in delays.items()})
+    return samples
+
+
+def _check_clocks(path: Path, delays: dict[tuple[str, bool], float]) -> None:
+    """Raise InvalidArgumentError if topics have stamps of different clocks.
+
+    ``delays`` are the times from stamp to receipt [s], by topic and whether it has stamps.
+    """
+    remedy = "stamp the messages of both topics by one clock, when they are measured or sent"
+    if len({is_stamped for _, is_stamped in delays}) > 1:
+        words = [f"{topic!r} {'with' if has else 'without'} stamps" for topic, has in delays]
+        problem = f"has messages of two clocks, the sender's and the recorder's: {', '.join(words)}"
+        raise error(str(path), problem, remedy)
+    if delays and max(delays.values()) - min(delays.values()) > CLOCK_OFFSET:
+        words = [f"{topic!r} {delay:.3f} s" for (topic, _), delay in delays.items()]
+        problem = f"has stamps of two clocks: before receipt by {', '.join(words)}"
+        raise error(str(path), problem, remedy)
+
+
+def _topics(path: Path) -> list[str]:
+    """Return the topics of joint states in a bag."""
+    with _reader(path) as reader:
+        return sorted(line.topic for line in reader.connections if line.msgtype == JOINT_STATE)
+
+
+def _reader(path: Path) -> Any:
+    """Return the reader of a bag."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingDependencyError("rosbags", "a log in a ROS bag", "tune") from None
-    topics = {reading.topic: ("qpos:", "measured_effort:")}
-    if reading.command_topic:
-        topics[reading.command_topic] = ("setpoint:", "effort:")
-    samples = defaultdict[str, dict[int, float]](dict)
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            states = [line for line in reader.connections if line.msgtype == JOINT_STATE]
-            # Without a connection the reader would return all messages.
-            for line, received, raw in reader.messages(connections=states) if states else ():
-                message: Any = reader.deserialize(raw, line.msgtype)
-                stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec or received
-                lists = message.position, message.effort
-                # A driver without such a value leaves the list empty.
-                for quantity, values in zip(topics.get(line.topic, ()), lists, strict=False):
-                    for name, value in zip(message.name, values, strict=False):
-                        samples[f"{quantity}{name}"][stamp] = float(value)
-    except Exception as bad:  # a damaged file can make the library raise anything
-        raise error(str(path), f"cannot be read: {bad}", "correct or record it again") from None
-    # Other devices publish joints of their own.
-    others = dict[str, str]()
-    for column in samples:
-        joint = column.partition(":")[2].removeprefix(reading.prefix)
-        if joint not in robot.joint_names:
-            others[column] = joint
-    left_out = ", ".join(sorted(set(others.values())))
-    for column in others:
-        del samples[column]
-    needed = {reading.topic: ("qpos:",), reading.command_topic: ("setpoint:", "effort:")}
-    for topic, quantities in needed.items():
-        if topic and not any(column.startswith(quantities) for column in samples):
-            problem = f"has no values in the topic {topic!r} of the robot's joints"
-            present = ", ".join(sorted(line.topic for line in states)) or "there are none"
-            remedy = f"topics of {JOINT_STATE}: {present}; other joints: {left_out or 'none'}"
-            raise error(str(path), problem, remedy)
-    if others:
-        warn(f"{path}: {left_out}: no joint of the robot, left out", LogWarning)
-    stamps = [sorted(rows) for column, rows in samples.items() if column.startswith("qpos:")]
-    first = max(joint[0] for joint in stamps)
-    last = min(joint[-1] for joint in stamps)
-    time = np.array([stamp - first for stamp in max(stamps, key=len) if first <= stamp <= last])
-    columns = {"time": time / 1e9}
-    for column, rows in samples.items():
-        moments = sorted(rows)
-        values = [rows[stamp] for stamp in moments]
-        columns[column] = np.interp(time, [stamp - first for stamp in moments], values)
-    return columns
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        names = ", ".join(sorted(file.name for file in path.iterdir())[:5]) or "nothing"
+        remedy = f"`ros2 bag reindex` writes it for a bag; {A_LOG}"
+        raise error(str(path), f"is a folder without metadata.yaml, with {names}", remedy)
+    return AnyReader([path], default_typestore=get_typestore(Stores.LATEST))

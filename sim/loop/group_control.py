@@ -89,7 +89,7 @@ def control_of(
     joints: Sequence[Joint],
     friction: Friction,
     envs: slice,
-    controller: OwnController | None,
+    controller: Any,
     share: float = 1.0,
 ) -> Control:
     """Return the control of the envs ``envs`` of a runner.

@@ -42,7 +42,7 @@ from batchpid.sim.robot.parts import (
 from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.sim.robot.robot_options import load_robot_actuators, setpoint_guard
 from batchpid.sim.robot.self_collision import SELF_COLLISION, SelfContact, read_srdf, self_contact
-from batchpid.sim.robot.simulated_links import link_masses, rigid_tree
+from batchpid.sim.robot.simulated_links import body_tree, link_masses
 from batchpid.sim.robot.tables import Body, Tables
 from batchpid.sim.robot.urdf import read_robot
 from batchpid.task_space.rigid_tree import RigidTree
@@ -60,6 +60,8 @@ GRAVITY_MARGIN = 2.0  # of the effort that holds the joint still
 SPEED = 3.0  # [rad/s or m/s], at which the joint's damping is overcome
 ACCELERATION = 30.0  # [rad/s^2 or m/s^2] of all joints at once
 POSES = 50
+TARGET_SHARES = (1.0, -1.0, 0.5, -0.5, 0.2, -0.2)
+"""Shares of the first move that are tried for one without contact."""
 
 
 def suggested_effort_limit(
@@ -236,16 +238,29 @@ class Robot:
     def target(self) -> Float64:
         """Pose (dof,) [rad or m] for a first move, within the limits.
 
-        The target of the bundled settings, else a quarter of the way from the start to the farther
-        limit of each joint, at most 0.5 rad or m.
+        The target of the bundled settings. Else a quarter of the way from the start to the farther
+        limit of each joint, at most 0.5 rad or m; a part of it, or of the way back, where links
+        would touch each other or the ground.
         """
         if self.settings is not None:
             return self.settings.target.copy()
+        return self._free_target.copy()
+
+    @cached_property
+    def _free_target(self) -> Float64:
         # Toward the farther limit, so that the move is inside.
         above = self.upper - self.start
         below = self.lower - self.start
-        distance = np.where(above >= -below, above, below)
-        return self.coupled(self.start + np.clip(0.25 * distance, -0.5, 0.5))
+        move = np.clip(0.25 * np.where(above >= -below, above, below), -0.5, 0.5)
+        model = self.dynamics(ground=self.fixed_base and self.has_ground)
+        for share in TARGET_SHARES:
+            ways = share * np.linspace(0.2, 1.0, 5)[:, None] * move
+            poses = self.coupled(np.clip(self.start + ways, self.lower, self.upper))
+            if not model.in_contact(poses).any():
+                free: Float64 = poses[-1]
+                return free
+        # Links touch at the start already, which is a finding.
+        return self.coupled(self.start + move)
 
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's
@@ -293,8 +308,8 @@ class Robot:
             [[-np.inf], [np.inf]],
             [self.lower, self.upper],
         )
-        limits = {"lower": low, "upper": high}
-        return rigid_tree(self.tables, coupling=self.coupling, fixed_base=self.fixed_base, **limits)
+        tree = body_tree(self.tables, self.fixed_base)
+        return replace(tree, coupling=self.coupling, lower=low, upper=high)
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof),
@@ -653,7 +668,7 @@ def _model(robot: Robot, ground: bool) -> RobotModel:
     ignored = frozenset(map(frozenset, robot.ignored_pairs))
     # Merged, since the engines simulate merged links, too.
     simulated = merge_links(robot.tables)
-    return RobotModel(rigid_tree(simulated), robot.coupling, simulated, ignored, ground)
+    return RobotModel(body_tree(simulated), robot.coupling, simulated, ignored, ground)
 
 
 def _find(name_or_path: str | Path) -> Path:

@@ -59,9 +59,11 @@ class RobotModel:
         """
         return ts.mass_matrix(self.tree, qpos)
 
-    def inverse_dynamics(self, qpos: Rows, qvel: Rows, qacc: Rows) -> Float64:
-        """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
-        return np.asarray(ts.inverse_dynamics(self.tree, qpos, qvel, qacc), np.float64)
+    def inverse_dynamics(self, qpos: Array, qvel: Array, qacc: Array) -> Array:
+        """Return the efforts (n, dof) [N m or N] of a motion, gravity included; in NumPy or JAX as
+        the arguments.
+        """
+        return ts.inverse_dynamics(self.tree, qpos, qvel, qacc)
 
     def holding_efforts(self, qpos: Rows) -> Float64:
         """Return the efforts (n, dof) [N m or N] that hold ``qpos`` against gravity; leaders hold
@@ -71,13 +73,13 @@ class RobotModel:
         efforts: Float64 = self._coupling.efforts(self.inverse_dynamics(qpos, still, still))
         return efforts
 
-    def forward_dynamics(self, qpos: Rows, qvel: Rows, effort: Rows) -> Float64:
+    def forward_dynamics(self, qpos: Array, qvel: Array, effort: Array) -> Array:
         """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity
         included.
 
-        Followers move with their leaders.
+        Followers move with their leaders. The result is in NumPy or JAX as the arguments.
         """
-        return np.asarray(ts.forward_dynamics(self._coupled, qpos, qvel, effort), np.float64)
+        return ts.forward_dynamics(self._coupled, qpos, qvel, effort)
 
     def standing_inertia(self, qpos: Rows) -> Float64:
         """Return the inertia (dof,) that each joint moves at one pose (dof,) if the base floats and

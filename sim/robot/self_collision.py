@@ -18,7 +18,7 @@ from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.distances import Contacts
 from batchpid.sim.robot.merging import merge_links, rigid_bodies
 from batchpid.sim.robot.parts import DisabledPair, Joint, Srdf
-from batchpid.sim.robot.simulated_links import rigid_tree
+from batchpid.sim.robot.simulated_links import body_tree
 from batchpid.sim.robot.xml import parse_xml
 
 SELF_COLLISION = ("auto", "urdf", "none")
@@ -102,7 +102,7 @@ def self_contact(robot: Any) -> SelfContact:
     solid = list(dict.fromkeys(shape.owner for shape in robot.tables.shapes))
     bodies = rigid_bodies(robot.tables.joints)
     simulated = merge_links(robot.tables)
-    tree = rigid_tree(simulated, fixed_base=robot.fixed_base)
+    tree = body_tree(simulated, robot.fixed_base)
     contacts = Contacts(tree, simulated.shapes, frozenset(), ground=False)
     computed: tuple[DisabledPair, ...] = ()
     if robot.reading.self_collision == "none":

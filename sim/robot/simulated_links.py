@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from batchpid.sim.robot.merging import Separate, link_inertias, merge_links, pla
 from batchpid.sim.robot.parts import LinkMass
 from batchpid.sim.robot.tables import Tables
 from batchpid.task_space.frames import SpatialInertia, matrix_of, rotate
-from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.rigid_tree import GRAVITY, RigidTree
 
 
 class Part(NamedTuple):
@@ -119,8 +120,12 @@ def _size(shapes: Sequence[Shape]) -> float:
 _EMPTY = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))
 
 
-def rigid_tree(tables: Tables, **options: Any) -> RigidTree:
-    """Return the rigid tree of all bodies; ``options`` are passed to :class:`RigidTree`.
+@lru_cache(maxsize=64)
+def body_tree(
+    tables: Tables, fixed_base: bool = True, gravity: tuple[float, ...] = GRAVITY
+) -> RigidTree:
+    """Return the rigid tree of all bodies, all joints independent; the same object for tables of
+    equal content.
 
     Links are in breadth-first order, as in SAPIEN. Raises RobotError if a mass comes from the
     volume of a mesh that cannot be read.
@@ -141,5 +146,6 @@ def rigid_tree(tables: Tables, **options: Any) -> RigidTree:
         mass=np.array([inertia.mass for inertia in of_bodies]),
         center=np.array([inertia.center for inertia in of_bodies]),
         inertia=np.array([inertia.tensor for inertia in of_bodies]),
-        **options,
+        fixed_base=fixed_base,
+        gravity=gravity,
     )

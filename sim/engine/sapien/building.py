@@ -23,7 +23,7 @@ from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.geometry.mesh_files import mesh_bytes
 from batchpid.sim.geometry.shapes import Shape, hull, mesh_file
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
-from batchpid.sim.robot.simulated_links import rigid_tree
+from batchpid.sim.robot.simulated_links import body_tree
 from batchpid.sim.robot.tables import Body, Tables
 from batchpid.task_space.frames import SpatialInertia, from_rpy, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
@@ -302,7 +302,7 @@ def rounded_tree(spec: SceneSpec) -> RigidTree:
             row = _placed(row._replace(joint=fixed), link.joint.pose_in_child.inv())
         rows.append(row)
     tables = Tables(tuple(rows), (), {})
-    return rigid_tree(tables, gravity=spec.gravity, fixed_base=spec.fixed_base)
+    return body_tree(tables, spec.fixed_base, spec.gravity)
 
 
 def _placed(row: Body, pose: Pose) -> Body:

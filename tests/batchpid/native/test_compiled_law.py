@@ -18,7 +18,7 @@ from native_cases import bits, numbers
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.native import extensions
-from batchpid.native.fused import header, segments
+from batchpid.native.passes import header, law_segments
 
 NATIVE = bp.BatchPID(bp.make_params(1, 1.0), 1, 0.01).native
 needs_extension = pytest.mark.skipif(not NATIVE, reason="there are no native programs")
@@ -264,10 +264,10 @@ def test_out_is_for_numpy():
 @needs_extension
 def test_the_commonest_laws_are_one_pass_and_compiled():
     """Each has one segment of all its operations, and the extension was built from these."""
-    found = list(segments())
+    found = list(law_segments())
     assert found
     assert {segment.first for segment in found} == {0}
-    file = Path(extensions.ROOT) / "batchpid" / "native" / "fused.h"
+    file = Path(extensions.ROOT) / "batchpid" / "native" / "passes.h"
     assert not file.is_file() or file.read_text() == header()
 
 

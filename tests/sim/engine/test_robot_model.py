@@ -7,6 +7,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from xml.etree import ElementTree
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -173,3 +174,13 @@ def test_dynamics_give_every_thread_its_own_results(panda):
         for alone, shared in zip(map(figures, parts), threads.map(figures, parts), strict=True):
             for one, other in zip(alone, shared, strict=True):
                 np.testing.assert_array_equal(one, other)
+
+
+def test_dynamics_take_arrays_of_jax():
+    """In JAX's usual float32, compiled."""
+    dynamics = Robot.load("panda").dynamics()
+    qpos = np.full((2, 9), 0.3)
+    for quantity in (dynamics.forward_dynamics, dynamics.inverse_dynamics):
+        expected = quantity(qpos, qpos, qpos)
+        found = jax.jit(quantity)(qpos, qpos, qpos)
+        assert np.abs(found - expected).max() < 1e-3 * np.abs(expected).max()

@@ -7,7 +7,7 @@ import pytest
 from arms import gains, load, motion, run
 
 import batchpid as bp
-from batchpid.sim import Randomization, Recorder, Runner, Uniform, write_recording
+from batchpid.sim import Randomization, Recorder, RecordingError, Runner, Uniform, write_recording
 from batchpid.sim.identification import LogWarning, Reading, logs_of_rollout, read_logs
 from batchpid.sim.identification.log import checked
 
@@ -39,8 +39,8 @@ def write(path, columns, delimiter=","):
     return path
 
 
-def read(robot, folder, columns, kind=None, **reading):
-    return read_logs(robot, [write(folder / "log.csv", columns)], kind, reading=Reading(**reading))
+def read(robot, folder, values, kind=None, **reading):
+    return read_logs(robot, [write(folder / "log.csv", values)], kind, reading=Reading(**reading))
 
 
 def test_columns_are_found_by_name_in_the_order_of_the_robot(robot, tmp_path):
@@ -66,6 +66,33 @@ def test_units_and_names_are_options(robot, tmp_path):
     assert log.held
     for name in ("time", "qpos", "command"):
         np.testing.assert_allclose(getattr(log, name), getattr(plain, name), atol=1e-12)
+
+
+def test_columns_of_other_names_units_and_signs_are_patterns(robot, tmp_path):
+    """The error of a file without them proposes the patterns."""
+    (plain,) = read(robot, tmp_path, table("measured_effort"))
+    columns = {"stamp_ms": 1e3 * TIME, "mode": ["idle"] * 200}
+    for joint in JOINTS:
+        columns[f"{joint}.pos_deg"] = np.degrees(table("measured_effort")[f"qpos:{joint}"])
+        columns[f"{joint}.tau_mNm"] = 1e3 * table("measured_effort")[f"measured_effort:{joint}"]
+    patterns = ("time: stamp_ms ms", "qpos: {joint}.pos_deg deg")
+    patterns += ("measured_effort: {joint}.tau_mNm mNm",)
+    with pytest.raises(bp.InvalidArgumentError) as refusal:
+        read(robot, tmp_path, columns)
+    assert all(f'"{pattern}"' in str(refusal.value) for pattern in patterns)
+    (log,) = read(robot, tmp_path, columns, columns=patterns)
+    for name in ("time", "qpos", "command"):
+        np.testing.assert_allclose(getattr(log, name), getattr(plain, name), atol=1e-12)
+    turned = (*patterns[:2], "measured_effort: -{joint}.tau_mNm -0.002")
+    turned += ("measured_effort:elbow: elbow.tau_mNm -1",)
+    (other,) = read(robot, tmp_path, columns, columns=turned)
+    np.testing.assert_allclose(other.command, plain.command * [2.0, -1000.0], atol=1e-12)
+    for problem, pattern in {
+        "pattern": "qpos: {joint}_q",
+        "unit": "qpos: {joint}.pos_deg ft",
+    }.items():
+        with pytest.raises(bp.InvalidArgumentError, match=problem):
+            read(robot, tmp_path, columns, columns=(pattern,))
 
 
 def test_measured_efforts_take_the_place_of_commands(robot, tmp_path):
@@ -201,8 +228,10 @@ def test_a_recording_is_refused_or_divided_at_a_change(robot, tmp_path, change):
             read_logs(robot, [path])
 
 
-def bag(path, messages):
-    """Write messages (topic, time [s], values by joint) of states, positions and efforts alike."""
+def bag(path, messages, stamp_of=lambda topic, time: time):
+    """Write messages (topic, time [s], values by joint) of states, positions and efforts alike;
+    their stamps are those of a function, None for none.
+    """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -217,10 +246,13 @@ def bag(path, messages):
         }
         for topic, time, values in messages:
             moment = 1_700_000_000_000_000_000 + round(1e9 * time)
+            stamped = stamp_of(topic, time)
+            nanoseconds = 0
+            if stamped is not None:
+                nanoseconds = 1_700_000_000_000_000_000 + round(1e9 * stamped)
             numbers, none = np.array([*values.values()], float), np.zeros(0)
-            message = state(
-                header(stamp(*divmod(moment, 10**9)), ""), [*values], numbers, none, numbers
-            )
+            head = header(stamp(*divmod(nanoseconds, 10**9)), "")
+            message = state(head, [*values], numbers, none, numbers)
             writer.write(places[topic], moment, types.serialize_cdr(message, state.__msgtype__))
     return path
 
@@ -257,9 +289,82 @@ def test_messages_of_a_bag_are_merged_by_joint(robot, tmp_path):
     np.testing.assert_allclose(log.qpos, np.sin(TIME[1:, None]) * np.ones(2), atol=1e-5)
     with pytest.raises(
         bp.InvalidArgumentError,
-        match=r"no values in the topic '/states'.*: /commands, /joint_states",
+        match=r"in the topic '/states'.*: /commands, /joint_states",
     ):
         read_logs(robot, [path], reading=Reading(topic="/states"))
     (tmp_path / "damaged.mcap").write_bytes(b"nothing")
     with pytest.raises(bp.InvalidArgumentError, match="cannot be read"):
         read_logs(robot, [tmp_path / "damaged.mcap"])
+
+
+@pytest.mark.parametrize("hold", [True, False])
+@pytest.mark.parametrize("seed", range(5))
+def test_commands_of_a_bag_act_from_their_own_stamps_on(tmp_path, hold, seed):
+    """Held, the command at any time is the last one at or before it; there are no rows outside the
+    times that all topics have, and none within a silence of one, which divides the log.
+    """
+    pytest.importorskip("rosbags")
+    rng = np.random.default_rng(seed)
+    stamps = {}
+    for topic in ("/joint_states", "/commands"):
+        period = rng.uniform(0.002, 0.02)
+        steps = period * rng.uniform(0.7, 1.3, int(3 / period))
+        stamps[topic] = np.round(rng.uniform(0, 0.3) + np.cumsum(steps), 9)
+    silent = str(rng.choice(["/joint_states", "/commands"]))
+    begin = rng.uniform(1, 1.5)
+    kept = (stamps[silent] < begin) | (stamps[silent] > begin + rng.uniform(0.1, 0.5))
+    stamps[silent] = stamps[silent][kept]
+    values = {topic: rng.uniform(-1, 1, len(times)) for topic, times in stamps.items()}
+    messages = []
+    for topic, times in stamps.items():
+        for time, value in zip(times.tolist(), values[topic].tolist(), strict=True):
+            messages.append((topic, time, dict.fromkeys(JOINTS, value)))
+    path = bag(tmp_path / "bag", sorted(messages, key=lambda message: message[1]))
+    reading = Reading(command_topic="/commands", hold=hold)
+    with pytest.warns(LogWarning) as notes:
+        logs = read_logs(load(tmp_path), [path], "setpoint", reading=reading)
+    assert any("the log is divided" in str(note.message) for note in notes)
+    assert len(logs) == 2
+    origin = max(times[0] for times in stamps.values())
+    for log in logs:
+        times = log.time + origin
+        for known in stamps.values():
+            assert known[0] - 1e-9 <= times[0]
+            assert times[-1] <= known[-1] + 1e-9
+            following = known[np.searchsorted(known, times - 1e-9)]
+            assert (following - times < 0.05).all()
+        moments = rng.uniform(log.time[0], log.time[-1], 200)
+        moments = moments[(np.abs(moments[:, None] + origin - stamps["/commands"]) > 1e-6).all(1)]
+        known, sent = stamps["/commands"], values["/commands"]
+        expected = np.interp(moments + origin, known, sent)
+        if hold:
+            expected = sent[np.searchsorted(known, moments + origin) - 1]
+        np.testing.assert_allclose(log.commands_at(moments)[:, 0], expected, atol=1e-6)
+
+
+def test_topics_of_two_clocks_are_refused_by_name(robot, tmp_path):
+    pytest.importorskip("rosbags")
+    topics = ("/joint_states", "/commands")
+    messages = [(topic, time, dict.fromkeys(JOINTS, 0.1)) for time in TIME for topic in topics]
+    for name, problem, stamp in (
+        (
+            "none",
+            "'/commands' without stamps",
+            lambda topic, time: time if topic[1] == "j" else None,
+        ),
+        ("late", r"'/commands' 0\.300 s", lambda topic, time: time - 0.3 * (topic[1] == "c")),
+    ):
+        path = bag(tmp_path / name, messages, stamp)
+        with pytest.raises(bp.InvalidArgumentError, match=problem):
+            read_logs(robot, [path], reading=Reading(command_topic="/commands"))
+
+
+def test_files_that_are_no_logs_say_what_a_log_is(robot, tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "run_0.db3").touch()
+    with pytest.raises(bp.InvalidArgumentError, match=r"without metadata\.yaml, with run_0\.db3"):
+        read_logs(robot, [tmp_path / "folder"])
+    h5py = pytest.importorskip("h5py")
+    h5py.File(tmp_path / "other.h5", "w").close()
+    with pytest.raises(RecordingError, match=r"format is not .*a log is a \.csv file with"):
+        read_logs(robot, [tmp_path / "other.h5"])

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import load_bundled
-from tiny_urdf import one_joint, random_tree, write
+from tiny_urdf import INERTIAL, one_joint, random_tree, write
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
@@ -29,10 +29,23 @@ def test_every_robot_has_a_target_within_its_limits(seed, low, width):
         np.clip(loaded.target, loaded.lower, loaded.upper), loaded.target, atol=1e-6
     )
     room = np.maximum(loaded.upper - loaded.start, loaded.start - loaded.lower)
-    np.testing.assert_allclose(
-        np.abs(loaded.target - loaded.start), np.minimum(0.25 * room, 0.5), atol=1e-12
-    )
+    assert (np.abs(loaded.target - loaded.start) <= np.minimum(0.25 * room, 0.5) + 1e-12).all()
+    model = loaded.dynamics()
+    if not model.in_contact(loaded.start[None])[0]:
+        assert not model.in_contact(loaded.target[None])[0]
     assert (load_bundled("panda").target == load_bundled("panda").settings.target).all()
+
+
+@pytest.mark.parametrize("low", [0.1, 1.0])
+def test_the_target_is_free_of_the_ground(low, tmp_path):
+    """The farther limit is below: half a radian towards it, the tip would be in the ground."""
+    box = '<collision><origin xyz="0.2 0 0"/><geometry><box size="0.4 0.04 0.04"/></geometry></collision>'
+    limit = '<limit lower="-1" upper="2" effort="10" velocity="2"/>'
+    text = one_joint(limit, arm=INERTIAL + box).replace('xyz="0 0 1"', f'xyz="0 0 {low}"')
+    loaded = Robot.load(write(tmp_path, text))
+    assert not loaded.dynamics().in_contact(loaded.target[None])[0]
+    assert (loaded.target[0] == 0.5) == (low == 1.0)
+    assert abs(loaded.target[0]) >= 0.1
 
 
 def test_a_robot_from_a_pipe():

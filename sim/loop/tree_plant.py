@@ -1,0 +1,140 @@
+r"""Rigid tree on a fixed base as a plant, in pure functions for NumPy and JAX: MuJoCo's motion without
+contact.
+
+With mass matrix M, armature A, damping B, bias h and the effort u of motors and friction, semi-implicit
+Euler steps follow from::
+
+    (M + A + dt B) a = u - h        v <- v + dt a        q <- q + dt v
+
+MuJoCo makes joint limits soft: it minimizes the sum of (a - a_free)^T M (a - a_free) / 2 and D_j
+min(0, s_j a_j - r_j)^2 / 2 over the joints beyond a limit ("Computation" in MuJoCo's
+documentation). Newton steps on the set of active limits find the minimum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from batchpid.arrays.array_types import Array, Float64
+from batchpid.arrays.elementwise import namespace
+from batchpid.motors.coupling import Coupling
+from batchpid.task_space.rigid_tree import Bodies, RigidTree
+from batchpid.task_space.tree_quantities import evaluated
+
+TURNS = 4
+"""Newton steps on the active limits: more sets than a robot changes in a time step."""
+IMPEDANCE = (0.99, 0.999, 1e-4)
+"""Least and largest impedance of a limit, and the depth at which it is largest [rad or m]: the first
+three numbers of MuJoCo's ``solimp``.
+"""
+
+
+@dataclass(frozen=True)
+class TreePlant:
+    """Rigid tree with ``inertia``: A + dt B (1 | envs, dof). Its state is (qpos, qvel)."""
+
+    tree: RigidTree
+    bodies: Bodies
+    inertia: Array
+    coupling: Coupling
+    low: Float64
+    high: Float64
+    """Limits (dof,) [rad or m]."""
+    weight: Float64
+    """Diagonal of M^-1 at the pose 0 (dof,): MuJoCo's ``dof_invweight0``."""
+    limit_time: float
+    """Time constant of the limits [s]: MuJoCo's ``solref``."""
+    timestep: float
+
+    def with_masses(self, factor: Array) -> Self:
+        """Return the plant with masses and inertias multiplied by ``factor`` (dof,), one for the
+        link that each joint moves; it may be traced.
+        """
+        bodies = self.bodies
+        rows = factor[..., None]
+        heavy = bodies._replace(mass=bodies.mass * rows, tensor=bodies.tensor * rows[..., None])
+        return replace(self, bodies=heavy)
+
+    def init(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
+        """Return the state of robots at ``qpos`` and ``qvel`` (envs, dof)."""
+        return self.coupling.positions(qpos), self.coupling.rates(qvel)
+
+    def read(self, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Return positions and velocities (envs, dof)."""
+        return state
+
+    def step(self, state: tuple[Array, Array], effort: Array) -> tuple[Array, Array]:
+        """Return the state after a time step under ``effort`` (envs, dof) [N m or N]."""
+        qpos, qvel = state
+        found = evaluated(self.tree, ("mass_matrix", "bias"), qpos, qvel, bodies=self.bodies)
+        matrix, bias = found["mass_matrix"], found["bias"]
+        xp = namespace(matrix)
+        eye = xp.eye(matrix.shape[-1], dtype=matrix.dtype)
+        matrix = matrix + self.inertia[..., None] * eye
+        # Followers move with their leaders: the equations are those of the leaders.
+        matrix = self.coupling.mass_matrix(matrix)
+        effort = self.coupling.efforts(effort - bias)
+        acceleration = self._acceleration(matrix, effort, qpos, qvel, xp)
+        qvel = self.coupling.rates(qvel + self.timestep * acceleration)
+        return self.coupling.positions(qpos + self.timestep * qvel), qvel
+
+    def _acceleration(
+        self,
+        matrix: Array,
+        effort: Array,
+        qpos: Array,
+        qvel: Array,
+        xp: Any,
+    ) -> Array:
+        """Return the accelerations (envs, dof) with the limits beyond which joints are."""
+        below, above = qpos - self.low, self.high - qpos
+        sign = (below < 0).astype(qpos.dtype) - (above < 0).astype(qpos.dtype)
+        eye = xp.eye(matrix.shape[-1], dtype=matrix.dtype)
+        least, most, width = IMPEDANCE
+
+        if xp is not np:
+            from jax import lax
+
+        def limited() -> Array:
+            distance = xp.where(sign > 0, below, xp.where(sign < 0, above, 0.0))
+            x = abs(distance) / width
+            curve = xp.where(x > 0.5, 1.0 - 2.0 * (1.0 - x) ** 2, 2.0 * x * x)
+            impedance = xp.where(x < 1.0, least + curve * (most - least), most)
+            cost = impedance / ((1.0 - impedance) * self.weight)
+            stiffness, rate_gain = (most * self.limit_time) ** -2.0, 2.0 / (most * self.limit_time)
+            push = sign * (-rate_gain * sign * qvel - stiffness * impedance * distance)
+            active = sign * sign
+
+            def turn(active: Array, _: Any) -> tuple[Array, Array]:
+                stiff = matrix + (active * cost)[..., None] * eye
+                a = _solved(stiff, effort + active * cost * push, xp)
+                return (sign * (a - push) < 0).astype(active.dtype), a
+
+            if xp is np:
+                for _ in range(TURNS):
+                    active, a = turn(active, None)
+                return a
+            return lax.scan(turn, active, length=TURNS)[1][-1]
+
+        def free() -> Array:
+            return _solved(matrix, effort, xp)
+
+        if xp is np:
+            return limited() if sign.any() else free()
+        chosen: Array = lax.cond((sign != 0).any(), limited, free)
+        return chosen
+
+
+def _solved(matrix: Array, right: Array, xp: Any) -> Array:
+    """Return the solutions (envs, dof) of positive definite systems."""
+    if xp is np:
+        solution: Array = np.linalg.solve(matrix, right[..., None])[..., 0]
+        return solution
+    from jax.scipy import linalg
+
+    factor = linalg.cho_factor(matrix)
+    solved: Array = linalg.cho_solve(factor, right[..., None])[..., 0]
+    return solved
