@@ -30,7 +30,8 @@ SHAPE = """<collision><origin xyz="0 0 {half}"/><geometry><cylinder radius="0.04
   </geometry></collision>"""
 JOINT = """<joint name="{child}_joint" type="{kind}"><parent link="{parent}"/><child link="{child}"/>
   <origin xyz="{xyz}"/><axis xyz="{axis}"/>
-  <limit lower="{low}" upper="{high}" effort="{effort}" velocity="3"/>{mimic}</joint>"""
+  <limit lower="{low}" upper="{high}" effort="{effort}" velocity="3"/>
+  <dynamics damping="0.5" friction="{friction}"/>{mimic}</joint>"""
 MASSES = 6.0, 5.0, 4.0, 2.0, 1.0, 0.5
 """Of the links of the foreign arm [kg]."""
 
@@ -44,11 +45,11 @@ class Floors(NamedTuple):
 
 
 FLOORS = {
-    "panda": Floors(0.0, 0.0, 0.0),
-    "six joints": Floors(0.0, 0.0, 0.0),
-    "six joints with shapes": Floors(8.0, 7.0, 6.0),
-    "coupled gripper": Floors(6.0, 5.0, 5.0),
-    "jaco2": Floors(6.0, 5.0, 5.0),
+    "panda": Floors(9.0, 8.3, 6.8),
+    "six joints": Floors(9.3, 8.6, 6.6),
+    "six joints with shapes": Floors(10.0, 9.0, 7.0),
+    "coupled gripper": Floors(7.0, 6.3, 5.6),
+    "jaco2": Floors(8.5, 8.0, 7.3),
 }
 
 
@@ -58,12 +59,19 @@ def foreign_arm(shapes: bool, gripper: bool) -> str:
     """
     parts = ['<link name="link0"/>']
 
-    def add(child: str, parent: str, mass: float, size: float, **joint: Any) -> None:
+    def add(
+        child: str,
+        parent: str,
+        mass: float,
+        size: float,
+        mimic: str = "",
+        **joint: Any,
+    ) -> None:
         shape = SHAPE.format(half=size / 2, size=0.6 * size) if shapes else ""
         numbers = {"across": mass * size**2 / 12 + 1e-4, "along": 8e-4 * mass + 1e-5}
         parts.append(LINK.format(name=child, half=size / 2, mass=mass, shape=shape, **numbers))
-        given = {"kind": "revolute", "low": -2.9, "high": 2.9, "effort": 150, "mimic": ""}
-        parts.append(JOINT.format(child=child, parent=parent, **given | joint))
+        given = {"kind": "revolute", "low": -2.9, "high": 2.9, "effort": 150, "friction": 0.3}
+        parts.append(JOINT.format(child=child, parent=parent, mimic=mimic, **given | joint))
 
     for number, mass in enumerate(MASSES, start=1):
         axis = "0 0 1" if number in (1, 4, 6) else "0 1 0"
@@ -71,7 +79,7 @@ def foreign_arm(shapes: bool, gripper: bool) -> str:
         below = 0.0 if number == 1 else 0.3 if number < 5 else 0.12
         add(f"link{number}", f"link{number - 1}", mass, size, axis=axis, xyz=f"0 0 {below}")
     for side in (1, -1) if gripper else ():
-        finger = {"kind": "prismatic", "low": 0.0, "high": 0.04, "effort": 20}
+        finger = {"kind": "prismatic", "low": 0.0, "high": 0.04, "effort": 20, "friction": 0}
         mimic = '<mimic joint="finger1_joint"/>' if side < 0 else ""
         place = {"axis": f"0 {side} 0", "xyz": f"0 {0.06 * side} 0.12", "mimic": mimic}
         add(f"finger{1 if side > 0 else 2}", "link6", 0.1, 0.06, **finger | place)

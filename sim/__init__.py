@@ -13,7 +13,6 @@ from batchpid.io.packages import attributes_of
 
 if TYPE_CHECKING:
     from batchpid.sim.diagnosis.loop_stability import StabilityWarning
-    from batchpid.sim.diagnosis.run_checks import SetpointWarning
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
     from batchpid.sim.engine.physics import MujocoSolver, Physics
     from batchpid.sim.findings import Finding, RepairWarning
@@ -62,7 +61,6 @@ __all__ = [
     "RunInfo",
     "Runner",
     "RunnerOptions",
-    "SetpointWarning",
     "Snapshot",
     "StabilityWarning",
     "Uniform",
@@ -99,7 +97,6 @@ _PLACES = {
     "RunInfo": "batchpid.sim.rollout",
     "Runner": "batchpid.sim.runner.runner",
     "RunnerOptions": "batchpid.sim.options.options",
-    "SetpointWarning": "batchpid.sim.diagnosis.run_checks",
     "Snapshot": "batchpid.sim.loop.snapshot",
     "StabilityWarning": "batchpid.sim.diagnosis.loop_stability",
     "Uniform": "batchpid.sim.randomization.distributions",

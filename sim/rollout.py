@@ -57,9 +57,16 @@ _CHANGES = {
 _OF_PARTS = ("start", "faults", "rates", "begun", "complete", "description", "urdf")
 """Fields that differ from part to part of a run."""
 _OF_ROBOT = (
-    *("joint_names", "units", "lower", "upper", "effort_limit"),
-    *("digest", "dissipation", "fixed_base"),
-)  # fields of RunInfo that are attributes of a robot
+    "joint_names",
+    "units",
+    "lower",
+    "upper",
+    "effort_limit",
+    "digest",
+    "dissipation",
+    "fixed_base",
+)
+"""Fields of :class:`RunInfo` that are attributes of a robot."""
 _OF_ENVS = ("params", "actuators", "start", "episodes")  # fields with a row for each env
 
 

@@ -5,7 +5,6 @@ the same in one call.
 from __future__ import annotations
 
 import time
-import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,7 +18,6 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Robot
 from batchpid.sim.cli.flags import BOUNDS, Gains, NumEnvs, Randomize, flag
 from batchpid.sim.cli.report import RunReport
-from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.tuning.evaluation import load_randomization
 from batchpid.sim.tuning.gain_sets import gain_set
 
@@ -156,8 +154,7 @@ def rollout(
         if robot.settings is not None and setpoint is None:
             notes += robot.settings.notes
 
-    with Runner(robot, num_envs, **options) as runner, warnings.catch_warnings():
-        warnings.simplefilter("ignore", SetpointWarning)  # the report has the finding
+    with Runner(robot, num_envs, **options) as runner:
         # The speed is that of the run alone, without the start of processes.
         began = time.perf_counter()
         # A start off the trajectory would count as an error of following.

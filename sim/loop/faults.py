@@ -23,7 +23,14 @@ from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.options.groups import FaultAction
 
 CAUSES = (
-    *("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort"),
+    "state",
+    "speed",
+    "setpoint",
+    "setpoint_rate",
+    "feedforward",
+    "qpos",
+    "qvel",
+    "effort",
     "setpoint_acceleration",
 )
 """Causes of faults: the state is not finite or a position beyond :data:`FARTHEST`, a joint is too

@@ -14,7 +14,6 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.checks.validate import array, at_least, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.engine.model_pack import ORIGIN
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.options.options import RunnerOptions
@@ -30,7 +29,6 @@ _SHORTEST = 1e-9
 def read_command(
     options: RunnerOptions,
     state: RunnerState,
-    limits: SetpointCheck | None,
     inputs: Mapping[str, ArrayLike | None],
     seconds: float,
     ticks: int | None = None,
@@ -40,7 +38,7 @@ def read_command(
 
     ``inputs`` are its arrays by the names of their arguments, in the order of :class:`Command`.
     Positions of followers are computed from their leaders; the loop passes efforts on to the
-    leaders. ``limits`` warns of setpoints.
+    leaders.
     """
     _, rate, acceleration, _ = inputs.values()
     if acceleration is not None:
@@ -49,7 +47,8 @@ def read_command(
     finite = options.on_invalid_input == "raise"
     rows = list[Any]()
     for (name, value), (kind, names) in zip(inputs.items(), options.command_columns, strict=True):
-        if value is None and rows:  # the setpoint, which is first, must be given
+        # The setpoint, which is first, must be given.
+        if value is None and rows:
             rows.append(None)
             continue
         entries: Any = value
@@ -63,10 +62,7 @@ def read_command(
     if coupling is not None:
         rows[0] = coupling.positions(rows[0])
         rows[1:3] = [None if table is None else coupling.rates(table) for table in rows[1:3]]
-    if limits is not None:
-        limits.check("setpoint", rows[0])
-    # No constructor of a named tuple, which is a call of Python in the path of a tick.
-    command = tuple.__new__(Command, rows)
+    command = Command(*rows)
     if rate is None or state.motion is None or state.params.gain_units is None:
         return command
     return accelerated(command, state.motion, seconds)
@@ -124,10 +120,12 @@ def accelerated(command: Command, motion: Motion, seconds: float) -> Command:
     position, velocity = motion
     if velocity is None:
         velocity = np.zeros_like(rate[0])
-    with np.errstate(invalid="ignore"):  # non-finite rates become faults
+    # Rates that are not finite become faults.
+    with np.errstate(invalid="ignore"):
         moved = np.diff(setpoint, axis=0, prepend=position[None])
         change = np.diff(rate, axis=0, prepend=velocity[None])
-        ahead = moved - seconds * rate  # of increments 0, else minus half the change
+        # 0 for increments, else minus half the change.
+        ahead = moved - seconds * rate
         fits = np.abs(ahead + 0.5 * seconds * change) < 4 * np.abs(ahead)
         if acceleration is None:
             acceleration = 0.0

@@ -9,8 +9,8 @@ from __future__ import annotations
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import chain, repeat
-from operator import is_not, itemgetter
+from itertools import chain
+from operator import itemgetter
 from typing import Self
 
 import numpy as np
@@ -21,7 +21,6 @@ from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.trees import flatten
 from batchpid.checks.validate import env_mask
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.group_control import empty_states
 from batchpid.sim.loop.loop import Loop
@@ -69,7 +68,6 @@ class Reset(Operation):
         cls,
         options: RunnerOptions,
         state: RunnerState,
-        limits: SetpointCheck,
         pose: tuple[ArrayLike | None, ArrayLike | None],
         mask: ArrayLike | None,
         seed: int | ArrayLike | None,
@@ -86,7 +84,6 @@ class Reset(Operation):
             chosen = np.ones(num_envs, bool)
         else:
             chosen = env_mask("mask", mask, num_envs)
-        limits.check("qpos", robot.coupled(qpos), chosen)
         if randomization is not None:
             draws = randomization.redraw(robot, draws, chosen, seed, options.first_env)
             qpos, qvel = randomization.start(qpos, qvel, draws, robot)
@@ -132,10 +129,7 @@ class Run(Operation):
                 table[: self.ticks, envs] = rows[:, envs]
 
     def encode(self, envs: slice) -> bytes:
-        are_given = tuple(
-            map(is_not, self.command, repeat(None))
-        )  # Command.given, without one more call in a tick
-        return pickle.dumps((self.ticks, self.substeps, are_given))
+        return pickle.dumps((self.ticks, self.substeps, self.command.given))
 
     def apply(self, loop: Loop) -> float:
         return loop.run(self.ticks, self.substeps, self.command.given)
@@ -161,9 +155,14 @@ class Run(Operation):
             work = (tuple(outcome.results), count)
         since = state.steps_since_checkpoint + steps
         changes = None if count else state.changes
-        values = faults, motion, state.steps + steps, since, work, changes
-        # Not _replace(), which is a call of Python in the path of a tick.
-        return tuple.__new__(RunnerState, (state.params, state.actuators, state.draws, *values))
+        return state._replace(
+            faults=faults,
+            motion=motion,
+            steps=state.steps + steps,
+            steps_since_checkpoint=since,
+            work=work,
+            changes=changes,
+        )
 
 
 @dataclass(frozen=True)

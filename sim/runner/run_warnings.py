@@ -1,10 +1,9 @@
-"""Warnings of a runner about its gains, its setpoints and what happens to its robots."""
+"""Warnings of a runner about its gains and what happens to its robots."""
 
 from __future__ import annotations
 
 from batchpid.errors import warn
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
-from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.findings import report_shortfalls
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.options.options import RunnerOptions
@@ -22,11 +21,6 @@ class RunWarnings:
         report_shortfalls(robot.path, options.engine, shortfalls)
         timestep = options.timestep
         control = options.control
-        self.limits = SetpointCheck(robot)
-        """Check of start poses, and of setpoints, against the limits of the joints."""
-        self.setpoint_limits = (
-            self.limits if options.sets_positions and options.guard is None else None
-        )
         self._control = control
         self._stability = StabilityCheck(robot, timestep) if control == "pid" else None
         self._issued = set[type[Warning]]()

@@ -228,7 +228,7 @@ class Runner(SingleOwner):
         checks = self._warnings
         seed = None if options.randomization is None else 0
         base = {"base_pose": None, "base_twist": None}
-        start = Reset.read(options, self._state, checks.limits, (None, None), None, seed, base)
+        start = Reset.read(options, self._state, (None, None), None, seed, base)
         self._call.begin()
         try:
             self._call.waits = True
@@ -292,9 +292,8 @@ class Runner(SingleOwner):
             :meth:`rollout` and :meth:`restore`.
         """
         self._ready()
-        limits = self._warnings.limits
         base = {"base_pose": base_pose, "base_twist": base_twist}
-        start = Reset.read(self.options, self._state, limits, (qpos, qvel), mask, seed, base)
+        start = Reset.read(self.options, self._state, (qpos, qvel), mask, seed, base)
         self._execute(start)
         return self.observe()
 
@@ -436,7 +435,6 @@ class Runner(SingleOwner):
             "feedforwards": feedforwards,
         }
         options = self.options
-        limits = self._warnings.setpoint_limits
         ticks = count_ticks(options, setpoints)
         chunks = list[AddChunk]()
         if options.plan is not None:
@@ -446,7 +444,7 @@ class Runner(SingleOwner):
                 goals.append(chunk.goal(goals[-1]))
             arrays["setpoints"] = np.array(goals[1:])
         seconds = options.substeps * options.timestep
-        command = read_command(options, self._state, limits, arrays, seconds, ticks)
+        command = read_command(options, self._state, arrays, seconds, ticks)
         seen = empty_observation(ticks, self.num_envs, options.robot.dof, observed=options.observed)
         info = self.info
         steps = self._state.steps + options.substeps * np.arange(1.0, ticks + 1)
@@ -677,9 +675,8 @@ class Runner(SingleOwner):
     def close(self) -> None:
         """End the workers and free the scenes. May be called again, as after an interrupt."""
         self._pool.closed = True
-        if not (
-            self._call.in_use and self._pool.is_local
-        ):  # its scenes are in use until the call ends
+        # The scenes of a loop in this process are in use until the call ends.
+        if not (self._call.in_use and self._pool.is_local):
             self._pool.close()
 
     @property
@@ -756,9 +753,8 @@ class Runner(SingleOwner):
             problem = f"is not the runner's {self.substeps}"
             remedy = "all ticks of a recording have the same length"
             raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
-        limits = self._warnings.setpoint_limits
         seconds = count * self.timestep
-        command = read_command(self.options, self._state, limits, inputs, seconds)
+        command = read_command(self.options, self._state, inputs, seconds)
         if chunk is not None:
             self._add_chunk(chunk)
         return Run(1, count, command)

@@ -212,12 +212,11 @@ class Observation(NamedTuple):
     def copied(self, derived: Mapping[str, Callable[[Observation], Rows]]) -> Observation:
         """Return a copy with arrays of its own, and with ``derived`` quantities, by name."""
         rows = list[Any]()
-        # No comprehension and no constructor, which are calls of Python in the path of a tick.
         for values in self:
             rows.append(None if values is None else values.copy())
         for name, derive in derived.items():
             rows[_INDICES[name]] = derive(self)
-        return tuple.__new__(Observation, rows)
+        return Observation(*rows)
 
     @staticmethod
     def join(parts: Sequence[Observation]) -> Observation:

@@ -8,7 +8,6 @@ is followed.
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,6 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.diagnosis.causes import absolute_band
-from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.randomization.checks import check_robot
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
@@ -193,26 +191,24 @@ def run_moves(
     tick = runner.timestep * runner.substeps
     ticks = max(2, round(seconds / tick))
     start = moves.start
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SetpointWarning)
-        # A randomization may move the start poses; without one they are exact.
-        if runner.options.randomization is None:
-            runner.reset(start)
-        else:
-            observation = runner.reset(start, seed=0 if streams is None else streams)
-            start = observation.qpos.astype(np.float64)
-        setpoints = np.broadcast_to(moves.target, (ticks, *moves.target.shape))
-        rates = None
-        if durations is not None:
-            motion = minimum_jerk(
-                start, moves.target, tick, duration=np.maximum(durations, tick)[:, None]
-            )
-            # The last row holds the target, at rest.
-            rows = np.minimum(np.arange(ticks), motion.ticks - 1)
-            is_smooth = durations[:, None] > 0
-            setpoints = np.where(is_smooth, motion.position[rows], setpoints)
-            rates = np.where(is_smooth, motion.velocity[rows], 0.0)
-        rollout = runner.rollout(setpoints, setpoint_rates=rates)
+    # A randomization may move the start poses; without one they are exact.
+    if runner.options.randomization is None:
+        runner.reset(start)
+    else:
+        observation = runner.reset(start, seed=0 if streams is None else streams)
+        start = observation.qpos.astype(np.float64)
+    setpoints = np.broadcast_to(moves.target, (ticks, *moves.target.shape))
+    rates = None
+    if durations is not None:
+        motion = minimum_jerk(
+            start, moves.target, tick, duration=np.maximum(durations, tick)[:, None]
+        )
+        # The last row holds the target, at rest.
+        rows = np.minimum(np.arange(ticks), motion.ticks - 1)
+        is_smooth = durations[:, None] > 0
+        setpoints = np.where(is_smooth, motion.position[rows], setpoints)
+        rates = np.where(is_smooth, motion.velocity[rows], 0.0)
+    rollout = runner.rollout(setpoints, setpoint_rates=rates)
     with_effort = runner.control != "drive"
     return rollout, step_response_metrics(runner.robot, rollout, start, with_effort=with_effort)
 

@@ -4,7 +4,8 @@ done.
 
 from __future__ import annotations
 
-import _signal  # the module signal takes 20 us to make enums of handlers
+# The module signal makes enums of handlers, which takes a twentieth of a tick.
+import _signal
 import os
 import threading
 from signal import SIGINT
@@ -49,17 +50,17 @@ class OneCall:
         process = os.getpid()
         if self._user or process != self._owner:
             raise self._refusal(me, process)
-        # No function is called since the check, so no other thread and no signal handler can run in
-        # between.
+        # No function was called since the check. CPython switches threads and calls signal handlers
+        # at calls of functions and at jumps back alone, so none can run in between.
         self._user = me
         self._handler = None
         self._is_held = False
-        if (
-            me == self._main and _signal.getsignal(SIGINT) is not None
-        ):  # None: it is not one of Python
+        # The handler is None where it is not one of Python.
+        if me == self._main and _signal.getsignal(SIGINT) is not None:
             try:
                 self._handler = _signal.signal(SIGINT, self._on_interrupt)
-            except BaseException:  # of the handler, for a SIGINT that came before
+            # An error of the handler, for a SIGINT that came before.
+            except BaseException:
                 self._user = 0
                 raise
 

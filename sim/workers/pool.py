@@ -115,7 +115,7 @@ class WorkerPool(SingleOwner):
         self._shared = SharedArrays(layout)
         self.arrays = Arrays.from_fields(self._shared.arrays)
         """Input and output of a request (ticks, envs, ...)."""
-        # Views are made once; a cached call is none of Python in the path of a tick.
+        # Views are made once.
         self._at = cache(self.arrays.at)
         self.present = self._at(0)
         """Tick with the present observation."""
@@ -214,8 +214,7 @@ class WorkerPool(SingleOwner):
             self.replay.append(request)
         if count:
             self.present = self._at(count - 1)
-        # No constructor of a named tuple, which is a call of Python in the path of a tick.
-        return tuple.__new__(Outcome, (results, failure, count, self.arrays, self._at))
+        return Outcome(results, failure, count, self.arrays, self._at)
 
     def close(self) -> None:
         """End all workers at once. May be called again, as after an interrupt."""
@@ -223,11 +222,8 @@ class WorkerPool(SingleOwner):
         for worker in self.workers:
             worker.close()
         self.workers = []
-        for name in (
-            "arrays",
-            "_at",
-            "present",
-        ):  # views that would keep the memory and its descriptor
+        # Views would keep the memory and its descriptor.
+        for name in ("arrays", "_at", "present"):
             vars(self).pop(name, None)
         self._shared.close()
 

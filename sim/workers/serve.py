@@ -37,9 +37,8 @@ def main() -> None:
     fcntl.fcntl(0, fcntl.F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(0, fcntl.F_SETFL, os.O_ASYNC)
     channel, memory = map(int, sys.argv[-2:])
-    with contextlib.suppress(
-        EOFError, BrokenPipeError, ConnectionResetError
-    ):  # the caller has ended
+    # These errors say that the caller has ended.
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         _serve(socket.socket(fileno=channel), memory)
     os._exit(0)  # nothing to save, and the engine's own cleanup can take long
 

@@ -140,9 +140,8 @@ class ProcessWorker(Worker):
 
     def open(self) -> None:
         paths = [path for path in sys.path if isinstance(path, str)]
-        paths.append(
-            str(Path(__file__).parents[3])
-        )  # where "" led to, before the caller changed the folder
+        # Where "" led to, before the caller changed the folder.
+        paths.append(str(Path(__file__).parents[3]))
         environment = os.environ | ONE_THREAD
         if native.obstacle():
             environment[native.SWITCH] = "0"  # one warning for all
@@ -179,7 +178,7 @@ class ProcessWorker(Worker):
                 os.sched_setaffinity(self.pid, {self._core})
 
     def send(self, request: Request) -> None:
-        # Time after which the worker counts as stuck. No method, which is a call of Python in a tick.
+        # Time after which the worker counts as stuck.
         limit = self._step_limit * (request.ticks or 1) * request.substeps
         limit += self._timeout + request.patience
         self._deadline = time.monotonic() + limit
@@ -211,7 +210,8 @@ class ProcessWorker(Worker):
 
     def close(self) -> None:
         self._end.close()
-        vars(self).pop("_answers", None)  # closed later where this is a signal handler in receive()
+        # It is closed later where this is a signal handler in receive().
+        vars(self).pop("_answers", None)
 
     def _raise_early(self, error: Exception) -> None:
         """Raise the error if it is a TimeoutError of a signal handler."""

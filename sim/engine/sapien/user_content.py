@@ -33,8 +33,13 @@ Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
 
 
 _STATE = (
-    *("pose", "entity_pose", "linear_velocity", "angular_velocity"),
-    *("sleeping", "is_sleeping", "children"),
+    "pose",
+    "entity_pose",
+    "linear_velocity",
+    "angular_velocity",
+    "sleeping",
+    "is_sleeping",
+    "children",
 )
 """Properties that a snapshot holds, or that follow from others."""
 _PLAIN = (bool, int, float, str, tuple, list, dict, np.ndarray)

@@ -23,7 +23,6 @@ def test_a_link_named_world_and_a_floating_base(tmp_path):
             assert (runner.observe().base_pose is None) == fixed_base
 
 
-@pytest.mark.filterwarnings("ignore::batchpid.sim.SetpointWarning")
 def test_joints_stop_at_their_limits(panda):
     """Within the travel of one sim step, and within 1e-4 rad where they rest under load."""
     with Runner(panda, 1, engine="mujoco", workers=0, substeps=1, compensate="none") as runner:
