@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import re
 import signal
 import subprocess
 import sys
@@ -128,6 +130,17 @@ def test_failures_are_one_line_and_a_status(batchpid, stub, failure, status, mes
     assert err.startswith("batchpid: ")
     assert message in err
     assert err.count("\n") == 1
+
+
+def test_the_variable_that_hinders_mujoco_is_named():
+    done = subprocess.run(
+        [sys.executable, "-m", "batchpid", "inspect", "panda"],
+        env=os.environ | {"MUJOCO_GL": "nothing"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert re.fullmatch("batchpid: .*MUJOCO_GL='nothing'.*; unset MUJOCO_GL.*\n", done.stderr)
 
 
 def test_a_bug_keeps_its_traceback(stub):

@@ -8,7 +8,7 @@ import pytest
 from export_cases import JOINTS, random_params, values
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
+from tiny_urdf import INERTIAL, joint, link, robot, write
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
@@ -86,38 +86,6 @@ def test_the_file_moves_as_the_runner_does(effects):
             mujoco.mj_step(model, data)
             np.testing.assert_allclose(data.qpos, reached, rtol=0, atol=1e-6)
     assert np.abs(reached - loaded.start).max() > 0.1
-
-
-def test_motors_friction_and_followers_are_written(tmp_path):
-    rubs = LIMIT + '<dynamics friction="0.25" damping="0.5"/>'
-    mimic = LIMIT + '<mimic joint="a" multiplier="-0.5" offset="0.1"/>'
-    parts = [
-        *(link(name, INERTIAL) for name in "xyz"),
-        joint("a", "x", "y", inner=rubs),
-        joint("b", "y", "z", inner=mimic),
-    ]
-    loaded = Robot.load(write(tmp_path, robot(*parts)))
-    motors = bp.make_actuators(
-        2, armature=0.02, coulomb=0.5, viscous=0.1, effort_limit=6.0, lag=0.001
-    )
-    exported = to_mjcf(
-        loaded, plain(loaded, effort_limit=10.0, anti_windup="conditional"), DT, actuators=motors
-    )
-    listed = [each.partition(":")[0] for each in exported.differences]
-    assert listed == ["anti_windup", "lag", "friction", "followers"]
-    model = model_of(exported)
-    held = model.joint("a")
-    assert (held.armature[0], held.frictionloss[0], held.damping[0]) == (0.02, 0.75, 0.6)
-    assert model.nu == 3
-    assert model.jnt_actfrcrange.tolist() == [[-6.0, 6.0], [0.0, 0.0]]
-    data = mujoco.MjData(model)
-    mujoco.mj_resetData(model, data)
-    data.qpos[1] = 0.1
-    for _ in range(2000):
-        data.ctrl[0] = 0.4
-        mujoco.mj_step(model, data)
-    assert abs(data.qpos[0]) > 0.05
-    assert data.qpos[1] == pytest.approx(0.1 - 0.5 * data.qpos[0], abs=2e-3)
 
 
 def test_an_inertia_of_no_body_is_replaced_and_listed(tmp_path):

@@ -360,11 +360,18 @@ def test_the_planes_of_the_file_are_the_ground(load):
     low = ARM.replace('type="plane"', 'type="plane" pos="0 0 -.5"').replace(
         '<body name="post">', '<body name="post" pos="0 0 -.2">'
     )
+    # A <pair> collides whatever the masks say.
+    paired = low.replace('name="floor"', 'name="floor" contype="0" conaffinity="0"')
+    paired = paired.replace('size=".04 .04 .04"', 'name="box" size=".04 .04 .04"')
+    pair = '<contact><pair geom1="floor" geom2="box"/></contact></mujoco>'
+    paired = paired.replace("</mujoco>", pair)
     heights = {}
     for name, text, options in (
         ("file", low, {}),
         ("off", low, {"ground": False}),
         ("ours", ARM, {}),
+        ("paired", paired, {}),
+        ("paired off", paired, {"ground": False}),
     ):
         text = (
             text
@@ -376,7 +383,8 @@ def test_the_planes_of_the_file_are_the_ground(load):
                 runner.step(runner.robot.start)
             heights[name] = runner.bodies(["cube"])[0, 0, 2]
     np.testing.assert_allclose((heights["file"], heights["ours"]), (-0.46, 0.04), atol=2e-3)
-    assert heights["off"] < -3
+    np.testing.assert_allclose(heights["paired"], heights["file"], atol=2e-3)
+    assert max(heights["off"], heights["paired off"]) < -3
 
 
 def test_an_error_of_mujoco_closes_the_runner(load):
@@ -486,12 +494,13 @@ def test_every_file_that_a_load_opens_is_part_of_the_identity(tmp_path, changed)
     with Runner(robot, 1, workers=0, engine="mujoco"):
         pass
     path = tmp_path / changed
+    stamp = path.stat().st_mtime_ns
     path.write_bytes(
         path.read_bytes()
         .replace(b".1", b".2")
         .replace(*(np.float32(x).tobytes() for x in (0.3, 0.5)))
     )
-    os.utime(path, (2e9, 2e9))  # MuJoCo keeps meshes by the time of the file
+    os.utime(path, ns=(stamp, stamp))  # by which MuJoCo keeps meshes
     assert Robot.load(tmp_path / "scene.xml").describe() != robot.describe()
     robot_model.cache_clear()
     with pytest.raises(RobotError, match="has changed since the robot was loaded"):

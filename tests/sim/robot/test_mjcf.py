@@ -12,12 +12,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from batchpid.errors import InvalidArgumentError, RobotError
+from batchpid.errors import RobotError
 from batchpid.sim import Robot, Runner, to_urdf
 from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.protocol import SceneSpec
-from batchpid.sim.tuning.gain_sets import gain_set
 from batchpid.sim.view.surfaces import surfaces
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
@@ -302,17 +301,6 @@ def test_a_tendon_that_pulls_coupled_fingers(load):
     np.testing.assert_allclose(np.ravel(gains.kd), [0, 10])
 
 
-def test_gains_of_servos(load, panda):
-    robot = load(ARM)
-    gains = gain_set(robot, "mjcf").params
-    np.testing.assert_array_equal(np.ravel(gains.kp), [400, 0, 0])
-    np.testing.assert_array_equal(np.ravel(gains.kd), [28, 0, 0])
-    np.testing.assert_array_equal(np.ravel(gains.effort_max), [20, 12, np.inf])
-    for other in (panda, load(CHAIN)):
-        with pytest.raises(InvalidArgumentError, match=r"no servos of an MJCF file.*designed"):
-            gain_set(other, "mjcf")
-
-
 def test_several_actuators_of_a_joint_add_up(load):
     text = two_links(
         rest="""<actuator><position joint="j" kp="5" gear="2" forcerange="-1 1"/>
@@ -460,10 +448,6 @@ def test_all_that_is_left_out_is_named(load):
     assert level.check(engine="sapien") == level.check()
 
 
-def test_a_plain_file_needs_no_repair(load):
-    assert load(two_links(), strict=True).repairs == ()
-
-
 BAD = {
     "ball joint": (
         two_links('<joint name="wrist" type="ball"/>'),
@@ -598,16 +582,6 @@ def test_a_geom_that_is_referred_to_stays(load):
     assert load(two_links(rest=sensor).replace(BOX, geom, 1)).dof == 1
 
 
-def test_an_include_brings_its_bodies(load, tmp_path):
-    arm = (
-        f'<mujocoinclude><body name="arm" pos="0 0 1"><joint name="j"/>{BOX}</body></mujocoinclude>'
-    )
-    (tmp_path / "arm.xml").write_text(arm)
-    assert load(
-        '<mujoco><worldbody><include file="arm.xml"/></worldbody></mujoco>'
-    ).joint_names == ("j",)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_a_damaged_file_is_a_robot_or_an_error(load, seed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # for MuJoCo's log
@@ -628,16 +602,6 @@ def test_an_unwritable_cache_is_an_error(load, monkeypatch, tmp_path):
     robot = load(ARM)
     with pytest.raises(RobotError, match=r"cannot be written.*XDG_CACHE_HOME"):
         to_urdf(robot)
-
-
-def test_is_drawn_by_its_shapes(load):
-    assert {surface.link for surface in surfaces(load(ARM))} == {
-        "base",
-        "upper",
-        "fore",
-        "flange",
-        "hand",
-    }
 
 
 def test_a_name_in_another_encoding_is_an_error_with_the_file(tmp_path):
