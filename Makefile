@@ -98,7 +98,7 @@ wheel: | $(RUN)
 	@$(WHEEL)/bin/pip install --quiet --disable-pip-version-check build
 	@BATCHPID_REQUIRE_NATIVE=1 $(WHEEL)/bin/python -m build --outdir dist .
 	@$(WHEEL)/bin/pip install --quiet --disable-pip-version-check dist/*.whl
-	@cd $(WHEEL) && bin/batchpid demo --num-envs 2 --seconds 1.5 --force | grep "native calls into SAPIEN"
+	@cd $(WHEEL) && bin/batchpid demo --engine sapien --num-envs 2 --seconds 1.5 --force | grep "native calls into SAPIEN"
 	@ls dist
 
 clean:

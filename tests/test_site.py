@@ -108,6 +108,7 @@ LONGER = {
     "tutorial.md": 200,
     "choosing-gains.md": 170,
     "task-space.md": 160,
+    "moving-setpoints.md": 170,
     "reliability.md": 230,
     "robots.md": 206,
     "sim-to-real.md": 155,

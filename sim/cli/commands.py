@@ -36,8 +36,8 @@ DOCUMENTS = (".yaml", ".yml", ".json")
 DEFAULT_ROBOT = "panda"
 FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
-LINE_SECONDS = 10.0
-"""Time between lines about the progress of a command [s]."""
+FIRST_SECONDS, LINE_SECONDS = 1.0, 10.0
+"""Time before the first line about the progress of a command, and between lines [s]."""
 FIXED: dict[str | None, bool] = {"fixed": True, "free": False}
 """Values of the flag ``--base``."""
 
@@ -284,12 +284,16 @@ def bar(label: str, unit: str = "it") -> Progress[Any]:
 
 def _lines(label: str, unit: str, items: Iterable[T]) -> Iterator[T]:
     """Yield ``items``, with lines about how many are done."""
-    began = told = time.monotonic()
+    began = time.monotonic()
+    due = began + FIRST_SECONDS
     total = f" of {len(items)}" if isinstance(items, Sized) else ""
     for count, item in enumerate(items):
         now = time.monotonic()
-        if now - told >= LINE_SECONDS:
-            told = now
-            text = f"{label}: {count}{total} {unit}, {now - began:.0f} s"
+        if now >= due and count:
+            due = now + LINE_SECONDS
+            left = ""
+            if isinstance(items, Sized):
+                left = f", about {(now - began) * (len(items) / count - 1):.0f} s left"
+            text = f"{label}: {count}{total} {unit}, {now - began:.0f} s{left}"
             print(f"batchpid: {text}", file=sys.stderr, flush=True)
         yield item

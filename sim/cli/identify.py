@@ -50,7 +50,7 @@ def identify_logs(
         Field("s", low=1e-5, high=0.01),
         flag(
             "Time step of the control that drove the robot [s]. Default: as the recordings say, else"
-            " 1/2000."
+            " the period of the rows up to 2.5 ms, or a part of a longer one of at most 1 ms."
         ),
     ] = None,
     hold: Annotated[
@@ -78,6 +78,15 @@ def identify_logs(
         ),
     ] = None,
     prefix: Annotated[str, flag("Prefix of the joints' names in the logs.")] = "",
+    columns: Annotated[
+        tuple[str, ...],
+        flag(
+            'Columns of a CSV file under other names, as "QUANTITY: PATTERN UNIT": "time: stamp_ms'
+            ' ms", "qpos: {joint}_pos_deg deg", "effort: -{joint}_tau mNm". Units are deg, mrad, mm,'
+            " mNm, ms, us, ns or a factor; a minus turns the sign.",
+            "PATTERN",
+        ),
+    ] = (),
     no_payload: Annotated[bool, flag("The robot carries no payload.")] = False,
     payload_link: Annotated[
         str | None,
@@ -106,8 +115,8 @@ def identify_logs(
     """Identify a robot's motors from logs of its motion, from this robot or another simulator.
 
     Finds armature, damping, friction, strength and bias of each joint, the delays of efforts and
-    setpoints, a lag of setpoints and a payload, by fitting simulated motions; writes them for --actuators
-    of other commands. A log has a header and SI units: "time, setpoint:JOINT ..., qpos:JOINT ...",
+    setpoints, a lag of setpoints and a payload, by fitting simulated motions; writes them for
+    --actuators of other commands. A log has a header and SI units: "time, setpoint:JOINT ..., qpos:JOINT ...",
     with the gains that drove the robot as --gains FILE, or "time, effort:JOINT ..., qpos:JOINT
     ...". The fit simulates a rigid-body model with a Runner's control and motors.
     """
@@ -122,7 +131,7 @@ def identify_logs(
         None if gains is None else _gains(robot, gains),
         payload=not no_payload,
         payload_link=payload_link,
-        reading=Reading(hold, degrees, topic, command_topic, prefix),
+        reading=Reading(hold, degrees, topic, command_topic, prefix, columns),
         compensate=compensate,
         timestep=timestep,
         extras=extras,

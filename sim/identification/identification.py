@@ -52,6 +52,10 @@ FOLLOWS = 0.01
 """A joint is stuck if the standard deviation of its positions is at most this share of its
 setpoints'.
 """
+LONGEST_STEP, USUAL_STEP = 2.5e-3, 1e-3
+"""Period up to which the rows of a log count as steps of the control, and the longest time step
+otherwise [s].
+"""
 SATURATIONS = (0.03, 0.2, 1.0)
 """Starts of the error at which the law saturates, over the 95 % quantile of the setpoint's error."""
 DETOUR = 0.1
@@ -89,8 +93,8 @@ def identify(
         Forces that the robot compensates by itself, or "none", as for logs of the complete efforts.
         Default: as the recordings say, else "gravity+coriolis+friction".
     timestep
-        Time step of the control that drove the robot [s]. Default: as the recordings say, else
-        1/2000.
+        Time step of the control that drove the robot [s]. Default: as the recordings say, else the
+        period of the rows up to 2.5 ms, or a part of a longer one of at most 1 ms.
     payload
         Find a payload, too.
     payload_link
@@ -108,7 +112,7 @@ def identify(
     workers
         Number of processes, 0 for this one.
     progress
-        Called after each evaluation.
+        Called after each evaluation, and each other reading of a log that is tried.
 
     Raises
     ------
@@ -134,7 +138,8 @@ def identify(
     read = _read(robot, logs, params, reading)
     moves, still = _moving(robot, read)
     robot, data = _prepared(robot, read, moves, params, compensate, timestep)
-    data, guesses = _regress(robot, data, bool({"kd", "gain"}.intersection(kinds)))
+    law_unknown = bool({"kd", "gain"}.intersection(kinds))
+    data, guesses = _regress(robot, data, law_unknown, progress)
     windows = windows_of(data)
     with ExitStack() as stack:
         run = _map(stack, integer("workers", workers, 0, 1000))
@@ -225,7 +230,7 @@ def _prepared(
         "compensate", forces, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none")
     )
     forces, is_friction, _ = forces.partition("+friction")
-    dt = _option("timestep", timestep, [log.timestep for log in logs], 1 / 2000)
+    dt = _option("timestep", timestep, [log.timestep for log in logs], _own_timestep(logs[0]))
     dt = number("timestep", dt, 1e-5, 0.01, "seconds")
     # Joints that did not move are held at their mean position, with the unlogged ones.
     qpos = np.concatenate([log.qpos for log in logs])
@@ -254,6 +259,17 @@ def _prepared(
         part = log.part(joints=moves)
         data.append(LogData(part, smooth(part, dt), plants[key], drive))
     return _resting(robot, start), data
+
+
+def _own_timestep(log: Log) -> float:
+    """Return the time step for a log that does not say it: the period of its rows, or a part of a
+    long one.
+    """
+    period = float(np.median(np.diff(log.time)))
+    parts = 1
+    if period > LONGEST_STEP:
+        parts = int(np.ceil(period / USUAL_STEP))
+    return float(np.clip(period / parts, 1e-4, LONGEST_STEP))
 
 
 def _resting(robot: Robot, start: Float64) -> Robot:
@@ -309,7 +325,10 @@ def _of_joints(params: bp.PIDParams, robot: Robot, log: Log) -> bp.PIDParams:
 
 
 def _regress(
-    robot: Robot, data: list[LogData], law_unknown: bool
+    robot: Robot,
+    data: list[LogData],
+    law_unknown: bool,
+    progress: Callable[[], object] | None,
 ) -> tuple[list[LogData], list[Guess]]:
     """Return the logs, marked whether the compensation passes through the motors, and the guesses
     of the regression.
@@ -325,9 +344,10 @@ def _regress(
         if others[0].cost < guesses[0].cost - DETOUR:
             data = exact
             guesses = others
-    words = better_reading(robot, _fitted(data)[0], guesses[0])
+    words = better_reading(robot, _fitted(data)[0], guesses[0], progress)
     if words and not (law_unknown and words.endswith("late")):
-        remedy = "correct the log or its options"
+        remedy = "correct the log, or name its columns with sign and unit, as in"
+        remedy += """ --columns "effort: -effort:{joint} mNm\""""
         raise InvalidArgumentError("logs", f"make sense with {words}", remedy=remedy)
     return data, guesses
 

@@ -16,6 +16,7 @@ refused where the stamps of its topics are of different clocks.
 from __future__ import annotations
 
 import os
+import re
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import replace
@@ -37,6 +38,22 @@ QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
 HDF5 = (".h5", ".hdf5")
 SECONDS = {"time": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9}
+UNITS = {
+    "deg": np.pi / 180,
+    "mrad": 1e-3,
+    "mm": 1e-3,
+    "mNm": 1e-3,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "ns": 1e-9,
+}
+"""Units of columns, over those of SI."""
+MEANINGS = {
+    "setpoint": r"cmd|goal|target|desired|ref|setpoint",
+    "measured_effort": r"tau|torque|effort|eff\b|nm",
+    "qpos": r"pos|angle|qpos|\bq\b",
+}
+"""Words in the names of columns by which a pattern is proposed, the clearest first."""
 JOINT_STATE = "sensor_msgs/msg/JointState"
 SILENT_PERIODS, LEAST_SILENCE = 3, 10_000_000
 """Silence of a topic that divides a log: in median periods of its messages, and at least [ns]."""
@@ -58,6 +75,11 @@ class Reading(NamedTuple):
     """Topic of the commands in a ROS bag; None: the measured efforts are used."""
     prefix: str = ""
     """Prefix of the joints' names in a file, which the robot's do not have."""
+    columns: tuple[str, ...] = ()
+    """Columns of a CSV file under other names, as "QUANTITY: PATTERN UNIT". In the pattern {joint}
+    stands for the joint's name, and "-" before it turns the sign; the unit is one of :data:`UNITS`
+    or a factor, and can be left out. "QUANTITY:JOINT: COLUMN UNIT" is for one joint.
+    """
 
 
 def read_logs(
@@ -112,8 +134,61 @@ def _read(
         return checked(robot, _build(robot, str(path), columns, commands, kind, reading), cuts)
     file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
     columns, numbers = read_csv(path, (*QUANTITIES, "time"))
+    columns = _renamed(robot, str(path), columns, reading.columns)
     log = _build(robot, str(path), columns, columns, kind, reading)
     return checked(robot, replace(log, lines=np.array(numbers)))
+
+
+def _renamed(
+    robot: Robot,
+    source: str,
+    columns: dict[str, Float64],
+    patterns: Iterable[str],
+) -> dict[str, Float64]:
+    """Return the columns with those that match ``patterns`` under the names and in the units of a
+    log.
+    """
+    renamed = dict(columns)
+    for text in patterns:
+        name, _, right = text.partition(": ")
+        pattern, *unit = right.split() or [""]
+        try:
+            scale = UNITS.get(unit[0]) or float(unit[0]) if unit else 1.0
+        except ValueError:
+            remedy = f"use one of {', '.join(UNITS)}, or a factor"
+            raise error(f"columns {text!r}", "has an unknown unit", remedy, unit[0]) from None
+        if pattern.startswith("-"):
+            scale = -scale
+            pattern = pattern[1:]
+        names = {pattern: name}
+        if "{joint}" in pattern:
+            joints = robot.joint_names
+            names = {pattern.replace("{joint}", joint): f"{name}:{joint}" for joint in joints}
+        present = names.keys() & columns.keys()
+        if not present:
+            problem = f"has no column of the pattern {text!r}"
+            raise error(source, problem, f"its columns are {', '.join(columns)}")
+        for column in present:
+            renamed[names[column]] = scale * columns[column]
+    return renamed
+
+
+def _proposed(robot: Robot, columns: Iterable[str]) -> str:
+    """Return the patterns that the names of columns suggest, as a remedy; "" for none."""
+    patterns = dict[str, None]()
+    for column in columns:
+        joints = [joint for joint in robot.joint_names if joint in column]
+        # The name of one joint may be part of another's.
+        pattern = column.replace(max(joints, key=len), "{joint}") if joints else column
+        words = pattern.replace("{joint}", " ").lower()
+        unit = next((unit for unit in UNITS if re.search(rf"(?i)[_. \[]{unit}\b", column)), "")
+        if not joints and re.search(r"time|stamp", words):
+            patterns[f"time: {column} {unit}".strip()] = None
+        for quantity, meaning in MEANINGS.items():
+            if joints and re.search(meaning, words.replace("_", " ")):
+                patterns[f"{quantity}: {pattern} {unit}".strip()] = None
+                break
+    return " ".join(f'"{pattern}"' for pattern in patterns)
 
 
 def logs_of_rollout(
@@ -194,6 +269,8 @@ def _build(
     if unit is None:
         problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
         remedy = "begin the header with time, in seconds, or time_ms, time_us, time_ns"
+        if proposed := _proposed(robot, columns):
+            remedy = f"name its columns (--columns {proposed})"
         raise error(source, problem, remedy)
     time = SECONDS[unit] * columns[unit]
     by = columns_by_joint(robot, source, columns | commands, QUANTITIES, reading.prefix)
@@ -215,6 +292,8 @@ def _build(
         for name in names or ["JOINT"]:
             if name not in by[quantity]:
                 remedy = "positions and commands are needed; a joint without both rests"
+                if not names and (proposed := _proposed(robot, columns)):
+                    remedy = f"name its columns (--columns {proposed})"
                 raise error(f"{source}: column {quantity}:{name}", "is missing", remedy)
         tables[quantity] = np.stack([by[quantity][name] for name in names], axis=1)
         if reading.degrees and quantity != "effort":

@@ -14,7 +14,7 @@ and the filtered positions. The delays with the least residual are taken from a 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from operator import attrgetter
@@ -270,7 +270,12 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     return [*values, bias, float(np.log((residual**2).mean() / motor + 1e-12))]
 
 
-def better_reading(robot: Robot, data: LogData, guess: Guess) -> str:
+def better_reading(
+    robot: Robot,
+    data: LogData,
+    guess: Guess,
+    progress: Callable[[], object] | None,
+) -> str:
     """Return the reading of a log that explains its efforts far better than the present one, in
     words; "" for none.
 
@@ -285,6 +290,8 @@ def better_reading(robot: Robot, data: LogData, guess: Guess) -> str:
         names = [robot.joint_names[joint] for joint in log.joints]
         costs = dict[str, float]()
         for words, on_qpos, on_command in _readings(log.kind, names, guess.odd):
+            if progress is not None:
+                progress()
             other = replace(begin, qpos=begin.qpos @ on_qpos, command=begin.command @ on_command)
             motion = smooth(other, data.drive.timestep)
             costs[words] = regress([data._replace(log=other, motion=motion)])[0].cost

@@ -202,11 +202,15 @@ class Dynamics:
         self._state = qpos, qvel
         self._columns = plant.columns
         self._described = _Poses(plant.tree, rows)
-        self._changed = list[tuple[Float64, _Poses]]()
+        self._changed = list[tuple[Any, Float64, _Poses]]()
         for change, value in masses.items():
             amount = value - (not change.is_payload)
-            if amount.any():
-                self._changed.append((amount, _Poses(_heavier(plant.tree, change), rows)))
+            moved = np.flatnonzero(amount)
+            if len(moved):
+                poses = _Poses(_heavier(plant.tree, change), len(moved))
+                # A slice is not copied, as it is for indices.
+                place: Any = slice(None) if len(moved) == rows else moved
+                self._changed.append((place, amount[moved], poses))
         self.matrix: Float64 = np.empty((*qpos.shape, qpos.shape[1]))
         self.force = np.empty_like(qpos)
         self.update()
@@ -214,16 +218,17 @@ class Dynamics:
     def update(self) -> None:
         """Compute the matrices and forces at the present poses."""
         columns = self._columns
-        matrix, force = self._described.at(*self._state, columns)
-        sums = matrix, force
-        for amount, poses in self._changed:
-            heavier = poses.at(*self._state, columns)
-            sums = (
-                sums[0] + amount[:, None, None] * (heavier[0] - matrix),
-                sums[1] + amount[:, None] * (heavier[1] - force),
-            )
-        self.matrix[...] = sums[0][:, columns][:, :, columns]
-        self.force[...] = sums[1][:, columns]
+        qpos, qvel = self._state
+        described = self._described.at(qpos, qvel, columns)
+        matrix, force = described
+        if self._changed:
+            matrix, force = matrix.copy(), force.copy()
+        for rows, amount, poses in self._changed:
+            heavier = poses.at(qpos[rows], qvel[rows], columns)
+            matrix[rows] += amount[:, None, None] * (heavier[0] - described[0][rows])
+            force[rows] += amount[:, None] * (heavier[1] - described[1][rows])
+        self.matrix[...] = matrix[:, columns][:, :, columns]
+        self.force[...] = force[:, columns]
 
 
 class SimulatedControl:

@@ -39,7 +39,7 @@ KEPT = 0.95
 """Share of the held-out error that an unknown has to leave for it to be kept."""
 COLORED = 0.2
 """Correlation of the residuals from which further effects are tried."""
-EFFECTS = {"stribeck": KEPT, "mass": 0.75, "offset": 0.75, "load_friction": 0.75}
+EFFECTS = {"stribeck": KEPT, "mass": 0.8, "offset": 0.8, "load_friction": 0.8}
 """Effects that are tried, and the share of the held-out error that each has to leave: every motor
 has more friction at rest, but a few percent may be an error of the model that looks like a mass.
 """
@@ -184,9 +184,9 @@ def _with_effect(
         columns = triangle[:, np.append(True, is_free)]
         step[is_free], _ = bounded_step(columns, DAMPING, low[is_free], high[is_free])
     before, *after = np.linalg.norm(wide.errors(point, steps) / solution.size, axis=1).tolist()
-    ratios = [left / EFFECTS[effect] for left, effect in zip(after, effects, strict=True)]
-    best = int(np.argmin(ratios))
-    if ratios[best] > before:
+    best = int(np.argmin(after))
+    # A linear step is no fit: half of the decrease will do.
+    if after[best] > 0.5 * (1 + EFFECTS[effects[best]]) * before:
         return result
     is_used = np.isin(names, [*present, *kinds_of(effects[best])])
     problem = replace(problem, unknowns=wider.only(is_used))

@@ -184,17 +184,22 @@ def fit_errors(
         Of the joints.
     """
     figure, blocks = _grid(names, 1, title, fits[-1][0][-1])
+    # Rows that are not numbers divide one line of a joint at the stretches' ends: a line for each
+    # stretch takes seconds.
+    gap = np.full((1, len(names)), np.nan)
+    time = np.concatenate([[*time, np.nan] for time, *_ in fits])
+    # An error of 0 has no place on a logarithmic axis.
+    before, after = (
+        np.maximum(np.abs(np.concatenate([part for row in fits for part in (row[at], gap)])), 1e-9)
+        for at in (2, 3)
+    )
+    held_out = np.concatenate([time[~fitted] for time, fitted, *_ in fits])
     for joint, (axes,) in enumerate(blocks):
         axes.set_ylabel(units[joint], fontsize=SMALL)
-        for time, fitted, before, after in fits:
-            # An error of 0 has no place on a logarithmic axis.
-            first = np.maximum(np.abs(before[:, joint]), 1e-9)
-            second = np.maximum(np.abs(after[:, joint]), 1e-9)
-            axes.semilogy(time, first, color=SECOND, lw=0.8, label="before")
-            axes.semilogy(time, second, color=ENV, lw=0.8, label="after")
-            held_out = time[~fitted]
-            if len(held_out):
-                axes.axvspan(held_out[0], held_out[-1], color=SETPOINT, alpha=0.15, lw=0)
+        axes.semilogy(time, before[:, joint], color=SECOND, lw=0.8, label="before")
+        axes.semilogy(time, after[:, joint], color=ENV, lw=0.8, label="after")
+        if len(held_out):
+            axes.axvspan(held_out[0], held_out[-1], color=SETPOINT, alpha=0.15, lw=0)
     _add_legend(figure)
     return figure
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Document, Progress
+from batchpid.arrays.array_types import Progress
 from batchpid.motors import DRIVEN
 from batchpid.sim.diagnosis.text import cause_lines, median_and_worst, overshoot_of_settled, table
 from batchpid.sim.engine.protocol import load_engine
@@ -75,19 +75,6 @@ class Comparison:
             pairs = zip(self.evaluations[::2], self.evaluations[1::2], strict=True)
             lines += [self._difference(*pair) for pair in pairs]
         return "\n".join(lines)
-
-    def document(self) -> Document:
-        """Return the figures of each set (moves, dof)."""
-        figures = {}
-        for evaluation in self.evaluations:
-            figures[evaluation.name] = {
-                "metrics": evaluation.metrics,
-                "chatter": evaluation.chatter,
-                "settling_limit": evaluation.settling_limit,
-                "following_error": evaluation.following_error,
-            }
-        moves = self.evaluations[0].moves.names
-        return {"joints": self.robot.joint_names, "moves": moves, "gains": figures}
 
     def figure(self) -> Figure:
         """Draw the first two evaluations on their first move."""

@@ -211,14 +211,14 @@ class Terminal(io.StringIO):
         return self.is_terminal
 
 
-def test_a_terminal_has_a_bar_and_a_pipe_a_line_every_ten_seconds(monkeypatch):
+def test_a_terminal_has_a_bar_and_a_pipe_lines_with_the_remaining_time(monkeypatch):
     for is_terminal in (True, False):
         monkeypatch.setattr("sys.stderr", Terminal(is_terminal))
         monkeypatch.setattr("time.monotonic", itertools.count(step=4).__next__)
         assert list(bar("working")(range(8))) == [*range(8)]
         said = sys.stderr.getvalue()
-        assert said.count("\n") == (0 if is_terminal else 2)
-    assert said.splitlines()[-1] == "batchpid: working: 5 of 8 it, 24 s"
+        assert said.count("\n") == (0 if is_terminal else 3)
+    assert said.splitlines()[-1] == "batchpid: working: 7 of 8 it, 32 s, about 5 s left"
 
 
 def test_no_default_output_needs_a_folder_of_the_user(batchpid):

@@ -39,8 +39,8 @@ def write(path, columns, delimiter=","):
     return path
 
 
-def read(robot, folder, columns, kind=None, **reading):
-    return read_logs(robot, [write(folder / "log.csv", columns)], kind, reading=Reading(**reading))
+def read(robot, folder, values, kind=None, **reading):
+    return read_logs(robot, [write(folder / "log.csv", values)], kind, reading=Reading(**reading))
 
 
 def test_columns_are_found_by_name_in_the_order_of_the_robot(robot, tmp_path):
@@ -66,6 +66,33 @@ def test_units_and_names_are_options(robot, tmp_path):
     assert log.held
     for name in ("time", "qpos", "command"):
         np.testing.assert_allclose(getattr(log, name), getattr(plain, name), atol=1e-12)
+
+
+def test_columns_of_other_names_units_and_signs_are_patterns(robot, tmp_path):
+    """The error of a file without them proposes the patterns."""
+    (plain,) = read(robot, tmp_path, table("measured_effort"))
+    columns = {"stamp_ms": 1e3 * TIME, "mode": ["idle"] * 200}
+    for joint in JOINTS:
+        columns[f"{joint}.pos_deg"] = np.degrees(table("measured_effort")[f"qpos:{joint}"])
+        columns[f"{joint}.tau_mNm"] = 1e3 * table("measured_effort")[f"measured_effort:{joint}"]
+    patterns = ("time: stamp_ms ms", "qpos: {joint}.pos_deg deg")
+    patterns += ("measured_effort: {joint}.tau_mNm mNm",)
+    with pytest.raises(bp.InvalidArgumentError) as refusal:
+        read(robot, tmp_path, columns)
+    assert all(f'"{pattern}"' in str(refusal.value) for pattern in patterns)
+    (log,) = read(robot, tmp_path, columns, columns=patterns)
+    for name in ("time", "qpos", "command"):
+        np.testing.assert_allclose(getattr(log, name), getattr(plain, name), atol=1e-12)
+    turned = (*patterns[:2], "measured_effort: -{joint}.tau_mNm -0.002")
+    turned += ("measured_effort:elbow: elbow.tau_mNm -1",)
+    (other,) = read(robot, tmp_path, columns, columns=turned)
+    np.testing.assert_allclose(other.command, plain.command * [2.0, -1000.0], atol=1e-12)
+    for problem, pattern in {
+        "pattern": "qpos: {joint}_q",
+        "unit": "qpos: {joint}.pos_deg ft",
+    }.items():
+        with pytest.raises(bp.InvalidArgumentError, match=problem):
+            read(robot, tmp_path, columns, columns=(pattern,))
 
 
 def test_measured_efforts_take_the_place_of_commands(robot, tmp_path):
@@ -294,8 +321,9 @@ def test_commands_of_a_bag_act_from_their_own_stamps_on(tmp_path, hold, seed):
             messages.append((topic, time, dict.fromkeys(JOINTS, value)))
     path = bag(tmp_path / "bag", sorted(messages, key=lambda message: message[1]))
     reading = Reading(command_topic="/commands", hold=hold)
-    with pytest.warns(LogWarning, match="is silent from .* the log is divided"):
+    with pytest.warns(LogWarning) as notes:
         logs = read_logs(load(tmp_path), [path], "setpoint", reading=reading)
+    assert any("the log is divided" in str(note.message) for note in notes)
     assert len(logs) == 2
     origin = max(times[0] for times in stamps.values())
     for log in logs:
