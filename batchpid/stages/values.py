@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import repeat
 from operator import is_not
 from typing import Any, NamedTuple
 
@@ -37,7 +38,7 @@ class Command(NamedTuple):
     @property
     def given(self) -> tuple[bool, ...]:
         """Which arrays are given."""
-        return tuple(is_not(rows, None) for rows in self)
+        return tuple(map(is_not, self, repeat(None)))
 
     def resting(self) -> Command:
         """Return the command without the rates of its setpoint."""
