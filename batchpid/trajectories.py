@@ -256,9 +256,8 @@ def trapezoidal(
     moves = np.broadcast_to(moves.any(-1, keepdims=True), move.shape)
     # An env that does not move gets any number, and a duration of 0.
     as_ = np.where(moves, as_, 1.0)
-    peak = np.minimum(
-        np.where(moves, vs, 1.0), np.sqrt(as_)
-    )  # a short move never reaches its cruising velocity
+    # A short move never reaches its cruising velocity.
+    peak = np.minimum(np.where(moves, vs, 1.0), np.sqrt(as_))
     ramp = peak / as_
     total = np.where(moves, 1 / peak + ramp, 0.0)
     time = _ticks(dt, total)

@@ -37,6 +37,7 @@ GONE = (
     r"\bfirst_gains\b|\bloop_delay\b|\brandomization_files\b",
     r"\bgizmo\b",
     r"\bis_ros2_control\b",
+    r"\bInverseKinematicsWarning\b",
     r"\bLogSettings\b",
     r"\bjerk_limited\b|import ruckig",
     r"\bmesa-vulkan-drivers\b",

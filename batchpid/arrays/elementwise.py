@@ -61,9 +61,8 @@ def in_dtype_of(params: Iterable[Array], *arrays: Array) -> list[Array]:
 
 def _as_dtype(x: Array, dtype: DType) -> Array:
     xp = namespace(x)
-    return x.astype(
-        xp.result_type(np.zeros((), dtype))
-    )  # in JAX float32 instead of float64, unless that is enabled
+    # In JAX float32 instead of float64, unless that is enabled.
+    return x.astype(xp.result_type(np.zeros((), dtype)))
 
 
 def clip(

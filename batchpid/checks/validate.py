@@ -88,9 +88,8 @@ def time_step(argument: str, value: object) -> float:
 
 def check_time_step(dt: object) -> None:
     """Check a time step that is not an array; the values of arrays are not read."""
-    if (
-        isinstance(dt, float) and 0.0 < dt <= LONGEST_STEP
-    ):  # at every sim step: without the checks' cost
+    # It is called at every sim step: most of them do without the cost of the checks.
+    if isinstance(dt, float) and 0.0 < dt <= LONGEST_STEP:
         return
     if isinstance(dt, np.generic) or not hasattr(dt, "__array_namespace__"):
         time_step("dt", dt)
@@ -230,9 +229,8 @@ def broadcast(
     if result.shape == shape:
         return result
     try:
-        if (
-            len(shape) == 2 and result.ndim <= 2
-        ):  # a small copy is faster to make, and to read, than a view
+        # A small copy is faster to make, and to read, than a view.
+        if len(shape) == 2 and result.ndim <= 2:
             rows = np.empty(shape)
             rows[...] = result
             return rows
@@ -263,9 +261,8 @@ def array(
     )
     is_read = type(value) is np.ndarray and value.dtype == np.float64  # nearly always
     result: NDArray[Any] = value if is_read else read_array(argument, value)  # type: ignore[assignment]
-    if (
-        result.ndim and result.shape[-1] != shape[-1]
-    ):  # one number for all joints is a scalar, not an array of one
+    # One number for all joints is a scalar, not an array of one.
+    if result.ndim and result.shape[-1] != shape[-1]:
         raise InvalidArgumentError(
             argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy
         )

@@ -43,7 +43,7 @@ def plan_functions(c: Dialect, plan: Plan, functions: str) -> str:
         return list(blend(k, state, *inputs))
 
     outputs = ["setpoint[j]", "rate[j]"]
-    inputs = [f"chunk[k * {n} + j]", "begin", "offset[j]", "first", "step", "rows"]
+    inputs = [f"chunk[k * {n} + j]", "begin", "offset[j]", "slope[j]", "first", "step", "rows"]
     curve_body = _body(c, plan, like, curve_step, ["t"], outputs)
     sample_body = _body(c, plan, like, sample_step, ["t", "dt"], [*held, *outputs])
     blend_body = _body(c, plan, like, blend_step, inputs, ["blended[k][j]", "weights[k][j]"])
@@ -92,12 +92,16 @@ static inline void {p}_add_chunk({p}_plan *state, const {t} *chunk, int n, {t} b
   const {t} ahead = {p}_max(ceil{f}((now - begin) / period + {half}), {zero});
   const {t} first = {p}_min(ahead, rows - {c.number(1.0)});
   const int end = (int)rows;
-  {t} blended[{horizon}][{n}], weights[{horizon}][{n}], offset[{n}], position[{n}], rate[{n}];
+  {t} blended[{horizon}][{n}], weights[{horizon}][{n}], offset[{n}], slope[{n}];
+  {t} position[{n}], rate[{n}];
+  const int f = (int)first, low = f > 0 ? f - 1 : 0, high = f + 1 < end ? f + 1 : end - 1;
   if (end < 1) return;
-  {p}_curve(state, begin + first * period, offset, rate);
+  {p}_curve(state, begin + first * period, offset, slope);
   {p}_curve(state, now, position, rate);
   for (int j = 0; j < {n}; ++j) {{
-    offset[j] = end > 1 ? offset[j] - chunk[(int)first * {n} + j] : {zero};
+    const {t} rise = chunk[high * {n} + j] - chunk[low * {n} + j];
+    offset[j] = end > 1 ? offset[j] - chunk[f * {n} + j] : {zero};
+    slope[j] = end > 1 ? slope[j] - rise / (({t})(high - low) * period) : {zero};
   }}
   for (int k = 0; k < end; ++k) {{
     const {t} step = ({t})k;

@@ -262,9 +262,8 @@ def advance(
 
     new = PIDState(
         integral=integral,
-        measurement=(
-            None if state.measurement is None else y.copy()
-        ),  # the caller may reuse its buffer
+        # The caller may reuse its buffer.
+        measurement=None if state.measurement is None else y.copy(),
         derivative=None if state.derivative is None else derivative,
         setpoint=None if state.setpoint is None else r + xp.zeros_like(y),
         setpoint_seen=None if state.setpoint_seen is None else xp.ones_like(y),

@@ -5,14 +5,17 @@ A chunk has rows c_k for the times T_k = time + k P. Of two and more rows, with 
 x(t) and the time t of the last sample, the blended rows are, by :func:`batchpid.make_plan`'s blend::
 
     newest      b_k = c_k
-    align       b_k = c_k + (x(T_f) - c_f) min(max(1 - (T_k - T_f) / fade, 0), 1)
+    align       b_k = c_k + o max(1 - s, 0) + (o + o' fade) u (1 - u)^2 / 5
+                s   = (T_k - T_f) / fade,   u = min(5 s, 1)
     ensemble    b_k = x(T_k) + g_k / (W_k + g_k) (c_k - x(T_k)),   g_k = 1 - W_k (1 - exp(-m))
     average     the same with g_k = W_k share / (1 - share), or 1 where W_k is 0
 
-f is the first row that is at least P / 2 ahead of t; those before it have passed, and are dropped.
-If all have passed, the last one is taken for t + P. W_k is the weight of the chunks so far at that
-time, to which g_k is added: without taper the g are exp(-m i), i = 0, 1, ... With a taper g_k is
-multiplied by min(1, (T_n - T_k) / taper), where T_n is the end of the chunk.
+o = x(T_f) - c_f is the offset, which fades, and o' = x'(T_f) - c'_f its rate, from which the rate
+of the fading is reached in a fifth of that time. f is the first row that is at least P / 2 ahead of
+t; those before it have passed, and are dropped. If all have passed, the last one is taken for t +
+P. W_k is the weight of the chunks so far at that time, to which g_k is added: without taper the g
+are exp(-m i), i = 0, 1, ... With a taper g_k is multiplied by min(1, (T_n - T_k) / taper), where
+T_n is the end of the chunk.
 
 The knots of the new plan are x(t) at t, where the plan has its rate too, and b_k at T_k from f on,
 with the rates (b_{k+1} - b_{k-1}) / (2 P), one-sided at the ends of the chunk. Behind the last row
@@ -42,6 +45,8 @@ from batchpid.motors import guard as guard_model
 from batchpid.motors.guard import Guard, GuardState
 from batchpid.plan.plans import SPARE_ROWS, Held, Linear, Plan
 
+EASE = 0.2
+"""Share of the fading in which its rate is reached."""
 LEAST_STEP = 1e-9
 """Least time between two samples [s]: the limits divide by it."""
 
@@ -118,8 +123,11 @@ def add(
     joined = xp.where(ahead > first, now + period, begin + first * period)
     position, rate, _ = curve(plan, state, now)
     # A single row tells no motion that could be aligned.
-    present, _, _ = curve(plan, state, begin + first * period)
+    present, slope, _ = curve(plan, state, begin + first * period)
     offset = xp.where(rows > 1, present - take_rows(chunk, first), 0.0)
+    low, high = xp.maximum(first - 1.0, 0.0), xp.minimum(first + 1.0, rows - 1.0)
+    rise = take_rows(chunk, high) - take_rows(chunk, low)
+    slope = xp.where(rows > 1, slope - rise / (xp.maximum(high - low, 1.0) * period), 0.0)
     # All rows at once: plan and state have an axis more.
     steps = xp.cumsum(xp.ones_like(chunk), axis=-2) - 1.0
     wide = state._replace(
@@ -129,9 +137,18 @@ def add(
         join=state.join[..., None, :],
         time=state.time[..., None, :],
     )
-    whole = begin[..., None, :], offset[..., None, :], first[..., None, :]
     options = mapped(lambda leaf: leaf[..., None, :], plan)
-    blended, weights = blend(options, wide, chunk, *whole, steps, rows)
+    blended, weights = blend(
+        options,
+        wide,
+        chunk,
+        begin[..., None, :],
+        offset[..., None, :],
+        slope[..., None, :],
+        first[..., None, :],
+        steps,
+        rows,
+    )
     # Central differences, one-sided at the ends of the chunk.
     path = blended
     if rows == 1:
@@ -165,6 +182,7 @@ def blend(
     chunk: Array,
     begin: Array,
     offset: Array,
+    slope: Array,
     first: Array,
     step: Array,
     rows: Array,
@@ -172,14 +190,16 @@ def blend(
     """Return row number ``step`` of a chunk that begins at ``begin`` [s], blended with the plan,
     and its weight.
 
-    ``offset`` is that of the alignment, in row ``first``, and ``rows`` the number of rows. All have
-    the shape of the times of ``state``, or one that broadcasts with it.
+    ``offset`` is that of the alignment, in row ``first``, and ``slope`` its rate; ``rows`` is the
+    number of rows. All have the shape of the times of ``state``, or one that broadcasts with it.
     """
     xp = namespace(*plan, state.knots, chunk, begin, step)
     if plan.fade is not None:
-        left = 1.0 - (step - first) * plan.period / plan.fade
-        share = plan.blended * xp.minimum(xp.maximum(left, 0.0), 1.0)
-        return chunk + share * offset, xp.zeros_like(chunk)
+        s = (step - first) * plan.period / plan.fade
+        u = xp.minimum(s / EASE, 1.0)
+        eased = EASE * u * ((1.0 - u) * (1.0 - u))
+        left = xp.maximum(1.0 - s, 0.0) * offset + eased * (offset + plan.fade * slope)
+        return chunk + plan.blended * left, xp.zeros_like(chunk)
     if plan.forgotten is None and plan.share is None:
         return chunk, xp.zeros_like(chunk)
     time = begin + step * plan.period

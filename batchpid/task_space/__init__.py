@@ -7,7 +7,6 @@ float64; JAX's arrays keep their dtype.
 
 from batchpid.task_space.inverse_kinematics import (
     IKResult,
-    InverseKinematicsWarning,
     inverse_kinematics,
 )
 from batchpid.task_space.operational_space import init, osc, reset
@@ -35,7 +34,6 @@ from batchpid.task_space.tree_quantities import (
 
 __all__ = [
     "IKResult",
-    "InverseKinematicsWarning",
     "OSCCoefficients",
     "OSCInputs",
     "OSCParams",

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import array, choice, entries, instance, integer, positive
-from batchpid.errors import InvalidArgumentError, warn
+from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import pose_error, pose_of
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
@@ -42,14 +42,10 @@ from batchpid.task_space.tree_kinematics import (
     velocities_of,
 )
 
-ON_FAILURE = ("warn", "raise", "return")
+ON_FAILURE = ("raise", "return")
 _DAMPING, _DAMPING_PER_ERROR = 1e-8, 0.1
 _LARGEST_ACCELERATION = 0.75  # relative to the velocity
 _PASSES = 4  # of the active set; joints that pass a limit after the last are clipped
-
-
-class InverseKinematicsWarning(UserWarning):
-    """Some poses were not reached."""
 
 
 class IKResult(NamedTuple):
@@ -84,7 +80,7 @@ def inverse_kinematics(
     position_tolerance: float = 1e-5,
     rotation_tolerance: float = 1e-4,
     seed: int = 0,
-    on_failure: str = "warn",
+    on_failure: str = "raise",
 ) -> IKResult:
     """Return joint positions that bring a tool to ``pose``, within the joint limits of ``tree``.
 
@@ -107,8 +103,7 @@ def inverse_kinematics(
     position_tolerance, rotation_tolerance
         Largest errors of a success [m, rad].
     on_failure
-        "warn": an :class:`InverseKinematicsWarning` names the first env that failed; "raise": an
-        error; "return": the caller checks ``success``.
+        "raise": an error names the first env that failed; "return": the caller checks ``success``.
 
     Raises
     ------
@@ -160,7 +155,7 @@ def inverse_kinematics(
         steps,
     )
     if on_failure != "return" and not success.all():
-        _report(result, on_failure)
+        raise _failure(result)
     return result
 
 
@@ -315,8 +310,8 @@ def _goals_and_starts(
     return goal, tree.positions(np.clip(rows, tree.lower, tree.upper))
 
 
-def _report(result: IKResult, on_failure: str) -> None:
-    """Warn, or raise, for the first env that failed."""
+def _failure(result: IKResult) -> InvalidArgumentError:
+    """Return the error for the first env that failed."""
     failed = np.flatnonzero(~result.success)
     env = int(failed[0])
     problem = (
@@ -325,7 +320,4 @@ def _report(result: IKResult, on_failure: str) -> None:
         f" {result.rotation_error[env] * 1e3:.3g} mrad remain"
     )
     remedy = "check that it is in reach, or give more starts or larger tolerances"
-    error = InvalidArgumentError("pose", problem, env=env, remedy=remedy)
-    if on_failure == "raise":
-        raise error
-    warn(str(error), InverseKinematicsWarning)
+    return InvalidArgumentError("pose", problem, env=env, remedy=remedy)

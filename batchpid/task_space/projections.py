@@ -55,9 +55,8 @@ def projections(
     m = d.mass_matrix
     chain = d.chain
     eye = xp.eye(m.shape[-1], dtype=m.dtype)
-    m_cc = xp.where(
-        (chain[:, None] * chain) > 0, m, eye
-    )  # the other joints apart, with unit inertia
+    # The other joints apart, with unit inertia.
+    m_cc = xp.where((chain[:, None] * chain) > 0, m, eye)
     y = whitened(m_cc, xp.concatenate([xp.swapaxes(j, -1, -2), eye + xp.zeros_like(m)], axis=-1))
     task_inertia, null_inertia, spring_inertia, singular = _inertias(
         k, gram(y[..., :6], y[..., :6]), xp

@@ -123,9 +123,9 @@ def _of_base(
         + _about_origin(part, bodies.base_center, xp)
     )
     eye = xp.eye(3, dtype=moment.dtype)
-    crossed = xp.stack(
-        [cross(moment, eye[axis] + xp.zeros_like(moment)) for axis in range(3)], axis=-1
-    )  # c x
+    # The matrix c x.
+    columns = [cross(moment, eye[axis] + xp.zeros_like(moment)) for axis in range(3)]
+    crossed = xp.stack(columns, axis=-1)
     zero = xp.zeros_like(crossed)
     upper = xp.concatenate([mass[..., None] * eye + zero, -crossed], axis=-1)
     return xp.concatenate([upper, xp.concatenate([crossed, tensor + zero], axis=-1)], axis=-2)

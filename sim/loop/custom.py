@@ -78,9 +78,8 @@ class OwnController:
         Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape
         or dtype.
         """
-        copies = (
-            read_only(np.array(rows)) for rows in inputs
-        )  # the controller may keep them, but not write to them
+        # The controller may keep them, but not write to them.
+        copies = (read_only(np.array(rows)) for rows in inputs)
         new, returned, *limited = self._called(unflatten(self._structure, state), *copies)
         # Copies again: the controller may change its own arrays at any time.
         leaves = _like(state, flatten(new, read=np.array))

@@ -43,9 +43,8 @@ class SapienLinkSensors:
         }
         self._roots = {at for at, name in enumerate(parents) if name is None}
         self._velocities = np.zeros((len(robots), len(self._contacts), 3))
-        self._parts: list[Any] = [None] * len(
-            robots
-        )  # links, joints, numbers of the links by entity, and gravity
+        # Links, joints, numbers of the links by entity, and gravity of each robot.
+        self._parts: list[Any] = [None] * len(robots)
         self._sums: dict[str, Float64] = {}
         self.take()
         self.place(range(len(robots)))

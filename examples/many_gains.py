@@ -1,7 +1,7 @@
 """One robot under many gains, in chunks: a recording for each, and after a kill the same command
 goes on.
 
-``python examples/chunks.py --num-envs 256 --folder gains`` moves a panda under 256 proportional
+``python examples/many_gains.py --num-envs 256 --folder gains`` moves a panda under 256 proportional
 gains. A recording is written as a whole or not at all, so one that exists is complete.
 """
 
