@@ -37,6 +37,8 @@ class Control(NamedTuple):
     gravity: bool = False
     coriolis: bool = False
     """Parts of the passive force that are compensated."""
+    powered: Array = None
+    """1.0 for joints with a motor, where forces are compensated, else 0.0 (dof,); None: all."""
     modelled: Array = None
     """Friction that the law compensates (dof,) [N m or N]; None for none."""
     band: Array = None

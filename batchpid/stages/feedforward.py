@@ -42,6 +42,8 @@ class Feedforward(Stage):
     """f = p + the caller's feedforward + modelled friction, for the leaders."""
 
     coupling: Coupling
+    powered: Array
+    """1.0 for joints with a motor, where p is compensated, else 0.0 (dof,); None: all."""
     friction: Array
     """Friction that the compensation cancels (dof,) [N m or N]; None for none."""
     band: Array
@@ -52,12 +54,16 @@ class Feedforward(Stage):
     @classmethod
     def of(cls, control: Control) -> Self:
         if control.modelled is None:
-            return cls(control.coupling, None, None, None)
-        return cls(control.coupling, control.modelled, control.band, control.turns)
+            return cls(control.coupling, control.powered, None, None, None)
+        known = control.modelled, control.band, control.turns
+        return cls(control.coupling, control.powered, *known)
 
     def step(self, state: tuple[()], values: Values) -> Told:
         command, seen = values.command, values.seen
-        forward = self.coupling.efforts(seen.passive + command.feedforward)
+        passive = seen.passive
+        if self.powered is not None:
+            passive = self.powered * passive
+        forward = self.coupling.efforts(passive + command.feedforward)
         if self.friction is not None:
             error = wrap(command.setpoint - seen.qpos, self.turns, namespace(seen.qpos))
             forward = forward + friction_model.compensation(

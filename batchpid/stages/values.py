@@ -72,7 +72,7 @@ class Outputs(NamedTuple):
     motor: Array = None
     """Effort of the motors [N m or N]."""
     saturated: Array = None
-    """Joints whose effort was limited; None under control "drive"."""
+    """Joints whose effort was limited; None under control "drive" without limits."""
     guarded: Array = None
     """Setpoints that the guard changed; None without guard."""
     returned: Array = None

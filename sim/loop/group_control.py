@@ -101,6 +101,8 @@ def control_of(
     known = known_joints(options.robot)
     turns = np.array([joint.continuous / TURN for joint in joints])
     modelled = np.array([joint.friction * share for joint in joints]) + known.coulomb
+    free = np.array([joint.name in (options.free_joints or ()) for joint in joints])
+    modelled[free] = 0.0
     has_modelled = "friction" in compensated and options.sets_positions and modelled.any()
     armature = None
     damping = np.array([joint.damping for joint in joints])
@@ -120,6 +122,7 @@ def control_of(
         friction=friction,
         gravity="gravity" in compensated,
         coriolis="coriolis" in compensated,
+        powered=1.0 - free if free.any() else None,
         modelled=modelled if has_modelled else None,
         band=np.array([BAND[joint.unit] for joint in joints]),
         turns=turns if turns.any() else None,

@@ -48,6 +48,8 @@ class Joint:
     friction: float = 0.0
     mimic: Mimic | None = None
     axis: tuple[float, ...] = (1.0, 0.0, 0.0)
+    has_motor: bool = True
+    """False where an MJCF file has actuators, and none for this joint."""
 
     @property
     def moves(self) -> bool:

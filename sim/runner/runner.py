@@ -108,7 +108,7 @@ class Runner(SingleOwner):
         link ``tool``, or a :class:`batchpid.sim.Controller`; forces that are compensated.
     timestep, substeps
         Time step of simulation and control [s]; sim steps of a tick.
-    actuators, plan, guard, stages
+    free_joints, actuators, plan, guard, stages
         Motors and sensors, default the robot's; plan of a slow policy; limits of setpoints; further
         stages of a sim step.
     engine, physics, collisions, ground, build
@@ -147,6 +147,7 @@ class Runner(SingleOwner):
         control: ControlMode | Literal["osc"] | Controller = "pid",
         tool: str | None = None,
         compensate: Compensation = "gravity+coriolis+friction",
+        free_joints: Sequence[str] | None = None,
         actuators: bp.Actuators | None = None,
         plan: bp.Plan | None = None,
         guard: bool | bp.Guard | None = None,
@@ -179,6 +180,7 @@ class Runner(SingleOwner):
             control=control,
             tool=tool,
             compensate=compensate,
+            free_joints=free_joints,
             actuators=actuators,
             plan=plan,
             guard=guard,

@@ -205,6 +205,7 @@ FEATURES: dict[str, Feature] = {
         {"control": "drive", "randomization": Randomization(payload=Uniform(0.1, 0.5))}
     ),
     "compensation of gravity alone": Feature({"compensate": "gravity"}),
+    "a joint without a motor": Feature({"free_joints": ["elbow"]}),
     "no compensation": Feature({"compensate": "none", "physics": "fast"}),
     "no collisions": Feature({"collisions": False, "ground": False}),
     "a reset at a fault": Feature({"on_fault": "reset", "speed_limit": 2.0}),

@@ -170,6 +170,7 @@ class TableReader:
             friction=float(model.dof_frictionloss[dof]),
             mimic=Mimic(*couplings[name]) if name in couplings else None,
             axis=tuple(model.jnt_axis[number].tolist()),
+            has_motor=name not in motors.unmoved,
         )
 
     def _add(self, body: int, row: Body, anchor: Float64) -> None:

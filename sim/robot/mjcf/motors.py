@@ -77,6 +77,8 @@ class Motors:
     """Motors of the joints by name, in N m or N; joints without an entry have none, or no limit."""
 
     effort_limit: dict[str, float] = field(default_factory=dict)
+    unmoved: set[str] = field(default_factory=set)
+    """Joints that no actuator moves, in a file with actuators."""
     """Infinite where the file gives none."""
     armature: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     """Reflected inertia [kg m^2 or kg]; a follower's armature is added to its leader's."""
@@ -154,8 +156,12 @@ def read_motors(
             _add_setpoints(model, actuator, law, robot, motors)
     for joint, name in robot.joints.items():
         if model.nu and name not in motors.effort_limit and name not in couplings:
-            text = "no actuator of the file moves the joint: it is controlled like all others"
-            remedy = "give it gains of 0 to let it move freely"
+            text = (
+                "no actuator of the file moves the joint: it is controlled like all others, without"
+                " compensation of gravity and friction"
+            )
+            remedy = "give it gains of 0 to let it move freely, or pass free_joints=[] to a runner"
+            motors.unmoved.add(name)
             findings.append(Finding("actuator", text, remedy, name))
         # A limit of 0 counts as none.
         limit = motors.effort_limit.get(name, math.inf) or math.inf

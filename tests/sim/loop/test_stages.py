@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from thermal import Thermal
+from tiny_urdf import INERTIAL, one_joint, write
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Runner
+from batchpid.sim import Robot, Runner
 from batchpid.stages import Stage
 
 
@@ -107,3 +108,40 @@ def test_a_stage_that_programs_cannot_have_runs_in_numpy_and_the_runner_says_so(
         assert runner.step(panda.start).ok.all()
     with Runner(panda, 2, workers=0, stages=[Thermal(8.0, 0.05)]) as runner:
         assert "stage" not in repr(runner)
+
+
+HOPPER = """<mujoco><worldbody><body pos="0 0 1"><joint name="rootz" type="slide" axis="0 0 1"/>
+<geom size=".1" mass="3"/><body pos="0 0 -.2"><joint name="hip" axis="0 1 0" range="-60 60"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.4" size=".04" mass="2"/></body></body></worldbody>
+<actuator><motor joint="hip" ctrlrange="-40 40"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("free", [None, [], ["rootz", "hip"]])
+def test_a_joint_that_no_actuator_moves_falls_and_does_not_hang_on_the_compensation(tmp_path, free):
+    path = tmp_path / "hopper.xml"
+    path.write_text(HOPPER)
+    robot = Robot.load(path)
+    (said,) = [one for one in robot.check() if one.joint == "rootz" and "no actuator" in one.text]
+    assert "free_joints" in said.remedy
+    params = robot.params(kp=[0.0, 50.0], ki=None, kd=[0.0, 5.0], effort_limit=None)
+    options = {"engine": "mujoco", "workers": 0, "params": params, "free_joints": free}
+    with Runner(robot, 1, **options) as runner:
+        for _ in range(20):
+            seen = runner.step(robot.start)
+    falls = free is None or "rootz" in free
+    assert seen.qpos[0, 0] == pytest.approx(-9.81 * 0.2**2 / 2 if falls else 0.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("control", ["pid", "drive"])
+def test_a_motor_that_is_too_weak_for_its_load_drops_it(tmp_path, control, engine):
+    """Under a drive, too: the compensation lifted what the motor cannot."""
+    link = INERTIAL.replace('mass value="1"', 'mass value="5"')
+    link = link.replace("<inertial>", '<inertial><origin xyz="0.5 0 0"/>')
+    limit = '<limit lower="-2" upper="2" effort="10" velocity="5"/>'
+    robot = Robot.load(write(tmp_path, one_joint(limit, arm=link)))
+    params = robot.params(kp=400.0, ki=None, kd=40.0)
+    with Runner(robot, 1, workers=0, control=control, params=params) as runner:
+        for _ in range(60):
+            seen = runner.step([0.0])
+    assert seen.saturated.all()
+    assert seen.qpos[0, 0] > 1.5

@@ -65,6 +65,7 @@ def test_setpoint_moves_with_constant_acceleration_to_the_end_of_the_tick(late):
 def test_feedforward_cancels_friction_in_the_direction_of_motion():
     friction, band, turns = np.array([0.5, 0.3]), np.array([0.1, 0.2]), np.array([0, 0.5 / math.pi])
     control = NEUTRAL._replace(modelled=friction, band=band, turns=turns)
+    control = control._replace(powered=np.array([1.0, 0.0]))
     values = at(command=Command(rows(), rows(), rows(), rows()))
     forward = run(control, "feedforward", values)[1].forward
     for env, joint in entries():
@@ -73,7 +74,9 @@ def test_feedforward_cancels_friction_in_the_direction_of_motion():
             error = math.remainder(error, 2 * math.pi)
         ahead = error + LOOKAHEAD * values.command.setpoint_rate[env, joint]
         share = min(max(ahead / band[joint], -1.0), 1.0)
-        given = values.seen.passive[env, joint] + values.command.feedforward[env, joint]
+        given = values.command.feedforward[env, joint]
+        if joint == 0:  # the other has no motor
+            given += values.seen.passive[env, joint]
         assert forward[env, joint] == pytest.approx(given + share * friction[joint], abs=1e-12)
 
 
@@ -95,7 +98,7 @@ def test_limits_are_narrowed_from_both_sides():
 
 
 def test_targets_of_drives_are_next_to_the_joint():
-    control = NEUTRAL._replace(mode="drive", params=PARAMS.replace(ki=None, kd=None))
+    control = NEUTRAL._replace(mode="drive", params=PARAMS.replace(ki=None))
     control = control._replace(turns=np.array([0.0, 0.5 / math.pi]))
     values = at(command=Command(10 * rows(), rows(), None, None), forward=rows())
     outputs = run(control, "law", values)[1].outputs
@@ -105,7 +108,15 @@ def test_targets_of_drives_are_next_to_the_joint():
             qpos = values.seen.qpos[env, joint]
             target = qpos + math.remainder(target - qpos, 2 * math.pi)
         assert outputs.target[env, joint] == pytest.approx(target, abs=1e-12)
-    assert outputs.qf is values.forward
+        # The drive's effort and the feedforward are within the limit together.
+        error = target - values.seen.qpos[env, joint]
+        rate = values.command.setpoint_rate[env, joint] - values.seen.qvel[env, joint]
+        wanted = 5.0 * error + 0.1 * rate
+        push = min(max(wanted, -3.0), 3.0)
+        total = push + values.forward[env, joint]
+        within = min(max(total, -3.0), 3.0)
+        assert outputs.qf[env, joint] + push == pytest.approx(within, abs=1e-12)
+        assert outputs.saturated[env, joint] == (within != total or push != wanted)
 
 
 def test_the_mass_matrix_is_that_half_way_through_the_steps_that_it_serves():
