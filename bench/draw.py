@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -150,16 +151,14 @@ def tidy(axes: Axes, grid: str) -> None:
 
 
 def machine(about: dict[str, Any]) -> str:
-    """Return the machine and the versions, in a line."""
+    """Return the machine and the versions."""
     packages = ", ".join(
         f"{name} {about[name]}"
         for name in ("sapien", "numpy", "mujoco", "gymnasium")
         if name in about
     )
-    return (
-        f"Measured on {about['cores']} cores of {about['processor']}, Python {about['python']},"
-        f" {packages}."
-    )
+    text = f"Measured on {about['cores']} cores of {about['processor']}, Python {about['python']},"
+    return textwrap.fill(f"{text} {packages}.", 120)
 
 
 def cases_table(cases: dict[str, Any]) -> str:
@@ -172,9 +171,7 @@ def cases_table(cases: dict[str, Any]) -> str:
             return ""
         ratio = figures["ratios"][case]
         alike = figures.get("per_process", {}).get(case, ratio)
-        both = (
-            f"{ratio:.2f}" if abs(alike - ratio) < 0.01 else f"{ratio:.2f}; {alike:.2f} per process"
-        )
+        both = f"{ratio:.2f}" if abs(alike - ratio) < 0.01 else f"{ratio:.2f}; {alike:.2f}"
         return f"{figures['rates'][case] / 1e3:.1f} ({both})"
 
     rows = [
@@ -194,10 +191,9 @@ def phases_table(cases: dict[str, Any]) -> str:
 
 
 def markdown(headers: list[str], rows: list[list[str]]) -> str:
-    """Return a Markdown table."""
-    from tabulate import tabulate
-
-    return str(tabulate(rows, headers, tablefmt="github", disable_numparse=True))
+    """Return a Markdown table, without blanks that align its columns."""
+    lines = [headers, ["---"] * len(headers), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Write the tables of fields in the guides: ``python docs/tables.py``.
+"""Write the lists of fields in the guides: ``python docs/tables.py``.
 
 Names, units, bounds and the values for off come from the tables in the code, meanings from the
 docstrings there.
@@ -11,7 +11,7 @@ import inspect
 import math
 import re
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, fields
 from itertools import pairwise
 from pathlib import Path
@@ -63,7 +63,7 @@ def cells(names: list[str], text: str, fields: Mapping[str, Field]) -> tuple[str
 def first_sentence(text: str) -> str:
     """Return the first sentence of a docstring, in Markdown."""
     plain = re.sub(r":\w+:|\*", "", " ".join(text.split())).replace("``", "`")
-    return re.match(r".*?(?<!e\.g)(?=\. |\.?$)", plain)[0].replace("|", "\\|")  # type: ignore[index]
+    return re.match(r".*?(?<!e\.g)(?=\. |\.?$)", plain)[0]  # type: ignore[index]
 
 
 ADVANCED = (
@@ -88,32 +88,44 @@ def advanced() -> str:
 
 
 def options() -> str:
-    """Return the table of the Runner's options, with their defaults and the places that keep
-    them.
-    """
-    defaults, bounds = (
-        {each.name: each.default for each in fields(RunnerKeywords)},
-        declared(RunnerKeywords, Field),
-    )
-    rows = [("option", "range", "default", "kept in", "flag", "meaning"), ("---",) * 6]
+    """Return the list of the Runner's options, with their defaults and the places that keep them."""
+    defaults = {each.name: each.default for each in fields(RunnerKeywords)}
+    bounds = declared(RunnerKeywords, Field)
+    rows = []
     for name, text in option_texts():
         if name in ADVANCED:
             continue
-        kept, flag = (
-            OPTIONS[name].places,
-            f"`--{'no-' * (defaults[name] is True)}{name}`" if OPTIONS[name].flag else "",
-        )
-        default = "" if defaults[name] in (MISSING, DEFAULT_ENGINE) else f"`{defaults[name]}`"
-        range_ = bound(bounds[name]) if name in bounds else ""
-        rows.append((f"`{name}`", range_, default, ", ".join(kept), flag, first_sentence(text)))
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        details = []
+        if name in bounds:
+            details.append(bound(bounds[name]))
+        if defaults[name] not in (MISSING, DEFAULT_ENGINE):
+            details.append(f"default `{defaults[name]}`")
+        if OPTIONS[name].places:
+            details.append(f"kept in {', '.join(OPTIONS[name].places)}")
+        if OPTIONS[name].flag:
+            details.append(f"`--{'no-' * (defaults[name] is True)}{name}`")
+        rows.append((f"`{name}`", "; ".join(details), first_sentence(text)))
+    return items(rows)
 
 
-def findings(kinds: tuple[FindingKind, ...], when: str, done: str) -> str:
-    """Return the table of kinds of findings, with the headers of two of its columns."""
-    rows = [("code", when, done), ("---",) * 3]
-    rows += [(f"`{kind.code}`", _escaped(kind.when), _escaped(kind.done)) for kind in kinds]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+def findings(kinds: tuple[FindingKind, ...], done: str) -> str:
+    """Return the list of kinds of findings: when they are made, and what is ``done``."""
+    return items(
+        [
+            (f"`{kind.code}`", "", f"{_escaped(kind.when)}. {done}: {_escaped(kind.done)}")
+            for kind in kinds
+        ]
+    )
+
+
+def items(rows: Iterable[tuple[str, str, str]]) -> str:
+    """Return a list in Markdown: a name, details in brackets, and its meaning in each item."""
+    texts = []
+    for name, details, meaning in rows:
+        brackets = f" ({details})" if details else ""
+        text = f"- {name}{brackets}: {meaning}"
+        texts += textwrap.wrap(text, 120, subsequent_indent="  ", break_on_hyphens=False)
+    return "\n".join(texts)
 
 
 def _escaped(text: str) -> str:
@@ -139,11 +151,15 @@ def table(
     without: tuple[str, ...],
     off: bool = True,
 ) -> str:
-    """Return a table in Markdown, with a column for the values that are ``off``."""
-    given = [cells(names, text, fields) for names, text in entries if names[0] not in without]
-    rows = [("option", "unit", "range", "off", "meaning"), ("---",) * 5, *given]
-    rows = rows if off else [row[:3] + row[4:] for row in rows]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    """Return a list in Markdown, with the values that are ``off``."""
+    rows = []
+    for names, text in entries:
+        if names[0] in without:
+            continue
+        name, unit, range_, neutral, meaning = cells(names, text, fields)
+        details = [part for part in (unit, range_, f"off: {neutral}" if off else "") if part]
+        rows.append((name, "; ".join(details), meaning))
+    return items(rows)
 
 
 def tables() -> dict[tuple[str, str], str]:
@@ -157,8 +173,8 @@ def tables() -> dict[tuple[str, str], str]:
         ),
         ("runner.md", "options"): options(),
         ("runner.md", "advanced"): advanced(),
-        ("robots.md", "files"): findings(OF_FILES, "the file has", "what is simulated"),
-        ("robots.md", "preflight"): findings(OF_ROBOTS, "what it says", "remedy"),
+        ("robots.md", "files"): findings(OF_FILES, "Simulated"),
+        ("robots.md", "preflight"): findings(OF_ROBOTS, "Remedy"),
     }
 
 

@@ -74,6 +74,14 @@ def test_every_block_is_of_a_kind_that_is_run():
             ), f"{page.name}: {match[0][:60]}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_a_page_begins_with_a_program_and_fits_a_screen(page):
+    text = page.read_text()
+    assert [line for line in text.splitlines() if len(line) > 120] == []
+    first = BLOCK.search(text)
+    assert first is None or first["language"] in ("python", "sh"), first[0]
+
+
 def test_what_a_program_prints_it_also_states():
     """A figure in a comment behind print() may become wrong, a statement cannot."""
     for page in PAGES:

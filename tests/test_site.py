@@ -104,20 +104,21 @@ def test_the_tables_of_fields_are_those_of_the_code():
 
 
 LONGER = {
-    "README.md": 180,
-    "tutorial.md": 200,
-    "choosing-gains.md": 170,
+    "README.md": 205,
+    "tutorial.md": 205,
+    "choosing-gains.md": 175,
+    "law.md": 165,
     "task-space.md": 160,
-    "moving-setpoints.md": 170,
-    "reliability.md": 230,
-    "robots.md": 206,
-    "sim-to-real.md": 155,
-    "architecture.md": 170,
-    "performance.md": 225,
-    "runner.md": 190,
-    "training.md": 265,
-    "deploy.md": 260,
-    "controllers.md": 235,
+    "moving-setpoints.md": 175,
+    "reliability.md": 200,
+    "robots.md": 225,
+    "sim-to-real.md": 170,
+    "architecture.md": 215,
+    "performance.md": 200,
+    "runner.md": 225,
+    "training.md": 250,
+    "deploy.md": 215,
+    "controllers.md": 305,
 }
 """Pages that may have more than 150 lines."""
 

@@ -21,15 +21,15 @@ from batchpid.sim.gym.robot_env import RobotEnv
 from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
 
 if TYPE_CHECKING:
-    from batchpid.sim.gym.stable_baselines import SB3VecEnv
+    from batchpid.sim.gym.stable_baselines import SB3VecEnv as SB3VecEnv
 
-__all__ = ["ReachEnv", "ReachVectorEnv", "RobotEnv", "RobotVectorEnv", "SB3VecEnv"]
+__all__ = ["ReachEnv", "ReachVectorEnv", "RobotEnv", "RobotVectorEnv"]
 
 
 def __getattr__(name: str) -> Any:
     # Stable-Baselines3 imports PyTorch, which takes seconds.
     if name == "SB3VecEnv":
-        from batchpid.sim.gym.stable_baselines import SB3VecEnv
+        from batchpid.sim.gym.stable_baselines import SB3VecEnv as SB3VecEnv
 
         return SB3VecEnv
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -97,8 +97,7 @@ class MujocoPack(ModelPack):
             self._free = FreeMotions(robot, self.size, self.joint_model)
         if self._constraint is not None and self.steps_natively:
             reads = self.spec.fixed_base and self.steps_read_force(True, True)
-            is_read = reads and self._free is None
-            self._constraint.use(self.joint_model, None if is_read else self._bias_model)
+            self._constraint.use(self.joint_model, None if reads else self._bias_model)
         self._change_world(range(self.size))
         self._change_masses(range(self.size))
         self._update(range(self.size))

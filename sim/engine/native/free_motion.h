@@ -99,6 +99,16 @@ FOR_EACH_PROCESSOR static void evaluate(FreeMotion const &of, std::int64_t block
   for (std::int64_t j = 0; j < dof; ++j) mass[j * (j + 3) / 2] += armature[j];
 }
 
+// Evaluate the blocks with a state that was written from outside.
+inline void evaluate_written(FreeMotion const &of) {
+  for (std::int64_t row = 0; row < of.robots; ++row) {
+    if (of.contact[row] != Contact::UNKNOWN) continue;
+    std::int64_t const block = row / WIDTH;
+    evaluate(of, block, FreeRoom::of(of.model->dof));
+    row = block * WIDTH + WIDTH - 1;
+  }
+}
+
 // Replace the efforts of room.acceleration by accelerations, with the limits beyond which joints are. Return a mask of
 // the robots whose active limits were not found.
 inline __attribute__((always_inline)) Lanes solve_with_limits(FreeMotion const &of, std::int64_t block, FreeRoom &room) {

@@ -345,6 +345,7 @@ inline void update_constraint(Group const &group, double const *qpos, double con
   std::int64_t const dof = group.dof;
   passive.resize(static_cast<std::size_t>(group.robots * dof));
   Model const *force = group.constraint->force;
+  if (force == nullptr && group.mujoco != nullptr && group.mujoco->free != nullptr) evaluate_written(*group.mujoco->free);
   if (force != nullptr) write_force(group, *force, {true, true}, qpos, qvel, passive.data());
   for (std::int64_t row = 0; row < group.robots && force == nullptr; ++row) {
     double *own = passive.data() + row * dof;
@@ -354,7 +355,11 @@ inline void update_constraint(Group const &group, double const *qpos, double con
                dof);
       continue;
     }
-    for (std::int64_t j = 0; j < dof; ++j) own[j] = group.mujoco->bias[row][group.mujoco->qvel_at[j]];
+    FreeMotion const *free = group.mujoco->free;
+    for (std::int64_t j = 0; j < dof; ++j) {
+      own[j] = free != nullptr ? free->bias[row / WIDTH * dof + j].of[row % WIDTH]
+                               : group.mujoco->bias[row][group.mujoco->qvel_at[j]];
+    }
   }
   update_constraint(*group.constraint, group.robots, qpos, passive.data(), nullptr);
 }

@@ -10,6 +10,8 @@ from tiny_urdf import INERTIAL, joint, link, one_joint, robot, write
 import batchpid as bp
 from batchpid.errors import MissingDependencyError
 from batchpid.sim import MujocoSolver, Robot, Runner
+from batchpid.sim.engine.protocol import load_engine
+from batchpid.sim.engine.scene_spec import SceneSpec
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
@@ -79,3 +81,16 @@ def test_without_mujoco_the_error_names_the_package(panda, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco.batch", None)
     with pytest.raises(MissingDependencyError, match="mujoco"):
         Runner(panda, 1, workers=0, engine="mujoco")
+
+
+def test_a_state_that_is_not_finite_is_the_loops_to_report(capfd):
+    """MuJoCo's own warning would name no env."""
+    engine = load_engine("mujoco")
+    legs = Robot.load("quadruped", fixed_base=False)  # a robot that MuJoCo steps, in any state
+    pack = engine.make_pack(SceneSpec.of(legs, 5e-4, engine.physics["accurate"]), 1)
+    states = pack.read_state()
+    pack.write_state_rows(np.full_like(states, np.nan))
+    assert np.isnan(pack.read_qpos()).all()
+    pack.write_state_rows(states)
+    assert np.isfinite(pack.read_qpos()).all()
+    assert capfd.readouterr().err == ""
