@@ -449,7 +449,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
                 self._generators[env] = np.random.default_rng(seeds[env])
             drawn = self.draw(env, self._generators[env])
             if self._latency[1] > 0:
-                late = self._generators[env].uniform(*self._latency)
+                low, high = self._latency
+                late = self._generators[env].uniform(low, high)
                 self._waits[env] = min(np.ceil(late / self._period - 1e-9), self._ticks - 1)
             self._starts[env] = self._returned("draw", drawn, dof)
         self._steps[mask] = 0
