@@ -45,11 +45,11 @@ class Floors(NamedTuple):
 
 
 FLOORS = {
-    "panda": Floors(9.0, 8.3, 6.8),
+    "panda": Floors(8.7, 8.2, 6.8),
     "six joints": Floors(9.3, 8.6, 6.6),
     "six joints with shapes": Floors(10.0, 9.0, 7.0),
     "coupled gripper": Floors(7.0, 6.3, 5.6),
-    "jaco2": Floors(8.5, 8.0, 7.3),
+    "jaco2": Floors(7.8, 7.3, 6.8),
 }
 
 

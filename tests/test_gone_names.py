@@ -79,7 +79,7 @@ GONE = (
     r"first_derivative",
     r"fork_server",
     r"fork server",
-    r"--(friction|payload|resume|window)\b(?!-)",
+    r"--(friction|payload|resume|window)(?![\w-])",
     r"from_ros2_control",
     r"gain_units=.inertia",
     r"\.held_out_error\(",

@@ -114,7 +114,7 @@ LONGER = {
     "reliability.md": 200,
     "robots.md": 225,
     "sim-to-real.md": 170,
-    "architecture.md": 200,
+    "architecture.md": 215,
     "performance.md": 200,
     "runner.md": 225,
     "training.md": 250,

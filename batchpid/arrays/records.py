@@ -26,7 +26,15 @@ from batchpid.arrays.array_types import Array, Document, DType, Rows
 from batchpid.arrays.elementwise import NAMED_TUPLES, namespace
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.trees import mapped, parts
-from batchpid.checks.validate import check_keywords, entries, integer, is_traced, names, read_array
+from batchpid.checks.validate import (
+    AxisKind,
+    check_keywords,
+    entries,
+    integer,
+    is_traced,
+    names,
+    read_array,
+)
 from batchpid.errors import InvalidArgumentError
 
 P = ParamSpec("P")
@@ -169,10 +177,12 @@ class LeafBuilder:
         joint_names: Sequence[str] | None,
         dtype: DType = None,
         values: Iterable[object] = (),
+        kind: AxisKind = "joint",
     ) -> None:
         """Without a ``dtype``, use the dtype of the traced arrays among ``values``, else
-        float64.
+        float64. ``kind`` says what the names are of.
         """
+        self.kind: AxisKind = kind
         self.joints = integer("joints", joints, 1, MOST_JOINTS)
         self.num_envs = 1
         if joint_names is None:
@@ -204,7 +214,7 @@ class LeafBuilder:
         # A number beyond float32 becomes infinite, and is judged by the bounds.
         with np.errstate(over="ignore"):
             array = read_array(name, value, traced=True).astype(self.dtype)
-        return field.checked(name, self.rows(name, array), self.names)
+        return field.checked(name, self.rows(name, array), self.names, kind=self.kind)
 
     def option(self, name: str, value: Array, field: Field) -> Array:
         """Return an option's leaf: None where it is neutral on every joint of every env."""

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.elementwise import clip, namespace, nearest_turn
+from batchpid.arrays.elementwise import namespace, nearest_turn
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams
 from batchpid.law.pid import advance_drive, init
@@ -20,11 +20,7 @@ from batchpid.stages.values import Told, Values
 
 @dataclass(frozen=True)
 class Drive(Stage):
-    """The engine's drives with stiffness kp and damping kd; qf = f, and less where drive and f
-    together would pass the limits of the params::
-
-        d  = kp (r - y) + kd (r' - y')     within the drive's limit, at the beginning of the step
-        qf = sat(d + f) - d
+    """The engine's drives with stiffness kp and damping kd; qf = f.
 
     With ki the drive's target moves by the integral over kp (:func:`batchpid.drive_target`), so
     that the drive acts as a PID whose P and D the engine integrates implicitly. The engine's drives
@@ -35,11 +31,6 @@ class Drive(Stage):
     integral: Coefficients | None
     """Coefficients of the integral that moves the targets."""
     turns: Array
-    drive: tuple[Array, Array]
-    """Damping and stiffness."""
-    low: Array
-    high: Array
-    """Limits of the total effort; None for none."""
     params: PIDParams
 
     name = "law"
@@ -52,8 +43,7 @@ class Drive(Stage):
         params, integral = control.params, None
         if params.ki is not None and np.any(params.ki > 0):
             integral = discretise(control.gains._replace(measurement_rate=None), control.timestep)
-        limits = params.effort_min, params.effort_max
-        return cls(integral, control.turns, control.drive, *limits, params)
+        return cls(integral, control.turns, params)
 
     def init(self, values: Values) -> Told:
         return init(self.params, values.seen.qpos), values
@@ -67,16 +57,4 @@ class Drive(Stage):
             state, target = advance_drive(self.integral, state, target, qpos, **rates)
         if rate is None:
             rate = namespace(target).zeros_like(target)
-        outputs = {"target": target, "target_rate": rate}
-        if self.low is None and self.high is None:
-            return state, values.told(qf=forward, motor=forward, **outputs)
-        damping, stiffness = self.drive
-        xp = namespace(qpos)
-        wanted = push = stiffness * (target - qpos) + damping * (rate - values.seen.qvel)
-        if self.high is not None:  # which the engine's drive has
-            push = clip(wanted, -self.high, self.high, xp)
-        total = push + forward
-        within = clip(total, self.low, self.high, xp)
-        forward = xp.where(within != total, within - push, forward)
-        saturated = (within != total) | (push != wanted)
-        return state, values.told(qf=forward, motor=forward, saturated=saturated, **outputs)
+        return state, values.told(qf=forward, motor=forward, target=target, target_rate=rate)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import repeat
 from operator import is_not
 from typing import Any, NamedTuple
 
@@ -37,7 +38,7 @@ class Command(NamedTuple):
     @property
     def given(self) -> tuple[bool, ...]:
         """Which arrays are given."""
-        return tuple(is_not(rows, None) for rows in self)
+        return tuple(map(is_not, self, repeat(None)))
 
     def resting(self) -> Command:
         """Return the command without the rates of its setpoint."""
@@ -72,7 +73,7 @@ class Outputs(NamedTuple):
     motor: Array = None
     """Effort of the motors [N m or N]."""
     saturated: Array = None
-    """Joints whose effort was limited; None under control "drive" without limits."""
+    """Joints whose effort was limited; None under control "drive"."""
     guarded: Array = None
     """Setpoints that the guard changed; None without guard."""
     returned: Array = None

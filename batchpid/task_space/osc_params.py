@@ -21,7 +21,7 @@ from batchpid.arrays.records import (
     frozen,
     with_fields,
 )
-from batchpid.checks.validate import choice, entries, instance, read_array
+from batchpid.checks.validate import AxisKind, choice, entries, instance, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.tree_dynamics import check_masses
@@ -220,7 +220,10 @@ def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...
 
     Raises InvalidArgumentError for an option that is given, and has no effect.
     """
-    builders = {group: LeafBuilder(len(names), names) for group, names in columns.items()}
+    builders = {}
+    for group, names in columns.items():
+        kind: AxisKind = "joint" if group == "joint" else "entry"
+        builders[group] = LeafBuilder(len(names), names, kind=kind)
     rows: Document = {}
     for name, field in FIELDS.items():
         value: Any = options.get(name, field.default)

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from batchpid.arrays.array_types import Bool, Document, Float32, Float64, Rows
 from batchpid.checks.validate import array, check_keywords, choice, env_mask, flag, integer, number
 from batchpid.errors import CallOrderError, InvalidArgumentError, SingleOwner
+from batchpid.plan import make_plan
 from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import LARGEST
 from batchpid.sim.robot.robot import Robot
@@ -75,6 +76,15 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         Of :class:`gymnasium.vector.AutoresetMode`.
     render_mode
         ``"rgb_array"``: :meth:`render` returns pictures.
+    chunk
+        Rows of a chunk: an action of one env is then (chunk, size), ``rate_hz`` rows a second, which
+        a plan executes (``plan=`` of the runner; default :func:`batchpid.make_plan`). None: no
+        plan.
+    execute
+        Rows of a chunk that a step executes; default all.
+    latency
+        Range of the time after which a chunk takes effect [s], at most the time of a step; drawn
+        for each env and episode, in whole rows: up, and before the step ends.
     options
         Of :class:`batchpid.sim.Runner`: params, workers, timestep, physics, compensate, build,
         randomization, ...
@@ -109,6 +119,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         max_episode_steps: int | None = 250,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        chunk: int | None = None,
+        execute: int | None = None,
+        latency: tuple[float, float] = (0.0, 0.0),
         **options: Any,
     ) -> None:
         if isinstance(robot, Robot):
@@ -138,6 +151,20 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         # Spaces come first: an invalid one is an error before any process starts.
         self.single_observation_space, self.single_action_space = self.spaces()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._action_shape = (self.num_envs, *(self.single_action_space.shape or ()))
+        self._period, self._rows, self._ticks = self.step_seconds, chunk, 1
+        if chunk is not None:
+            self._rows = integer("chunk", chunk, 1, 999)
+            self._ticks = integer("execute", chunk if execute is None else execute, 1, chunk)
+            self.step_seconds = self._ticks * self._period
+            plan = make_plan(self.robot.dof, period=self._period, horizon=self._rows + 1)
+            options = {"plan": plan, **options}
+            box = self.single_action_space
+            low, high = (np.tile(end, (self._rows, 1)) for end in (box.low, box.high))
+            self.single_action_space = spaces.Box(low, high, dtype=box.dtype.type)
+        self._latency = [number("latency", end, 0.0, self.step_seconds, "s") for end in latency]
+        self._waits = np.zeros(self.num_envs, np.int64)
+        self._chunks: list[tuple[Float64, Float64]] = []
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.metadata = {  # type: ignore[misc]
             **type(self).metadata,
@@ -148,7 +175,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._generators = np.random.default_rng().spawn(self.num_envs)
         self._starts = np.tile(self.robot.start, (self.num_envs, 1))
         self._setpoint = np.zeros((self.num_envs, self.runner.command.size))
-        self.action = np.zeros(self.action_space.shape or ())
+        self.action = np.zeros(self._action_shape)
         self._action_names: Sequence[str] = [str(column) for column in range(self.action.shape[1])]
         self._observation = np.zeros(self.observation_space.shape or (), np.float32)
         self._success = np.zeros(self.num_envs, bool)
@@ -295,7 +322,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """
         self._expect_no_step("step_async")
         space: Any = self.single_action_space
-        action = array("actions", actions, self.action.shape, self._action_names, kind="entry")
+        shape = self.action_space.shape or ()
+        action = array("actions", actions, shape, self._action_names, kind="entry")
         action = np.clip(action, space.low, space.high)
         begins = self._done.copy()
         if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
@@ -304,6 +332,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             )
         # In next-step mode an ended env holds its setpoint: step_wait begins its next episode.
         last = self._setpoint
+        if self._rows is not None:
+            self._send_chunk(action, last, begins)
+            return
         setpoint = self._returned("command", self.command(action, last), last.shape)
         setpoint = np.where(begins[:, None], last, setpoint)
         rate = self.rate(setpoint, last)
@@ -312,6 +343,22 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self.runner.send(setpoint, setpoint_rate=rate)
         self.action = action
         self._setpoint = setpoint
+        self._is_stepping = True
+
+    def _send_chunk(self, action: Float64, last: Float64, begins: Bool) -> None:
+        """Begin a step with chunks of actions (envs, rows, size); envs that begin get none."""
+        rows = [last]
+        for row in action.swapaxes(0, 1):
+            rows.append(self._returned("command", self.command(row, rows[-1]), last.shape))
+        chunk = np.stack(rows, 1)
+        for tick in range(self._ticks):
+            enters = (self._waits == tick) & ~begins
+            age = np.where(enters, tick * self._period, np.inf)
+            self._chunks.append((chunk, age))
+        chunk, age = self._chunks.pop(0)
+        self.runner.send(chunk, latency=age)
+        self.action = action[:, self._ticks - 1]
+        self._setpoint = np.where(begins[:, None], last, rows[self._ticks])
         self._is_stepping = True
 
     def step_wait(self) -> tuple[Float32, Float64, Bool, Bool, Document]:
@@ -325,6 +372,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if not self._is_stepping:
             raise CallOrderError("step_wait: no step is under way; call step_async(actions) first")
         observed = self.runner.recv()
+        while self._chunks:
+            chunk, age = self._chunks.pop(0)
+            observed = self.runner.step(chunk, latency=age)
         # From here on the step has ended, even if a hook of the task raises.
         self._is_stepping = False
         self._observe(observed)
@@ -398,6 +448,10 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             if seeds is not None:
                 self._generators[env] = np.random.default_rng(seeds[env])
             drawn = self.draw(env, self._generators[env])
+            if self._latency[1] > 0:
+                low, high = self._latency
+                late = self._generators[env].uniform(low, high)
+                self._waits[env] = min(np.ceil(late / self._period - 1e-9), self._ticks - 1)
             self._starts[env] = self._returned("draw", drawn, dof)
         self._steps[mask] = 0
         self._done = self._done & ~mask

@@ -363,10 +363,11 @@ class Control(OptionGroup):
         ControlMode | Literal["osc"] | Controller,
         option("snapshot", recording="control_name"),
     ] = "pid"
-    """``"pid"``, the default; ``"drive"``: the engine's internal PD drive, with the params' kp and
-    kd as stiffness and damping; ``"effort"``: the setpoint is the joint effort; ``"osc"``:
-    operational-space control of the link ``tool``, whose setpoints are poses (7,), a
-    :class:`batchpid.sim.OperationalSpace` with its defaults; or a :class:`Controller`.
+    """``"pid"``, the default; ``"drive"``: the engine's internal PD drive, with the params' kp and kd
+    as stiffness and damping, a baseline whose compensation is not limited; ``"effort"``: the
+    setpoint is the joint effort; ``"osc"``: operational-space control of the link ``tool``, whose
+    setpoints are poses (7,), a :class:`batchpid.sim.OperationalSpace` with its defaults; or a
+    :class:`Controller`.
     """
     tool: Annotated[str | None, option("snapshot", "recording")] = None
     """Link that control "osc" moves; default the last link of the robot's longest chain."""

@@ -314,7 +314,7 @@ def needed(function, more=(), module=None):
     values |= (
         {"start": POSE[0], "target": POSE[0]} if function is trajectories.straight_line else {}
     )
-    values |= {"center": Y, "amplitude": Y, "frequency": 1.0}
+    values |= {"center": Y, "amplitude": Y, "frequency": 1.0, "period": 0.1, "horizon": 4}
     parameters = inspect.signature(function).parameters.items()
     required = {
         name

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from robots import load_bundled
 
-from batchpid.sim import Robot, RunnerOptions
+from batchpid.sim import Robot, Runner, RunnerOptions
 from batchpid.sim.engine.protocol import load_engine
 
 
@@ -26,6 +26,7 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
         original(options, *args, **{"engine": name, **given})
 
     monkeypatch.setattr(RunnerOptions, "__init__", init)
+    monkeypatch.setitem(Runner.__init__.__kwdefaults__, "engine", name)
     return name
 
 

@@ -364,3 +364,19 @@ def test_stable_baselines3_gets_the_same_steps_and_the_last_observations():
             np.testing.assert_array_equal(infos[1]["terminal_observation"], info["final_obs"][1])
     adapted.close()
     plain.close()
+
+
+def test_chunks_take_effect_after_the_latency_of_each_env():
+    options = {"chunk": 6, "execute": 4, "latency": (0.02, 0.07), "workers": 0}
+    envs = gymnasium.make_vec("batchpid/Reach-v0", num_envs=4, **options)
+    envs.reset(seed=1)
+    task = envs.unwrapped
+    start = task.observed.qpos.copy()
+    assert envs.action_space.shape == (4, 6, *task.action.shape[1:])
+    envs.step(np.full(envs.action_space.shape, 0.5))
+    # Until its first chunk an env has no row ahead.
+    waits = task.observed.starved / task.runner.substeps
+    assert set(waits) <= {1.0, 2.0, 3.0}
+    moved = np.abs(task.observed.qpos - start).max(1)
+    assert moved[waits == waits.max()].max() < moved[waits == waits.min()].min()
+    envs.close()

@@ -83,10 +83,11 @@ def test_without_mujoco_the_error_names_the_package(panda, monkeypatch):
         Runner(panda, 1, workers=0, engine="mujoco")
 
 
-def test_a_state_that_is_not_finite_is_the_loops_to_report(panda, capfd):
+def test_a_state_that_is_not_finite_is_the_loops_to_report(capfd):
     """MuJoCo's own warning would name no env."""
     engine = load_engine("mujoco")
-    pack = engine.make_pack(SceneSpec.of(panda, 5e-4, engine.physics["accurate"]), 1)
+    legs = Robot.load("quadruped", fixed_base=False)  # a robot that MuJoCo steps, in any state
+    pack = engine.make_pack(SceneSpec.of(legs, 5e-4, engine.physics["accurate"]), 1)
     states = pack.read_state()
     pack.write_state_rows(np.full_like(states, np.nan))
     assert np.isnan(pack.read_qpos()).all()
