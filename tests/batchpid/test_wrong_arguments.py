@@ -222,7 +222,10 @@ Y, TREE = np.zeros((1, 2)), planar()
 PARAMS = bp.make_params(2, 4.0, 1.0, 1.0)
 OSC = ts.make_osc_params(TREE, integral_gain=1.0)
 POSE = ts.link_poses(TREE, Y, ["tip"])[:, 0]
-MOTORS, GUARD = bp.make_actuators(2, lag=0.1), bp.make_guard(2, rate=1.0)
+MOTORS, GUARD = (
+    bp.make_actuators(2, lag=0.1, sensor_delay=0.01, backlash=0.1),
+    bp.make_guard(2, rate=1.0),
+)
 RUBBING = friction.Friction(np.ones((1, 2)), np.ones((1, 2)))
 VALUES = {
     "num_envs": 1, "joints": 2, "joint_names": ["a", "b"], "measurement": Y, "setpoint": Y, "effort": Y, "qpos": Y,
@@ -422,3 +425,38 @@ def test_texts(text, key, joint, tmp_path):
     for suffix in (".yaml", ".json")[: 1 if is_motor else 2]:
         (path := tmp_path / f"file{suffix}").write_text(text)
         assert str(path) in str(refused(str(path) if key == "text" else key, load, path, *names))
+
+
+def arrays(value):
+    """Yield the arrays of a value, and of the tuples in it."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from arrays(part)
+
+
+HELD = bp.make_params(
+    2, 4.0, 1.0, 1.0, non_finite="hold", effort_rate_limit=9.0, derivative_filter_time=0.1
+)
+LAW = {bp.init, bp.step, bp.step_terms, bp.reset, bp.track}
+RATES = ("measurement_rate", "setpoint_rate", "feedforward")
+
+
+@pytest.mark.parametrize(
+    ("module", "function"),
+    dict.fromkeys([*(row.values[:2] for row in rows()), (guard.__name__, guard.init)]),
+)
+def test_a_result_shares_no_memory_with_an_argument(module, function):
+    """A caller may write the next values into its arrays."""
+    held = {"params": HELD, "state": bp.init(HELD, Y)} if function in LAW else {}
+    given = needed(function, module=module) | dict.fromkeys(RATES, Y) | held
+    names = given.keys() & inspect.signature(function).parameters.keys()
+    copies = {
+        name: given[name] + 0.0 if isinstance(given[name], np.ndarray) else given[name]
+        for name in names
+    }
+    found = [*arrays(function(**copies))]
+    for argument in copies.values():
+        if isinstance(argument, np.ndarray):
+            assert not any(np.shares_memory(each, argument) for each in found)
