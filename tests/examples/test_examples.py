@@ -90,6 +90,13 @@ def test_the_boxes_of_hello_world_fall_to_the_ground(run):
     assert last == pytest.approx([0, 0, 0, 0], abs=5e-3)
 
 
+def test_the_engines_move_alike(run):
+    pytest.importorskip("sapien")
+    text = run("two_engines.py")
+    assert "times as fast" in text
+    assert float(text.split()[-2]) < 1e-3
+
+
 def test_list_joints_lists_every_joint(run):
     text = run("list_joints.py", "jaco2")
     assert text.count("name: ") == 13
