@@ -76,7 +76,6 @@ GONE = (
     r"--evaluations",
     r"--gains (?:[\w.]+ )*tutorial\b",
     r"find_robots",
-    r"first_derivative",
     r"fork_server",
     r"fork server",
     r"--(friction|payload|resume|window)(?![\w-])",
@@ -159,7 +158,6 @@ GONE = (
     r"--variation",
     r"--viewer",
     r"view[^\n]* --control",
-    r"weight_origin",
     r"--within",
     r"xarray",
 )

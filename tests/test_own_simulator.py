@@ -9,7 +9,9 @@ import pytest
 from pages import ROOT, blocks
 
 PAGE = ROOT / "docs/controllers.md"
-MODEL, PLAIN, MJX = [match["code"] for match in blocks(PAGE, "python")][-3:]
+CODES = [match["code"] for match in blocks(PAGE, "python")]
+FIRST = next(at for at, code in enumerate(CODES) if "ARM = " in code)
+MODEL, PLAIN, MJX = CODES[FIRST : FIRST + 3]
 LONGEST = 30
 """Lines of an example, without blank ones."""
 

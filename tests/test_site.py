@@ -109,6 +109,7 @@ LONGER = {
     "choosing-gains.md": 175,
     "law.md": 165,
     "task-space.md": 160,
+    "stages.md": 185,
     "moving-setpoints.md": 175,
     "reliability.md": 200,
     "robots.md": 225,

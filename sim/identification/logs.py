@@ -67,18 +67,15 @@ class Reading(NamedTuple):
 
     hold: bool = False
     """True if commands hold from row to row, False to interpolate between rows."""
-    degrees: bool = False
-    """True if positions of revolute joints, setpoints included, are in degrees."""
     topic: str = "/joint_states"
     """Topic of the measurements in a ROS bag."""
     command_topic: str | None = None
     """Topic of the commands in a ROS bag; None: the measured efforts are used."""
-    prefix: str = ""
-    """Prefix of the joints' names in a file, which the robot's do not have."""
     columns: tuple[str, ...] = ()
-    """Columns of a CSV file under other names, as "QUANTITY: PATTERN UNIT". In the pattern {joint}
-    stands for the joint's name, and "-" before it turns the sign; the unit is one of :data:`UNITS`
-    or a factor, and can be left out. "QUANTITY:JOINT: COLUMN UNIT" is for one joint.
+    """Columns of a CSV file or bag under other names or in other units, as "QUANTITY: PATTERN
+    UNIT". In the pattern {joint} stands for the joint's name, and "-" before it turns the sign; the
+    unit is one of :data:`UNITS` or a factor, and can be left out. "QUANTITY:JOINT: COLUMN UNIT" is
+    for one joint.
     """
 
 
@@ -134,21 +131,22 @@ def _read(
         return checked(robot, _build(robot, str(path), columns, commands, kind, reading), cuts)
     file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
     columns, numbers = read_csv(path, (*QUANTITIES, "time"))
-    columns = _renamed(robot, str(path), columns, reading.columns)
+    sources = _sources(robot, str(path), columns, reading.columns)
+    columns = {name: scale * columns[column] for name, (column, scale) in sources.items()}
     log = _build(robot, str(path), columns, columns, kind, reading)
     return checked(robot, replace(log, lines=np.array(numbers)))
 
 
-def _renamed(
+def _sources(
     robot: Robot,
     source: str,
-    columns: dict[str, Float64],
+    columns: Iterable[str],
     patterns: Iterable[str],
-) -> dict[str, Float64]:
-    """Return the columns with those that match ``patterns`` under the names and in the units of a
-    log.
+) -> dict[str, tuple[str, float]]:
+    """Return the column of a file and its unit for each name of a log: those that ``patterns``
+    name, and the others as they are.
     """
-    renamed = dict(columns)
+    matched = dict[str, tuple[str, float]]()
     for text in patterns:
         name, _, right = text.partition(": ")
         pattern, *unit = right.split() or [""]
@@ -164,13 +162,14 @@ def _renamed(
         if "{joint}" in pattern:
             joints = robot.joint_names
             names = {pattern.replace("{joint}", joint): f"{name}:{joint}" for joint in joints}
-        present = names.keys() & columns.keys()
+        present = [column for column in columns if column in names]
         if not present:
             problem = f"has no column of the pattern {text!r}"
             raise error(source, problem, f"its columns are {', '.join(columns)}")
         for column in present:
-            renamed[names[column]] = scale * columns[column]
-    return renamed
+            matched[names[column]] = column, scale
+    used = {column for column, _ in matched.values()}
+    return {column: (column, 1.0) for column in columns if column not in used} | matched
 
 
 def _proposed(robot: Robot, columns: Iterable[str]) -> str:
@@ -273,7 +272,7 @@ def _build(
             remedy = f"name its columns (--columns {proposed})"
         raise error(source, problem, remedy)
     time = SECONDS[unit] * columns[unit]
-    by = columns_by_joint(robot, source, columns | commands, QUANTITIES, reading.prefix)
+    by = columns_by_joint(robot, source, columns | commands, QUANTITIES)
     if by["feedforward"]:
         remedy = "log the complete efforts, without the columns of the feedforward"
         raise error(source, "has a feedforward, which a fit does not simulate", remedy)
@@ -286,7 +285,6 @@ def _build(
         if robot.independent[joint] and name in by["qpos"] | by[kind]:
             joints.append(joint)
     names = [robot.joint_names[joint] for joint in joints]
-    revolute = np.array([robot.units[joint] == "rad" for joint in joints])
     tables = dict[str, Float64]()
     for quantity in ("qpos", kind):
         for name in names or ["JOINT"]:
@@ -296,8 +294,6 @@ def _build(
                     remedy = f"name its columns (--columns {proposed})"
                 raise error(f"{source}: column {quantity}:{name}", "is missing", remedy)
         tables[quantity] = np.stack([by[quantity][name] for name in names], axis=1)
-        if reading.degrees and quantity != "effort":
-            tables[quantity] *= np.where(revolute, np.radians(1.0), 1.0)
     measured = measured and kind == "effort"
     table = tables[kind]
     hold = reading.hold
@@ -315,14 +311,16 @@ def _read_bag(
     Messages are merged by the names of joints: each joint has the samples of all messages that name
     it. Rows are at the stamps of the joint with most positions.
     """
-    samples = _samples(path, reading)
+    found = _samples(path, reading)
+    samples = dict[str, dict[int, float]]()
     # Other devices publish joints of their own.
     others = set[str]()
-    for column in list(samples):
-        joint = column.partition(":")[2].removeprefix(reading.prefix)
-        if joint not in robot.joint_names:
+    for name, (column, scale) in _sources(robot, str(path), found, reading.columns).items():
+        joint = name.partition(":")[2]
+        if joint in robot.joint_names:
+            samples[name] = {stamp: scale * value for stamp, value in found[column].items()}
+        else:
             others.add(joint)
-            del samples[column]
     quantities = ("setpoint:", "effort:") if reading.command_topic else ("measured_effort:",)
     moved = {column: stamps for column, stamps in samples.items() if column.startswith("qpos:")}
     driven = {column: stamps for column, stamps in samples.items() if column.startswith(quantities)}

@@ -4,6 +4,7 @@ import importlib.util
 import os
 import re
 import runpy
+import shlex
 import sys
 from functools import partial
 from pathlib import Path
@@ -89,6 +90,13 @@ def test_the_boxes_of_hello_world_fall_to_the_ground(run):
     assert last == pytest.approx([0, 0, 0, 0], abs=5e-3)
 
 
+def test_the_engines_move_alike(run):
+    pytest.importorskip("sapien")
+    text = run("two_engines.py")
+    assert "times as fast" in text
+    assert float(text.split()[-2]) < 1e-3
+
+
 def test_list_joints_lists_every_joint(run):
     text = run("list_joints.py", "jaco2")
     assert text.count("name: ") == 13
@@ -130,7 +138,7 @@ def test_the_motor_of_each_kind_of_controller_is_identified(run, tmp_path, kind)
         for each in run("real_logs.py", "--out", str(tmp_path)).splitlines()
         if f"{kind}." in each
     ]
-    words = [*line.split()[1:], "--out", str(tmp_path / "motors.yaml")]
+    words = [*shlex.split(line)[1:], "--out", str(tmp_path / "motors.yaml")]
     assert not main(words)
     module = runpy.run_path(str(EXAMPLES / "real_logs.py"))
     found = bp.load_actuators(tmp_path / "motors.yaml", ("hinge",))[0]
