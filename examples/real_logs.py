@@ -77,7 +77,9 @@ def servo(robot: Robot, out: Path, seconds: float) -> list[str]:
     time, qpos, _ = move(robot, "servo", wave(seconds), params)
     degrees = {"setpoint:hinge": np.degrees(wave(seconds)), "qpos:hinge": np.degrees(qpos)}
     _write(out / "servo.csv", time_ms=1000 * time, **degrees)
-    return ["--gains", str(out / "servo.yaml"), "--compensate", "none", "--degrees"]
+    units = [f"'{quantity}: {quantity}:{{joint}} deg'" for quantity in ("qpos", "setpoint")]
+    gains = ["--gains", str(out / "servo.yaml")]
+    return [*gains, "--compensate", "none", "--columns", *units]
 
 
 def velocity(robot: Robot, out: Path, seconds: float) -> list[str]:

@@ -39,7 +39,7 @@ RECORDED = {
 } | QUANTITIES
 """Quantity of each array of a :class:`Rollout`, ``time`` aside."""
 OPTIONAL = ("feedforward", "changes")
-"""Arrays of a :class:`Rollout` that are None where there are none."""
+"""Arrays of a :class:`Rollout` that may be None."""
 
 
 RESET, RESTORE, PARAMS, ACTUATORS = 1, 2, 4, 8

@@ -212,10 +212,13 @@ BATCHPID_INLINE void apply(Program const &program, Code code, Index first, Index
       for (Index i = 0; i < n; ++i) out[i] = x.data[static_cast<Index>(y.data[y.step ? i : i % program.chunk])];
       break;
     case TAKE_ROW:
-      for (Index i = 0; i < n; ++i) {  // a place beyond the table, or NaN, is one in it
-        T const row = y.data[y.step ? i : i % program.chunk], last = static_cast<T>(x.step / columns - 1);
-        auto const place = static_cast<Index>(row > 0 ? std::min(row, last) : T(0));
-        out[i] = x.data[(first + i) / columns * x.step + place * columns + (first + i) % columns];
+      for (Index row = 0; row < n; row += columns) {  // a place beyond the table, or NaN, is one in it
+        T const *table = x.data + (first + row) / columns * x.step, last = static_cast<T>(x.step / columns - 1);
+        T const *b = y.data + (y.step ? row : row % program.chunk);
+        for (Index i = 0; i < columns; ++i) {
+          auto const place = static_cast<Index>(b[i] > 0 ? std::min(b[i], last) : T(0));
+          out[row + i] = table[place * columns + i];
+        }
       }
       break;
     case GATHER:

@@ -269,16 +269,18 @@ def curve(
     zero = xp.zeros_like(start)
     if isinstance(plan.interpolation, Held):
         return start, zero, zero
-    u = xp.minimum(xp.maximum((t - begin) / length, 0.0), 1.0)
+    frequency = 1.0 / length
+    u = xp.minimum(xp.maximum((t - begin) * frequency, 0.0), 1.0)
     rise = take_rows(state.knots, row + 1.0) - start
     if isinstance(plan.interpolation, Linear):
-        return start + u * rise, rise / length, zero
+        return start + u * rise, rise * frequency, zero
     v, w = take_rows(state.rates, row), take_rows(state.rates, row + 1.0)
     c = 3.0 * rise - length * (2.0 * v + w)
     d = length * (v + w) - 2.0 * rise
-    position = start + u * (length * v + u * (c + u * d))
-    rate = v + u * (2.0 * c + 3.0 * (u * d)) / length
-    return position, rate, (2.0 * c + 6.0 * (u * d)) / (length * length)
+    bend, twist = 2.0 * c, u * d
+    position = start + u * (length * v + u * (c + twist))
+    rate = v + u * (bend + 3.0 * twist) * frequency
+    return position, rate, (bend + 6.0 * twist) * (frequency * frequency)
 
 
 def _row(plan: Plan, row: Array, xp: ArrayModule) -> Array:

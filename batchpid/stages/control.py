@@ -1,4 +1,4 @@
-"""Control of some robots, from which their stages are made."""
+"""Control of a number of robots, from which their stages are made."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ class Control(NamedTuple):
     modelled: Array = None
     """Friction that the law compensates (dof,) [N m or N]; None for none."""
     band: Array = None
-    """Half width of the band of small errors in which that is reduced [rad or m]."""
+    """Half width of the band of small errors in which this compensation is reduced [rad or m]."""
     turns: Array = None
     """1 / (2 pi) on continuous joints, 0 elsewhere; None without such joints."""
     armature: Array = None
     """Armature of the motors that a law with the mass matrix knows (dof,) [kg m^2 or kg]."""
     damping: Array = None
-    """Viscous damping that it knows (dof,) [N m s/rad or N s/m]."""
+    """Viscous damping that such a law knows (dof,) [N m s/rad or N s/m]."""
     further: tuple[Any, ...] = ()
     """Stages of the caller's, each with ``after``, the name of the stage before it."""
 

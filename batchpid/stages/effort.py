@@ -1,4 +1,4 @@
-"""Efforts of the caller: of an own controller, or commanded."""
+"""Efforts of the caller's own controller, and commanded efforts."""
 
 from __future__ import annotations
 

@@ -31,8 +31,8 @@ class InertiaState(NamedTuple):
 
 @dataclass(frozen=True)
 class Inertia(Stage):
-    """Inertias that the joints show to friction, for the envs where they are ``REFRESH_STEPS``
-    old.
+    """Inertias of the joints for the friction model, updated every ``REFRESH_STEPS`` sim steps of an
+    env.
     """
 
     friction: model.Friction
@@ -41,7 +41,7 @@ class Inertia(Stage):
     drive: tuple[Array, Array]
     """Damping and stiffness of the engine's drives."""
     armature: Array
-    """Of the actuators, which the model's matrix has (1 | M, dof); None for none."""
+    """Armature of the actuators, which the model's matrix includes (1 | M, dof); None for none."""
 
     name = "inertia"
     starting = ("armature",)

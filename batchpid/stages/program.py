@@ -19,8 +19,8 @@ from batchpid.stages.values import Values
 class StageProgram:
     """Stages, their states, and the values before them, whose arrays it reads.
 
-    It changes the arrays of ``states`` in place, and makes others for what it changes of
-    ``values``: of their outputs, or with ``passes`` of all of them, for stages after it.
+    It changes the arrays of ``states`` in place. It makes new arrays for the ``values`` that it
+    changes: for the outputs alone, or with ``passes`` for all, which stages after it read.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class StageProgram:
 
 
 class _Traced(NamedTuple):
-    """Program of some stages."""
+    """Program of consecutive stages."""
 
     program: Trace
     changed: Pytree

@@ -1,8 +1,8 @@
 """A stage of the control of robots, and the functions of a list of stages.
 
-A stage is a frozen dataclass of its constants. What it keeps from one sim step to the next is its
-state, and what it tells the stages after it is in :class:`batchpid.stages.values.Values`. So a list
-of stages is one tree of arrays, and their states are another: a snapshot is the states by name, a
+A stage is a frozen dataclass of its constants. Its memory from one sim step to the next is its
+state; its results go to the stages after it in :class:`batchpid.stages.values.Values`. So a list of
+stages is a tree of arrays, and their states are another: a snapshot holds the states by name, a
 restart of some envs is :func:`started` under a mask, and a native program is a trace of
 :func:`stepped`.
 """
@@ -30,17 +30,17 @@ class Stage:
     """
 
     name: ClassVar[str]
-    """Names its state in snapshots."""
+    """Name of its state in snapshots."""
     after: ClassVar[str]
-    """Name of the stage behind which one of the caller's stands."""
+    """Name of the stage before it, for a stage of the caller's."""
     native: ClassVar[str] = ""
-    """Kind of stage in tick.h that does the step in native code; "": a trace of ``step`` does."""
+    """Kind of stage in tick.h that replaces ``step`` in native code; "": a trace of ``step`` runs."""
     calls_model: ClassVar[bool] = False
     """Whether ``step`` calls functions of the robots' model, which no program has."""
     is_brief: ClassVar[bool] = False
-    """Whether each tick makes its state anew, so that snapshots have none of it."""
+    """Whether each tick makes its state anew, so that snapshots do not hold it."""
     starting: ClassVar[tuple[str, ...]] = ()
-    """Constants that ``init`` needs, and ``step`` does not."""
+    """Constants that only ``init`` needs."""
 
     @classmethod
     def of(cls, control: Control) -> Any:
@@ -55,7 +55,7 @@ class Stage:
         return 1
 
     def init(self, values: Values) -> Told:
-        """Return the state of envs that start, and what the stages after it see."""
+        """Return the state of envs at their start, and the values for the stages after it."""
         return (), values
 
     def step(self, state: Any, values: Values) -> Told:
@@ -63,7 +63,7 @@ class Stage:
         raise NotImplementedError
 
     def adopt(self, before: Any, state: Any, values: Values) -> Pytree:
-        """Return ``state``, of the stage ``before``, for this stage in its place."""
+        """Return the state of the stage ``before`` as a state of this stage, which replaces it."""
         return state
 
     def bind(self, program: Any, state: Any, values: Values) -> Values:
@@ -72,7 +72,7 @@ class Stage:
 
 
 def running(stages: Iterable[Any]) -> tuple[Any, ...]:
-    """Return stages with the constants of ``step`` alone, for programs."""
+    """Return stages without the constants that only ``init`` needs, for programs."""
     return tuple([replace(stage, **dict.fromkeys(stage.starting)) for stage in stages])
 
 
@@ -87,7 +87,7 @@ def stepped(stages: Sequence[Any], states: States, values: Values) -> tuple[Stat
 
 
 def started(stages: Iterable[Any], values: Values) -> States:
-    """Return the states of envs that start: each stage from what those before it show."""
+    """Return the states of envs at their start: each stage gets the values of those before it."""
     states = list[Pytree]()
     for stage in stages:
         state, values = stage.init(values)

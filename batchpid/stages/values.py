@@ -1,4 +1,4 @@
-"""What the stages of a sim step read, and what they tell the stages after them."""
+"""Inputs and results of the stages of a sim step."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from batchpid.arrays.elementwise import namespace
 class Command(NamedTuple):
     """Command of one tick, (envs, ...), or of several, (ticks, envs, ...).
 
-    An array that the caller does not give is None in the calling process, and 0 in a loop, which
-    passes rates on only where some are given.
+    A missing array is None in the calling process, and 0 in a loop. A loop passes rates on only where
+    some are given.
     """
 
     setpoint: Array
@@ -120,7 +120,7 @@ class Model(NamedTuple):
 
 
 class Values(NamedTuple):
-    """What the stages of a sim step read and replace; arrays (M, dof)."""
+    """Values that the stages of a sim step read and replace; arrays (M, dof)."""
 
     command: Command
     """Without rates where joint setpoints do not move within a tick."""
@@ -147,7 +147,7 @@ class Values(NamedTuple):
     limits: tuple[Array, Array] = (None, None)
     """Least and largest effort that the motors deliver; None for no limit."""
     limited: Array = None
-    """Joints whose effort the caller's own controller has limited; None if it does not tell."""
+    """Joints whose effort the caller's own controller has limited; None if it does not report it."""
     outputs: Outputs = Outputs()
 
     def within(self, low: Array, high: Array) -> Values:

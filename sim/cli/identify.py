@@ -60,9 +60,6 @@ def identify_logs(
             " always held."
         ),
     ] = False,
-    degrees: Annotated[
-        bool, flag("Positions and setpoints of revolute joints are in degrees.")
-    ] = False,
     topic: Annotated[
         str,
         flag(
@@ -77,13 +74,12 @@ def identify_logs(
             " Default: measured efforts."
         ),
     ] = None,
-    prefix: Annotated[str, flag("Prefix of the joints' names in the logs.")] = "",
     columns: Annotated[
         tuple[str, ...],
         flag(
-            'Columns of a CSV file under other names, as "QUANTITY: PATTERN UNIT": "time: stamp_ms'
-            ' ms", "qpos: {joint}_pos_deg deg", "effort: -{joint}_tau mNm". Units are deg, mrad, mm,'
-            " mNm, ms, us, ns or a factor; a minus turns the sign.",
+            'Columns under other names or in other units, as "QUANTITY: PATTERN UNIT": "time:'
+            ' stamp_ms ms", "qpos: {joint}_pos_deg deg", "effort: -{joint}_tau mNm". Units are deg,'
+            " mrad, mm, mNm, ms, us, ns or a factor; a minus turns the sign.",
             "PATTERN",
         ),
     ] = (),
@@ -131,7 +127,7 @@ def identify_logs(
         None if gains is None else _gains(robot, gains),
         payload=not no_payload,
         payload_link=payload_link,
-        reading=Reading(hold, degrees, topic, command_topic, prefix, columns),
+        reading=Reading(hold, topic, command_topic, columns),
         compensate=compensate,
         timestep=timestep,
         extras=extras,

@@ -1,4 +1,4 @@
-r"""Intervals of a fit: what the logs show, and what they do not.
+r"""Confidence intervals of a fit, and the unknowns that the logs do not determine.
 
 With the residuals r and their derivatives J in units of the prior's deviations, the information of
 the data is ``J^T J / s^2`` with the mean square s^2 of the residuals. J comes from differences along

@@ -230,7 +230,7 @@ def _unwrapped(robot: Robot, log: Log) -> Log:
         problem = (
             f"{log.place(row)}, column 'qpos:{names[column]}' is far beyond the joint's limits"
         )
-        remedy = "positions are in rad or m; degrees need the option degrees (--degrees)"
+        remedy = 'positions are in rad or m; degrees need --columns "qpos: qpos:{joint} deg"'
         remedy += "; a joint that turns freely is of type continuous"
         between = f"{low[column]:g} to {high[column]:g}"
         raise log.error(f"{problem}, {between}", remedy, log.qpos[row, column])

@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,7 +37,6 @@ from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
 QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
 HDF5 = (".h5", ".hdf5")
-SECONDS = {"time": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9}
 UNITS = {
     "deg": np.pi / 180,
     "mrad": 1e-3,
@@ -67,18 +66,15 @@ class Reading(NamedTuple):
 
     hold: bool = False
     """True if commands hold from row to row, False to interpolate between rows."""
-    degrees: bool = False
-    """True if positions of revolute joints, setpoints included, are in degrees."""
     topic: str = "/joint_states"
     """Topic of the measurements in a ROS bag."""
     command_topic: str | None = None
     """Topic of the commands in a ROS bag; None: the measured efforts are used."""
-    prefix: str = ""
-    """Prefix of the joints' names in a file, which the robot's do not have."""
     columns: tuple[str, ...] = ()
-    """Columns of a CSV file under other names, as "QUANTITY: PATTERN UNIT". In the pattern {joint}
-    stands for the joint's name, and "-" before it turns the sign; the unit is one of :data:`UNITS`
-    or a factor, and can be left out. "QUANTITY:JOINT: COLUMN UNIT" is for one joint.
+    """Columns of a CSV file or bag under other names or in other units, as "QUANTITY: PATTERN
+    UNIT". In the pattern {joint} stands for the joint's name, and "-" before it turns the sign; the
+    unit is one of :data:`UNITS` or a factor, and can be left out. "QUANTITY:JOINT: COLUMN UNIT" is
+    for one joint.
     """
 
 
@@ -134,29 +130,33 @@ def _read(
         return checked(robot, _build(robot, str(path), columns, commands, kind, reading), cuts)
     file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
     columns, numbers = read_csv(path, (*QUANTITIES, "time"))
-    columns = _renamed(robot, str(path), columns, reading.columns)
+    sources = _sources(robot, str(path), columns, reading.columns)
+    columns = {name: scale * columns[column] for name, (column, scale) in sources.items()}
     log = _build(robot, str(path), columns, columns, kind, reading)
     return checked(robot, replace(log, lines=np.array(numbers)))
 
 
-def _renamed(
+def _sources(
     robot: Robot,
     source: str,
-    columns: dict[str, Float64],
+    columns: Collection[str],
     patterns: Iterable[str],
-) -> dict[str, Float64]:
-    """Return the columns with those that match ``patterns`` under the names and in the units of a
-    log.
+) -> dict[str, tuple[str, float]]:
+    """Return the column of a file and its unit for each name of a log: those that ``patterns``
+    name, and the others as they are.
     """
-    renamed = dict(columns)
+    matched = dict[str, tuple[str, float]]()
+    for unit in ("ms", "us", "ns"):
+        if f"time_{unit}" in columns and "time" not in columns:
+            matched["time"] = f"time_{unit}", UNITS[unit]
     for text in patterns:
         name, _, right = text.partition(": ")
-        pattern, *unit = right.split() or [""]
+        pattern, *units = right.split() or [""]
         try:
-            scale = UNITS.get(unit[0]) or float(unit[0]) if unit else 1.0
+            scale = UNITS.get(units[0]) or float(units[0]) if units else 1.0
         except ValueError:
             remedy = f"use one of {', '.join(UNITS)}, or a factor"
-            raise error(f"columns {text!r}", "has an unknown unit", remedy, unit[0]) from None
+            raise error(f"columns {text!r}", "has an unknown unit", remedy, units[0]) from None
         if pattern.startswith("-"):
             scale = -scale
             pattern = pattern[1:]
@@ -164,13 +164,14 @@ def _renamed(
         if "{joint}" in pattern:
             joints = robot.joint_names
             names = {pattern.replace("{joint}", joint): f"{name}:{joint}" for joint in joints}
-        present = names.keys() & columns.keys()
+        present = [column for column in columns if column in names]
         if not present:
             problem = f"has no column of the pattern {text!r}"
             raise error(source, problem, f"its columns are {', '.join(columns)}")
         for column in present:
-            renamed[names[column]] = scale * columns[column]
-    return renamed
+            matched[names[column]] = column, scale
+    used = {column for column, _ in matched.values()}
+    return {column: (column, 1.0) for column in columns if column not in used} | matched
 
 
 def _proposed(robot: Robot, columns: Iterable[str]) -> str:
@@ -265,15 +266,13 @@ def _build(
     """Return the log that the columns of a file hold; ``commands`` are columns with their own
     times.
     """
-    unit = next((name for name in SECONDS if name in columns), None)
-    if unit is None:
+    if "time" not in columns:
         problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
         remedy = "begin the header with time, in seconds, or time_ms, time_us, time_ns"
         if proposed := _proposed(robot, columns):
             remedy = f"name its columns (--columns {proposed})"
         raise error(source, problem, remedy)
-    time = SECONDS[unit] * columns[unit]
-    by = columns_by_joint(robot, source, columns | commands, QUANTITIES, reading.prefix)
+    by = columns_by_joint(robot, source, columns | commands, QUANTITIES)
     if by["feedforward"]:
         remedy = "log the complete efforts, without the columns of the feedforward"
         raise error(source, "has a feedforward, which a fit does not simulate", remedy)
@@ -286,7 +285,6 @@ def _build(
         if robot.independent[joint] and name in by["qpos"] | by[kind]:
             joints.append(joint)
     names = [robot.joint_names[joint] for joint in joints]
-    revolute = np.array([robot.units[joint] == "rad" for joint in joints])
     tables = dict[str, Float64]()
     for quantity in ("qpos", kind):
         for name in names or ["JOINT"]:
@@ -296,14 +294,17 @@ def _build(
                     remedy = f"name its columns (--columns {proposed})"
                 raise error(f"{source}: column {quantity}:{name}", "is missing", remedy)
         tables[quantity] = np.stack([by[quantity][name] for name in names], axis=1)
-        if reading.degrees and quantity != "effort":
-            tables[quantity] *= np.where(revolute, np.radians(1.0), 1.0)
-    measured = measured and kind == "effort"
-    table = tables[kind]
-    hold = reading.hold
-    command_time = SECONDS[unit] * commands[unit]
-    log = Log(source, tuple(joints), kind, time, tables["qpos"], command_time, table, hold)
-    return replace(log, measured=measured)
+    return Log(
+        source,
+        tuple(joints),
+        kind,
+        columns["time"],
+        tables["qpos"],
+        commands["time"],
+        tables[kind],
+        held=reading.hold,
+        measured=measured and kind == "effort",
+    )
 
 
 def _read_bag(
@@ -315,14 +316,16 @@ def _read_bag(
     Messages are merged by the names of joints: each joint has the samples of all messages that name
     it. Rows are at the stamps of the joint with most positions.
     """
-    samples = _samples(path, reading)
+    found = _samples(path, reading)
+    samples = dict[str, dict[int, float]]()
     # Other devices publish joints of their own.
     others = set[str]()
-    for column in list(samples):
-        joint = column.partition(":")[2].removeprefix(reading.prefix)
-        if joint not in robot.joint_names:
+    for name, (column, scale) in _sources(robot, str(path), found, reading.columns).items():
+        joint = name.partition(":")[2]
+        if joint in robot.joint_names:
+            samples[name] = {stamp: scale * value for stamp, value in found[column].items()}
+        else:
             others.add(joint)
-            del samples[column]
     quantities = ("setpoint:", "effort:") if reading.command_topic else ("measured_effort:",)
     moved = {column: stamps for column, stamps in samples.items() if column.startswith("qpos:")}
     driven = {column: stamps for column, stamps in samples.items() if column.startswith(quantities)}

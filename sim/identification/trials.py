@@ -1,13 +1,13 @@
-"""Fit from several starts, without the delays that it does not need, and with the effects that it
-does.
+"""Fit from several starts, and choice of the unknowns that the logs need.
 
-A start ends in a valley where the payload is sought at the wrong link, or the law's limit far from
-the error that saturates it: a short fit from each start shows the better one. What is fitted in
-addition to the motors has to lower the error at held-out rows, with free initial states of windows:
-a delay or a lag of setpoints is left out unless its absence raises that error, and friction at
-rest, masses, offsets and load friction are added, the most helpful first, where residuals are
-correlated and the error falls. One evaluation with all of them, and the linear step of each, tell
-which to try.
+A fit may end in a local minimum, for example with a payload at the wrong link, or with the law's
+limit far from the error that saturates it. A short fit from each start shows the better one.
+
+Unknowns besides those of the motors have to lower the error at held-out rows, with free initial
+states of windows. A delay or a lag of setpoints is left out unless its absence raises that error.
+Where residuals are correlated, friction at rest, masses, offsets and load friction are added, the
+most helpful first, as long as the error falls. One evaluation with all of them, and the linear step
+of each, give the order of the trials.
 """
 
 from __future__ import annotations

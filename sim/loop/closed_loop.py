@@ -67,7 +67,7 @@ class LoopObservation(NamedTuple):
 class ClosedLoop:
     """A plant under the control of a Runner: :func:`closed_loop`.
 
-    ``start`` (dof,) is where robots start, ``tree`` what the law knows of them.
+    ``start`` (dof,) is the start pose of robots, ``tree`` their model that the law knows.
     """
 
     plant: Plant
@@ -83,7 +83,7 @@ class ClosedLoop:
     ) -> Self:
         """Return this loop with other params, actuators or plant, whose arrays may be traced.
 
-        Friction and armature of other actuators, which are the plant's, stay.
+        Friction and armature belong to the plant: those of other actuators have no effect.
         """
         control = self.control
         if params is not None:
@@ -127,7 +127,7 @@ class ClosedLoop:
         feedforward: Array = None,
         substeps: int = 1,
     ) -> tuple[LoopState, LoopObservation]:
-        """Advance by a tick of ``substeps`` sim steps; return the state and what is observed.
+        """Advance by a tick of ``substeps`` sim steps; return the state and the observation.
 
         The command is that of :meth:`batchpid.sim.Runner.step`, (dof,) or (envs, dof).
         """

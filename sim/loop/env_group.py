@@ -75,7 +75,7 @@ class EnvGroup:
         self._last = Table(arrays, *last, self._faults.rows)
         reads_base = "base_state" in options.load_engine().capabilities and pack.spec.mjcf is None
         is_read = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
-        has_parts = bool(self._sensors.values or self._pushes.counts or options.plan)
+        has_parts = bool(self._sensors.values or self._pushes.counts)
         self._observes_natively = is_read and not has_parts
         setup = self._setup()
         self._prepare(setup, started(setup.stages, self._values(setup)))

@@ -20,7 +20,7 @@ from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.loop.group_control import GroupControl
 from batchpid.sim.loop.numpy_executor import COUPLING_STEPS
 from batchpid.stages.program import StageProgram
-from batchpid.stages.stage import States, recalled
+from batchpid.stages.stage import States, by_name, recalled
 from batchpid.stages.values import Command, Measured, Outputs, Step, Values
 
 
@@ -177,6 +177,9 @@ class TickProgram:
             twist = np.zeros((len(none), 6))
             self.place(base_pose=pose, base_twist=twist)
             copies += (seen.base_pose, pose), (seen.base_twist, twist)
+        if seen.starved is not None:
+            states = by_name(self._setup.stages, self._buffers.states)
+            copies.append((seen.starved, states["plan"].starved))
         transfers = [self._transfer(rows, row) for rows, row in copies]
         for rows, row in zip(command, self._buffers.command, strict=True):
             if row is not None:
@@ -188,7 +191,7 @@ class TickProgram:
         # Of arrays of numbers only commands have tables in double precision.
         kind, size = "write_bytes", row.nbytes
         if row.dtype == np.float64:
-            kind, size = "write_floats", row.size
+            kind, size = "write_floats", table[0].size
             if table.dtype == np.float64:
                 kind = "read"
         return interface.Transfer(
@@ -196,6 +199,8 @@ class TickProgram:
             row=self._address(row, row.dtype),
             stride=0 if len(table) == 1 else table.strides[0],
             size=size,
+            # A number of each env has the same value for all joints of the row.
+            step=row.size // table[0].size,
             kind=interface.TRANSFERS.index(kind),
         )
 

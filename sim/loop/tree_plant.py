@@ -89,7 +89,7 @@ class TreePlant:
         qvel: Array,
         xp: Any,
     ) -> Array:
-        """Return the accelerations (envs, dof) with the limits beyond which joints are."""
+        """Return the accelerations (envs, dof) with the active joint limits."""
         below, above = qpos - self.low, self.high - qpos
         sign = (below < 0).astype(qpos.dtype) - (above < 0).astype(qpos.dtype)
         eye = xp.eye(matrix.shape[-1], dtype=matrix.dtype)

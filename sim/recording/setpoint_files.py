@@ -155,7 +155,6 @@ def columns_by_joint(
     source: str,
     columns: dict[str, Float64],
     quantities: Sequence[str],
-    prefix: str = "",
 ) -> dict[str, dict[str, Float64]]:
     """Return the columns of ``quantities`` by quantity and by the robot's name of their joint;
     others are left out.
@@ -166,7 +165,6 @@ def columns_by_joint(
     for name, values in columns.items():
         quantity, colon, joint = name.partition(":")
         if colon and quantity in tables:
-            joint = joint.removeprefix(prefix)
             choice(f"{source}: column {name!r}: joint", joint, robot.joint_names)
             tables[quantity][joint] = values
     return tables

@@ -739,7 +739,9 @@ class Runner(SingleOwner):
         """Return the operation for the arguments of :meth:`step`, checked; a chunk enters the plan."""
         inputs = dict(zip(Command._fields, arrays, strict=True))
         chunk = None
-        if self.options.plan is not None:
+        if self.options.plan is not None and not any(entry is not None for entry in arrays[:3]):
+            inputs["setpoint"] = self._goal
+        elif self.options.plan is not None:
             if inputs["setpoint"] is None:
                 inputs["setpoint"], latency = self._goal, np.inf
             chunks, ages = read_chunks(self.options, inputs, latency)

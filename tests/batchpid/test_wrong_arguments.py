@@ -94,132 +94,122 @@ def test_choices_of_the_law(name):
         refused(name, bp.make_params, 2, 1.0, **{name: value})
 
 
-ROW, AXIS = np.ones((1, 2)), [True] + [False] * 5
-COMBINATIONS = [
-    (bp.make_params, "kp", {"kp": None}),
-    (bp.make_params, "kd", {"kp": np.ones((2, 2)), "kd": np.ones((4, 2))}),
-    (bp.make_params, "effort_min", {"effort_min": [0, 2], "effort_max": 1}),
-    (bp.make_params, "effort_limit", {"effort_limit": 1, "effort_max": 2}),
-    (bp.make_params, "effort_limit", {"effort_limit": [1, math.nan]}),
-    (bp.make_params, "anti_windup", {"anti_windup": ["none", "wind"]}),
-    (bp.make_params, "tracking_time", {"tracking_time": 1.0}),
-    (
-        bp.make_params,
-        "derivative_filter_time",
-        {"derivative_filter_time": 1e-3, "gain_units": "mass_matrix", "discretization": "implicit"},
-    ),
-    (bp.make_actuators, "sensor_delay", {"sensor_delay": 0.01, "max_delay": 0.005}),
-    (bp.make_actuators, "static", {"static": 0.1, "coulomb": [0.1, 0.2]}),
-    (bp.make_actuators, "no_load_speed", {"saturation_effort": 10.0}),
-    (bp.make_actuators, "saturation_effort", {"no_load_speed": 10.0}),
-    (bp.make_actuators, "stribeck", {"stribeck": 0.1, "coulomb": 0.2}),
-    (bp.make_guard, "lower", {"lower": 1.0, "upper": 0.0}),
-    (ts.make_osc_params, "stiffness", {"stiffness": [1.0, 2.0]}),
-    (ts.make_osc_params, "damping_ratio", {"damping_ratio": math.nan}),
-    (ts.make_osc_params, "axes", {"axes": [1, 0, 1, 1, 1, 1]}),
-    (ts.make_osc_params, "force_axes", {"axes": [True] * 6, "force_axes": AXIS}),
-    (ts.make_osc_params, "posture_stiffness", {"posture_stiffness": [1.0] * 3}),
-    (ts.make_osc_params, "effort_min", {"effort_min": 1.0, "effort_max": 0.0}),
-    (ts.make_osc_params, "position_error_limit", {"position_error_limit": -1.0}),
-    (
-        ts.make_osc_params,
-        "effort_min",
-        {"stiffness": np.ones((3, 6)), "effort_limit": np.ones((2, 2))},
-    ),
-    (ts.make_osc_params, "integral_gain", {"integral_gain": -1.0}),
-    (ts.make_osc_params, "integral_limit", {"integral_gain": 1.0, "integral_limit": math.nan}),
-    (ts.make_osc_params, "integral_limit", {"integral_limit": 1.0}),
-    (ts.make_osc_params, "limit_margin", {"limit_margin": -0.1}),
-    (ts.make_osc_params, "limit_stiffness", {"limit_stiffness": [10.0, 20.0]}),
-    (ts.make_osc_params, "damping_ratio", {"damping": 9.0, "damping_ratio": 0.7}),
-    *((ts.make_osc_params, name, {name: "other"}) for name in osc_params.TASK_CHOICES),
-    (motors.dumps_actuators, "actuators", {"record": {}}),
-    (bp.drive_target, "state", {"state": 3}),
-    (trajectories.minimum_jerk, "max_velocity", {"max_velocity": math.inf}),
-    (trajectories.minimum_jerk, "dt", {"dt": 10**400, "duration": 1.0}),
-    (bp.drive_target, "measurement_rate", {"measurement_rate": np.ones((1, 3))}),
-    (bp.drive_target, "params.deadband", {"params": bp.make_params(2, 4.0, deadband=0.1)}),
-    (batchpid.export.to_c, "params", {"params": bp.make_params(2, np.ones((2, 2)))}),
-    (
-        batchpid.export.to_c,
-        "inputs",
-        {"params": bp.make_params(2, 1.0, measurement_rate="measured"), "inputs": ()},
-    ),
-    (batchpid.export.to_c, "inputs", {"inputs": ("velocity",)}),
-    (batchpid.export.to_c, "prefix", {"prefix": "a-b"}),
-    (batchpid.export.to_c, "tree", {"tree": planar((1.0,))}),
-    (
-        batchpid.export.to_ros2_control,
-        "inertia",
-        {"params": bp.make_params(2, 1.0, gain_units="mass_matrix")},
-    ),
-    (batchpid.export.to_ros2_control, "inertia", {"inertia": [0.0, 1.0]}),
-    (
-        batchpid.export.to_ros2_control,
-        "effort_min",
-        {"params": bp.make_params(2, 1.0, effort_min=2, effort_max=2)},
-    ),
-    (trajectories.minimum_jerk, "duration", {"duration": None}),
-    (trajectories.minimum_jerk, "duration", {"duration": 1.0, "max_velocity": 1.0}),
-    (trajectories.trapezoidal, "max_velocity", {"max_velocity": [1.0, -1.0]}),
-    (trajectories.trapezoidal, "max_acceleration", {"max_acceleration": math.inf}),
-    (metrics.step_metrics, "measurement", {"measurement": np.zeros((1, 1, 2))}),
-    (metrics.step_metrics, "setpoint", {"setpoint": np.zeros(3)}),
-    (metrics.step_metrics, "saturated", {"saturated": np.zeros((9, 1, 2))}),
-    (metrics.step_metrics, "band", {"band": 0.0}),
-    *((bp.design_gains, name, {name: 0.0}) for name in ("bandwidth_hz", "dt")),
-    (bp.design_gains, "damping_ratio", {"damping_ratio": -1.0}),
-    (bp.design_gains, "margin", {"margin": 1.5}),
-    (bp.design_gains, "gain_units", {"gain_units": "torque"}),
-    (bp.design_gains, "load", {"load": -1.0}),
-    (bp.design_gains, "load", {"load": 1.0, "gain_units": "mass_matrix"}),
-    (bp.design_gains, "discretization", {"discretization": "implicit", "gain_units": "effort"}),
-    (bp.stability_bound, "mass_matrix", {"mass_matrix": -np.eye(2)}),
-    (bp.stability_bound, "kp", {"kp": [1.0, 2.0, 3.0]}),
-    (ts.inverse_kinematics, "starts", {"starts": 0}),
-    (ts.inverse_kinematics, "rotation_tolerance", {"rotation_tolerance": 0.0}),
-    (ts.inverse_kinematics, "on_failure", {"on_failure": "ignore"}),
-    (
-        ts.inverse_kinematics,
-        "start",
-        {"pose": np.tile(np.eye(7)[3], (3, 1)), "start": np.zeros((2, 2))},
-    ),
-    (ts.make_osc_params, "tree", {"tree": "panda"}),
-]
+AXIS = [True] + [False] * 5
+COMBINATIONS = {
+    bp.make_params: [
+        {"kp": None},
+        {"kd": np.ones((4, 2)), "kp": np.ones((2, 2))},
+        {"effort_min": [0, 2], "effort_max": 1},
+        {"effort_limit": 1, "effort_max": 2},
+        {"effort_limit": [1, math.nan]},
+        {"anti_windup": ["none", "wind"]},
+        {"tracking_time": 1.0},
+        {
+            "derivative_filter_time": 1e-3,
+            "gain_units": "mass_matrix",
+            "discretization": "implicit",
+        },
+    ],
+    bp.make_actuators: [
+        {"sensor_delay": 0.01, "max_delay": 0.005},
+        {"static": 0.1, "coulomb": [0.1, 0.2]},
+        {"no_load_speed": ..., "saturation_effort": 10.0},
+        {"saturation_effort": ..., "no_load_speed": 10.0},
+        {"stribeck": 0.1, "coulomb": 0.2},
+    ],
+    motors.dumps_actuators: [{"actuators": ..., "record": {}}],
+    bp.make_guard: [{"lower": 1.0, "upper": 0.0}],
+    ts.make_osc_params: [
+        {"stiffness": [1.0, 2.0]},
+        {"damping_ratio": math.nan},
+        {"damping_ratio": 0.7, "damping": 9.0},
+        {"axes": [1, 0, 1, 1, 1, 1]},
+        {"force_axes": AXIS, "axes": [True] * 6},
+        {"posture_stiffness": [1.0] * 3},
+        {"effort_min": 1.0, "effort_max": 0.0},
+        {"effort_min": ..., "stiffness": np.ones((3, 6)), "effort_limit": np.ones((2, 2))},
+        {"position_error_limit": -1.0},
+        {"integral_gain": -1.0},
+        {"integral_limit": math.nan, "integral_gain": 1.0},
+        {"integral_limit": 1.0},
+        {"limit_margin": -0.1},
+        {"limit_stiffness": [10.0, 20.0]},
+        *({name: "other"} for name in osc_params.TASK_CHOICES),
+    ],
+    bp.drive_target: [
+        {"state": 3},
+        {"measurement_rate": np.ones((1, 3))},
+    ],
+    batchpid.export.to_c: [
+        {"params": bp.make_params(2, np.ones((2, 2)))},
+        {"inputs": (), "params": bp.make_params(2, 1.0, measurement_rate="measured")},
+        {"inputs": ("velocity",)},
+        {"prefix": "a-b"},
+        {"tree": planar((1.0,))},
+    ],
+    batchpid.export.to_ros2_control: [
+        {"inertia": ..., "params": bp.make_params(2, 1.0, gain_units="mass_matrix")},
+        {"inertia": [0.0, 1.0]},
+        {"effort_min": ..., "params": bp.make_params(2, 1.0, effort_min=2, effort_max=2)},
+    ],
+    trajectories.minimum_jerk: [
+        {"max_velocity": math.inf},
+        {"dt": 10**400, "duration": 1.0},
+        {"duration": None},
+        {"duration": 1.0, "max_velocity": 1.0},
+    ],
+    trajectories.trapezoidal: [{"max_velocity": [1.0, -1.0]}, {"max_acceleration": math.inf}],
+    metrics.step_metrics: [
+        {"measurement": np.zeros((1, 1, 2))},
+        {"setpoint": np.zeros(3)},
+        {"saturated": np.zeros((9, 1, 2))},
+        {"band": 0.0},
+    ],
+    bp.design_gains: [
+        {"bandwidth_hz": 0.0},
+        {"damping_ratio": -1.0},
+        {"margin": 1.5},
+        {"gain_units": "torque"},
+        {"load": -1.0},
+        {"load": 1.0, "gain_units": "mass_matrix"},
+        {"discretization": "implicit", "gain_units": "effort"},
+    ],
+    bp.stability_bound: [{"mass_matrix": -np.eye(2)}, {"kp": [1.0, 2.0, 3.0]}],
+    ts.inverse_kinematics: [
+        {"starts": 0},
+        {"rotation_tolerance": 0.0},
+        {"on_failure": "ignore"},
+        {"start": np.zeros((2, 2)), "pose": np.tile(np.eye(7)[3], (3, 1))},
+    ],
+}
+"""By function, arguments of which the first is wrong, by itself or beside the others; ``...`` is not
+passed.
+"""
+
+
+@pytest.mark.parametrize("function", COMBINATIONS, ids=lambda function: function.__name__)
+def test_options_that_do_not_go_together(function):
+    for row in COMBINATIONS[function]:
+        changes = {name: value for name, value in row.items() if value is not ...}
+        refused(next(iter(row)), function, **needed(function, changes) | changes)
 
 
 PLACES = [
-    (ts.make_osc_params, "stiffness", {"stiffness": [1, 1, -1, 1, 1, 1]}, {"entry": "z"}, -1.0),
-    (ts.make_osc_params, "smallest_eigenvalue", {"smallest_eigenvalue": 0.0}, {"entry": "s0"}, 0.0),
-    (
-        ts.make_osc_params,
-        "posture_stiffness",
-        {"posture_stiffness": [1.0, -1.0]},
-        {"joint": "joint2"},
-        -1.0,
-    ),
-    (ts.inverse_kinematics, "pose", {"pose": 2 * np.ones((1, 7))}, {"entry": "qw"}, 4.0),
-    (ts.inverse_kinematics, "point", {"point": [0.0, math.inf, 0.0]}, {"entry": "y"}, math.inf),
+    (ts.make_osc_params, {"stiffness": [1, 1, -1, 1, 1, 1]}, {"entry": "z"}, -1.0),
+    (ts.make_osc_params, {"smallest_eigenvalue": 0.0}, {"entry": "s0"}, 0.0),
+    (ts.make_osc_params, {"posture_stiffness": [1.0, -1.0]}, {"joint": "joint2"}, -1.0),
+    (ts.inverse_kinematics, {"pose": 2 * np.ones((1, 7))}, {"entry": "qw"}, 4.0),
+    (ts.inverse_kinematics, {"point": [0.0, math.inf, 0.0]}, {"entry": "y"}, math.inf),
 ]
 
 
-@pytest.mark.parametrize(
-    ("function", "argument", "changes", "places", "value"),
-    [pytest.param(*row, id=f"{row[0].__name__}-{row[1]}") for row in PLACES],
-)
-def test_an_error_names_the_entry_and_its_value(function, argument, changes, places, value):
-    error = refused(argument, function, **needed(function, changes) | changes)
-    found = {"joint": error.joint, "entry": error.entry, "env": error.env}
-    assert {name: place for name, place in found.items() if place is not None} == places
+@pytest.mark.parametrize(("function", "changes", "places", "value"), PLACES)
+def test_an_error_names_the_entry_and_its_value(function, changes, places, value):
+    error = refused(*changes, function, **needed(function, changes) | changes)
+    assert dict.fromkeys(("joint", "entry", "env")) | places == {
+        name: getattr(error, name) for name in ("joint", "entry", "env")
+    }
     assert error.value == value
-
-
-@pytest.mark.parametrize(
-    ("function", "argument", "changes"),
-    [pytest.param(*row, id=f"{row[0].__name__}-{row[1]}") for row in COMBINATIONS],
-)
-def test_options_that_do_not_go_together(function, argument, changes):
-    refused(argument, function, **needed(function, changes) | changes)
 
 
 # -- Other arguments, by their names
@@ -230,7 +220,10 @@ Y, TREE = np.zeros((1, 2)), planar()
 PARAMS = bp.make_params(2, 4.0, 1.0, 1.0)
 OSC = ts.make_osc_params(TREE, integral_gain=1.0)
 POSE = ts.link_poses(TREE, Y, ["tip"])[:, 0]
-MOTORS, GUARD = bp.make_actuators(2, lag=0.1), bp.make_guard(2, rate=1.0)
+MOTORS, GUARD = (
+    bp.make_actuators(2, lag=0.1, sensor_delay=0.01, backlash=0.1),
+    bp.make_guard(2, rate=1.0),
+)
 RUBBING = friction.Friction(np.ones((1, 2)), np.ones((1, 2)))
 VALUES = {
     "num_envs": 1, "joints": 2, "joint_names": ["a", "b"], "measurement": Y, "setpoint": Y, "effort": Y, "qpos": Y,
@@ -430,3 +423,38 @@ def test_texts(text, key, joint, tmp_path):
     for suffix in (".yaml", ".json")[: 1 if is_motor else 2]:
         (path := tmp_path / f"file{suffix}").write_text(text)
         assert str(path) in str(refused(str(path) if key == "text" else key, load, path, *names))
+
+
+def arrays(value):
+    """Yield the arrays of a value, and of the tuples in it."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from arrays(part)
+
+
+HELD = bp.make_params(
+    2, 4.0, 1.0, 1.0, non_finite="hold", effort_rate_limit=9.0, derivative_filter_time=0.1
+)
+LAW = {bp.init, bp.step, bp.step_terms, bp.reset, bp.track}
+RATES = ("measurement_rate", "setpoint_rate", "feedforward")
+
+
+@pytest.mark.parametrize(
+    ("module", "function"),
+    dict.fromkeys([*(row.values[:2] for row in rows()), (guard.__name__, guard.init)]),
+)
+def test_a_result_shares_no_memory_with_an_argument(module, function):
+    """A caller may write the next values into its arrays."""
+    held = {"params": HELD, "state": bp.init(HELD, Y)} if function in LAW else {}
+    given = needed(function, module=module) | dict.fromkeys(RATES, Y) | held
+    names = given.keys() & inspect.signature(function).parameters.keys()
+    copies = {
+        name: given[name] + 0.0 if isinstance(given[name], np.ndarray) else given[name]
+        for name in names
+    }
+    found = [*arrays(function(**copies))]
+    for argument in copies.values():
+        if isinstance(argument, np.ndarray):
+            assert not any(np.shares_memory(each, argument) for each in found)

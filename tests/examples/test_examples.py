@@ -4,6 +4,7 @@ import importlib.util
 import os
 import re
 import runpy
+import shlex
 import sys
 from functools import partial
 from pathlib import Path
@@ -137,7 +138,7 @@ def test_the_motor_of_each_kind_of_controller_is_identified(run, tmp_path, kind)
         for each in run("real_logs.py", "--out", str(tmp_path)).splitlines()
         if f"{kind}." in each
     ]
-    words = [*line.split()[1:], "--out", str(tmp_path / "motors.yaml")]
+    words = [*shlex.split(line)[1:], "--out", str(tmp_path / "motors.yaml")]
     assert not main(words)
     module = runpy.run_path(str(EXAMPLES / "real_logs.py"))
     found = bp.load_actuators(tmp_path / "motors.yaml", ("hinge",))[0]

@@ -12,7 +12,7 @@ from thermal import Thermal
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
 import batchpid as bp
-from batchpid.sim import MujocoSolver, Physics, Randomization, Robot, Uniform
+from batchpid.sim import MujocoSolver, OperationalSpace, Physics, Randomization, Robot, Uniform
 from batchpid.sim.options.options import RunnerKeywords
 
 
@@ -54,6 +54,11 @@ class Law:
         return None, self.kp * np.tanh(setpoint - qpos) - 5.0 * qvel + passive
 
 
+def tool(name="hand", **options):
+    """Controller of one axis of a link, which leaves a joint to the posture."""
+    return OperationalSpace(ARM, name, axes=[True] + [False] * 5, **options)
+
+
 def box(size, scene, env):
     import sapien
 
@@ -80,7 +85,10 @@ VALUES = {
     "workers": [0, 1],
     "timestep": [1 / 2000, 1 / 1000],
     "substeps": [20, 7],
-    "control": [Law(), Law(30.0)],
+    "control": [
+        Law(), Law(30.0), tool(), tool(damping_ratio=0.1), tool(stiffness=9.0), tool("arm"),
+        tool(point=[0.3, 0, 0.1]), tool(posture=[0.1, 0.1]),
+    ],
     "tool": ["arm", "hand"],
     "physics": [MujocoSolver(iterations=3), Physics("PGS", 3)],
     "build": [box_of(0.05), box_of(0.1)],

@@ -21,13 +21,8 @@ from robots import load_bundled
 import batchpid as bp
 import batchpid.sim
 from batchpid.errors import MissingDependencyError
-from batchpid.sim import (
-    RunInfo,
-    Runner,
-    RunnerOptions,
-)
+from batchpid.sim import Runner, RunnerOptions
 from batchpid.sim.cli import parse
-from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.options.options import GROUPS, RunnerKeywords
 
 PANDA = load_bundled("panda")
@@ -146,14 +141,6 @@ def test_options_travel_to_workers_as_they_are():
     received = pickle.loads(pickle.dumps(options))
     assert received.actuators is None
     assert received.described == options.described
-
-
-def test_marked_options_are_fields_of_what_keeps_them():
-    options = RunnerOptions(PANDA, 2)
-    assert options.values_for("scene").keys() <= {each.name for each in fields(SceneSpec)}
-    assert options.values_for("recording").keys() <= {each.name for each in fields(RunInfo)}
-    assert options.values_for("snapshot").keys() <= options.described.keys()
-    assert {"timestep", "collisions", "ground"} <= options.values_for("scene").keys()
 
 
 @pytest.mark.parametrize("control", ["pid", "drive"])

@@ -7,6 +7,7 @@ import inspect
 from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -156,21 +157,31 @@ def test_a_call_with_any_value_changes_nothing_if_it_is_refused(contain: bool) -
     command = {"setpoint": ROW, "setpoint_rate": ROW, "feedforward": ROW, "substeps": 2}
     table = {f"{name}s": command[name][None] for name in [*command][:3]}
     with Runner(ARM, N, workers=0, substeps=2, params=PARAMS, **options) as runner:
-        methods: list[tuple[Callable[..., Any], dict[str, Any]]] = [
-            (runner.step, command),
-            (lambda **given: runner.send(**given) or runner.recv(), command),
-            (runner.rollout, table),
-            (runner.reset, {"qpos": ROW, "qvel": ROW, "mask": np.ones(N, bool), "seed": None}),
-            (runner.restore, {"snapshot": None}),
-            (lambda params: setattr(runner, "params", params), {"params": PARAMS}),
-            (lambda actuators: setattr(runner, "actuators", actuators), {"actuators": None}),
-        ]
-        for function, good in methods:
-            for name in good:
-                for value in ODD:
-                    call = partial(function, **{**good, name: value})
-                    is_usable = value is None or (isinstance(value, float) and value == -1.5)
-                    assert is_refused(runner, call, name) or is_usable or contain, (name, value)
+        calls: dict[str, dict[str, Any]] = {
+            "step": command,
+            "send": command,
+            "rollout": table,
+            "reset": {"qpos": ROW, "qvel": ROW, "mask": np.ones(N, bool), "seed": None},
+            "restore": {"snapshot": None},
+            "params": {"params": PARAMS},
+            "actuators": {"actuators": None},
+        }
+        for method, good in calls.items():
+            for name, value in product(good, ODD):
+                call = partial(act, runner, method, {**good, name: value})
+                is_usable = value is None or (isinstance(value, float) and value == -1.5)
+                assert is_refused(runner, call, name) or is_usable or contain, (name, value)
+
+
+def act(runner: Runner, name: str, arguments: dict[str, Any]) -> None:
+    """Call a method, or set a property."""
+    method = getattr(runner, name)
+    if not callable(method):
+        setattr(runner, *arguments.popitem())
+        return
+    method(**arguments)
+    if name == "send":
+        runner.recv()
 
 
 def is_refused(runner: Runner, call: Callable[[], Any], name: str) -> bool:
@@ -191,220 +202,174 @@ def is_refused(runner: Runner, call: Callable[[], Any], name: str) -> bool:
     return refused
 
 
-# -- options that exclude each other
+# -- constructors: options that are wrong by themselves or beside others
 
 MOTORS = bp.make_actuators(DOF, strength=0.9)
-PUSHES = {"push": Uniform(0, 1), "push_interval": Uniform(1, 2)}
-RUNNERS: list[tuple[dict[str, Any], str]] = [
-    ({"worker": 1}, "worker"),
-    ({"engine": "bullet"}, "engine"),
-    ({"backend": "torch"}, "backend"),
-    ({"stages": [np.zeros(DOF)]}, "stages"),
-    ({"stages": [Thermal(1.0, 1.0), Thermal(1.0, 1.0)]}, "stages"),
-    ({"stages": [NowhereElse(1.0, 1.0)]}, "stages"),
-    ({"cluster": "ray", "workers": 2}, "workers"),
-    ({"cluster": "slurm"}, "cluster"),
-    ({"physics": MujocoSolver(), "engine": "sapien"}, "physics"),
-    ({"physics": Physics("PGS", 4), "engine": "mujoco"}, "physics"),
-    ({"build": box, "engine": "mujoco"}, "build"),
-    ({"build": box, "collisions": False}, "build"),
-    ({"ground": True, "collisions": False}, "ground"),
-    ({"contacts": ["hand"], "collisions": False}, "contacts"),
-    ({"contacts": ["foot"]}, "contacts"),
-    ({"contacts": "hand"}, "contacts"),
-    ({"wrenches": ["base"]}, "wrenches"),
-    ({"robot": FREE, "collisions": False}, "collisions"),
-    ({"robot": FREE, "control": "osc"}, "control"),
-    ({"robot": SAPIENS_OWN, "engine": "mujoco"}, "robot"),
-    ({"speed_limit": np.full(DOF, np.inf)}, "speed_limit"),
-    ({"speed_limit": np.ones(3)}, "speed_limit"),
-    ({"guard": True, "control": "effort"}, "guard"),
-    ({"guard": True, "control": Hold(command=CommandSpec(("x",)))}, "guard"),
-    ({"guard": bp.make_guard(1, rate=1.0)}, "guard"),
-    ({"plan": bp.make_plan(1, period=0.1, horizon=2)}, "plan"),
-    ({"plan": bp.make_plan(2, period=0.1, horizon=2), "control": "effort"}, "plan"),
-    ({"control": print}, "control"),
-    ({"control": Hold(command="xy")}, "control"),
-    ({"control": Hold(command=("x", "x"))}, "control"),
-    ({"control": ["pid"]}, "control"),
-    ({"control": "osc", "tool": ["hand"]}, "tool"),
-    ({"tool": "hand"}, "tool"),
-    ({"params": load_bundled("panda").params()}, "params"),
-    ({"params": ARM.params(kp=np.ones((3, DOF)))}, "params"),
-    ({"params": ARM.params(kp=1.0, gain_units="mass_matrix"), "control": "drive"}, "gain_units"),
-    ({"actuators": bp.make_actuators(3, strength=0.9)}, "actuators"),
-    ({"actuators": bp.make_actuators(DOF, strength=np.full((3, DOF), 0.9))}, "actuators"),
-    ({"actuators": MOTORS, "control": "drive"}, "actuators"),
-    ({"randomization": Randomization(**PUSHES)}, "push"),
-    ({"robot": FREE, "randomization": Randomization(push=Uniform(0, 1))}, "push_interval"),
-    (
+PUSH = {"push": Uniform(0, 1)}
+FREE_PUSHED = {"randomization": Randomization(**PUSH), "robot": FREE}
+REFUSED: dict[Callable[..., Any], list[dict[str, Any]]] = {
+    Runner: [
+        {"worker": 1},
+        {"stages": [Thermal(1.0, 1.0), Thermal(1.0, 1.0)]},
+        {"stages": [NowhereElse(1.0, 1.0)]},
+        {"workers": 2, "cluster": "ray"},
+        {"physics": MujocoSolver(), "engine": "sapien"},
+        {"physics": Physics("PGS", 4), "engine": "mujoco"},
+        {"build": box, "engine": "mujoco"},
+        {"build": box, "collisions": False},
+        {"ground": True, "collisions": False},
+        {"contacts": ["hand"], "collisions": False},
+        {"contacts": ["foot"]},
+        {"contacts": "hand"},
+        {"wrenches": ["base"]},
+        {"collisions": False, "robot": FREE},
+        {"control": "osc", "robot": FREE},
+        {"robot": SAPIENS_OWN, "engine": "mujoco"},
+        {"speed_limit": np.full(DOF, np.inf)},
+        {"speed_limit": np.ones(3)},
+        {"guard": True, "control": "effort"},
+        {"guard": True, "control": Hold(command=CommandSpec(("x",)))},
+        {"guard": bp.make_guard(1, rate=1.0)},
+        {"plan": bp.make_plan(1, period=0.1, horizon=2)},
+        {"plan": bp.make_plan(2, period=0.1, horizon=2), "control": "effort"},
+        {"control": print},
+        {"control": Hold(command="xy")},
+        {"control": Hold(command=("x", "x"))},
+        {"tool": ["hand"], "control": "osc"},
+        {"tool": "hand"},
+        {"params": load_bundled("panda").params()},
+        {"params": ARM.params(kp=np.ones((3, DOF)))},
         {
-            "robot": FREE,
-            "randomization": Randomization(push=Uniform(0, 1), push_interval=Uniform(0, 1)),
+            "gain_units": ...,
+            "params": ARM.params(kp=1.0, gain_units="mass_matrix"),
+            "control": "drive",
         },
-        "push_interval",
-    ),
-    (
+        {"actuators": bp.make_actuators(3, strength=0.9)},
+        {"actuators": bp.make_actuators(DOF, strength=np.full((3, DOF), 0.9))},
+        {"actuators": MOTORS, "control": "drive"},
+        {"push": ..., "randomization": Randomization(**PUSH, push_interval=Uniform(1, 2))},
+        {"push_interval": ..., **FREE_PUSHED},
         {
-            "robot": FREE,
+            "push_interval": ...,
+            **FREE_PUSHED,
+            "randomization": Randomization(**PUSH, push_interval=Uniform(0, 1)),
+        },
+        {
+            "push": ...,
+            **FREE_PUSHED,
             "randomization": Randomization(push={"vq": Uniform(0, 1)}, push_interval=Uniform(1, 2)),
         },
-        "push",
-    ),
-    (
-        {"randomization": Randomization(ground_friction=Uniform(0, 1)), "collisions": False},
-        "ground_friction",
-    ),
-]
+        {
+            "ground_friction": ...,
+            "randomization": Randomization(ground_friction=Uniform(0, 1)),
+            "collisions": False,
+        },
+    ],
+    Ray: [{"address": "ray://host:1"}, {"nodes": 0}, {"cpus_per_node": 0.5}],
+    CommandSpec: [{"units": ("m",)}, {"neutral": (0, 1, 2)}, {"neutral": (np.inf, 0)}],
+    ARM.guard: [{"rate": -1.0}],
+    Robot.load: [{"dissipation": "none"}],
+    OperationalSpace: [{"link": "foot"}],
+}
+"""By constructor, options of which the first is wrong; ``...`` is a part of an option after it."""
+GOOD: dict[Callable[..., Any], dict[str, Any]] = {
+    Runner: {"robot": ARM, "num_envs": N, "workers": 0},
+    CommandSpec: {"names": ("x", "y")},
+    Robot.load: {"name_or_path": "panda"},
+    OperationalSpace: {"robot": ARM},
+}
 
 
-@pytest.mark.parametrize(("options", "argument"), RUNNERS, ids=label)
-def test_options_that_do_not_go_together_are_refused_by_name(
-    options: dict[str, Any], argument: str, request: pytest.FixtureRequest
+@pytest.mark.parametrize(
+    ("make", "row"), [(make, row) for make, rows in REFUSED.items() for row in rows], ids=label
+)
+def test_refused_constructors_name_their_argument(
+    make: Callable[..., Any], row: dict[str, Any]
 ) -> None:
-    if options.get("backend") == "jax":
-        request.getfixturevalue("needs_jax")
-    options = {"robot": ARM, "num_envs": N, **options}
-    options.setdefault("workers", None if "cluster" in options else 0)
-    assert argument in named(lambda: Runner(**options))
+    options = {name: value for name, value in row.items() if value is not ...}
+    assert next(iter(row)) in named(lambda: make(**GOOD.get(make, {}) | options))
 
 
 # -- calls of a runner
 
-CALLS: list[tuple[str, dict[str, Any], str]] = [
-    ("step", {"setpoint": ROW, "setpoint_acceleration": ROW}, "setpoint_acceleration"),
-    (
-        "step",
-        {"setpoint": ROW, "setpoint_rate": ROW, "setpoint_acceleration": np.zeros(3)},
-        "setpoint_acceleration",
-    ),
-    ("step", {"setpoint": ROW, "substeps": 0}, "substeps"),
-    ("rollout", {"setpoints": ROW}, "setpoints"),
-    ("rollout", {"setpoints": np.zeros((4, 3, DOF))}, "setpoints"),
-    ("reset", {"mask": [True]}, "mask"),
-    ("reset", {"seed": 0}, "seed"),
-    ("reset", {"base_pose": np.zeros(7)}, "base_pose"),
-    ("reset", {"base_twist": np.zeros(6)}, "base_twist"),
-    ("bodies", {"names": ["ball"]}, "names"),
-    ("params", {"value": load_bundled("panda").params()}, "params"),
-    ("actuators", {"value": bp.make_actuators(3, strength=0.9)}, "actuators"),
+ACCELERATED = {"setpoint_acceleration": ROW, "setpoint": ROW, "setpoint_rate": ROW}
+UNUSED = [
+    ("step", ACCELERATED),
+    ("rollout", {f"{name}s": row[None] for name, row in ACCELERATED.items()}),
 ]
+CALLS: list[tuple[dict[str, Any], list[tuple[str, dict[str, Any]]]]] = [
+    (
+        {},
+        [
+            ("step", {"setpoint_acceleration": ROW, "setpoint": ROW}),
+            ("step", {**ACCELERATED, "setpoint_acceleration": np.zeros(3)}),
+            ("step", {"substeps": 0, "setpoint": ROW}),
+            ("rollout", {"setpoints": ROW}),
+            ("rollout", {"setpoints": np.zeros((4, 3, DOF))}),
+            ("reset", {"mask": [True]}),
+            ("reset", {"seed": 0}),
+            ("reset", {"base_pose": np.zeros(7)}),
+            ("reset", {"base_twist": np.zeros(6)}),
+            ("bodies", {"names": ["ball"]}),
+            ("params", {"params": load_bundled("panda").params()}),
+            ("actuators", {"actuators": bp.make_actuators(3, strength=0.9)}),
+        ],
+    ),
+    ({"params": ARM.params(kp=9.0)}, UNUSED),
+    ({"control": "drive"}, UNUSED),
+    ({"control": "effort"}, UNUSED),
+    (
+        {
+            "robot": FREE,
+            "engine": "mujoco",
+            "ground": False,
+            "randomization": Randomization(payload=Uniform(0, 1)),
+        },
+        [
+            ("reset", {"base_pose": np.zeros(7)}),
+            ("reset", {"base_pose": np.zeros(3)}),
+            ("reset", {"base_twist": [0, 0, np.nan, 0, 0, 0]}),
+            *(("reset", {"seed": seed}) for seed in (-1, 0.5, [1, 2, 3], [-1] * N)),
+        ],
+    ),
+    (
+        {"control": Hold(command=CommandSpec(("x", "y", "z")))},
+        [
+            ("step", {"setpoint": np.zeros((N, 2))}),
+            ("step", {"setpoint_rate": np.zeros(2), "setpoint": np.zeros(3)}),
+            ("step", {"feedforward": np.zeros(3), "setpoint": np.zeros(3)}),
+        ],
+    ),
+]
+"""Options of a runner, and its calls, each with arguments of which the first is wrong."""
 
 
-@pytest.fixture(scope="module")
-def runner() -> Any:
-    with Runner(ARM, N, workers=0, substeps=2) as made:
-        yield made
-
-
-def call(runner: Runner, name: str, arguments: dict[str, Any]) -> str:
-    """Make a wrong call; check that it changes nothing, and return the name of the argument in its
-    error.
-    """
-    before, time = runner.observe(), runner.time
-    act = (lambda: setattr(runner, name, arguments["value"])) if "value" in arguments else None
-    argument = named(act or (lambda: getattr(runner, name)(**arguments)))
-    assert_identical(runner.observe(), before)
-    assert runner.time == time
-    assert runner.step(ROW if runner.robot.fixed_base else runner.robot.start).ok.all()
-    return argument
-
-
-@pytest.mark.parametrize(("name", "arguments", "argument"), CALLS, ids=label)
-def test_a_refused_call_names_its_argument(
-    runner: Runner, name: str, arguments: dict[str, Any], argument: str
+@pytest.mark.parametrize(("options", "calls"), CALLS)
+def test_a_refused_call_names_its_argument_and_changes_nothing(
+    options: dict[str, Any], calls: list[tuple[str, dict[str, Any]]]
 ) -> None:
-    assert argument.removesuffix("s") in call(runner, name, arguments)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "argument"),
-    [
-        ({"base_pose": np.zeros(7)}, "base_pose"),
-        ({"base_pose": np.zeros(3)}, "base_pose"),
-        ({"base_twist": [0, 0, np.nan, 0, 0, 0]}, "base_twist"),
-        *(({"seed": seed}, "seed") for seed in (-1, 0.5, [1, 2, 3], [-1] * N)),
-    ],
-)
-def test_a_refused_reset_of_a_floating_base_names_its_argument(
-    arguments: dict[str, Any], argument: str
-) -> None:
-    drawn = Randomization(payload=Uniform(0, 1))
-    with Runner(FREE, N, workers=0, engine="mujoco", ground=False, randomization=drawn) as runner:
-        assert call(runner, "reset", arguments) == argument
-
-
-@pytest.mark.parametrize(
-    "options", [{"params": ARM.params(kp=9.0)}, {"control": "drive"}, {"control": "effort"}]
-)
-def test_an_acceleration_that_no_gain_uses_is_refused(options: dict[str, Any]) -> None:
-    with Runner(ARM, N, workers=0, **options) as runner:
-        given = {"setpoint_rate": ROW, "setpoint_acceleration": ROW}
-        assert call(runner, "step", {"setpoint": ROW, **given}) == "setpoint_acceleration"
-        given = {f"{name}s": rows[None] for name, rows in given.items()}
-        assert (
-            call(runner, "rollout", {"setpoints": ROW[None], **given}) == "setpoint_accelerations"
-        )
+    with Runner(**GOOD[Runner] | options) as runner:
+        start = runner.observe()
+        for name, arguments in calls:
+            argument = next(iter(arguments))
+            assert argument.removesuffix("s") in named(partial(act, runner, name, arguments))
+            assert_identical(runner.observe(), start)
+            assert runner.time == 0
+        size = runner.options.command.size
+        assert runner.step(np.zeros(size) if runner.robot.fixed_base else start.qpos).ok.all()
 
 
 def test_a_refused_command_of_entries_names_the_entry() -> None:
     control = Hold(command=CommandSpec(("x", "y", "z")))
-    bad = np.zeros((N, 3))
-    bad[1, 2] = np.nan
     with Runner(ARM, N, workers=0, control=control) as runner:
-        with pytest.raises(InvalidArgumentError) as caught:
-            runner.step(bad)
-        assert (
-            caught.value.argument,
-            caught.value.entry,
-            caught.value.joint,
-            caught.value.env,
-        ) == (
-            "setpoint",
-            "z",
-            None,
-            1,
-        )
-        for arguments, argument in (
-            ({"setpoint": np.zeros((N, 2))}, "setpoint"),
-            ({"setpoint": np.zeros(3), "setpoint_rate": np.zeros(2)}, "setpoint_rate"),
-            ({"setpoint": np.zeros(3), "feedforward": np.zeros(3)}, "feedforward"),
-        ):
-            assert named(lambda arguments=arguments: runner.step(**arguments)) == argument
+        with pytest.raises(InvalidArgumentError, match=r"^setpoint, entry 'z', env 1: "):
+            runner.step([[0, 0, 0], [0, 0, np.nan]])
         assert runner.step(np.zeros(3)).ok.all()
 
 
-# -- constructors
-
-MADE: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
-    *(
-        (Ray, options, next(iter(options)))
-        for options in ({"address": "ray://host:1"}, {"nodes": 0}, {"cpus_per_node": 0.5})
-    ),
-    *(
-        (lambda **options: CommandSpec(("x", "y"), **options), options, argument)
-        for options, argument in (
-            ({"units": ("m",)}, "units"),
-            ({"neutral": (0, 1, 2)}, "neutral"),
-            ({"neutral": (np.inf, 0)}, "neutral"),
-        )
-    ),
-    (ARM.guard, {"rate": -1.0}, "rate"),
-    (Robot.load, {"name_or_path": "panda", "dissipation": "none"}, "dissipation"),
-    (OperationalSpace, {"robot": ARM, "link": "foot"}, "link"),
-]
-
-
-@pytest.mark.parametrize(("make", "options", "argument"), MADE)
-def test_refused_constructors_name_their_argument(
-    make: Callable[..., Any], options: dict[str, Any], argument: str
-) -> None:
-    assert argument in named(lambda: make(**options))
-
-
 @pytest.mark.parametrize("arguments", [("run.txt",), (3,), ("run.h5", None)])
-def test_a_recorder_that_is_refused_is_not_attached(runner: Runner, arguments: Any) -> None:
-    path, recorded = (*arguments, runner)[:2]
-    with pytest.raises(BatchPIDError):
-        Recorder(path, recorded)
-    assert runner.recorder is None
+def test_a_recorder_that_is_refused_is_not_attached(arguments: Any) -> None:
+    with Runner(**GOOD[Runner]) as runner:
+        with pytest.raises(BatchPIDError):
+            Recorder(*(*arguments, runner)[:2])
+        assert runner.recorder is None

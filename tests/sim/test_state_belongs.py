@@ -11,18 +11,8 @@ from identical import assert_identical
 from option_values import ARM, DECLARED, VALUES, is_slow, option_values
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import OperationalSpace, Randomization, Robot, Runner, RunnerOptions, Uniform
+from batchpid.sim import Randomization, Runner, RunnerOptions, Uniform
 from batchpid.sim.gym import ReachVectorEnv
-
-POSTURE = np.array([0, -0.5, 0, -2.2, 0, 1.8, 0.8, 0.02, 0.02])
-OTHER = {
-    "stiffness": {"stiffness": 1000.0},
-    "damping": {"damping_ratio": 0.1},
-    "link": {"link": "panda_link5"},
-    "point": {"point": [0, 0, 0.3]},
-    "posture": {"posture": POSTURE + 0.01},
-}
-
 
 BASE = {
     "robot": ARM,
@@ -122,16 +112,6 @@ def check(ours, theirs, before=None):
     np.testing.assert_array_equal(places, ends)
 
 
-def osc_runner(robot, link="panda_hand", **options):
-    control = OperationalSpace(robot, link, **{"posture": POSTURE, **options})
-    return Runner(robot, 1, workers=0, engine="mujoco", control=control)
-
-
-@pytest.fixture(scope="module")
-def panda():
-    return Robot.load("panda")
-
-
 def test_every_option_is_kept_or_has_a_role_apart():
     reasons = {"snapshot", "restored", "processes", "next commands"}
     for option in fields(RunnerOptions):
@@ -180,34 +160,16 @@ PAIRS = st.lists(st.sampled_from(NAMES), min_size=1, max_size=2, unique=True).fl
 )
 
 
-@settings(max_examples=12, deadline=None)
-@given(PAIRS)
 @pytest.mark.filterwarnings("ignore")
-def test_a_snapshot_under_two_options_is_refused_or_goes_on_as_before(pair):
-    assume(all(map(is_possible, pair)))
-    check(*pair)
+@pytest.mark.parametrize("examples", [12, pytest.param(800, marks=pytest.mark.slow)])
+def test_a_snapshot_under_any_two_options_is_refused_or_goes_on_as_before(examples):
+    @settings(max_examples=examples, deadline=None)
+    @given(PAIRS)
+    def try_pairs(pair):
+        assume(all(map(is_possible, pair)))
+        check(*pair)
 
-
-@pytest.mark.slow
-@settings(max_examples=800, deadline=None)
-@given(PAIRS)
-@pytest.mark.filterwarnings("ignore")
-def test_a_snapshot_under_any_two_options_is_refused_or_goes_on_as_before(pair):
-    assume(all(map(is_possible, pair)))
-    check(*pair)
-
-
-@pytest.mark.parametrize("other", OTHER.values(), ids=OTHER)
-def test_a_snapshot_of_another_controller_is_refused(panda, other):
-    with osc_runner(panda) as runner:
-        runner.reset(POSTURE)
-        snapshot = runner.snapshot()
-        runner.restore(snapshot)
-    with (
-        osc_runner(panda, **other) as runner,
-        pytest.raises(InvalidArgumentError, match=r"control|tool"),
-    ):
-        runner.restore(snapshot)
+    try_pairs()
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -1,8 +1,8 @@
 """States of robots on fixed bases, and what native code needs to step them without MuJoCo where
 they touch nothing (``free_motion.h``).
 
-A robot steps so exactly where its state has no contact, so the bits of a motion depend on nothing
-else. The arrays of a pack hold the state of every robot, and ``mujoco.MjData`` is working memory.
+Native code steps a robot if and only if its state has no contact, so the bits of a motion depend on
+nothing else. The arrays of a pack hold the state of every robot, and ``mujoco.MjData`` is working memory.
 Native code steps vectors of robots, so a table has the shape (blocks, columns, WIDTH).
 """
 

@@ -298,7 +298,7 @@ class Transfer(ctypes.Structure):
 
     _fields_ = [
         *_all(ctypes.c_void_p, "table", "row"),
-        *_all(ctypes.c_int64, "stride", "size"),
+        *_all(ctypes.c_int64, "stride", "size", "step"),
         *_all(ctypes.c_int32, "kind", "unused"),
     ]
 

@@ -32,7 +32,8 @@ struct Transfer {
   char *table;          // double to READ, float to WRITE_FLOATS
   char *row;            // double, except to WRITE_BYTES
   std::int64_t stride;  // of the table's ticks [bytes]; 0: each tick overwrites the one before
-  std::int64_t size;    // numbers, or bytes
+  std::int64_t size;    // numbers of the table, or bytes
+  std::int64_t step;    // of the row, from a number to WRITE_FLOATS to the next one [numbers]
   TransferKind kind;
 };
 
@@ -179,7 +180,7 @@ inline void write_observation(Tick const &arrays, std::int64_t tick) {
     if (each->kind == TransferKind::WRITE_BYTES) std::memcpy(table, each->row, static_cast<std::size_t>(each->size));
     if (each->kind != TransferKind::WRITE_FLOATS) continue;
     for (std::int64_t i = 0; i < each->size; ++i) {
-      reinterpret_cast<float *>(table)[i] = static_cast<float>(reinterpret_cast<double const *>(each->row)[i]);
+      reinterpret_cast<float *>(table)[i] = static_cast<float>(reinterpret_cast<double const *>(each->row)[i * each->step]);
     }
   }
 }

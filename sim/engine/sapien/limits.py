@@ -1,4 +1,5 @@
-"""Limits of PhysX: what SAPIEN cannot run, and what it runs otherwise than the robot's file says.
+"""Limits of PhysX: robots that SAPIEN cannot simulate, and content that it simulates otherwise than
+the robot's file says.
 
 PhysX ignores pairs of links by its filter. Each shape has four words of 32 bits. As SAPIEN sets the
 filter up, two shapes are ignored if the upper halves of word 3 differ, or if they share a bit of
@@ -42,7 +43,7 @@ _MUJOCO = "use the engine 'mujoco'"
 
 
 def refusals(spec: SceneSpec) -> Iterator[Finding]:
-    """Yield what SAPIEN cannot run at all."""
+    """Yield the reasons for which SAPIEN cannot simulate the robot."""
     count = len(spec.simulated.bodies)
     if count > MAX_LINKS:
         text = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
@@ -50,7 +51,7 @@ def refusals(spec: SceneSpec) -> Iterator[Finding]:
 
 
 def shortfalls(spec: SceneSpec) -> Iterator[Finding]:
-    """Yield what SAPIEN runs otherwise than the robot's file says."""
+    """Yield content that SAPIEN simulates otherwise than the robot's file says."""
     if spec.mjcf is not None:
         yield from spec.mjcf.losses
     if not spec.collisions:
@@ -105,7 +106,7 @@ def filter_words(spec: SceneSpec) -> tuple[dict[str, Words], frozenset[Pair]]:
 def collision_groups(
     bodies: Sequence[str], ignored: Collection[Pair], free: Collection[Pair] = frozenset()
 ) -> tuple[dict[str, Words], frozenset[Pair]]:
-    """Return filter words, and the pairs that should be ignored but that no words were left for.
+    """Return filter words, and the pairs to be ignored for which no words were left.
 
     With the words, PhysX ignores the other pairs of ``ignored``, perhaps some of ``free``, and no
     others. The ground and the user's content, with the default words 1, 1, 0, 0, touch every body.

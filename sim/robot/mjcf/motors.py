@@ -77,9 +77,9 @@ class Motors:
     """Motors of the joints by name, in N m or N; joints without an entry have none, or no limit."""
 
     effort_limit: dict[str, float] = field(default_factory=dict)
+    """Infinite where the file gives none."""
     unmoved: set[str] = field(default_factory=set)
     """Joints that no actuator moves, in a file with actuators."""
-    """Infinite where the file gives none."""
     armature: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     """Reflected inertia [kg m^2 or kg]; a follower's armature is added to its leader's."""
     kp: dict[str, float] = field(default_factory=lambda: defaultdict(float))

@@ -56,7 +56,7 @@ def choices(command: str) -> set[str]:
 
 
 def test_there_are_few_flags():
-    assert sum(len(flags(command).keys() - {"-h", "--help"}) for command in COMMANDS) <= 92
+    assert sum(len(flags(command).keys() - {"-h", "--help"}) for command in COMMANDS) <= 81
 
 
 @pytest.mark.parametrize("flag", HAVE)

@@ -61,8 +61,8 @@ def test_units_and_names_are_options(robot, tmp_path):
     for name in columns:
         if name.startswith("qpos"):
             columns[name] = np.degrees(columns[name])
-    reading = {"degrees": True, "prefix": "arm_", "hold": True}
-    (log,) = read(robot, tmp_path, columns, **reading)
+    patterns = "qpos: qpos:arm_{joint} deg", "effort: effort:arm_{joint}"
+    (log,) = read(robot, tmp_path, columns, columns=patterns, hold=True)
     assert log.held
     for name in ("time", "qpos", "command"):
         np.testing.assert_allclose(getattr(log, name), getattr(plain, name), atol=1e-12)
@@ -119,7 +119,7 @@ FAULTS = {
     r"line 12, column 'qpos:elbow' is empty or not finite": changed("qpos:elbow", 10, ""),
     r"line 12, column 'qpos:elbow' is not a number": changed("qpos:elbow", 10, "1 rad"),
     r"line 12: time decreases": changed("time", 10, 0.0),
-    r"far beyond the joint's limits.*--degrees": {
+    r"far beyond the joint's limits.*--columns": {
         name: 60 * v if name[0] == "q" else v for name, v in table().items()
     },
     r"one row per 5 s": table(time=1e3 * TIME),
@@ -285,8 +285,10 @@ def test_messages_of_a_bag_are_merged_by_joint(robot, tmp_path):
         )
     ]
     path = bag(tmp_path / "apart", apart)
-    (log,) = read_logs(robot, [path], "setpoint", reading=Reading(command_topic="/commands"))
+    reading = Reading(command_topic="/commands", columns=("setpoint: -setpoint:{joint} deg",))
+    (log,) = read_logs(robot, [path], "setpoint", reading=reading)
     np.testing.assert_allclose(log.qpos, np.sin(TIME[1:, None]) * np.ones(2), atol=1e-5)
+    np.testing.assert_allclose(log.command[0], -np.radians(np.sin(TIME[1])), atol=1e-4)
     with pytest.raises(
         bp.InvalidArgumentError,
         match=r"in the topic '/states'.*: /commands, /joint_states",
