@@ -36,6 +36,8 @@ CASES = {
 def target_of(robot, options):
     if options.get("control") == "osc":
         return np.array([0.4, 0.1, 0.5, 1.0, 0, 0, 0])
+    if not robot.independent.all():
+        return robot.target  # a step to its limits of 9 rad ends in chaos
     # Beyond a limit, so that joints meet theirs.
     ends = robot.start + 1.1 * (np.where(np.isfinite(robot.upper), robot.upper, 1.0) - robot.start)
     return np.where(np.arange(robot.dof) % 2, ends, robot.start)
@@ -55,10 +57,11 @@ def test_motions_are_those_of_a_runner_in_mujoco_without_contact(case):
             state, seen = loop.step(state, target, substeps=SUBSTEPS)
             expected = runner.step(target)
             # A Runner keeps the mass matrix of coupled joints for four sim steps.
-            near = 1e-3 if "coupled" in case else 1e-6
+            near = 3e-5 if "coupled" in case else 1e-6
             np.testing.assert_allclose(seen.qpos, expected.qpos, atol=near)
     at_limits = (seen.qpos > robot.upper) | (seen.qpos < robot.lower)
-    assert at_limits.any() or "osc" in case or not np.isfinite(robot.upper).all()
+    is_free = "osc" in case or "coupled" in case or not np.isfinite(robot.upper).all()
+    assert at_limits.any() or is_free
 
 
 @pytest.fixture
