@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,7 +37,6 @@ from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
 QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
 HDF5 = (".h5", ".hdf5")
-SECONDS = {"time": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9}
 UNITS = {
     "deg": np.pi / 180,
     "mrad": 1e-3,
@@ -140,21 +139,24 @@ def _read(
 def _sources(
     robot: Robot,
     source: str,
-    columns: Iterable[str],
+    columns: Collection[str],
     patterns: Iterable[str],
 ) -> dict[str, tuple[str, float]]:
     """Return the column of a file and its unit for each name of a log: those that ``patterns``
     name, and the others as they are.
     """
     matched = dict[str, tuple[str, float]]()
+    for unit in ("ms", "us", "ns"):
+        if f"time_{unit}" in columns and "time" not in columns:
+            matched["time"] = f"time_{unit}", UNITS[unit]
     for text in patterns:
         name, _, right = text.partition(": ")
-        pattern, *unit = right.split() or [""]
+        pattern, *units = right.split() or [""]
         try:
-            scale = UNITS.get(unit[0]) or float(unit[0]) if unit else 1.0
+            scale = UNITS.get(units[0]) or float(units[0]) if units else 1.0
         except ValueError:
             remedy = f"use one of {', '.join(UNITS)}, or a factor"
-            raise error(f"columns {text!r}", "has an unknown unit", remedy, unit[0]) from None
+            raise error(f"columns {text!r}", "has an unknown unit", remedy, units[0]) from None
         if pattern.startswith("-"):
             scale = -scale
             pattern = pattern[1:]
@@ -264,14 +266,12 @@ def _build(
     """Return the log that the columns of a file hold; ``commands`` are columns with their own
     times.
     """
-    unit = next((name for name in SECONDS if name in columns), None)
-    if unit is None:
+    if "time" not in columns:
         problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
         remedy = "begin the header with time, in seconds, or time_ms, time_us, time_ns"
         if proposed := _proposed(robot, columns):
             remedy = f"name its columns (--columns {proposed})"
         raise error(source, problem, remedy)
-    time = SECONDS[unit] * columns[unit]
     by = columns_by_joint(robot, source, columns | commands, QUANTITIES)
     if by["feedforward"]:
         remedy = "log the complete efforts, without the columns of the feedforward"
@@ -294,12 +294,17 @@ def _build(
                     remedy = f"name its columns (--columns {proposed})"
                 raise error(f"{source}: column {quantity}:{name}", "is missing", remedy)
         tables[quantity] = np.stack([by[quantity][name] for name in names], axis=1)
-    measured = measured and kind == "effort"
-    table = tables[kind]
-    hold = reading.hold
-    command_time = SECONDS[unit] * commands[unit]
-    log = Log(source, tuple(joints), kind, time, tables["qpos"], command_time, table, hold)
-    return replace(log, measured=measured)
+    return Log(
+        source,
+        tuple(joints),
+        kind,
+        columns["time"],
+        tables["qpos"],
+        commands["time"],
+        tables[kind],
+        held=reading.hold,
+        measured=measured and kind == "effort",
+    )
 
 
 def _read_bag(

@@ -120,7 +120,6 @@ COMBINATIONS = {
     motors.dumps_actuators: [{"actuators": ..., "record": {}}],
     bp.make_guard: [{"lower": 1.0, "upper": 0.0}],
     ts.make_osc_params: [
-        {"tree": "panda"},
         {"stiffness": [1.0, 2.0]},
         {"damping_ratio": math.nan},
         {"damping_ratio": 0.7, "damping": 9.0},
@@ -168,7 +167,6 @@ COMBINATIONS = {
     ],
     bp.design_gains: [
         {"bandwidth_hz": 0.0},
-        {"dt": 0.0},
         {"damping_ratio": -1.0},
         {"margin": 1.5},
         {"gain_units": "torque"},

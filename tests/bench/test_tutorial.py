@@ -40,7 +40,8 @@ def test_runner_follows_the_tutorials_loop():
         loop.target = setpoint
         recorded.append(loop.run(1))
     unlimited = robot.params(effort_limit=None)
-    with Runner(robot, 2, control=SimplePIDs(), params=unlimited, workers=0, substeps=1) as runner:
+    options = {"engine": "sapien", "workers": 0, "substeps": 1}
+    with Runner(robot, 2, control=SimplePIDs(), params=unlimited, **options) as runner:
         rollout = runner.rollout(setpoints)
     moved = np.abs(rollout.qpos[-1, 0] - settings.start)[ARM]
     assert moved.min() > 0.3, "the arm must have moved for the comparison to mean anything"
@@ -52,7 +53,7 @@ def test_internal_drive_follows_the_tutorials_internal_drive():
     robot = Robot.load("panda", dissipation="sapien")
     target = robot.settings.target
     expected = TutorialLoop(robot, target, external_pid=False, internal_drive=True).run(1000)
-    with Runner(robot, 1, control="drive", workers=0, substeps=1000) as runner:
+    with Runner(robot, 1, engine="sapien", control="drive", workers=0, substeps=1000) as runner:
         obs = runner.step(target)
     np.testing.assert_allclose(obs.qpos[0, ARM], expected[ARM], atol=2e-3)
     assert np.abs(obs.qpos[0] - robot.start)[ARM].min() > 0.2

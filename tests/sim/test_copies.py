@@ -117,8 +117,9 @@ def efforts_of(law, backend, inputs, disturb):
     envs, joints = 128, 4  # JAX takes over large and aligned arrays without a copy
 
     def draw():
-        kp = rng.uniform(1, 9, (envs, joints))
-        return own(bp.make_params(joints, kp=kp, ki=2.0, kd=0.5, **law))
+        return own(
+            bp.make_params(joints, kp=rng.uniform(1, 9, (envs, joints)), ki=2.0, kd=0.5, **law)
+        )
 
     params = draw()
     pid = bp.BatchPID(params, envs, 0.01, backend)

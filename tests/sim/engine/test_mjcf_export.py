@@ -261,9 +261,10 @@ EFFECTS = ("saturation_effort", "no_load_speed", "lag")
 
 def symmetric_limit(params):
     """Return the limit of the integral (joints,) that holds in both directions, infinite for none."""
-    ends = (getattr(params, name) for name in ("integral_min", "integral_max"))
-    low, high = (np.full(3, np.inf) if end is None else np.abs(end[0]) for end in ends)
-    return np.minimum(low, high)
+    low, high = params.integral_min, params.integral_max
+    below = np.full(3, np.inf) if low is None else -np.asarray(low)[0]
+    above = np.full(3, np.inf) if high is None else np.asarray(high)[0]
+    return np.maximum(np.minimum(below, above), 0.0)
 
 
 @given(random_params(), st.integers(0, 2**32 - 1))

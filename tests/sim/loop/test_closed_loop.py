@@ -55,7 +55,7 @@ def test_motions_are_those_of_a_runner_in_mujoco_without_contact(case):
             state, seen = loop.step(state, target, substeps=SUBSTEPS)
             expected = runner.step(target)
             # A Runner keeps the mass matrix of coupled joints for four sim steps.
-            near = 3e-5 if "coupled" in case else 1e-6
+            near = 1e-3 if "coupled" in case else 1e-6
             np.testing.assert_allclose(seen.qpos, expected.qpos, atol=near)
     at_limits = (seen.qpos > robot.upper) | (seen.qpos < robot.lower)
     assert at_limits.any() or "osc" in case or not np.isfinite(robot.upper).all()
