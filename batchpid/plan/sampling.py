@@ -274,12 +274,13 @@ def curve(
     rise = take_rows(state.knots, row + 1.0) - start
     if isinstance(plan.interpolation, Linear):
         return start + u * rise, rise * frequency, zero
-    v, w = take_rows(state.rates, row), take_rows(state.rates, row + 1.0)
-    c = 3.0 * rise - length * (2.0 * v + w)
-    d = length * (v + w) - 2.0 * rise
-    bend, twist = 2.0 * c, u * d
-    position = start + u * (length * v + u * (c + twist))
-    rate = v + u * (bend + 3.0 * twist) * frequency
+    # The rates as distances in the time of this segment.
+    v = length * take_rows(state.rates, row)
+    w = length * take_rows(state.rates, row + 1.0)
+    c = 3.0 * rise - (2.0 * v + w)
+    bend, twist = 2.0 * c, u * (v + w - 2.0 * rise)
+    position = start + u * (v + u * (c + twist))
+    rate = (v + u * (bend + 3.0 * twist)) * frequency
     return position, rate, (bend + 6.0 * twist) * (frequency * frequency)
 
 
