@@ -128,8 +128,9 @@ def test_a_call_from_a_signal_handler_raises(runner: Runner, on_alarm: Any) -> N
         raised.append(True)
 
     on_alarm(handler)
+    # Long steps: the signal comes during one of them.
     while not raised:
-        seen = runner.step(TABLE[0], substeps=500)
+        seen = runner.step(TABLE[0], substeps=LONG)
     assert seen.ok.all()
 
 
