@@ -40,7 +40,7 @@ def namespace(*leaves: Array) -> ArrayModule:
 
 @cache
 def _register_in_jax() -> None:
-    """Let ``jax.export`` serialize functions of records; for all else JAX knows named tuples."""
+    """Register the named tuples of records for ``jax.export``. Nothing else in JAX needs it."""
     from jax.export import register_namedtuple_serialization
 
     for kind in NAMED_TUPLES:

@@ -28,7 +28,7 @@ BESIDE_P: tuple[dict[str, Any], ...] = (
     {"kd": 1.0},
     {"ki": 1.0, "kd": 1.0},
 )
-"""Gains beside kp of P, PI, PD and PID."""
+"""Gains of P, PI, PD and PID in addition to kp."""
 ANTI_WINDUPS = ("none", "clamp", "conditional", "back_calculation")
 FILTER_TIMES = (None, 0.01)
 NUMBERS = np.zeros((1, 1))
