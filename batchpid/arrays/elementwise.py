@@ -136,9 +136,11 @@ def read_history(history: Array, places: Array) -> Array:
 @_recorded("take_row")
 def take_rows(table: Array, rows: Array) -> Array:
     """Return the numbers of ``table`` (..., rows, joints) in row ``rows`` (..., joints) of each
-    joint; the numbers of the rows are floats.
+    joint, or in several (..., n, joints); the numbers of the rows are floats.
     """
     xp = namespace(table, rows)
+    if rows.ndim == table.ndim:
+        return xp.take_along_axis(table, rows.astype(int), -2)
     return xp.take_along_axis(table, rows[..., None, :].astype(int), -2)[..., 0, :]
 
 
