@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -54,17 +54,25 @@ def passive_force(
     return np.asarray(force, np.float64)
 
 
+class HasTree(Protocol):
+    """Robots of one kind."""
+
+    @property
+    def rigid_tree(self) -> RigidTree:
+        """Their tree."""
+
+
 class NativeModel:
-    """Model of the robots of ``pack``, without their variation, on a base of this kind of
-    :data:`BASES`.
+    """Model of the robots of ``pack``, on a base of this kind of :data:`BASES`, with ``inertias``
+    (robots, dof + 1, 13) where they differ: :meth:`RigidTree.inertias`.
     """
 
-    def __init__(self, pack: EnginePack, base: str = "fixed") -> None:
+    def __init__(self, pack: HasTree, base: str = "fixed", inertias: Float64 | None = None) -> None:
         # The pack's tree is read at the first use: SAPIEN has to build a robot for it.
         self._pack = pack
         self._base = base
         self._native = native.extension("_gateway")
-        self._inertias: Float64 | None = None
+        self._inertias = inertias
 
     @cached_property
     def _structure(self) -> tuple[ModelStruct, Any]:
@@ -80,7 +88,9 @@ class NativeModel:
             "varies": self._inertias is not None,
             "base": BASES.index(self._base),
         }
-        return ModelStruct(gravity=self._pack.spec.gravity, **numbers, **addresses), arrays
+        return ModelStruct(
+            gravity=tuple(self._pack.rigid_tree.bodies.gravity), **numbers, **addresses
+        ), arrays
 
     @property
     def address(self) -> int:

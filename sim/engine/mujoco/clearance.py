@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Float64, MjData, MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.mujoco.speed_bounds import speed_bounds
-from batchpid.sim.engine.mujoco.vectors import aligned
 from batchpid.sim.engine.native.interface import WIDTH, Clearance
+from batchpid.sim.engine.native.vectors import aligned
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -18,8 +18,8 @@ import numpy as np
 from batchpid.arrays.array_types import Float64, MjData, MjModel, Rows
 from batchpid.sim.engine.mujoco.clearance import touching_pairs
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
-from batchpid.sim.engine.mujoco.vectors import aligned, table
 from batchpid.sim.engine.native.interface import CONTACT, FARTHEST, WIDTH, FreeMotion
+from batchpid.sim.engine.native.vectors import aligned, table
 from batchpid.sim.engine.native_model import NativeModel
 
 _NONE, _SOME, _UNKNOWN = range(len(CONTACT))
