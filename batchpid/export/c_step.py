@@ -109,7 +109,8 @@ class Dialect(NamedTuple):
         text = re.sub(r"batchpid|BATCHPID|\bdouble\b", lambda match: words[match[0]], text)
         text = re.sub(r"\b(\d+\.\d+|(?:sin|cos|ceil)(?=\())", rf"\1{self.suffix}", text)
         for name, part in parts.items():
-            text = re.sub(rf" */\* \[{name}\] \*/\n", lambda _, part=part: part, text)
+            before, after = re.split(rf" */\* \[{name}\] \*/\n", text)
+            text = before + part + after
         return f"{text}\n"
 
     def number(self, value: float) -> str:
