@@ -25,7 +25,7 @@ from batchpid.sim.engine.scene_spec import (
 )
 from batchpid.task_space.rigid_tree import RigidTree
 
-ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
+BASE_AT_REST = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
 """Pose and twist of a base at rest at the origin."""
 
 

@@ -23,7 +23,7 @@ from sapien import Pose, physx
 from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.model_pack import ORIGIN, ModelPack
+from batchpid.sim.engine.model_pack import BASE_AT_REST, ModelPack
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import Engine
@@ -314,7 +314,7 @@ class Pack(ModelPack):
         their efforts become zero, and the content of their scenes is reset.
         """
         bases = (
-            np.tile(ORIGIN, (len(rows), 1))
+            np.tile(BASE_AT_REST, (len(rows), 1))
             if base is None
             else self._moved_to_origin(rows, base, 1.0)
         )
