@@ -18,8 +18,8 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import choice, flag, instance, integer, number
-from batchpid.errors import InvalidArgumentError, MissingDependencyError, warn
-from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked
+from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.sim.identification.log import CommandKind, Log, checked
 from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.problem import Problem, windows_of
 from batchpid.sim.identification.regression import (
@@ -120,11 +120,6 @@ def identify(
         An option is out of range or contradicts a recording, or a file holds no log of this robot.
     MissingDependencyError
         SciPy is missing.
-
-    Warns
-    -----
-    LogWarning
-        A log was changed when it was read, or a joint did not move.
     """
     if find_spec("scipy") is None:
         raise MissingDependencyError("scipy", "identification", "tune")
@@ -207,9 +202,6 @@ def _moving(robot: Robot, logs: list[Log]) -> tuple[Bool, tuple[str, ...]]:
     if not moves.any():
         problem = f"show no motion of any joint ({names})"
         raise InvalidArgumentError("logs", problem, remedy="record a motion")
-    if still:
-        words = "did not move, or did not follow its setpoint: left out, and held in place"
-        warn(f"{names} {words}", LogWarning)
     return moves, still
 
 

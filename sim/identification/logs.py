@@ -27,8 +27,8 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import file_path
-from batchpid.errors import BatchPIDError, MissingDependencyError, warn
-from batchpid.sim.identification.log import GAP, CommandKind, Log, LogWarning, checked
+from batchpid.errors import BatchPIDError, MissingDependencyError
+from batchpid.sim.identification.log import GAP, CommandKind, Log, checked
 from batchpid.sim.recording.recording_files import RecordingError, read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
@@ -126,8 +126,12 @@ def _read(
             raise RecordingError(f"{bad}; {A_LOG}, or a recording of a Runner") from bad
         return logs_of_rollout(robot, rollout, kind, source=str(path))
     if path.exists() and (suffix in BAGS or path.is_dir()):
-        columns, commands, cuts = _read_bag(robot, path, reading)
-        return checked(robot, _build(robot, str(path), columns, commands, kind, reading), cuts)
+        remarks = list[str]()
+        columns, commands, cuts = _read_bag(robot, path, reading, remarks)
+        log = _build(robot, str(path), columns, commands, kind, reading)
+        for remark in remarks:
+            log = log.with_remark(remark)
+        return checked(robot, log, cuts)
     file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
     columns, numbers = read_csv(path, (*QUANTITIES, "time"))
     sources = _sources(robot, str(path), columns, reading.columns)
@@ -308,10 +312,13 @@ def _build(
 
 
 def _read_bag(
-    robot: Robot, path: Path, reading: Reading
+    robot: Robot,
+    path: Path,
+    reading: Reading,
+    remarks: list[str],
 ) -> tuple[dict[str, Float64], dict[str, Float64], list[int]]:
     """Return the columns of positions and those of commands in a bag by name, in seconds since the
-    first row, and the rows before which a topic was silent.
+    first row, and the rows before which a topic was silent; append to ``remarks`` what is left out.
 
     Messages are merged by the names of joints: each joint has the samples of all messages that name
     it. Rows are at the stamps of the joint with most positions.
@@ -339,8 +346,7 @@ def _read_bag(
             remedy += f" joints: {', '.join(sorted(others)) or 'none'}"
             raise error(str(path), problem, remedy)
     if others:
-        left_out = ", ".join(sorted(others))
-        warn(f"{path}: {left_out}: no joint of the robot, left out", LogWarning)
+        remarks.append(f"{', '.join(sorted(others))}: no joint of the robot, left out")
     # Nanoseconds since 1970 have more digits than a float.
     origin = min(min(rows) for rows in samples.values())
     tables = dict[str, Float64]()
@@ -357,11 +363,11 @@ def _read_bag(
     outside = (first - times[0]) / 1e9, (times[-1] - last) / 1e9
     if max(outside) > GAP:
         words = f"first {max(outside[0], 0):.3f} s and last {max(outside[1], 0):.3f} s"
-        warn(f"{path}: {words} without values of all columns: left out", LogWarning)
+        remarks.append(f"{words} without values of all columns: left out")
     times = times[(times >= first) & (times <= last)]
     for begin, end, silent in _silences(used, first, last):
         words = f"is silent from {(begin - first) / 1e9:.3f} to {(end - first) / 1e9:.3f} s"
-        warn(f"{path}: {', '.join(silent)} {words}: the log is divided there", LogWarning)
+        remarks.append(f"{', '.join(silent)} {words}: the log is divided there")
         times = times[(times <= begin) | (times >= end)]
         cuts.append(end)
     positions = {"time": (times - first) / 1e9}

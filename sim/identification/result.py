@@ -65,6 +65,14 @@ class Identification:
         return self.fit.problem.unknowns
 
     @property
+    def remarks(self) -> list[str]:
+        """Sentences on what was left out of the logs, and on joints that did not move."""
+        logs = (part.log for part in self.fit.problem.data)
+        remarks = dict.fromkeys(remark for log in logs for remark in log.remarks)
+        words = "did not move, or did not follow its setpoint: left out, and held in place"
+        return [*remarks, *(f"joint {name!r} {words}" for name in self.still)]
+
+    @property
     def _point(self) -> Float64:
         return self.fit.solution.point
 
@@ -226,6 +234,7 @@ class Identification:
             "at_bounds": self.at_bounds,
             "effects": self.effects,
             "did_not_move_hence_ideal": list(self.still),
+            "remarks": self.remarks,
             "held_out_error": list(self.held_out_error),
             "converged": self.converged,
             "compensation_through_motors": self.drive.through,
@@ -305,6 +314,7 @@ class Identification:
             lines.append(f"at its bound: {', '.join(self.at_bounds)}")
         if not self.converged:
             lines.append("the fit has not converged: the values are the best so far")
+        lines += self.remarks
         return "\n".join(lines)
 
 
