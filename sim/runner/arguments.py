@@ -5,7 +5,7 @@ to.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,9 +18,11 @@ from batchpid.sim.engine.model_pack import BASE_AT_REST
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot_model import base_start
-from batchpid.sim.runner.runner_state import Motion, RunnerState
 from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS
 from batchpid.stages.values import Command
+
+if TYPE_CHECKING:
+    from batchpid.sim.runner.operations import Motion, RunnerState
 
 _SHORTEST = 1e-9
 """Smallest length of a quaternion: a shorter one has large rounding errors."""
