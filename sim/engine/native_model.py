@@ -17,7 +17,7 @@ import numpy as np
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.motors.coupling import Coupling
-from batchpid.motors.friction import SHARE, Friction, FrictionState
+from batchpid.motors.friction import DEADBEAT_SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import BASES, STATUS, Group, ModelStruct, Refresh
 from batchpid.task_space.rigid_tree import RigidTree
@@ -185,7 +185,7 @@ class NativeRefresh:
         arrays |= coupling.native()
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
         self._structure = Refresh(
-            model=model.address, timestep=timestep, share=SHARE, steps=steps, **addresses
+            model=model.address, timestep=timestep, share=DEADBEAT_SHARE, steps=steps, **addresses
         )
         self._kept = model, arrays
 

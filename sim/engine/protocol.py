@@ -50,7 +50,7 @@ Capability = Literal["build", "partial_force", "base_state", "complete_state", "
 """
 
 
-ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
+BASE_AT_REST = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
 """Pose and twist of a base at rest at the origin."""
 
 

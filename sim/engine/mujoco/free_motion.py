@@ -33,7 +33,9 @@ def place_of_contacts() -> int | None:
     """
     planes = _COUNT * '<geom type="plane" size="0 0 1"/>'
     ball = '<body pos="0 0 0.05"><freejoint/><geom size="0.1"/></body>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{planes}{ball}</worldbody></mujoco>")
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody>{planes}{ball}</worldbody></mujoco>"
+    )
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
     # The number lies between these two arrays of the structure.

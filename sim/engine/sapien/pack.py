@@ -25,7 +25,7 @@ from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.physics import PHYSICS
-from batchpid.sim.engine.protocol import ORIGIN, Engine, EnginePack
+from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
 from batchpid.sim.engine.sapien.building import (
     RESTITUTION,
     build_scene,
@@ -302,7 +302,7 @@ class Pack(EnginePack):
         their efforts become zero, and the content of their scenes is reset.
         """
         bases = (
-            np.tile(ORIGIN, (len(rows), 1))
+            np.tile(BASE_AT_REST, (len(rows), 1))
             if base is None
             else self._moved_to_origin(rows, base, 1.0)
         )
