@@ -10,18 +10,20 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.motors.coupling import Coupling
-from batchpid.motors.friction import SHARE, Friction, FrictionState
+from batchpid.motors.friction import DEADBEAT_SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import BASES, STATUS, Group, ModelStruct, Refresh
-from batchpid.sim.engine.protocol import CompiledModel, EnginePack
+from batchpid.sim.engine.native.interface import BASES, STATUS, WIDTH, Group, ModelStruct, Refresh
 from batchpid.task_space.rigid_tree import RigidTree
+
+if TYPE_CHECKING:
+    from batchpid.sim.engine.protocol import EnginePack
 
 
 def passive_force(
@@ -52,6 +54,31 @@ def passive_force(
     if coriolis and not gravity:
         force = force - ts.bias(tree, qpos, zero, bodies=bodies)
     return np.asarray(force, np.float64)
+
+
+ALIGNMENT = 64
+"""Alignment of vectors in memory [bytes]."""
+
+
+def aligned(*shape: int) -> Float64:
+    """Return an array of zeros whose memory begins where a vector may."""
+    size = 8 * int(np.prod(shape))
+    memory = np.zeros(size + ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % ALIGNMENT
+    rows: Float64 = memory[start : start + size].view(np.float64).reshape(shape)
+    return rows
+
+
+def table(rows: Rows, size: int) -> Float64:
+    """Return ``rows`` (size | 1, columns) in blocks (blocks, columns, WIDTH), as lanes of native
+    code read them.
+    """
+    blocks = -(-size // WIDTH)
+    out = aligned(blocks, rows.shape[1], WIDTH)
+    numbers = np.minimum(np.arange(blocks * WIDTH), size - 1)
+    padded = np.broadcast_to(rows, (size, rows.shape[1]))[numbers]
+    out[...] = padded.reshape(blocks, WIDTH, -1).swapaxes(1, 2)
+    return out
 
 
 class HasTree(Protocol):
@@ -169,7 +196,7 @@ class NativeRefresh:
 
     def __init__(
         self,
-        model: CompiledModel,
+        model: NativeModel,
         size: int,
         armature: Float64,
         friction: Friction,
@@ -193,7 +220,7 @@ class NativeRefresh:
         arrays |= coupling.native()
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
         self._structure = Refresh(
-            model=model.address, timestep=timestep, share=SHARE, steps=steps, **addresses
+            model=model.address, timestep=timestep, share=DEADBEAT_SHARE, steps=steps, **addresses
         )
         self._kept = model, arrays
 
@@ -216,7 +243,7 @@ class NativeStep:
     program.
 
     ``arrays`` and ``fields`` fill a :class:`.interface.Group`; a joint speed beyond ``speed_limit``
-    (dof,) shows in the status. Implements :class:`batchpid.sim.engine.protocol.CompiledStep`.
+    (dof,) shows in the status.
     """
 
     def __init__(
@@ -276,5 +303,5 @@ def passive_force_of(pack: EnginePack, natively: bool) -> Callable[..., Float64]
     every executor takes them from it, since the engines' and NumPy's differ in the last bits.
     """
     if natively:
-        return NativeModel(pack, "fixed" if pack.spec.fixed_base else "held").passive_force
+        return pack.force_model.passive_force
     return lambda *state: passive_force(pack.rigid_tree.held, *state)

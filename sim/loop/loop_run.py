@@ -13,8 +13,7 @@ from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import WIDTH, FreeMotion, Group
-from batchpid.sim.engine.native.vectors import aligned, table
-from batchpid.sim.engine.native_model import NativeModel, NativeRefresh
+from batchpid.sim.engine.native_model import NativeModel, NativeRefresh, aligned, table
 from batchpid.sim.loop.closed_loop import ClosedLoop, LoopState
 from batchpid.sim.loop.group_control import GroupControl
 from batchpid.sim.loop.native_program import Buffers, TickProgram
