@@ -19,7 +19,7 @@ from typing import Any, Literal, Protocol
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.io.packages import imported
+from batchpid.io.files import imported
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
