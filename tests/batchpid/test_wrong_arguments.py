@@ -95,6 +95,7 @@ def test_choices_of_the_law(name):
 
 
 AXIS = [True] + [False] * 5
+LATE = bp.make_params(2, 1.0, 1.0, gain_units="mass_matrix", discretization="implicit")
 COMBINATIONS = {
     bp.make_params: [
         {"kp": None},
@@ -135,6 +136,10 @@ COMBINATIONS = {
         {"limit_margin": -0.1},
         {"limit_stiffness": [10.0, 20.0]},
         *({name: "other"} for name in osc_params.TASK_CHOICES),
+    ],
+    bp.track: [
+        {"ki": ..., "params": bp.make_params(2, 1.0)},
+        {"dt": None, "params": LATE._replace(gain_units=None)},
     ],
     bp.drive_target: [
         {"state": 3},
