@@ -118,8 +118,19 @@ COMBINATIONS = {
         {"saturation_effort": ..., "no_load_speed": 10.0},
         {"stribeck": 0.1, "coulomb": 0.2},
     ],
+    motors.init: [
+        {
+            "max_delay": ...,
+            "actuators": bp.make_actuators(2, lag=1.0, command_delay=1.0),
+            "dt": 1e-6,
+        }
+    ],
     motors.dumps_actuators: [{"actuators": ..., "record": {}}],
     bp.make_guard: [{"lower": 1.0, "upper": 0.0}],
+    bp.make_plan: [
+        {"fade": 1.0, "blend": "newest"},
+        *({"taper": 0.1}, {"latest": [3]}, {"acceleration": 0.0}, {"period": 0.0}, {"horizon": 0}),
+    ],
     ts.make_osc_params: [
         {"stiffness": [1.0, 2.0]},
         {"damping_ratio": math.nan},
