@@ -167,7 +167,7 @@ def discretise(
     check_time_step(dt)
     a = actuators
     xp = namespace(*actuators)
-    late = [
+    command, sensor = [
         None if seconds is None else delay.discretise(seconds, dt, history.shape[-2])
         for seconds, history in (
             (a.command_delay, state.command),
@@ -175,7 +175,8 @@ def discretise(
         )
     ]
     k = MotorCoefficients(
-        *late,
+        command=command,
+        sensor=sensor,
         envelope=envelope(a),
         commands=command_envelope(a),
         intake=None if a.lag is None else -xp.expm1(-dt / xp.maximum(a.lag, 1e-3 * dt)),
