@@ -144,9 +144,9 @@ def replace_envs(state: T, fresh: T, mask: Array) -> T:
         return rebuilt
     old: Any = state
     xp = namespace(old, fresh, mask)
-    wanted = xp.asarray(mask)
-    wanted = wanted.reshape(*wanted.shape, *[1] * (old.ndim - wanted.ndim))
-    chosen: T = xp.where(wanted, fresh, old)
+    rows = xp.asarray(mask)
+    rows = rows.reshape(*rows.shape, *[1] * (old.ndim - rows.ndim))
+    chosen: T = xp.where(rows, fresh, old)
     return chosen
 
 

@@ -36,8 +36,8 @@ effort, here the effort of the motor::
 
 With K = J / dt one joint stops in one step (deadbeat), and up to 4/3 of that is stable. Coupled
 joints share it: with the correlations C_ij = A_ij / sqrt(A_ii A_jj) of A = (M + dt B)^-1, J_j = 1 /
-(A_jj sum_i |C_ij|) keeps the eigenvalues of A J within [0, 1], by Gershgorin's theorem. SHARE of K
-is left for inertias that change between two refreshes.
+(A_jj sum_i |C_ij|) keeps the eigenvalues of A J within [0, 1], by Gershgorin's theorem.
+DEADBEAT_SHARE of K leaves room for inertias that change between two refreshes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
 from batchpid.checks.validate import check_time_step
 
-SHARE = 0.7
+DEADBEAT_SHARE = 0.7
 """Share of the deadbeat gain K that is used."""
 LOOKAHEAD = 0.1
 """Time ahead at which the setpoint is taken to determine the direction of motion [s]."""
@@ -174,7 +174,7 @@ def refresh(
     shared = (correlation * rubs.astype(correlation.dtype)[..., None, :]).sum(-1)
     k = xp.where(
         rubs,
-        SHARE / (dt * mobility * xp.where(rubs, shared, 1.0)),
+        DEADBEAT_SHARE / (dt * mobility * xp.where(rubs, shared, 1.0)),
         0.0,
     )
     w = 1 - dt * implicit * mobility

@@ -49,7 +49,7 @@ class _GuardFields(NamedTuple):
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
 
 
-FIELDS = declared(_GuardFields, Field)
+GUARD_FIELDS = declared(_GuardFields, Field)
 """Options of a joint."""
 
 
@@ -60,7 +60,7 @@ class Guard(Record, _GuardFields):
 
     __slots__ = ()
     NAME = "guard"
-    FIELDS = FIELDS
+    FIELDS = GUARD_FIELDS
 
 
 class GuardState(NamedTuple):
@@ -74,7 +74,7 @@ class GuardState(NamedTuple):
     """r within the limits of the position [rad or m]."""
 
 
-@with_fields(*FIELDS)
+@with_fields(*GUARD_FIELDS)
 def make_guard(
     joints: int,
     *,
@@ -109,7 +109,7 @@ def make_guard(
             low = xp.where(mask > 0, -math.inf, low)
         if high is not None:
             high = xp.where(mask > 0, math.inf, high)
-    rates = {name: FIELDS[name] for name in ("rate", "acceleration")}
+    rates = {name: GUARD_FIELDS[name] for name in ("rate", "acceleration")}
     return Guard(
         lower=build.freeze(low),
         upper=build.freeze(high),
