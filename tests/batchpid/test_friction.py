@@ -99,7 +99,7 @@ def test_it_takes_its_share_of_the_velocity_that_a_joint_would_have_without_a_ch
         v, before = after(total[0, 0] + b * v), v
         if step:  # the first step has no velocity of a step before
             np.testing.assert_allclose(
-                v, (1 - friction.SHARE) * unchanged, rtol=1e-9, atol=1e-12 * abs(before)
+                v, (1 - friction.DEADBEAT_SHARE) * unchanged, rtol=1e-9, atol=1e-12 * abs(before)
             )
         q += DT * v
 

@@ -20,9 +20,9 @@ import batchpid.task_space as ts
 from batchpid import metrics, motors, trajectories
 from batchpid.arrays.choices import CHOICES
 from batchpid.errors import InvalidArgumentError
-from batchpid.law.params import FIELDS as LAW_FIELDS
+from batchpid.law.params import LAW_FIELDS
 from batchpid.motors import friction, guard
-from batchpid.motors.actuators import FIELDS as MOTOR_FIELDS
+from batchpid.motors.actuators import ACTUATOR_FIELDS
 from batchpid.task_space import osc_params
 
 NAMES = ["shoulder", "elbow"]
@@ -47,8 +47,8 @@ def refused(argument, function, *arguments, **keywords):
 
 OPTIONS = [
     *((bp.make_params, {"kp": 1.0, "ki": 1.0}, name, field) for name, field in LAW_FIELDS.items()),
-    *((bp.make_actuators, {}, name, field) for name, field in MOTOR_FIELDS.items()),
-    *((bp.make_guard, {}, name, field) for name, field in guard.FIELDS.items()),
+    *((bp.make_actuators, {}, name, field) for name, field in ACTUATOR_FIELDS.items()),
+    *((bp.make_guard, {}, name, field) for name, field in guard.GUARD_FIELDS.items()),
 ]
 
 NEEDS = {"tracking_time": {"anti_windup": "back_calculation", "effort_limit": 1.0}}
