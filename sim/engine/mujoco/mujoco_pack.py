@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Bool, Float64, MjData, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.model_pack import BASE_AT_REST, ModelPack
 from batchpid.sim.engine.mujoco.data_pool import STATE, DataPool, rest
 from batchpid.sim.engine.mujoco.file_scene import check_links
 from batchpid.sim.engine.mujoco.free_motion import FreeMotions, place_of_contacts
@@ -34,7 +33,7 @@ from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel, passive_force
 from batchpid.sim.engine.physics import SOLVERS
-from batchpid.sim.engine.protocol import Engine
+from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import CONTACT_FRICTION
@@ -48,11 +47,8 @@ _JOINTS = ("dof_armature", "dof_damping", "actuator_biasprm", "actuator_forceran
 """Fields of ``mujoco.MjModel`` that joints and drives change."""
 
 
-class MujocoPack(ModelPack):
-    """M robots of ``spec``. Arrays are (M, dof), in the order of ``spec.joints``, SI units.
-
-    Implements :class:`batchpid.sim.engine.protocol.EnginePack`.
-    """
+class MujocoPack(EnginePack):
+    """Pack of robots in MuJoCo."""
 
     def __init__(
         self,
@@ -128,7 +124,7 @@ class MujocoPack(ModelPack):
             self._evaluate(rows)
         else:
             self._free.use(self.models)
-        self._calls: object = object()
+        self.calls = object()
         self._own_step: MujocoStep | None = None
 
     def _evaluate(self, rows: Iterable[int]) -> None:
@@ -200,10 +196,6 @@ class MujocoPack(ModelPack):
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         return gravity and coriolis and self._is_model
-
-    @property
-    def calls(self) -> object:
-        return self._calls
 
     def compiled_step(
         self,
