@@ -73,6 +73,8 @@ class Symbol:
     It can also be a matrix in each row, or a history of samples, which a program changes in place.
     """
 
+    ndim = 2
+
     def __init__(self, namespace: Namespace, is_mask: bool = False) -> None:
         self._namespace = namespace
         self.is_mask = is_mask

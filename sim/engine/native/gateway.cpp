@@ -63,7 +63,7 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
     if (!array.open(PyTuple_GetItem(arguments[2], i), numbers, 0, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) return nullptr;
     bound->outputs.push_back({array.as<void>(), array.itemsize() == 1});
   }
-  if (!tables_fit(program, program.rows, bound->inputs)) return misfit();
+  if (!tables_fit(program, bound->inputs)) return misfit();
   return capsule_of(std::move(bound));
 }
 
