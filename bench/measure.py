@@ -32,14 +32,14 @@ from workload import Case, Workload, run_round
 
 from batchpid.io.files import package_versions, write_atomically
 from batchpid.sim import Robot
-from batchpid.sim.cli.report import table
+from batchpid.sim.diagnosis.text import table
 from batchpid.sim.engine import native
 from batchpid.sim.engine.protocol import EnginePack, load_engine
 from batchpid.sim.loop import env_group
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.workers.exchange import SharedArrays
+from batchpid.sim.workers.requests import SharedArrays
 from batchpid.stages.values import Command
 
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"

@@ -1,13 +1,12 @@
-"""Robots that stand on the floor: the closed loop in MuJoCo over ``mujoco.batch`` without control,
+"""Robots that stand on the floor, or beside objects: the closed loop in MuJoCo over ``mujoco.batch`` without control,
 in the same motion.
 
 The peer steps the same compiled model with MuJoCo's default options from the same state, and gets
 the efforts that the closed loop applied at each sim step. A user of ``mujoco.batch`` can set the
 options of the closed loop, a sparse Jacobian and no islands: then the ratio is about 1.05. Robots
 of the package example-robot-data are measured where it is installed, or where the variable
-EXAMPLE_ROBOT_DATA names its folder ``robots``; a quadruped of boxes always is. MotrixSim, where
-installed (``pip install motrixsim``), steps the exported MJCF under the same efforts. Processor
-time, in one process, on one thread.
+EXAMPLE_ROBOT_DATA names its folder ``robots``; a quadruped of boxes, and a panda with a cube beside
+it, always are. Processor time, in one process, on one thread.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ import mujoco
 import mujoco.batch as mujoco_batch
 import numpy as np
 import pytest
+from lxml import etree
 
 from batchpid import PIDParams
 from batchpid.sim import MujocoSolver, Robot, Runner
@@ -40,6 +40,8 @@ FILES = {
 }
 FLOORS = {"Go2": 1.4, "G1": 1.4}
 """Least ratio over ``mujoco.batch`` without control."""
+CUBE = """<body name="cube" pos=".5 0 .03"><freejoint/>
+  <geom type="box" size=".03 .03 .03" density="400"/></body>"""
 LINK = """<link name="{name}"><inertial><origin xyz="0 0 {down}"/><mass value="{mass}"/>
   <inertia ixx="{inertia}" iyy="{inertia}" izz="{inertia}" ixy="0" ixz="0" iyz="0"/></inertial>
   <collision><origin xyz="0 0 {down}"/><geometry><box size="{size}"/></geometry></collision></link>"""
@@ -60,8 +62,21 @@ def quadruped() -> str:
     return f'<robot name="quadruped">{"".join(parts)}</robot>'
 
 
+def panda_with_a_cube() -> str:
+    """Return the MJCF of a panda and a cube on a floor."""
+    root = etree.fromstring(to_mjcf(Robot.load("panda"), None, 1 / 2000).text.encode())
+    root.find("worldbody").append(etree.fromstring(CUBE))
+    for keyframe in root.findall("keyframe"):
+        root.remove(keyframe)
+    return etree.tostring(root, encoding="unicode")
+
+
 def load(name: str, folder: Path) -> Robot:
-    """Return a robot on a floating base; skip one whose file is not found."""
+    """Return a robot on a floating base, or the panda; skip one whose file is not found."""
+    if name == "panda and cube":
+        path = folder / "panda_and_cube.xml"
+        path.write_text(panda_with_a_cube())
+        return Robot.load(path)
     if name == "boxes":
         path = folder / "quadruped.urdf"
         path.write_text(quadruped())
@@ -99,35 +114,42 @@ def closed_loop(runner: Runner, table: np.ndarray) -> tuple[float, np.ndarray]:
     return (time.process_time() - began) / (len(table) * SUBSTEPS * runner.num_envs), qpos
 
 
-def efforts_of(robot: Robot, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose of the base at the start (7,), and the efforts (steps, dof) of the closed
-    loop.
+def efforts_of(robot: Robot, table: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the efforts (steps, dof) of the closed loop, and the poses (1, 7) of a floating base at
+    the start.
     """
     with Runner(robot, 1, params=gains(robot), workers=0, engine="mujoco", substeps=1) as runner:
-        start = runner.reset().base_pose[0].astype(np.float64)
-        return start, runner.rollout(np.repeat(table, SUBSTEPS, axis=0)).effort[:, 0].astype(
-            np.float64
-        )
+        base_pose = runner.reset().base_pose
+        efforts = runner.rollout(np.repeat(table, SUBSTEPS, axis=0)).effort[:, 0]
+        return efforts.astype(np.float64), base_pose
 
 
 def bare_engine(
-    robot: Robot, num_envs: int, start: np.ndarray, efforts: np.ndarray
+    robot: Robot, num_envs: int, efforts: np.ndarray, base_pose: np.ndarray | None
 ) -> tuple[float, np.ndarray]:
     """Return what :func:`closed_loop` returns, of ``mujoco.batch`` under ``efforts`` (steps,
     dof).
     """
-    options = {"fixed_base": False}
-    built = robot_model(
-        SceneSpec(
-            robot.tables, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
-        )
+    spec = SceneSpec(
+        robot.tables,
+        robot.ignored_pairs,
+        robot.joints,
+        1 / 2000,
+        MujocoSolver(),
+        fixed_base=robot.fixed_base,
+        mjcf=robot.mjcf,
     )
+    built = robot_model(spec)
     model = copy.copy(built.model)
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
     model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
     batch = mujoco_batch.Batch(model, num_envs, nthread=1, persistent=True)
     qpos, applied = batch.bind("qpos"), batch.bind("qfrc_applied")
-    qpos[:, :7], qpos[:, built.qpos] = start, robot.start
+    if base_pose is None:
+        qpos[:] = built.model.key_qpos[0]
+    else:
+        qpos[:, :7] = base_pose
+    qpos[:, built.qpos] = robot.start
     began = time.process_time()
     for row in efforts:
         applied[:, built.qvel] = row
@@ -135,31 +157,7 @@ def bare_engine(
     return (time.process_time() - began) / (len(efforts) * num_envs), qpos[:, built.qpos]
 
 
-def motrix(robot: Robot, num_envs: int, start: np.ndarray, efforts: np.ndarray) -> float:
-    """Return the processor time of an env step of MotrixSim under ``efforts`` (steps, dof)."""
-    import motrixsim
-
-    model = motrixsim.load_mjcf_str(to_mjcf(robot, None, 1 / 2000).text)
-    data = motrixsim.SceneData(model, batch=[num_envs])
-    qpos = np.array(data.dof_pos)
-    qpos[:, :3] = start[:3]
-    # MotrixSim writes a quaternion with its real part last.
-    qpos[:, 3:7] = np.roll(start[3:7], -1)
-    columns = [model.get_joint(name).dof_pos_index for name in robot.joint_names]
-    qpos[:, columns] = robot.start
-    data.set_dof_pos(qpos, model)
-    began = time.process_time()
-    for row in efforts:
-        data.actuator_ctrls = np.tile(row, (num_envs, 1))
-        motrixsim.step(model, data)
-    seconds = time.process_time() - began
-    # Contacts differ between the engines, but in this time no robot falls.
-    assert (data.dof_pos[:, 2] > 0.8 * start[2]).all()
-    assert not (data.dof_pos == qpos).all(), "the robots did not move"
-    return seconds / (len(efforts) * num_envs)
-
-
-@pytest.mark.parametrize("name", [*FILES, "boxes"])
+@pytest.mark.parametrize("name", [*FILES, "boxes", "panda and cube"])
 def test_standing_robots(benchmark, report, compare, most, name, tmp_path):
     benchmark.group = "on the floor, in one process"
     robot, num_envs, rounds = (
@@ -168,7 +166,7 @@ def test_standing_robots(benchmark, report, compare, most, name, tmp_path):
         min(ROUNDS, most.rounds),
     )
     table = setpoints(robot, SUBSTEPS * min(TICKS, most.ticks))
-    start, efforts = efforts_of(robot, table)
+    efforts, base_pose = efforts_of(robot, table)
 
     def measure():
         rows = []
@@ -178,7 +176,7 @@ def test_standing_robots(benchmark, report, compare, most, name, tmp_path):
             for _ in range(rounds + 1):
                 (ours, moved), (bare, theirs) = (
                     closed_loop(runner, table),
-                    bare_engine(robot, num_envs, start, efforts),
+                    bare_engine(robot, num_envs, efforts, base_pose),
                 )
                 np.testing.assert_allclose(moved, theirs, atol=2e-3)
                 assert np.abs(moved - robot.start).max() > 0.1 * SHAKE, "the robots did not move"
@@ -191,7 +189,3 @@ def test_standing_robots(benchmark, report, compare, most, name, tmp_path):
     benchmark.extra_info["over mujoco.batch without control"] = round(ratio, 3)
     case = f"closed loop, {num_envs} envs"
     compare(name, case, "mujoco.batch without control", ratio, FLOORS.get(name))
-    if importlib.util.find_spec("motrixsim"):
-        ours = statistics.median(ours for ours, _ in rows)
-        theirs = motrix(robot, num_envs, start, efforts)
-        compare(name, case, "MotrixSim without control", theirs / ours)

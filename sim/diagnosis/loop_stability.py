@@ -18,7 +18,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.errors import InvalidArgumentError, warn
-from batchpid.law.implicit import as_explicit
+from batchpid.law.coefficients import as_explicit
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
@@ -86,9 +86,9 @@ def _loop(
         loop["mass_matrix"] = eye[None]
     else:
         # The law knows the damping, too, as part of its matrix.
-        known = robot.actuators or bp.Actuators()
-        implicit = coupling.reduced_damping(robot.damping + table(known.viscous)[0])
-        model = matrix(known.armature)[:1] + timestep * eye * implicit
+        described = robot.actuators or bp.Actuators()
+        implicit = coupling.reduced_damping(robot.damping + table(described.viscous)[0])
+        model = matrix(described.armature)[:1] + timestep * eye * implicit
         plant = matrix(motors.armature) + timestep * eye * damping[:, None]
         loop |= {"mass_matrix": plant, "model": strength[..., None] * model}
     loop["filter_time"] = column(params.derivative_filter_time)

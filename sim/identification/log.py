@@ -16,17 +16,17 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.elementwise import TURN
-from batchpid.errors import InvalidArgumentError, warn
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
 
 CommandKind = Literal["setpoint", "effort"]
-BEYOND = 0.3, 0.05
+LIMIT_MARGINS = 0.3, 0.05
 """Distances [rad], [m] beyond a joint limit at which a position counts as given in another
 unit.
 """
 MIN_ROWS, MIN_SECONDS = 50, 0.2
 """Least number of rows and length [s] of a stretch."""
-LONGEST = 0.05
+LONGEST_PERIOD = 0.05
 """Longest period of the rows [s]."""
 GAP, PERIODS = 0.1, 5.0
 """Least length of a gap, in seconds and in median periods of the rows; the longer one applies."""
@@ -34,10 +34,6 @@ CLEAR = np.pi / 2
 """Largest change from row to row, apart from whole turns, at which the number of turns is certain
 [rad].
 """
-
-
-class LogWarning(UserWarning):
-    """Rows of a log were left out, or a joint did not move."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +73,8 @@ class Log:
     """Number of each row's line in a file (rows,)."""
     is_checked: bool = False
     """True for the result of :func:`checked`."""
+    remarks: tuple[str, ...] = ()
+    """Sentences on what was left out of its source, for the report."""
 
     @property
     def seconds(self) -> float:
@@ -117,9 +115,9 @@ class Log:
         """Return the error of this log."""
         return InvalidArgumentError(self.source, problem, remedy=remedy, value=value)
 
-    def warn(self, problem: str) -> None:
-        """Warn about this log."""
-        warn(f"{self.source}: {problem}", LogWarning)
+    def with_remark(self, remark: str) -> Log:
+        """Return the log with one remark more."""
+        return replace(self, remarks=(*self.remarks, f"{self.source}: {remark}"))
 
 
 def interpolated(time: Float64, known: Rows, table: Rows) -> Float64:
@@ -145,7 +143,7 @@ def checked(robot: Robot, log: Log, resets: Sequence[int] = ()) -> list[Log]:
     log = _in_order(log)
     period = float(np.median(np.diff(log.time))) if len(log.time) > 1 else 0.0
     units = "time is in seconds, or the column is time_ms, time_us or time_ns"
-    if period > LONGEST:
+    if period > LONGEST_PERIOD:
         problem = f"has one row per {period:.3g} s, too few to see friction and delay"
         raise log.error(problem, f"record at 100 Hz or more; {units}")
     gaps = np.flatnonzero(np.diff(log.time) > max(GAP, PERIODS * period)) + 1
@@ -163,9 +161,10 @@ def checked(robot: Robot, log: Log, resets: Sequence[int] = ()) -> list[Log]:
         remedy = f"record {MIN_ROWS} rows and {MIN_SECONDS} s without a gap; {units}"
         raise log.error(problem, remedy)
     if short:
-        log.warn(
-            f"stretches between gaps in time or resets are too short, left out: {short[0]} ..."
-        )
+        remark = f"stretches between gaps in time or resets are too short, left out: {short[0]} ..."
+        # The source of a stretch names its rows, too.
+        remarks = log.with_remark(remark).remarks
+        parts = [replace(part, remarks=remarks) for part in parts]
     return parts
 
 
@@ -193,7 +192,7 @@ def _in_order(log: Log) -> Log:
     if not repeats.any():
         return log
     first = log.place(np.argmax(repeats))
-    log.warn(f"{repeats.sum()} rows repeat a time, the first at {first}: left out")
+    log = log.with_remark(f"{repeats.sum()} rows repeat a time, the first at {first}: left out")
     return log.part(~repeats, np.diff(log.command_time, prepend=-np.inf) > 0)
 
 
@@ -221,7 +220,7 @@ def _unwrapped(robot: Robot, log: Log) -> Log:
         remedy = "give positions in rad, log more rows per second, or remove wrong rows"
         raise log.error(f"{problem} {steps[row, column]:.3g} rad", remedy)
     # Positions far beyond the limits are in another unit; those that wrap are within a turn.
-    margin = np.where(revolute, *BEYOND)
+    margin = np.where(revolute, *LIMIT_MARGINS)
     low = robot.lower[joints]
     high = robot.upper[joints]
     beyond = (log.qpos < low - margin) | (log.qpos > high + margin)

@@ -27,14 +27,14 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import file_path
-from batchpid.errors import BatchPIDError, MissingDependencyError, warn
-from batchpid.sim.identification.log import GAP, CommandKind, Log, LogWarning, checked
+from batchpid.errors import BatchPIDError, MissingDependencyError
+from batchpid.sim.identification.log import GAP, CommandKind, Log, checked
 from batchpid.sim.recording.recording_files import RecordingError, read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
 
-QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
+LOG_QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
 HDF5 = (".h5", ".hdf5")
 UNITS = {
@@ -126,10 +126,14 @@ def _read(
             raise RecordingError(f"{bad}; {A_LOG}, or a recording of a Runner") from bad
         return logs_of_rollout(robot, rollout, kind, source=str(path))
     if path.exists() and (suffix in BAGS or path.is_dir()):
-        columns, commands, cuts = _read_bag(robot, path, reading)
-        return checked(robot, _build(robot, str(path), columns, commands, kind, reading), cuts)
+        remarks = list[str]()
+        columns, commands, cuts = _read_bag(robot, path, reading, remarks)
+        log = _build(robot, str(path), columns, commands, kind, reading)
+        for remark in remarks:
+            log = log.with_remark(remark)
+        return checked(robot, log, cuts)
     file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
-    columns, numbers = read_csv(path, (*QUANTITIES, "time"))
+    columns, numbers = read_csv(path, (*LOG_QUANTITIES, "time"))
     sources = _sources(robot, str(path), columns, reading.columns)
     columns = {name: scale * columns[column] for name, (column, scale) in sources.items()}
     log = _build(robot, str(path), columns, columns, kind, reading)
@@ -272,7 +276,7 @@ def _build(
         if proposed := _proposed(robot, columns):
             remedy = f"name its columns (--columns {proposed})"
         raise error(source, problem, remedy)
-    by = columns_by_joint(robot, source, columns | commands, QUANTITIES)
+    by = columns_by_joint(robot, source, columns | commands, LOG_QUANTITIES)
     if by["feedforward"]:
         remedy = "log the complete efforts, without the columns of the feedforward"
         raise error(source, "has a feedforward, which a fit does not simulate", remedy)
@@ -308,22 +312,25 @@ def _build(
 
 
 def _read_bag(
-    robot: Robot, path: Path, reading: Reading
+    robot: Robot,
+    path: Path,
+    reading: Reading,
+    remarks: list[str],
 ) -> tuple[dict[str, Float64], dict[str, Float64], list[int]]:
     """Return the columns of positions and those of commands in a bag by name, in seconds since the
-    first row, and the rows before which a topic was silent.
+    first row, and the rows before which a topic was silent; append to ``remarks`` what is left out.
 
     Messages are merged by the names of joints: each joint has the samples of all messages that name
     it. Rows are at the stamps of the joint with most positions.
     """
-    found = _samples(path, reading)
+    columns = _samples(path, reading)
     samples = dict[str, dict[int, float]]()
     # Other devices publish joints of their own.
     others = set[str]()
-    for name, (column, scale) in _sources(robot, str(path), found, reading.columns).items():
+    for name, (column, scale) in _sources(robot, str(path), columns, reading.columns).items():
         joint = name.partition(":")[2]
         if joint in robot.joint_names:
-            samples[name] = {stamp: scale * value for stamp, value in found[column].items()}
+            samples[name] = {stamp: scale * value for stamp, value in columns[column].items()}
         else:
             others.add(joint)
     quantities = ("setpoint:", "effort:") if reading.command_topic else ("measured_effort:",)
@@ -339,8 +346,7 @@ def _read_bag(
             remedy += f" joints: {', '.join(sorted(others)) or 'none'}"
             raise error(str(path), problem, remedy)
     if others:
-        left_out = ", ".join(sorted(others))
-        warn(f"{path}: {left_out}: no joint of the robot, left out", LogWarning)
+        remarks.append(f"{', '.join(sorted(others))}: no joint of the robot, left out")
     # Nanoseconds since 1970 have more digits than a float.
     origin = min(min(rows) for rows in samples.values())
     tables = dict[str, Float64]()
@@ -357,11 +363,11 @@ def _read_bag(
     outside = (first - times[0]) / 1e9, (times[-1] - last) / 1e9
     if max(outside) > GAP:
         words = f"first {max(outside[0], 0):.3f} s and last {max(outside[1], 0):.3f} s"
-        warn(f"{path}: {words} without values of all columns: left out", LogWarning)
+        remarks.append(f"{words} without values of all columns: left out")
     times = times[(times >= first) & (times <= last)]
     for begin, end, silent in _silences(used, first, last):
         words = f"is silent from {(begin - first) / 1e9:.3f} to {(end - first) / 1e9:.3f} s"
-        warn(f"{path}: {', '.join(silent)} {words}: the log is divided there", LogWarning)
+        remarks.append(f"{', '.join(silent)} {words}: the log is divided there")
         times = times[(times <= begin) | (times >= end)]
         cuts.append(end)
     positions = {"time": (times - first) / 1e9}
@@ -372,10 +378,10 @@ def _read_bag(
     stamps = stamps[(stamps >= first) & (stamps <= last)]
     commands = {"time": (stamps - first) / 1e9}
     for column in driven:
-        known, values = tables[column]
-        commands[column] = np.interp(stamps, known, values)
+        sent, values = tables[column]
+        commands[column] = np.interp(stamps, sent, values)
         if reading.hold:
-            commands[column] = values[np.searchsorted(known, stamps, "right") - 1]
+            commands[column] = values[np.searchsorted(sent, stamps, "right") - 1]
     return positions, commands, np.searchsorted(times, cuts).tolist()
 
 

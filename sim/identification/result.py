@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,19 +20,20 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.sim.identification.intervals import INTERVAL
 from batchpid.sim.identification.problem import Problem
-from batchpid.sim.identification.simulator import LogControl, changed_params
+from batchpid.sim.identification.simulator import changed_params
 from batchpid.sim.identification.trials import Fit
-from batchpid.sim.identification.unknowns import KINDS, Unknown, Unknowns, least_value
+from batchpid.sim.identification.unknowns import UNKNOWN_KINDS, Unknown, Unknowns, least_value
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import load_robot_actuators
 from batchpid.sim.robot.urdf_export import to_urdf
+from batchpid.stages import Control
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
-NEAR = 1e-6
+AT_BOUND = 1e-6
 """Distance from a bound, over the typical size, at which a value is there."""
 EXPLAINS = 0.5
 """Share of the position error of the robot as described that a file may leave."""
@@ -65,6 +67,14 @@ class Identification:
         return self.fit.problem.unknowns
 
     @property
+    def remarks(self) -> list[str]:
+        """Sentences on what was left out of the logs, and on joints that did not move."""
+        logs = (part.log for part in self.fit.problem.data)
+        remarks = dict.fromkeys(remark for log in logs for remark in log.remarks)
+        words = "did not move, or did not follow its setpoint: left out, and held in place"
+        return [*remarks, *(f"joint {name!r} {words}" for name in self.still)]
+
+    @property
     def _point(self) -> Float64:
         return self.fit.solution.point
 
@@ -79,7 +89,7 @@ class Identification:
         return self.unknowns.joints
 
     @property
-    def drive(self) -> LogControl:
+    def drive(self) -> Control:
         """Control of the first log."""
         return self.fit.problem.data[0].drive
 
@@ -136,7 +146,7 @@ class Identification:
     def at_bounds(self) -> list[str]:
         """Unknowns whose value, with the description's, is at its bound."""
         low, high = self.unknowns.bounds
-        is_held = (self._point <= low + NEAR) | (self._point >= high - NEAR)
+        is_held = (self._point <= low + AT_BOUND) | (self._point >= high - AT_BOUND)
         return [self._name(entry) for entry in self.unknowns.only(is_held).entries]
 
     def interval(
@@ -146,8 +156,8 @@ class Identification:
         identify it.
 
         Friction and damping include the description's. ``kind`` is a name of
-        :data:`batchpid.sim.identification.unknowns.KINDS`, ``joint`` the number of a joint among
-        :attr:`joints`, the name of a link for "mass", None for "delay", "setpoint_delay" and
+        :data:`batchpid.sim.identification.unknowns.UNKNOWN_KINDS`, ``joint`` the number of a joint
+        among :attr:`joints`, the name of a link for "mass", None for "delay", "setpoint_delay" and
         "payload".
 
         Raises
@@ -226,9 +236,10 @@ class Identification:
             "at_bounds": self.at_bounds,
             "effects": self.effects,
             "did_not_move_hence_ideal": list(self.still),
+            "remarks": self.remarks,
             "held_out_error": list(self.held_out_error),
             "converged": self.converged,
-            "compensation_through_motors": self.drive.through,
+            "compensation_through_motors": not self.drive.further,
             "identified_from": [part.log.source for part in self.fit.problem.data],
         }
 
@@ -253,7 +264,7 @@ class Identification:
         the law.
         """
         law = self.unknowns.tables(self.values[None], "law")
-        if self.drive.params is None or law.keys() <= {"slew"}:
+        if self.drive.mode == "effort" or law.keys() <= {"slew"}:
             return None
         return changed_params(self.drive.params, law)
 
@@ -282,10 +293,12 @@ class Identification:
         for place, table in document["intervals"].items():
             cells = ", ".join(f"{kind} {_cell(kind, *row)}" for kind, row in table.items())
             lines.append(f"{place}: {cells}")
-        if self.drive.compensate != "none":
-            path = "through its motors" if self.drive.through else "apart from its motors"
-            friction = "" if self.drive.modelled is None else "+friction"
-            lines.append(f"the robot compensates {self.drive.compensate}{friction} {path}")
+        drive = self.drive
+        if drive.gravity:
+            parts = {"coriolis": drive.coriolis, "friction": drive.modelled is not None}
+            forces = "+".join(["gravity", *compress(parts, parts.values())])
+            path = "apart from its motors" if drive.further else "through its motors"
+            lines.append(f"the robot compensates {forces} {path}")
         before, after = self.held_out_error
         lines.append(
             "position error on the held-out part, simulated from the logged state:"
@@ -305,6 +318,7 @@ class Identification:
             lines.append(f"at its bound: {', '.join(self.at_bounds)}")
         if not self.converged:
             lines.append("the fit has not converged: the values are the best so far")
+        lines += self.remarks
         return "\n".join(lines)
 
 
@@ -316,7 +330,7 @@ def _cell(
 ) -> str:
     """Return a value with its interval, or its bound where the interval is wider than itself."""
     half = high - value
-    if half > abs(value) and KINDS[kind].positive:
+    if half > abs(value) and UNKNOWN_KINDS[kind].positive:
         return f"< {high:.2g}"
     # As many digits as the first one of the interval has, and one more.
     digits = np.log10(max(abs(value), half) / half)
@@ -326,7 +340,7 @@ def _cell(
 def _of_all_joints(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
     """Return the fields of actuators (n, dof) with ``values`` (n, unknowns)."""
     fields = dict[str, Float64]()
-    neutral = {kind.field: kind.neutral for kind in KINDS.values()}
+    neutral = {kind.field: kind.neutral for kind in UNKNOWN_KINDS.values()}
     for name, table in unknowns.tables(values, "motor").items():
         fields[name] = np.full((len(values), unknowns.robot.dof), neutral[name])
         fields[name][:, unknowns.joints] = table
@@ -363,8 +377,8 @@ def draw_motors(
         region = documents.read(path)["about"][KEY]
         entries = []
         for kind, place in region["unknowns"]:
-            joint = robot.joint_names.index(place) if KINDS[kind].per == "joint" else None
-            least = max(least_value(robot, kind, joint or 0), 1e-3 * KINDS[kind].neutral)
+            joint = robot.joint_names.index(place) if UNKNOWN_KINDS[kind].per == "joint" else None
+            least = max(least_value(robot, kind, joint or 0), 1e-3 * UNKNOWN_KINDS[kind].neutral)
             entries.append(Unknown(kind, joint, 0.0, 1.0, least))
         root = np.array(region["root"], float)
         normal = np.random.default_rng(seed).normal(size=(count, root.shape[1]))

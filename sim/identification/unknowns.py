@@ -17,7 +17,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.motors.actuators import Actuators
-from batchpid.sim.identification.simulator import MassChange, PlantCandidates
+from batchpid.sim.identification.simulator import Candidates
 from batchpid.sim.robot.robot import Robot
 
 
@@ -40,7 +40,7 @@ class Kind(NamedTuple):
     """Largest value."""
 
 
-KINDS = {
+UNKNOWN_KINDS = {
     "armature": Kind("motor", "joint", "inertia", 4.0, field="armature"),
     "damping": Kind("motor", "joint", "damping", 4.0, field="viscous"),
     "friction": Kind("motor", "joint", "effort", 4.0, field="coulomb"),
@@ -109,7 +109,7 @@ def least_value(robot: Robot, kind: str, joint: int) -> float:
     """
     if kind in DESCRIBED:
         return -float(getattr(robot, DESCRIBED[kind])[joint])
-    return 0.0 if KINDS[kind].positive else -np.inf
+    return 0.0 if UNKNOWN_KINDS[kind].positive else -np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ class Unknowns:
         """
         entries = list(self.entries)
         for name in kinds:
-            kind = KINDS[name]
+            kind = UNKNOWN_KINDS[name]
             if kind.per == "link":
                 entries += [Unknown(name, None, 1.0, 1.0, 0.0, link) for link in self.links]
                 continue
@@ -163,7 +163,7 @@ class Unknowns:
     @cached_property
     def kinds(self) -> list[Kind]:
         """Kind of each unknown."""
-        return [KINDS[entry.kind] for entry in self.entries]
+        return [UNKNOWN_KINDS[entry.kind] for entry in self.entries]
 
     @cached_property
     def sizes(self) -> Float64:
@@ -224,7 +224,7 @@ class Unknowns:
             tables["static"] += tables.get("coulomb", 0.0)
         return tables
 
-    def candidates(self, values: Float64) -> PlantCandidates:
+    def candidates(self, values: Float64) -> Candidates:
         """Return the candidates with ``values`` (n, unknowns)."""
         fields = self.tables(values, "motor", "sensor")
         if "command_delay" in fields:
@@ -232,12 +232,12 @@ class Unknowns:
         none = np.zeros((len(values), 1))
         sender = self.tables(values, "setpoint")
         late, lag = (sender.get(name, none)[:, 0] for name in SENDER)
-        masses = {}
+        masses: dict[str, dict[str, Float64]] = {"payload": {}, "mass": {}}
         for column, entry in enumerate(self.entries):
             if entry.link is not None:
-                masses[MassChange(entry.link, entry.kind == "payload")] = values[:, column]
+                masses[entry.kind][entry.link] = values[:, column]
         law = self.tables(values, "law")
-        return PlantCandidates(Actuators(**fields), law, late, lag, masses)
+        return Candidates(Actuators(**fields), law, late, lag, **masses)
 
     def only(self, mask: Bool) -> Unknowns:
         """Return the unknowns of a mask (unknowns,); the others have their neutral value."""

@@ -64,13 +64,16 @@ class Group(ctypes.Structure):
     _fields_ = [
         *_all(
             ctypes.c_void_p,
-            "gateway",
+            "functions",
+            "articulations",
+            "systems",
             "qf",
             "skip",
             "speed_limit",
             "mujoco",
             "constraint",
             "joints",
+            "lanes",
         ),
         *_all(ctypes.c_int64, "robots", "dof"),
         *_all(ctypes.c_int32, "gravity", "coriolis", "senses"),
