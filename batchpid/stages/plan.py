@@ -30,6 +30,7 @@ class Plan(Stage):
 
     name = "plan"
     starting = ("lag",)
+    due = ("now", "end")
 
     @classmethod
     def of(cls, control: Control) -> Self | None:
@@ -40,6 +41,9 @@ class Plan(Stage):
 
     def init(self, values: Values) -> Told:
         return model.init(self.options, values.measured.qpos, -self.lag), values
+
+    def renewed(self, state: model.PlanState) -> model.PlanState:
+        return model.renewed(self.options, state, state.now + self.timestep)
 
     def step(self, state: model.PlanState, values: Values) -> Told:
         time = state.now + self.timestep

@@ -1,4 +1,6 @@
-"""Consecutive stages as one native program, traced from :func:`batchpid.stages.stage.stepped`."""
+"""Consecutive stages as one native program, traced from :func:`batchpid.stages.stage.advanced`
+or :func:`batchpid.stages.stage.renewed`.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from batchpid.arrays.array_types import Array, Pytree
 from batchpid.arrays.trees import filled, leaves, mapped, structure
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.tracing import Trace, trace_trees
-from batchpid.stages.stage import States, running, stepped
+from batchpid.stages.stage import States, advanced, renewed, running
 from batchpid.stages.values import Values
 
 
@@ -20,7 +22,8 @@ class StageProgram:
     """Stages, their states, and the values before them, whose arrays it reads.
 
     It changes the arrays of ``states`` in place. It makes new arrays for the ``values`` that it
-    changes: for the outputs alone, or with ``passes`` for all, which stages after it read.
+    changes: for the outputs alone, or with ``passes`` for all, which stages after it read. With
+    ``renews`` it renews the states and changes nothing else.
 
     Attributes
     ----------
@@ -42,13 +45,14 @@ class StageProgram:
         values: Values,
         shape: tuple[int, int],
         passes: bool = False,
+        renews: bool = False,
     ) -> None:
         constants = mapped(_split, running(stages))
         # Programs have no keys of noise, counts, or state of a controller.
         states = mapped(_number, tuple(states))
         state, self.inputs = leaves(states), leaves((states, values))
         histories = tuple([array.ndim == 3 for array in state])
-        traced = _trace(histories, passes, *map(structure, (constants, states, values)))
+        traced = _trace(histories, passes, renews, *map(structure, (constants, states, values)))
         masks = traced.program.masks
         self.outputs = [np.zeros(shape, bool if is_mask else float) for is_mask in masks]
         for array, place in zip(state, traced.places, strict=False):  # the state comes first
@@ -78,6 +82,7 @@ class _Traced(NamedTuple):
 def _trace(
     histories: tuple[bool, ...],
     passes: bool,
+    renews: bool,
     constants: Any,
     states: Any,
     values: Any,
@@ -92,7 +97,10 @@ def _trace(
 
     def function(stages: Any, states: States, values: Values) -> list[Any]:
         numbers = {symbol: number for number, symbol in enumerate(leaves((states, values)))}
-        new, after = stepped(stages, states, values)
+        if renews:
+            new, after = renewed(stages, states), values
+        else:
+            new, after = advanced(stages, states, values)
         changed = new, after if passes else after.outputs
         outputs = set(map(id, leaves(after.outputs)))
         results, places = list[Any](), list[int]()

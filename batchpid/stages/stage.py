@@ -41,6 +41,10 @@ class Stage:
     """Whether each tick makes its state anew, so that snapshots do not hold it."""
     starting: ClassVar[tuple[str, ...]] = ()
     """Constants that only ``init`` needs."""
+    due: ClassVar[tuple[str, str]] | None = None
+    """Fields of the state, the time of an env and the time from which :meth:`renewed` changes its
+    state; None for never.
+    """
 
     @classmethod
     def of(cls, control: Control) -> Any:
@@ -57,6 +61,10 @@ class Stage:
     def init(self, values: Values) -> Told:
         """Return the state of envs at their start, and the values for the stages after it."""
         return (), values
+
+    def renewed(self, state: Any) -> Any:
+        """Return the state for the next sim step, before ``step``, changed where its time is due."""
+        return state
 
     def step(self, state: Any, values: Values) -> Told:
         """Return the state after a sim step, and the values for the stages after it."""
@@ -78,6 +86,17 @@ def running(stages: Iterable[Any]) -> tuple[Any, ...]:
 
 def stepped(stages: Sequence[Any], states: States, values: Values) -> tuple[States, Values]:
     """Advance stages by a sim step; return their states, and the values after them."""
+    return advanced(stages, renewed(stages, states), values)
+
+
+def renewed(stages: Sequence[Any], states: States) -> States:
+    """Return the states for the next sim step: :meth:`Stage.renewed`."""
+    pairs = zip(stages, states, strict=True)
+    return tuple([state if stage.due is None else stage.renewed(state) for stage, state in pairs])
+
+
+def advanced(stages: Sequence[Any], states: States, values: Values) -> tuple[States, Values]:
+    """Advance stages by a sim step, from :func:`renewed` states on."""
     new = list[Pytree]()
     values = recalled(stages, states, values)
     for stage, state in zip(stages, states, strict=True):

@@ -162,6 +162,10 @@ class TickProgram:
     def _add_stages(self, values: Values, moves: bool) -> Outputs:
         """Add the stages; return the results after them."""
         setup = self._setup
+        for stage, state in zip(setup.stages, self.buffers.states, strict=True):
+            if stage.due is not None:
+                clock, due = [self._address(getattr(state, name), np.float64) for name in stage.due]
+                self._add_program([(stage, state)], values, renews=True, clock=clock, due=due)
         waiting = list[tuple[Any, Pytree]]()
         for stage, state in zip(setup.stages, self.buffers.states, strict=True):
             if not stage.native:
@@ -183,15 +187,21 @@ class TickProgram:
         return outputs
 
     def _add_program(
-        self, pairs: list[tuple[Any, Pytree]], values: Values, passes: bool = False
+        self,
+        pairs: list[tuple[Any, Pytree]],
+        values: Values,
+        passes: bool = False,
+        renews: bool = False,
+        **fields: Any,
     ) -> Values:
         """Add a program of stages and their states; return the values after it, which it
-        ``passes`` on to further stages.
+        ``passes`` on to further stages. ``renews`` as in :class:`StageProgram`; ``fields`` are of
+        the program's stage in native code.
         """
         if not pairs:
             return values
         stages, states = zip(*pairs, strict=True)
-        made = StageProgram(stages, states, values, self.buffers.before.shape, passes)
+        made = StageProgram(stages, states, values, self.buffers.before.shape, passes, renews)
         if made.outputs:
             # Native code sets the addresses of the noise, which is another in each sim step.
             drawn = [id(block) for block in leaves(values.noise)]
@@ -200,6 +210,7 @@ class TickProgram:
                 "program",
                 program=len(self._programs),
                 noise=(*noise, -1, -1)[:2],
+                **fields,
             )
             rows = tuple([(array, _row_size(array)) for array in made.inputs])
             arguments = made.program.arguments

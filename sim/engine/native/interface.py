@@ -246,6 +246,7 @@ class Stage(ctypes.Structure):
         *_all(ctypes.c_int32, "kind", "program"),
         ("noise", 2 * ctypes.c_int32),
         ("every", ctypes.c_int64),
+        *_all(ctypes.c_void_p, "clock", "due"),
     ]
 
 
