@@ -62,6 +62,8 @@ class Plan(Stage):
         """
         xp = namespace(chunk, latency)
         mask = xp.isfinite(chunk).all((1, 2)) & xp.isfinite(latency)
+        if mask.all():
+            return model.add(self.options, state, chunk, state.now[:, 0] + self.lag - latency)
         chunk = xp.where(mask[:, None, None], chunk, 0.0)
         time = state.now[:, 0] + self.lag - xp.where(mask, latency, 0.0)
         return replace_envs(state, model.add(self.options, state, chunk, time), mask)

@@ -41,9 +41,9 @@ class Stage:
     """Whether each tick makes its state anew, so that snapshots do not hold it."""
     starting: ClassVar[tuple[str, ...]] = ()
     """Constants that only ``init`` needs."""
-    due: ClassVar[tuple[str, str]] | None = None
-    """Fields of the state, the time of an env and the time from which :meth:`renewed` changes its
-    state; None for never.
+    due: ClassVar[tuple[str, ...]] = ()
+    """Two fields of the state: the time of an env, and the time from which :meth:`renewed` changes
+    its state; () for never.
     """
 
     @classmethod
@@ -92,7 +92,7 @@ def stepped(stages: Sequence[Any], states: States, values: Values) -> tuple[Stat
 def renewed(stages: Sequence[Any], states: States) -> States:
     """Return the states for the next sim step: :meth:`Stage.renewed`."""
     pairs = zip(stages, states, strict=True)
-    return tuple([state if stage.due is None else stage.renewed(state) for stage, state in pairs])
+    return tuple([stage.renewed(state) if stage.due else state for stage, state in pairs])
 
 
 def advanced(stages: Sequence[Any], states: States, values: Values) -> tuple[States, Values]:

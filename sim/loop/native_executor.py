@@ -4,7 +4,7 @@ needs Python.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -96,6 +96,16 @@ class NativeExecutor:
         if sensors is not None:  # the noise is drawn anew for another object as the key
             key = states[self._places["sensors"]].key
             self._replace("sensors", sensors._replace(key=key))
+
+    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
+        """Change the state of a stage:
+        :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.change`.
+        """
+        before = self._buffers.states[self._places[name]]
+        after = function(self.setup.stage(name), before)
+        for array, rows in zip(leaves(before), leaves(after), strict=True):
+            if rows is not array:
+                array[...] = rows
 
     def _sensors(self) -> ActuatorState | None:
         """Return the state of the sensors, if there are some."""

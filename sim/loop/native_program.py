@@ -163,7 +163,7 @@ class TickProgram:
         """Add the stages; return the results after them."""
         setup = self._setup
         for stage, state in zip(setup.stages, self.buffers.states, strict=True):
-            if stage.due is not None:
+            if stage.due:
                 clock, due = [self._address(getattr(state, name), np.float64) for name in stage.due]
                 self._add_program([(stage, state)], values, renews=True, clock=clock, due=due)
         waiting = list[tuple[Any, Pytree]]()

@@ -4,11 +4,12 @@ of controllers in Python.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Float64, Pytree, Rows
 from batchpid.sim.engine.native_model import NativeStep
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.custom import controller_errors
@@ -63,6 +64,16 @@ class NumPyExecutor:
     def write_state(self, states: States) -> None:
         """Replace the states; they have the arrays of the states before."""
         self._states = states
+
+    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
+        """Change the state of the stage ``name``, between sim steps, to ``function(stage, state)``,
+        which has the same arrays or others in their place.
+        """
+        pairs = zip(self.setup.stages, self._states, strict=True)
+        changed = [
+            function(stage, state) if stage.name == name else state for stage, state in pairs
+        ]
+        self._states = tuple(changed)
 
     def results(self) -> Outputs:
         """Return the results of the last sim step as NumPy arrays."""
