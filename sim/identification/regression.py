@@ -28,7 +28,7 @@ from batchpid.sim.identification.log import Log, interpolated
 from batchpid.sim.identification.simulator import (
     Dynamics,
     LogControl,
-    Plant,
+    LogPlant,
     PlantCandidates,
     SimulatedControl,
 )
@@ -90,7 +90,7 @@ class LogData(NamedTuple):
 
     log: Log
     motion: Motion
-    plant: Plant
+    plant: LogPlant
     drive: LogControl
 
 

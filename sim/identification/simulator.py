@@ -105,7 +105,7 @@ class Stretch(NamedTuple):
     """Time from the row to that end [s] (rows,)."""
 
 
-class Plant:
+class LogPlant:
     """Logged ``joints`` of ``robot``; those that are ``free`` (joints,) have no limits."""
 
     def __init__(self, robot: Robot, joints: tuple[int, ...], free: Any = False) -> None:
@@ -193,7 +193,7 @@ class Dynamics:
 
     def __init__(
         self,
-        plant: Plant,
+        plant: LogPlant,
         masses: Mapping[MassChange, Float64],
         qpos: Float64,
         qvel: Float64,
@@ -336,7 +336,7 @@ def changed_params(params: bp.PIDParams, law: Mapping[str, Float64]) -> bp.PIDPa
 
 
 def simulate(
-    plant: Plant,
+    plant: LogPlant,
     drive: LogControl,
     robots: PlantCandidates,
     states: Float64,
@@ -428,7 +428,7 @@ def simulate(
 
 
 def _move(
-    plant: Plant,
+    plant: LogPlant,
     dt: float,
     q: Float64,
     v: Float64,

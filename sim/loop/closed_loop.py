@@ -275,7 +275,7 @@ def closed_loop(
         scene.joints,
         friction,
         slice(0, num_envs),
-        controller and _Traced(controller),
+        controller and _TracedController(controller),
         DISSIPATION[scene.dissipation].modelled,
     )
     tree = robot.kinematic_tree(armature=np.zeros(robot.dof)).held
@@ -284,7 +284,7 @@ def closed_loop(
     return ClosedLoop(plant, control, tree, robot.start)
 
 
-class _Traced:
+class _TracedController:
     """The caller's own controller in a program of JAX."""
 
     def __init__(self, controller: OwnController) -> None:

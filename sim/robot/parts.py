@@ -159,7 +159,7 @@ class FileDefaults:
     integral_limit: Float64 | None = None
 
 
-class Reading(NamedTuple):
+class FileReading(NamedTuple):
     """How a file was read, and what it says besides bodies, shapes and joints.
 
     ``package_dirs`` are the folders in which meshes are looked up first. ``defaults`` come from an

@@ -31,11 +31,11 @@ from batchpid.sim.robot.merging import merge_links, place_links
 from batchpid.sim.robot.mimics import couple, coupling_of
 from batchpid.sim.robot.parts import (
     DISSIPATION,
+    FileReading,
     Joint,
     LinkMass,
     MjcfFile,
     Placement,
-    Reading,
     Settings,
     Srdf,
 )
@@ -101,7 +101,7 @@ class Robot:
     joints: tuple[Joint, ...]
     fixed_base: bool
     dissipation: str
-    reading: Reading
+    reading: FileReading
     settings: Settings | None
     mjcf: MjcfFile | None = None
     actuators: bp.Actuators | None = None
@@ -466,7 +466,7 @@ class Robot:
             joints,
             source.fixed_base,
             dissipation,
-            Reading(self_collision, srdf, folders, source.defaults, source.base_start),
+            FileReading(self_collision, srdf, folders, source.defaults, source.base_start),
             _read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
             source.mjcf,
         )

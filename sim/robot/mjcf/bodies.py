@@ -25,7 +25,7 @@ from batchpid.sim.findings import Finding, Notes
 from batchpid.sim.geometry.inertia import possible_inertia
 from batchpid.sim.geometry.shapes import Shape, ShapeKind
 from batchpid.sim.robot.mjcf.model import RobotInFile, can_collide, label, unique
-from batchpid.sim.robot.mjcf.motors import Couplings, Motors
+from batchpid.sim.robot.mjcf.motors import Couplings, JointMotors
 from batchpid.sim.robot.parts import DisabledPair, Joint, Mimic
 from batchpid.sim.robot.tables import (
     NO_TURN,
@@ -59,7 +59,7 @@ class TableReader:
         model: MjModel,
         robot: RobotInFile,
         notes: Notes,
-        motors: Motors,
+        motors: JointMotors,
     ) -> None:
         self._model = model
         self._robot = robot
