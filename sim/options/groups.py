@@ -20,7 +20,7 @@ from batchpid.arrays.array_types import Array, Document, Rows
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.field_tables import Field, plain
 from batchpid.arrays.jax_settings import require_jax
-from batchpid.checks.validate import choice, instance, joint_speeds, names
+from batchpid.checks.validate import array, at_least, choice, instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.physics import MujocoSolver, Physics
 from batchpid.sim.engine.protocol import Engine, load_engine, require
@@ -459,9 +459,11 @@ class ControlOptions(OptionGroup):
             choice("free_joints", name, robot.joint_names)
         values = {"free_joints": tuple(free), "stages": fit_stages(self.stages)}
         limit = self.speed_limit
+        joints = robot.joint_names
         if limit is not None:
             # A copy: the caller may change the array later.
-            limit = read_only(joint_speeds("speed_limit", limit, robot.joint_names).copy())
+            speeds = array("speed_limit", limit, (1, robot.dof), joints)[0].copy()
+            limit = read_only(at_least("speed_limit", speeds, 0.0, joints, above=True))
         return self.changed(control=control, tool=link, speed_limit=limit, **values)
 
     @property
