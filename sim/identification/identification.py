@@ -42,8 +42,7 @@ from batchpid.sim.identification.unknowns import (
     kinds_of,
 )
 from batchpid.sim.options.groups import Compensation
-from batchpid.sim.robot.parts import FileDefaults
-from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot import Robot, link_tree
 from batchpid.sim.robot.robot_options import BAND, known_joints
 
 STILL = {"rad": 1e-3, "m": 1e-4}
@@ -152,7 +151,7 @@ def _payload_links(robot: Robot, name: str | None) -> list[str | None]:
     """Return the links where a payload may be: the one with a ``name``, or the last link with a
     mass that is fixed behind the tool, and the tool.
     """
-    tree = robot.rigid_tree
+    tree = link_tree(robot)
     if name is not None:
         return [choice("payload_link", name, tree.links)]
     body = tree.link_bodies[tree.index(tree.tool)]
@@ -235,7 +234,7 @@ def _prepared(
     free = (qpos.min(0) < robot.lower[joints]) | (qpos.max(0) > robot.upper[joints])
     # A Runner compensates the friction of the description and of the robot's motors, too.
     modelled = None
-    friction = (robot.friction + known_joints(robot).coulomb)[joints]
+    friction = (robot.friction + known_joints(robot)["coulomb"])[joints]
     if is_friction and friction.any():
         band = np.array([BAND[robot.units[joint]] for joint in joints])
         turns = robot.continuous[joints] / TURN
@@ -266,8 +265,7 @@ def _own_timestep(log: Log) -> float:
 
 def _resting(robot: Robot, start: Float64) -> Robot:
     """Return ``robot`` with the start pose ``start`` (dof,)."""
-    reading = robot.reading._replace(defaults=FileDefaults(start))
-    return replace(robot, settings=None, reading=reading)
+    return replace(robot, settings=None, source=robot.source._replace(start=start))
 
 
 def _option(

@@ -31,7 +31,7 @@ from batchpid.motors.friction import Friction
 from batchpid.motors.guard import Guard
 from batchpid.native.availability import obstacle
 from batchpid.sim.engine.scene_spec import added_friction
-from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot import Robot, link_tree
 from batchpid.stages import Control, stages_of
 from batchpid.stages.friction import REFRESH_STEPS, Inertia
 from batchpid.stages.program import StageProgram
@@ -118,7 +118,7 @@ class Plant:
             leader = number[coupling.leader[joint]]
             ratio = coupling.multiplier[joint]
             followers.append(Follower(number[joint], leader, ratio, coupling.offset[joint]))
-        tree = robot.rigid_tree.fixed_at(coupling.positions(robot.start), moves)
+        tree = link_tree(robot).fixed_at(coupling.positions(robot.start), moves)
         self.tree = replace(tree, coupling=Coupling.of(tree.dof, followers))
         """Rigid tree of the logged joints and their followers."""
         # A slice is not copied, as it is for indices.

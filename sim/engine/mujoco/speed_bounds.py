@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.tables import Joint
 
 _LONGEST = 10.0
 """Largest position of a sliding joint in which bounds of speeds hold [m]."""
