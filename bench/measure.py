@@ -39,7 +39,7 @@ from batchpid.sim.loop import env_group
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.workers.exchange import SharedArrays
+from batchpid.sim.workers.requests import SharedArrays
 from batchpid.stages.values import Command
 
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"

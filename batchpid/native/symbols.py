@@ -12,7 +12,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array, DType
 from batchpid.native.extensions import MASKS, OPERATIONS
 
-_NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
+_OTHER_NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
 """Operations that have another name in NumPy."""
 
 
@@ -48,7 +48,7 @@ class Namespace:
         return result
 
     def __getattr__(self, name: str) -> Callable[..., Symbol]:
-        name = _NAMES.get(name, name)
+        name = _OTHER_NAMES.get(name, name)
         if name not in OPERATIONS:
             raise AttributeError(f"programs have no operation {name!r}")
         return lambda *values: self.apply(name, *values)
@@ -72,6 +72,8 @@ class Symbol:
 
     It can also be a matrix in each row, or a history of samples, which a program changes in place.
     """
+
+    ndim = 2
 
     def __init__(self, namespace: Namespace, is_mask: bool = False) -> None:
         self._namespace = namespace

@@ -220,20 +220,20 @@ def _segments(
             operand for _, operands, _ in inside for operand in operands if operand not in made
         )
         numbers = {symbol: number for number, symbol in enumerate([*read, *made])}
-        kept = [symbol for symbol in made if last_use.get(symbol, -1) >= end]
-        if len(inside) < 2 or len(read) > MOST_OPERANDS or len(kept) > MOST_OPERANDS:
+        results = [symbol for symbol in made if last_use.get(symbol, -1) >= end]
+        if len(inside) < 2 or len(read) > MOST_OPERANDS or len(results) > MOST_OPERANDS:
             continue
-        code = [len(read), len(kept)]
+        code = [len(read), len(results)]
         for name, operands, _ in inside:
             entries = [numbers[operand] for operand in operands]
             code += [OPERATIONS.index(name), *entries, *(2 * entries[:1])][:4]
-        code += [numbers[symbol] for symbol in kept]
+        code += [numbers[symbol] for symbol in results]
         yield Segment(
             first,
             end - first,
             _packed(code),
             _packed(places[symbol] for symbol in read),
-            _packed(places[symbol] for symbol in kept),
+            _packed(places[symbol] for symbol in results),
         )
 
 

@@ -22,7 +22,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
-from batchpid.sim.findings import KINDS, LIMIT_TOLERANCE, SEVERITIES, Finding, Findings
+from batchpid.sim.findings import FINDING_KINDS, LIMIT_TOLERANCE, SEVERITIES, Finding, Findings
 from batchpid.sim.geometry.shapes import (
     LEAST_MASS,
     extent,
@@ -86,7 +86,7 @@ def check(
     plan = _Plan(robot, start, goal, params, timestep)
     findings = list(robot.repairs)
     for oddity in ODDITIES:
-        kind = KINDS[oddity.code]
+        kind = FINDING_KINDS[oddity.code]
         for place in oddity.places(plan):
             text = place.text or kind.when
             remedy = place.remedy or kind.done

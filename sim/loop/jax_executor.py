@@ -24,7 +24,7 @@ One program then serves all groups, and the results of an env do not depend on i
 """
 
 
-_KEPT = ("measured", "timestep", "step", "model", "matrix", "inertia")
+_KEPT_VALUES = ("measured", "timestep", "step", "model", "matrix", "inertia")
 """Values that stages in programs do not change."""
 
 
@@ -77,11 +77,11 @@ class JAXExecutor(NumPyExecutor):
                 if program is None:
                     changed, values = stepped(stages[part], states[part], values)
                 else:
-                    given = states[part], _without(values, "model")
-                    results = program(*jax.tree.map(self._padded, given))
+                    inputs = states[part], _without(values, "model")
+                    results = program(*jax.tree.map(self._padded, inputs))
                     changed, after = jax.tree.map(lambda rows: np.asarray(rows)[:size], results)
-                    kept = {name: getattr(values, name) for name in _KEPT}
-                    values = after._replace(**kept)
+                    unchanged = {name: getattr(values, name) for name in _KEPT_VALUES}
+                    values = after._replace(**unchanged)
                 new += changed
         self._states = tuple(new)
         return values
@@ -113,6 +113,6 @@ def _compiled(stages: Any) -> Any:
     def step(constants: list[Array], states: States, values: Values) -> tuple[States, Values]:
         values = values._replace(model=Model())
         states, values = stepped(filled(stages, iter(constants)), states, values)
-        return states, _without(values, *_KEPT)
+        return states, _without(values, *_KEPT_VALUES)
 
     return jax.jit(step, compiler_options={"xla_cpu_multi_thread_eigen": False})

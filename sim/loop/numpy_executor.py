@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.sim.engine.protocol import CompiledStep, EnginePack
+from batchpid.sim.engine.native_model import NativeStep
+from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.custom import controller_errors
 from batchpid.sim.loop.faults import is_near
 from batchpid.sim.loop.group_control import GroupControl
@@ -126,7 +127,7 @@ class EngineSteps:
         """Whether the native sim step reads the passive force."""
         if self._is_native:
             self.native_force = self.reads_force and setup.pack.steps_read_force(*self._parts)
-        self._step: CompiledStep | None = None
+        self._step: NativeStep | None = None
         self._bound: object = None
 
     def measure(self) -> Measured:
@@ -153,7 +154,7 @@ class EngineSteps:
             passive = self._passive_force(qpos)
         return Measured(qpos, qvel, passive), step.may_have_failed(status)
 
-    def compiled(self) -> CompiledStep:
+    def compiled(self) -> NativeStep:
         """Return the native sim step of the present robots."""
         pack = self._pack
         if self._step is None or self._bound is not pack.calls:

@@ -12,7 +12,7 @@ from lxml import etree
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.errors import RobotError
 from batchpid.sim.findings import Finding
-from batchpid.sim.geometry.mesh_files import LARGEST, check_mesh, find_mesh
+from batchpid.sim.geometry.mesh_files import LARGEST_NUMBER, check_mesh, find_mesh
 from batchpid.sim.geometry.shapes import MOMENTS, SMALLEST, Shape, from_entries, possible_inertia
 from batchpid.sim.robot.tables import (
     MOVING_TYPES,
@@ -139,7 +139,7 @@ class ElementReader:
             limits[f"{key}_limit"] = values[0]
         if placeholders:
             text = f"<limit {' '.join(placeholders)}> is a placeholder or not within"
-            text += f" +-{LARGEST:g}: no limit"
+            text += f" +-{LARGEST_NUMBER:g}: no limit"
             self.warn("limits", text, "give <limit effort= velocity=> of the motor", name)
         # A guard has one limit for both.
         braking = limits.pop("deceleration_limit")
@@ -158,9 +158,7 @@ class ElementReader:
         for key, endless in (("lower", -math.inf), ("upper", math.inf)):
             values = numbers(limit, key, "0", limit=True)
             if values is None:
-                text = (
-                    f"<limit {key}={text_of(limit, key)!r}> is not a number within +-{LARGEST:g}:"
-                )
+                text = f"<limit {key}={text_of(limit, key)!r}> is not a number within +-{LARGEST_NUMBER:g}:"
                 text += f" no {key} limit"
                 self.warn("limits", text, GIVE_RANGE, name)
                 values = (endless,)
@@ -231,7 +229,7 @@ class ElementReader:
             center, turn = read_origin(inertial, "")
         value = numbers(mass, "value", "0")
         if value is None or value[0] < 0 or 0 < value[0] < SMALLEST:
-            text = f"<mass value={text_of(mass, 'value')!r}> is no mass from {SMALLEST:g} to {LARGEST:g}"
+            text = f"<mass value={text_of(mass, 'value')!r}> is no mass from {SMALLEST:g} to {LARGEST_NUMBER:g}"
             text += ": it counts as missing"
             self.warn("inertia", text, "give a mass > 0 [kg]", link=body.name)
             return body

@@ -1,1 +1,1 @@
-"""Runner: N robots under one batch controller, and its operations."""
+"""Runner: N robots under one batch controller, and its requests."""

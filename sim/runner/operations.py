@@ -1,17 +1,15 @@
-"""Operations of a Runner: the change of each worker's loop, and the state of the runner after it.
+"""Requests of a Runner to its workers, and its state after each.
 
-An operation holds checked arguments for all envs and changes nothing by itself. The runner sends it
-to the workers, and then replaces its state by the result of :meth:`Operation.committed`.
+A request holds checked arguments for all envs and changes nothing by itself. The runner sends it to
+the workers, and then replaces its state by the result of :func:`committed`.
 """
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from itertools import chain
-from operator import itemgetter
-from typing import Self
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,268 +20,213 @@ from batchpid.arrays.trees import flatten
 from batchpid.checks.validate import env_mask
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, Fault, FaultLog
 from batchpid.sim.loop.group_control import empty_states
-from batchpid.sim.loop.loop import Loop
-from batchpid.sim.loop.snapshot import Snapshot, join_rows
+from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE
 from batchpid.sim.runner.arguments import base_rows, joint_rows
-from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.workers.pool import Outcome
 from batchpid.sim.workers.requests import Request
 from batchpid.stages.stage import by_name
 from batchpid.stages.values import Command
 
+READ = Request("read", changes_loop=False)
+"""Read the state of every env."""
+SNAPSHOT = Request("snapshot")
+"""Read the state of every env, and go on as if restored from it."""
+ALL = slice(None)
+"""All envs."""
+Motion = tuple[Float64, Float64 | None]
+"""Setpoints of joints and their rates (envs, dof); None for 0."""
 
-class Operation(Request):
-    """Base of all operations, which are frozen dataclasses."""
 
-    def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        """Return the state after the operation, from the state before it and the outcome in the
-        workers.
-        """
-        return state
-
-
-@dataclass(frozen=True)
-class Reset(Operation):
-    """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), floating bases at
-    ``base`` (envs, 13).
+class RunnerState(NamedTuple):
+    """Everything about a runner that its commands change, apart from the workers. Replaced once by
+    each command.
     """
-
-    mask: Bool
-    qpos: Float64
-    qvel: Float64
-    draws: Draws
-    base: Float64 | None
-    ticks = 1
-
-    @property
-    def placed(self) -> Bool:
-        return self.mask
-
-    @classmethod
-    def read(
-        cls,
-        options: RunnerOptions,
-        state: RunnerState,
-        pose: tuple[ArrayLike | None, ArrayLike | None],
-        mask: ArrayLike | None,
-        seed: int | ArrayLike | None,
-        base: Mapping[str, ArrayLike | None],
-    ) -> Self:
-        """Return the operation for arguments of :meth:`batchpid.sim.Runner.reset`."""
-        robot = options.robot
-        num_envs = options.num_envs
-        randomization = options.randomization
-        draws = state.draws
-        qpos = joint_rows(options, "qpos", robot.start if pose[0] is None else pose[0])
-        qvel = joint_rows(options, "qvel", 0.0 if pose[1] is None else pose[1])
-        if mask is None:
-            chosen = np.ones(num_envs, bool)
-        else:
-            chosen = env_mask("mask", mask, num_envs)
-        if randomization is not None:
-            draws = randomization.redraw(robot, draws, chosen, seed, options.first_env)
-            qpos, qvel = randomization.start(qpos, qvel, draws, robot)
-        elif seed is not None:
-            raise InvalidArgumentError(
-                "seed", "has no effect without a randomization", remedy="leave it out"
-            )
-        qpos = robot.coupling.positions(qpos)
-        qvel = robot.coupling.rates(qvel)
-        return cls(chosen, qpos, qvel, draws, base_rows(options, base, qpos, chosen))
-
-    def apply(self, loop: Loop) -> None:
-        loop.reset(self.mask, self.qpos, self.qvel, self.draws, self.base)
-
-    def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        chosen = self.mask[:, None]
-        motion = state.motion
-        if motion is not None:
-            setpoint, rate = motion
-            rate = np.where(chosen, self.qvel, 0.0 if rate is None else rate)
-            motion = np.where(chosen, self.qpos, setpoint), rate
-        faults = state.faults.without(self.mask).with_events(outcome.at(0))
-        return state.changed(RESET, self.mask, faults=faults, draws=self.draws, motion=motion)
-
-
-@dataclass(frozen=True)
-class Run(Operation):
-    """Run ``ticks`` of ``substeps`` sim steps under ``command`` (ticks, envs, ...), which travels
-    in the arrays.
-    """
-
-    ticks: int = field()  # without the default of the base class
-    substeps: int = field()
-    command: Command = field()
-    counts_ticks = True
-
-    def for_envs(self, envs: slice) -> Self:
-        return replace(self, command=self.command.map(itemgetter((slice(None), envs))))
-
-    def write(self, arrays: Arrays, envs: slice) -> None:
-        for table, rows in zip(arrays.command, self.command, strict=True):
-            if rows is not None:
-                table[: self.ticks, envs] = rows[:, envs]
-
-    def encode(self, envs: slice) -> bytes:
-        return pickle.dumps((self.ticks, self.substeps, self.command.given))
-
-    def apply(self, loop: Loop) -> float:
-        return loop.run(self.ticks, self.substeps, self.command.given)
-
-    def join(self, results: list[float]) -> float:
-        return max(results)
-
-    def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        setpoint, rate, *_ = self.command
-        faults = state.faults
-        motion = state.motion
-        count = outcome.num_ticks
-        are_ok = np.logical_and.reduce(outcome.arrays.observation.ok[:count], axis=None)
-        if not are_ok:
-            for arrays in outcome.completed:
-                faults = faults.with_events(arrays)
-        if motion is not None and count:
-            motion = setpoint[count - 1], None if rate is None else rate[count - 1]
-        steps = count * self.substeps
-        if outcome.failure:
-            work = state.work
-        else:
-            work = (tuple(outcome.results), count)
-        since = state.steps_since_checkpoint + steps
-        changes = None if count else state.changes
-        return state._replace(
-            faults=faults,
-            motion=motion,
-            steps=state.steps + steps,
-            steps_since_checkpoint=since,
-            work=work,
-            changes=changes,
-        )
-
-
-@dataclass(frozen=True)
-class SetParams(Operation):
-    """Change gains, limits and times between ticks."""
 
     params: bp.PIDParams
-
-    def apply(self, loop: Loop) -> None:
-        loop.set_params(self.params)
-
-    def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        return state.changed(PARAMS, params=self.params)
-
-
-@dataclass(frozen=True)
-class SetActuators(Operation):
-    """Change the actuators between ticks; None removes them."""
-
     actuators: bp.Actuators | None
-
-    def apply(self, loop: Loop) -> None:
-        loop.set_actuators(self.actuators)
-
-    def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        return state.changed(ACTUATORS, actuators=self.actuators)
-
-
-@dataclass(frozen=True)
-class AddChunk(Operation):
-    """Add a chunk (envs, rows, dof) that is ``latency`` (envs,) [s] old to the plans; infinite for
-    no chunk.
-    """
-
-    chunk: Float64
-    latency: Float64
-
-    def goal(self, before: Float64) -> Float64:
-        """Return the last row of each env (envs, dof), NaN where a row is not finite, or ``before``
-        without a chunk.
-        """
-        is_finite = np.isfinite(self.chunk).all(1)
-        goal = np.where(is_finite, self.chunk[:, -1], np.nan)
-        return np.where(np.isfinite(self.latency)[:, None], goal, before)
-
-    def apply(self, loop: Loop) -> None:
-        loop.add_chunk(self.chunk, self.latency)
-
-
-@dataclass(frozen=True)
-class ReadRows(Operation):
-    """Read the state of every env."""
-
-    changes_loop = False
-
-    def apply(self, loop: Loop) -> dict[str, Rows]:
-        return loop.read()
-
-    def join(self, results: list[dict[str, Rows]]) -> dict[str, Rows]:
-        return join_rows(results)
-
-
-@dataclass(frozen=True)
-class TakeSnapshot(ReadRows):
-    """Read the state of every env, and go on as if restored from it."""
-
-    changes_loop = True
-
-    def apply(self, loop: Loop) -> dict[str, Rows]:
-        return loop.snapshot()
-
-    def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        return state._replace(steps_since_checkpoint=0)
-
-
-@dataclass(frozen=True)
-class Restore(Operation):
-    """Put every env into its state in ``snapshot``, with its params and ``draws``."""
-
-    snapshot: Snapshot
     draws: Draws
-    ticks = 1
-
-    def apply(self, loop: Loop) -> None:
-        loop.restore(self.snapshot, self.draws)
-
-    def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        snapshot = self.snapshot
-        motion = state.motion
-        if motion is not None:
-            setpoint, rate = snapshot.rows["motion"].swapaxes(0, 1)
-            motion = setpoint, rate
-        return state.changed(
-            RESTORE,
-            params=snapshot.params,
-            actuators=snapshot.actuators,
-            draws=self.draws,
-            faults=state.faults.restored(snapshot.rows["containment/step"]),
-            motion=motion,
-            steps=snapshot.steps,
-            steps_since_checkpoint=0,
-        )
-
-
-@dataclass(frozen=True)
-class ReadPoses(Operation):
-    """Read the poses of the entities that ``build`` returned, or of the bodies ``names`` of a
-    file.
+    faults: FaultLog
+    motion: Motion | None
+    """Setpoint of the last tick and its rate, or position and velocity after a reset. None for
+    other setpoints.
     """
+    steps: int = 0
+    steps_since_checkpoint: int = 0
+    work: tuple[tuple[float, ...], int] = ((), 1)
+    """Seconds of each worker in the last run, and the ticks of that run."""
+    changes: Rows | None = None
+    """Changes of each env since the last tick (envs,): :attr:`batchpid.sim.Rollout.changes`."""
 
-    names: tuple[str, ...] | None = None
-    changes_loop = False
+    def changed(self, change: int, envs: Bool | slice = ALL, **values: Any) -> RunnerState:
+        """Return a state with other ``values``, which notes a ``change`` of some envs."""
+        changes = np.zeros(len(self.faults), np.uint8) if self.changes is None else self.changes
+        changes = changes.copy()
+        changes[envs] |= change
+        return self._replace(changes=changes, **values)
 
-    def for_envs(self, envs: slice) -> Self:
-        return self
+    @classmethod
+    def first(cls, options: RunnerOptions) -> RunnerState:
+        """Return the state before the first reset, which places all envs."""
+        robot = options.robot
+        count = options.num_envs
+        draws = NOTHING
+        if options.randomization is not None:
+            draws = options.randomization.first(robot, count, options.first_env)
+        faults = FaultLog(count, partial(_fault, options))
+        motion = None
+        if options.sets_positions:
+            motion = (np.tile(robot.start, (count, 1)), None)
+        return cls(options.params, options.actuators, draws, faults, motion)
 
-    def apply(self, loop: Loop) -> list[Rows]:
-        return loop.poses(self.names)
 
-    def join(self, results: list[list[Rows]]) -> list[Rows]:
-        return [*chain.from_iterable(results)]
+# -- requests
+
+
+def reset_request(
+    options: RunnerOptions,
+    state: RunnerState,
+    pose: tuple[ArrayLike | None, ArrayLike | None],
+    mask: ArrayLike | None,
+    seed: int | ArrayLike | None,
+    base: Mapping[str, ArrayLike | None],
+) -> Request:
+    """Return the request for arguments of :meth:`batchpid.sim.Runner.reset`."""
+    robot = options.robot
+    num_envs = options.num_envs
+    randomization = options.randomization
+    draws = state.draws
+    qpos = joint_rows(options, "qpos", robot.start if pose[0] is None else pose[0])
+    qvel = joint_rows(options, "qvel", 0.0 if pose[1] is None else pose[1])
+    if mask is None:
+        chosen = np.ones(num_envs, bool)
+    else:
+        chosen = env_mask("mask", mask, num_envs)
+    if randomization is not None:
+        draws = randomization.redraw(robot, draws, chosen, seed, options.first_env)
+        qpos, qvel = randomization.start(qpos, qvel, draws, robot)
+    elif seed is not None:
+        raise InvalidArgumentError(
+            "seed", "has no effect without a randomization", remedy="leave it out"
+        )
+    qpos = robot.coupling.positions(qpos)
+    qvel = robot.coupling.rates(qvel)
+    inputs = chosen, qpos, qvel, draws, base_rows(options, base, qpos, chosen)
+    return Request("reset", inputs, ticks=1)
+
+
+def run_request(ticks: int, substeps: int, command: Command) -> Request:
+    """Return the request to run ``ticks`` of ``substeps`` sim steps under ``command`` (ticks, envs,
+    ...).
+    """
+    return Request("run", (ticks, substeps, command.given), ticks, substeps, command)
+
+
+def restore_request(snapshot: Snapshot, draws: Draws) -> Request:
+    """Return the request to put every env into its state in ``snapshot``, with its params and
+    ``draws``.
+    """
+    return Request("restore", (snapshot, draws), ticks=1)
+
+
+def goal_of(chunk: Float64, latency: Float64, before: Float64) -> Float64:
+    """Return the last row of each env's chunk (envs, dof), NaN where a row is not finite, or
+    ``before`` without a chunk: where the latency is infinite.
+    """
+    is_finite = np.isfinite(chunk).all(1)
+    goal = np.where(is_finite, chunk[:, -1], np.nan)
+    return np.where(np.isfinite(latency)[:, None], goal, before)
+
+
+# -- the state after them
+
+
+def committed(request: Request, state: RunnerState, outcome: Outcome) -> RunnerState:
+    """Return the state after a request, from the state before it and the outcome in the workers."""
+    change = CHANGES.get(request.method)
+    return state if change is None else change(request, state, outcome)
+
+
+def _after_reset(request: Request, state: RunnerState, outcome: Outcome) -> RunnerState:
+    mask, qpos, qvel, draws, _ = request.arguments
+    motion = state.motion
+    if motion is not None:
+        setpoint, rate = motion
+        rate = np.where(mask[:, None], qvel, 0.0 if rate is None else rate)
+        motion = np.where(mask[:, None], qpos, setpoint), rate
+    faults = state.faults.without(mask).with_events(outcome.at(0))
+    return state.changed(RESET, mask, faults=faults, draws=draws, motion=motion)
+
+
+def _after_run(request: Request, state: RunnerState, outcome: Outcome) -> RunnerState:
+    setpoint, rate, *_ = request.command
+    faults = state.faults
+    motion = state.motion
+    work = state.work
+    count = outcome.num_ticks
+    if not np.logical_and.reduce(outcome.arrays.observation.ok[:count], axis=None):
+        for arrays in outcome.completed:
+            faults = faults.with_events(arrays)
+    if motion is not None and count:
+        motion = setpoint[count - 1], None if rate is None else rate[count - 1]
+    if outcome.failure is None:
+        work = tuple(outcome.results), count
+    steps = count * request.substeps
+    return state._replace(
+        faults=faults,
+        motion=motion,
+        steps=state.steps + steps,
+        steps_since_checkpoint=state.steps_since_checkpoint + steps,
+        work=work,
+        changes=None if count else state.changes,
+    )
+
+
+def _after_params(request: Request, state: RunnerState, _: Outcome) -> RunnerState:
+    return state.changed(PARAMS, params=request.arguments[0])
+
+
+def _after_actuators(request: Request, state: RunnerState, _: Outcome) -> RunnerState:
+    return state.changed(ACTUATORS, actuators=request.arguments[0])
+
+
+def _after_snapshot(_: Request, state: RunnerState, __: Outcome) -> RunnerState:
+    return state._replace(steps_since_checkpoint=0)
+
+
+def _after_restore(request: Request, state: RunnerState, _: Outcome) -> RunnerState:
+    snapshot, draws = request.arguments
+    motion = state.motion
+    if motion is not None:
+        setpoint, rate = snapshot.rows["motion"].swapaxes(0, 1)
+        motion = setpoint, rate
+    return state.changed(
+        RESTORE,
+        params=snapshot.params,
+        actuators=snapshot.actuators,
+        draws=draws,
+        faults=state.faults.restored(snapshot.rows["containment/step"]),
+        motion=motion,
+        steps=snapshot.steps,
+        steps_since_checkpoint=0,
+    )
+
+
+CHANGES: dict[str, Callable[[Request, RunnerState, Outcome], RunnerState]] = {
+    "reset": _after_reset,
+    "run": _after_run,
+    "set_params": _after_params,
+    "set_actuators": _after_actuators,
+    "snapshot": _after_snapshot,
+    "restore": _after_restore,
+}
+"""Functions for the state after a request, by its method; the others change nothing."""
+
+# -- snapshots
 
 
 def snapshot_of(options: RunnerOptions, state: RunnerState, rows: dict[str, Rows]) -> Snapshot:
@@ -299,8 +242,8 @@ def snapshot_of(options: RunnerOptions, state: RunnerState, rows: dict[str, Rows
     return Snapshot(options.described, state.steps, state.params, rows, state.actuators)
 
 
-def restored(options: RunnerOptions, snapshot: Snapshot, present: Snapshot) -> Restore:
-    """Return the operation that restores a snapshot, checked and copied.
+def restored(options: RunnerOptions, snapshot: Snapshot, present: Snapshot) -> Request:
+    """Return the request that restores a snapshot, checked and copied.
 
     ``present`` is any snapshot of this runner; only the shapes of its ``control/`` arrays may
     differ, since params and actuators decide them.
@@ -320,4 +263,16 @@ def restored(options: RunnerOptions, snapshot: Snapshot, present: Snapshot) -> R
     control = by_name(*empty)
     rows = {name: table for name, table in present.rows.items() if "control/" not in name}
     snapshot.check_rows(rows | flatten({"control": control}))
-    return Restore(replace(snapshot.copy(), params=params, actuators=actuators), draws)
+    return restore_request(replace(snapshot.copy(), params=params, actuators=actuators), draws)
+
+
+def _fault(options: RunnerOptions, env: int, arrays: Arrays) -> Fault:
+    """Return the last fault of an env in the arrays of a tick."""
+    step = int(arrays.fault.step[env])
+    cause = CAUSES[arrays.fault.cause[env]]
+    command = options.own_command
+    kind, names = "joint", options.robot.joint_names
+    if command is not None and cause in COMMAND_CAUSES:
+        kind, names = "entry", command.names
+    joint = names[arrays.fault.joint[env]]
+    return Fault(env, step, step * options.timestep, joint, cause, options.on_fault, kind)

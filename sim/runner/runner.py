@@ -1,6 +1,6 @@
 """Runner: N robots in N headless scenes, stepped by worker processes under one batch controller.
 
-Each method makes an operation of its arguments (:mod:`batchpid.sim.runner.operations`), and
+Each method makes a request of its arguments (:mod:`batchpid.sim.runner.operations`), and
 :meth:`Runner._execute` runs it.
 
 Longer than 350 lines because the public signatures and their documentation are spelled out for
@@ -23,11 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Float64, Progress, Rows
 from batchpid.checks.validate import check_keywords, choice, instance
-from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner
+from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
+from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.engine.physics import MujocoSolver, Physics
+from batchpid.sim.findings import report_shortfalls
 from batchpid.sim.loop.backend import describe, native_obstacle
-from batchpid.sim.loop.faults import Fault
+from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import (
     DEFAULT_ENGINE,
@@ -47,25 +49,23 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.rollout import Rollout, RunInfo
 from batchpid.sim.runner.arguments import count_ticks, read_chunks, read_command
 from batchpid.sim.runner.operations import (
-    AddChunk,
-    Operation,
-    ReadPoses,
-    ReadRows,
-    Reset,
-    Restore,
-    Run,
-    SetActuators,
-    SetParams,
-    TakeSnapshot,
+    READ,
+    SNAPSHOT,
+    RunnerState,
+    committed,
+    goal_of,
+    reset_request,
+    restore_request,
     restored,
+    run_request,
     snapshot_of,
 )
-from batchpid.sim.runner.run_warnings import RunWarnings
-from batchpid.sim.runner.runner_state import RunnerState
 from batchpid.sim.signals.quantities import CommandSpec, Observation, empty_observation
+from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
-from batchpid.sim.workers.pool import Outcome, WorkerPool
+from batchpid.sim.workers.pool import Outcome, RecoveryWarning, WorkerPool
+from batchpid.sim.workers.requests import Request
 from batchpid.stages import Stage
 from batchpid.stages.values import Command
 
@@ -209,12 +209,18 @@ class Runner(SingleOwner):
         self.substeps = checked.substeps
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
-        self._call, self._warnings = OneCall(), RunWarnings(checked)
+        self._call = OneCall()
         self._derived = checked.derived
         self._state = RunnerState.first(checked)
-        self._sent: Run | None = None  # by send(), until recv()
+        self._sent: Request | None = None  # by send(), until recv()
         self._is_running = False  # whether the workers run it
         self._cause: BaseException | None = None  # of the end
+        self._has_warned = False  # of a fault
+        self._stability: StabilityCheck | None = None
+        if self.control == "pid":
+            self._stability = StabilityCheck(self.robot, self.timestep)
+        shortfalls = checked.load_engine().shortfalls(checked.scene)
+        report_shortfalls(self.robot.path, checked.engine, shortfalls)
         try:
             self._open()
         except BaseException:
@@ -225,10 +231,9 @@ class Runner(SingleOwner):
     def _open(self) -> None:
         """Start the workers, and reset all envs."""
         options = self.options
-        checks = self._warnings
         seed = None if options.randomization is None else 0
         base = {"base_pose": None, "base_twist": None}
-        start = Reset.read(options, self._state, (None, None), None, seed, base)
+        start = reset_request(options, self._state, (None, None), None, seed, base)
         self._call.begin()
         try:
             self._call.waits = True
@@ -237,8 +242,14 @@ class Runner(SingleOwner):
         finally:
             self._call.end()
         self._execute(start)
-        checks.check_stability(self._state)
-        checks.check_controller()
+        self._check_stability()
+        if isinstance(self.control, OperationalSpace):
+            self.control.check_stability()
+
+    def _check_stability(self) -> None:
+        """Warn of gains beyond the stability bound of the sampled loop."""
+        if self._stability is not None:
+            self._stability.check(self._state.params, self._state.actuators)
 
     def __repr__(self) -> str:
         options = self.options
@@ -293,7 +304,7 @@ class Runner(SingleOwner):
         """
         self._ready()
         base = {"base_pose": base_pose, "base_twist": base_twist}
-        start = Reset.read(self.options, self._state, (qpos, qvel), mask, seed, base)
+        start = reset_request(self.options, self._state, (qpos, qvel), mask, seed, base)
         self._execute(start)
         return self.observe()
 
@@ -436,12 +447,12 @@ class Runner(SingleOwner):
         }
         options = self.options
         ticks = count_ticks(options, setpoints)
-        chunks = list[AddChunk]()
+        chunks = list[tuple[Float64, Float64]]()
         if options.plan is not None:
-            chunks = list(map(AddChunk, *read_chunks(options, arrays, latency, ticks)))
+            chunks = list(zip(*read_chunks(options, arrays, latency, ticks), strict=True))
             goals = [self._goal]
             for chunk in chunks:
-                goals.append(chunk.goal(goals[-1]))
+                goals.append(goal_of(*chunk, goals[-1]))
             arrays["setpoints"] = np.array(goals[1:])
         seconds = options.substeps * options.timestep
         command = read_command(options, self._state, arrays, seconds, ticks)
@@ -461,10 +472,10 @@ class Runner(SingleOwner):
                 done = min(ticks, number + self._max_ticks())
                 if chunks:
                     done = number + 1
-                    self._add_chunk(chunks[number])
+                    self._add_chunk(*chunks[number])
                 part = slice(number, done)
                 rows = command.map(itemgetter(part))
-                self._execute(Run(done - number, options.substeps, rows))
+                self._execute(run_request(done - number, options.substeps, rows))
                 observed = self._pool.arrays.observation.map(itemgetter(slice(done - number)))
                 for name in options.observed:
                     getattr(seen, name)[part] = getattr(observed, name)
@@ -490,7 +501,7 @@ class Runner(SingleOwner):
             ``build`` returned more entities for one env than for another, or in SAPIEN is not given.
         """
         self._ready()
-        rows = self._read(ReadPoses())
+        rows = self._read(Request("poses", changes_loop=False))
         if len({len(poses) for poses in rows}) != 1:
             problem = "was not given, or returned more entities for one env than for another"
             remedy = "let build(scene, env) return as many entities for every env"
@@ -514,7 +525,7 @@ class Runner(SingleOwner):
             remedy = "use robot.kinematic_tree() for links"
             raise InvalidArgumentError("names", problem, remedy=remedy)
         chosen = tuple([choice("names", name, self.options.mjcf.bodies) for name in names])
-        return np.stack(self._read(ReadPoses(chosen)))
+        return np.stack(self._read(Request("poses", (chosen,), changes_loop=False)))
 
     @property
     def params(self) -> bp.PIDParams:
@@ -527,8 +538,8 @@ class Runner(SingleOwner):
     def params(self, params: bp.PIDParams) -> None:
         self._ready()
         checked = self.options.check_params(params)
-        self._execute(SetParams(checked))
-        self._warnings.check_stability(self._state)
+        self._execute(Request("set_params", (checked,)))
+        self._check_stability()
 
     @property
     def actuators(self) -> bp.Actuators | None:
@@ -544,7 +555,7 @@ class Runner(SingleOwner):
     def actuators(self, actuators: bp.Actuators | None) -> None:
         self._ready()
         checked = self.options.check_actuators(actuators)
-        self._execute(SetActuators(checked))
+        self._execute(Request("set_actuators", (checked,)))
 
     def snapshot(self) -> Snapshot:
         """Return the state of all envs, physics and controller, for :meth:`restore`.
@@ -607,7 +618,7 @@ class Runner(SingleOwner):
     @cached_property
     def _present(self) -> Snapshot:
         """Snapshot of a moment, whose names and shapes those to restore are compared with."""
-        return snapshot_of(self.options, self._state, self._read(ReadRows()))
+        return snapshot_of(self.options, self._state, self._read(READ))
 
     @cached_property
     def _versions(self) -> dict[str, str]:
@@ -735,8 +746,8 @@ class Runner(SingleOwner):
         arrays: tuple[ArrayLike | None, ...],
         latency: ArrayLike,
         substeps: int | None,
-    ) -> Run:
-        """Return the operation for the arguments of :meth:`step`, checked; a chunk enters the plan."""
+    ) -> Request:
+        """Return the request for the arguments of :meth:`step`, checked; a chunk enters the plan."""
         inputs = dict(zip(Command._fields, arrays, strict=True))
         chunk = None
         if self.options.plan is not None and not any(entry is not None for entry in arrays[:3]):
@@ -745,8 +756,8 @@ class Runner(SingleOwner):
             if inputs["setpoint"] is None:
                 inputs["setpoint"], latency = self._goal, np.inf
             chunks, ages = read_chunks(self.options, inputs, latency)
-            chunk = AddChunk(chunks[0], ages[0])
-            inputs["setpoint"] = chunk.goal(self._goal)
+            chunk = chunks[0], ages[0]
+            inputs["setpoint"] = goal_of(*chunk, self._goal)
         if substeps is None:
             count = self.substeps
         else:
@@ -758,8 +769,8 @@ class Runner(SingleOwner):
         seconds = count * self.timestep
         command = read_command(self.options, self._state, inputs, seconds)
         if chunk is not None:
-            self._add_chunk(chunk)
-        return Run(1, count, command)
+            self._add_chunk(*chunk)
+        return run_request(1, count, command)
 
     @property
     def _goal(self) -> Float64:
@@ -767,17 +778,17 @@ class Runner(SingleOwner):
         assert self._state.motion is not None
         return self._state.motion[0]
 
-    def _add_chunk(self, chunk: AddChunk) -> None:
+    def _add_chunk(self, chunk: Float64, latency: Float64) -> None:
         """Add a chunk to the plans, if it is for an env."""
-        if np.isfinite(chunk.latency).any():
-            self._execute(chunk)
+        if np.isfinite(latency).any():
+            self._execute(Request("add_chunk", (chunk, latency)))
 
-    def _read(self, operation: Operation) -> Any:
-        """Return the result of an operation that reads from the loops of all envs."""
-        return operation.join(self._execute(operation).results)
+    def _read(self, request: Request) -> Any:
+        """Return the result of a request that reads from the loops of all envs."""
+        return request.join(self._execute(request).results)
 
-    def _execute(self, operation: Operation) -> Outcome:
-        """Execute an operation, or complete the one that was sent; then issue warnings.
+    def _execute(self, request: Request) -> Outcome:
+        """Execute a request, or complete the one that was sent; then issue warnings.
 
         Ctrl-C does not interrupt it between the request and the new state. The runner is closed if
         the workers cannot complete the request, or if a second Ctrl-C ends it.
@@ -785,26 +796,26 @@ class Runner(SingleOwner):
         call = self._call
         pool = self._pool
         is_sent = self._is_running
-        run = operation if isinstance(operation, Run) else None
+        is_run = request.method == "run"
         is_due = self.recorder is not None or self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
-        if is_due and run is not None and not is_sent:
+        if is_due and is_run and not is_sent:
             self._prepare_ticks()
-        elif is_due and isinstance(operation, Reset):
+        elif is_due and request.method == "reset":
             self._prepare_reset()
         # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
             call.waits, before = True, self._state
             if not is_sent:
-                pool.begin(operation)
+                pool.begin(request)
             outcome = pool.finish()
             call.waits = self._is_running = False
             # Ticks before a failure count: the workers have run them.
-            if outcome.failure is None or run is not None:
-                self._state = operation.committed(before, outcome)
-            if run is not None and self.recorder is not None:
-                self._record(self.recorder, run, before, outcome)
-            if outcome.failure is not None and operation.changes_loop:
+            if outcome.failure is None or is_run:
+                self._state = committed(request, before, outcome)
+            if is_run and self.recorder is not None:
+                self._record(self.recorder, request, before, outcome)
+            if outcome.failure is not None and request.changes_loop:
                 self._fail(outcome.failure.error)
         except BaseException as error:
             self._fail(error)
@@ -816,9 +827,13 @@ class Runner(SingleOwner):
         if outcome.failure is not None:
             raise outcome.failure.error
         # Warnings come last: as errors they must leave a runner that can go on.
-        state = self._state
-        if pool.warnings or state.faults.events:
-            self._warnings.issue(state.faults, pool.warnings)
+        while pool.warnings:
+            warn(pool.warnings.pop(), RecoveryWarning)
+        events = self._state.faults.events
+        if events and not self._has_warned:
+            self._has_warned = True
+            text = f"{events[0]}; see runner.faults for more; this warning is not repeated"
+            warn(text, FaultWarning)
         return outcome
 
     def _prepare_ticks(self) -> None:
@@ -839,8 +854,8 @@ class Runner(SingleOwner):
         is_wanted = not self._keeps_bits and self.options.build is None
         if is_wanted and not self._pool.replay.waits:
             state = self._state
-            snapshot = snapshot_of(self.options, state, self._read(ReadRows()))
-            restore = Restore(snapshot.copy(), state.draws)
+            snapshot = snapshot_of(self.options, state, self._read(READ))
+            restore = restore_request(snapshot.copy(), state.draws)
             self._pool.replay.start_at_resets(restore, self.num_envs)
             self._state = state._replace(steps_since_checkpoint=0)
 
@@ -852,7 +867,7 @@ class Runner(SingleOwner):
     def _record(
         self,
         recorder: TickRecorder,
-        run: Run,
+        run: Request,
         before: RunnerState,
         outcome: Outcome,
     ) -> None:
@@ -878,8 +893,8 @@ class Runner(SingleOwner):
         begins.
         """
         state = self._state
-        snapshot = snapshot_of(self.options, state, self._read(TakeSnapshot()))
-        self._pool.replay.start_from(Restore(snapshot.copy(), state.draws))
+        snapshot = snapshot_of(self.options, state, self._read(SNAPSHOT))
+        self._pool.replay.start_from(restore_request(snapshot.copy(), state.draws))
         return snapshot
 
     def _max_ticks(self) -> int:

@@ -17,8 +17,7 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Failure
 from batchpid.sim.options.groups import Ray
-from batchpid.sim.workers.exchange import SharedArrays
-from batchpid.sim.workers.requests import Build, Request, Start, split
+from batchpid.sim.workers.requests import Request, SharedArrays, Start, split
 from batchpid.sim.workers.worker import Worker, WorkerLost, pickled
 
 NODE_STEPS = 25_000
@@ -179,7 +178,7 @@ class NodeWorker(Worker):
     def send(self, request: Request) -> None:
         limit = self._step_limit * (request.ticks or 1) * request.substeps
         self._limit = limit + self._timeout + request.patience
-        if isinstance(request, Build):
+        if request.method == "build":
             self._call = self._actor.start.remote(self._message, self._cluster.workers)
         else:
             self._call = self._actor.execute.remote(request.for_envs(self.envs))

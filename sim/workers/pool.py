@@ -18,14 +18,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
+from batchpid.arrays.array_types import Bool
 from batchpid.errors import ClosedError, SingleOwner
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Failure, order
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeInfo, NodeWorker
-from batchpid.sim.workers.replay import Replay
-from batchpid.sim.workers.requests import Build, Request, Start, split
+from batchpid.sim.workers.requests import BUILD, Request, SharedArrays, Start, split
 from batchpid.sim.workers.worker import (
     LocalWorker,
     ProcessWorker,
@@ -69,6 +68,64 @@ class Outcome(NamedTuple):
     def completed(self) -> list[Arrays]:
         """Ticks that all envs completed."""
         return [self.at(tick) for tick in range(self.num_ticks)]
+
+
+class Replay:
+    """Requests from which the replacement of a lost worker reaches the present state, bit by bit:
+    those that changed the loops since a checkpoint; the first ones restore it.
+
+    Parameters
+    ----------
+    most_ticks
+        Ticks that are kept. With more since the last checkpoint a lost worker cannot be replaced.
+    """
+
+    def __init__(self, most_ticks: int) -> None:
+        self._most_ticks = most_ticks
+        self._waiting: Bool = np.zeros(0, bool)
+        self.start_from(None)
+
+    def start_from(self, request: Request | None) -> None:
+        """Forget all requests; ``request`` brings a new worker to the present state, in which it is
+        by itself with None.
+        """
+        self.requests: list[Request] = [BUILD]
+        """The requests, in their order; none if there were too many."""
+        if request is not None:
+            self.requests.append(request)
+        self._ticks = 0
+        self._next: list[Request] = []
+
+    def start_at_resets(self, request: Request, num_envs: int) -> None:
+        """Start from ``request``, which restores the present state, once every env was reset.
+
+        Until then the earlier requests stay: an engine may have state that ``request`` does not
+        restore, and that a reset clears.
+        """
+        self._next = [request]
+        self._waiting = np.ones(num_envs, bool)
+
+    @property
+    def waits(self) -> bool:
+        """True while envs have to be reset before the last checkpoint is of use."""
+        return bool(self._next)
+
+    def append(self, request: Request) -> None:
+        """Add a request that all loops have executed."""
+        self._ticks += max(1, request.ticks)
+        if self.requests:
+            self.requests.append(request)
+        if self._next:
+            self._next.append(request)
+            if request.method == "reset":
+                self._waiting = self._waiting & ~request.arguments[0]
+            if not self._waiting.any():
+                self.requests = [BUILD, *self._next]
+                self._ticks = sum(max(1, each.ticks) for each in self._next)
+                self._next = []
+        if self._ticks > self._most_ticks:
+            self.requests = []
+            self._next = []
 
 
 class WorkerPool(SingleOwner):
@@ -119,7 +176,7 @@ class WorkerPool(SingleOwner):
         self._at = cache(self.arrays.at)
         self.present = self._at(0)
         """Tick with the present observation."""
-        self._request: Request = Build()
+        self._request = BUILD
         row = 3 * options.command.size + options.robot.dof
         self.replay = Replay(MOST_BYTES // (row * num_envs * np.dtype(float).itemsize))
         """Requests for the replacement of a lost worker."""
@@ -141,7 +198,7 @@ class WorkerPool(SingleOwner):
         """Start the workers and wait until all are ready."""
         for worker in self.workers:
             worker.open()
-        failure = self.run(Build()).failure
+        failure = self.run(BUILD).failure
         if failure is not None:
             raise failure.error
 

@@ -1,71 +1,144 @@
-"""Requests to workers (:mod:`batchpid.sim.runner.operations`), the start of a loop, and the division
-of envs among workers.
+"""What a pool and its workers exchange: shared arrays, requests, the start of a loop.
+
+The memory of the arrays is an anonymous file (memfd), passed to the worker by file descriptor. The
+kernel frees it when the last process that uses it ends, even by a crash, so nothing is left behind
+in /dev/shm.
 """
 
 from __future__ import annotations
 
+import mmap
+import os
 import pickle
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import chain, pairwise
+from operator import itemgetter
 from typing import Any, Self
 
+import numpy as np
+
 import batchpid as bp
-from batchpid.arrays.array_types import Bool
-from batchpid.sim.loop.arrays import Arrays
+from batchpid.arrays.array_types import Rows
+from batchpid.errors import SingleOwner
+from batchpid.io.files import standard_streams_occupied
+from batchpid.sim.loop.arrays import Arrays, Layout
 from batchpid.sim.loop.loop import Loop
+from batchpid.sim.loop.snapshot import join_rows
 from batchpid.sim.options.options import RunnerOptions
+from batchpid.stages.values import Command
+
+_ALIGN = 64  # a cache line, so that two workers never write to the same one
 
 
-class Request(ABC):
-    """Base of all requests, which are frozen dataclasses for all envs of a pool."""
+class SharedArrays(SingleOwner):
+    """Named arrays in one block of shared memory: a new one, or the existing one with file
+    descriptor ``fd``.
+    """
 
-    changes_loop = True
+    def __init__(self, layout: Layout, fd: int | None = None) -> None:
+        self.layout = layout
+        offsets = {}
+        size = 0
+        for name, (shape, dtype) in layout.items():
+            offsets[name] = size
+            nbytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
+            size += -(-nbytes // _ALIGN) * _ALIGN
+        with standard_streams_occupied():
+            self.fd = os.memfd_create("batchpid") if fd is None else fd
+            os.ftruncate(self.fd, max(size, 1))
+            memory = mmap.mmap(self.fd, max(size, 1))  # duplicates the descriptor
+        self.arrays: dict[str, Rows] = {
+            name: np.ndarray(shape, dtype, buffer=memory, offset=offsets[name])
+            for name, (shape, dtype) in layout.items()
+        }
+
+    def close(self) -> None:
+        """Close the descriptor. The memory is freed when no array refers to it."""
+        fd = self.fd
+        self.fd = -1
+        self.arrays = {}
+        if fd >= 0:
+            os.close(fd)
+
+
+NO_COMMAND = Command(None)
+JOINED: dict[str, Callable[[list[Any]], Any]] = {
+    "run": max,
+    "read": join_rows,
+    "snapshot": join_rows,
+    "poses": lambda results: [*chain.from_iterable(results)],
+}
+"""Functions of the results of all workers, by the method of the request; others have no result."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """Call of a method of the loops of all envs of a pool."""
+
+    method: str
+    """Name of the method of :class:`batchpid.sim.loop.loop.Loop`; "build" for its constructor, with
+    the :class:`Start` of each worker.
+    """
+    arguments: tuple[Any, ...] = ()
+    """Arguments for all envs. Arrays (envs, ...) and objects with ``for_envs`` are divided, others
+    are the same for all workers.
+    """
+    ticks: int = 0
+    """Ticks of the arrays that hold observations afterwards; 0: the observation does not change."""
+    substeps: int = 10
+    """Sim steps of each tick, or the number of sim steps that take as long as the request."""
+    command: Command = NO_COMMAND
+    """Commands (ticks, envs, ...), which travel in the arrays."""
+    changes_loop: bool = True
     """True if the replacement of a lost worker repeats the request, and an error in it closes the
     pool.
     """
-    ticks = 0
-    """Ticks of the arrays that hold observations afterwards; 0: the observation does not change."""
-    substeps = 10
-    """Sim steps of each tick, or the number of sim steps that take as long as the request."""
-    patience = 0.0
-    """Further time that the request may take [s]."""
-    counts_ticks = False
-    """True if the ticks that every env completed before an error are kept."""
 
     @property
-    def placed(self) -> Bool | None:
-        """Envs that the request resets (envs,)."""
-        return None
+    def counts_ticks(self) -> bool:
+        """Whether the ticks that every env completed before an error are kept."""
+        return self.method == "run"
 
-    def for_envs(self, envs: slice) -> Self:
-        """Return the request for some envs: fields are arrays (envs, ...), None, or have this
-        method.
-        """
+    @property
+    def patience(self) -> float:
+        """Further time that the request may take [s]."""
+        # Mostly for imports, from a disk that may be slow.
+        return 60.0 if self.method == "build" else 0.0
+
+    def arguments_for(self, envs: slice) -> tuple[Any, ...]:
+        """Return the arguments for some envs."""
 
         def part(value: Any) -> Any:
-            if value is None:
-                return None
-            if hasattr(value, "for_envs"):
-                return value.for_envs(envs)
-            return value[envs]
+            if isinstance(value, np.ndarray):
+                return value[envs]
+            return value.for_envs(envs) if hasattr(value, "for_envs") else value
 
-        return type(self)(*map(part, vars(self).values()))
+        return tuple(map(part, self.arguments))
 
-    def write(self, arrays: Arrays, envs: slice) -> None:  # noqa: B027
-        """Write the rows of some envs to the shared arrays (ticks, envs, ...)."""
+    def for_envs(self, envs: slice) -> Self:
+        """Return the request for some envs."""
+        command = self.command.map(itemgetter((slice(None), envs)))
+        return replace(self, arguments=self.arguments_for(envs), command=command)
+
+    def write(self, arrays: Arrays, envs: slice) -> None:
+        """Write the commands of some envs to the shared arrays (ticks, envs, ...)."""
+        for table, rows in zip(arrays.command, self.command, strict=True):
+            if rows is not None:
+                table[: self.ticks, envs] = rows[:, envs]
 
     def encode(self, envs: slice) -> bytes:
-        """Return the message for a worker, pickled: the part of its envs."""
-        return pickle.dumps(self.for_envs(envs))
-
-    @abstractmethod
-    def apply(self, loop: Loop) -> object:
-        """Execute it and return its result."""
+        """Return the message for a worker, pickled: method and arguments for its envs."""
+        return pickle.dumps((self.method, self.arguments_for(envs)))
 
     def join(self, results: list[Any]) -> Any:
         """Return the result for all envs from the results of their parts."""
-        return None
+        joined = JOINED.get(self.method)
+        return None if joined is None else joined(results)
+
+
+BUILD = Request("build", changes_loop=False)
+"""Start of every loop, with which a replay begins by itself."""
 
 
 @dataclass(frozen=True)
@@ -88,19 +161,6 @@ class Start:
         """Return the loop, with the shared arrays (ticks, envs, ...) of the pool's envs."""
         envs = slice(self.first_env + self.envs.start, self.first_env + self.envs.stop)
         return Loop(self.options, self.params, envs, arrays.at((slice(None), self.envs)))
-
-
-@dataclass(frozen=True)
-class Build(Request):
-    """Build the loop; each worker has the :class:`Start` of its loop."""
-
-    # Every replay begins with its own.
-    changes_loop = False
-    patience = 60.0
-    """Mostly for imports, from a disk that may be slow."""
-
-    def apply(self, loop: Loop) -> None:
-        pass
 
 
 def split(num_envs: int, parts: int) -> list[slice]:

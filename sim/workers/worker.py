@@ -1,4 +1,4 @@
-"""Workers as the pool sees them: a loop in this process, or the caller's end of a worker process.
+"""Workers: a loop in this process, and both ends of a worker process.
 
 A worker process is a fresh Python, which does not import the caller's ``__main__``: it works from
 notebooks and from scripts without a main guard. It shares with the caller a socket and a block of
@@ -10,9 +10,13 @@ alone, since a worker is in another session.
 from __future__ import annotations
 
 import contextlib
+import faulthandler
+import fcntl
+import gc
 import json
 import os
 import pickle
+import select
 import signal
 import socket
 import subprocess
@@ -30,8 +34,7 @@ from batchpid.io.files import standard_streams_occupied
 from batchpid.sim.engine import native
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Failure, Loop
-from batchpid.sim.workers.exchange import SharedArrays
-from batchpid.sim.workers.requests import Build, Request, Start
+from batchpid.sim.workers.requests import Request, SharedArrays, Start
 
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
@@ -41,8 +44,8 @@ ONE_THREAD |= {"NPROC": "1", "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0", "JAX_PLATFORM
 caller's thread.
 """
 _PROGRAM = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); import batchpid.sim.workers.serve as"
-    " s; s.main()"
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); import batchpid.sim.workers.worker"
+    " as w; w.serve()"
 )
 
 
@@ -56,7 +59,7 @@ STEP_LIMIT = 1e-3
 
 class Worker(SingleOwner, ABC):
     """Loop of some envs: :meth:`send` a request, then :meth:`receive` its result. The first request
-    is a Build.
+    is BUILD.
     """
 
     pid: int | None = None
@@ -113,7 +116,7 @@ class LocalWorker(Worker):
         try:
             if self._loop is None:
                 self._loop = self._start.build(Arrays.from_fields(self._shared.arrays))
-            self._result = request.apply(self._loop)
+            self._result = _called(self._loop, request.method, request.arguments)
         except Exception as error:
             self._result = Failure.of(error)
 
@@ -184,7 +187,7 @@ class ProcessWorker(Worker):
         self._deadline = time.monotonic() + limit
         self._socket.settimeout(limit)
         try:
-            message = self._message if type(request) is Build else request.encode(self.envs)
+            message = self._message if request.method == "build" else request.encode(self.envs)
             # A worker that has died is an error here, where SIGPIPE would end the process.
             self._socket.sendall(message, socket.MSG_NOSIGNAL)
         except OSError as error:
@@ -274,3 +277,64 @@ def pinned_cores(workers: int) -> list[int]:
     if workers == len(cores):
         return cores
     return []
+
+
+# -- in the worker process
+# ------------------------------------------------------------------------------------------------
+
+_SPIN_SECONDS = 2e-4
+"""Seconds of spinning for the next request before blocking: waking up takes 30 us."""
+
+
+def serve() -> None:
+    """Run the main program of a worker process: build the loop, then serve the caller's requests
+    until it closes the socket.
+
+    The descriptors of the socket and of the shared memory are the last arguments of the program.
+    """
+    if sys.stderr is not None:
+        faulthandler.enable()
+    # The caller holds the other end of the pipe at standard input. When it ends, the kernel kills
+    # this process, even in a call that no Python code interrupts.
+    fcntl.fcntl(0, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(0, fcntl.F_SETSIG, signal.SIGKILL)
+    fcntl.fcntl(0, fcntl.F_SETFL, os.O_ASYNC)
+    channel, memory = map(int, sys.argv[-2:])
+    # These errors say that the caller has ended.
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        _serve(socket.socket(fileno=channel), memory)
+    os._exit(0)  # nothing to save, and the engine's own cleanup can take long
+
+
+def _serve(connection: socket.socket, memory: int) -> None:
+    requests = connection.makefile("rb")
+    start, layout = pickle.load(requests)
+    try:
+        loop = start.build(Arrays.from_fields(SharedArrays(layout, memory).arrays))
+    except Exception as error:
+        connection.sendall(pickle.dumps(Failure.of(error).portable()))
+        return
+    connection.sendall(pickle.dumps(None))
+    # The hot loop makes no reference cycles, so that collections would only cost time.
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    poller = select.poll()
+    poller.register(connection, select.POLLIN)
+    while True:
+        spin_end = time.perf_counter() + _SPIN_SECONDS
+        while not poller.poll(0) and time.perf_counter() < spin_end:
+            os.sched_yield()
+        connection.sendall(pickle.dumps(_result(loop, *pickle.load(requests))))
+
+
+def _result(loop: Loop, method: str, arguments: tuple[Any, ...]) -> Any:
+    try:
+        return _called(loop, method, arguments)
+    except Exception as error:
+        return Failure.of(error).portable()
+
+
+def _called(loop: Loop, method: str, arguments: tuple[Any, ...]) -> Any:
+    """Return the result of a method of the loop; the loop itself has been built."""
+    return None if method == "build" else getattr(loop, method)(*arguments)

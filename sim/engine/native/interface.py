@@ -64,7 +64,9 @@ class Group(ctypes.Structure):
     _fields_ = [
         *_all(
             ctypes.c_void_p,
-            "gateway",
+            "functions",
+            "articulations",
+            "systems",
             "qf",
             "skip",
             "speed_limit",
