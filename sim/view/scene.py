@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.io.packages import imported
+from batchpid.io.files import imported
 from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.mesh_files import find_mesh, read_mesh
 from batchpid.sim.geometry.shapes import convex_hull
