@@ -19,7 +19,7 @@ from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import BASES, STATUS, Group, ModelStruct, Refresh
+from batchpid.sim.engine.native.interface import number, structure
 from batchpid.sim.engine.protocol import CompiledModel, EnginePack
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -56,7 +56,7 @@ def passive_force(
 
 class NativeModel:
     """Model of the robots of ``pack``, without their variation, on a base of this kind of
-    :data:`BASES`.
+    Base in model.h.
     """
 
     def __init__(self, pack: EnginePack, base: str = "fixed") -> None:
@@ -67,7 +67,7 @@ class NativeModel:
         self._inertias: Float64 | None = None
 
     @cached_property
-    def _structure(self) -> tuple[ModelStruct, Any]:
+    def _structure(self) -> tuple[Any, Any]:
         tree, rows = self._pack.rigid_tree.tables
         if self._inertias is None:
             inertias = self._pack.rigid_tree.inertias()[None]
@@ -78,9 +78,10 @@ class NativeModel:
         numbers = {
             "dof": len(tree),
             "varies": self._inertias is not None,
-            "base": BASES.index(self._base),
+            "base": number("Base", self._base.upper()),
         }
-        return ModelStruct(gravity=self._pack.spec.gravity, **numbers, **addresses), arrays
+        gravity = tuple(self._pack.spec.gravity)
+        return structure("Model")(gravity=gravity, **numbers, **addresses), arrays
 
     @property
     def address(self) -> int:
@@ -182,7 +183,7 @@ class NativeRefresh:
         }
         arrays |= coupling.native()
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
-        self._structure = Refresh(
+        self._structure = structure("Refresh")(
             model=model.address, timestep=timestep, share=SHARE, steps=steps, **addresses
         )
         self._kept = model, arrays
@@ -205,7 +206,7 @@ class NativeStep:
     """Sim step of ``robots`` with ``dof`` joints as one native call, from Python or from an XLA
     program.
 
-    ``arrays`` and ``fields`` fill a :class:`.interface.Group`; a joint speed beyond ``speed_limit``
+    ``arrays`` and ``fields`` fill a Group of sim_step.h; a joint speed beyond ``speed_limit``
     (dof,) shows in the status. Implements :class:`batchpid.sim.engine.protocol.CompiledStep`.
     """
 
@@ -222,7 +223,7 @@ class NativeStep:
             self._arrays["speed_limit"] = np.broadcast_to(speed_limit, dof).astype(np.float64)
         addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
         self._native = native.extension("_gateway")
-        self._group = Group(robots=robots, dof=dof, **addresses, **fields)
+        self._group = structure("Group")(robots=robots, dof=dof, **addresses, **fields)
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension that does a sim
@@ -241,7 +242,7 @@ class NativeStep:
         """Return whether an env may have failed in a sim step with this status; RuntimeError if the
         engine has.
         """
-        if status & 1 << STATUS.index("failed"):
+        if status & number("Status", "FAILED"):
             raise RuntimeError(self._group.message.decode(errors="replace"))
         return bool(status)
 

@@ -29,13 +29,12 @@ from batchpid.motors.actuators import Actuators
 from batchpid.motors.coupling import Coupling, Follower
 from batchpid.motors.friction import Friction
 from batchpid.motors.guard import Guard
-from batchpid.native.availability import obstacle
+from batchpid.native.array_program import obstacle
 from batchpid.sim.engine.scene_spec import added_friction
 from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control, stages_of
 from batchpid.stages.friction import REFRESH_STEPS, Inertia
-from batchpid.stages.program import StageProgram
-from batchpid.stages.stage import by_name, running, started, stepped
+from batchpid.stages.stage import StageProgram, by_name, running, started, stepped
 from batchpid.stages.values import Command, Measured, Model, Values
 from batchpid.task_space import native_rows
 from batchpid.task_space.rigid_tree import RigidTree

@@ -21,7 +21,7 @@ from batchpid.arrays.array_types import Float64, MjData, MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.mujoco.speed_bounds import speed_bounds
 from batchpid.sim.engine.mujoco.vectors import aligned
-from batchpid.sim.engine.native.interface import WIDTH, Clearance
+from batchpid.sim.engine.native.interface import WIDTH, structure
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -220,7 +220,7 @@ class GroupClearance:
         # Native code has their addresses.
         self._kept = [*models], data
         fields = zip(("flags", "counts", "types_at", "affinities_at"), places() or (), strict=True)
-        self._fields = Clearance(
+        self._fields = structure("Clearance")(
             kinematics=kinematics,
             number=pairs,
             ways=ways,

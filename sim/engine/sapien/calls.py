@@ -20,7 +20,7 @@ from sapien.physx import PhysxArticulation, PhysxCpuSystem
 from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import SWITCH, extension
-from batchpid.sim.engine.native.interface import STATUS, SYMBOLS
+from batchpid.sim.engine.native.interface import SYMBOLS, number
 from batchpid.sim.engine.native_model import NativeStep
 
 TESTED = ("3.0.3",)
@@ -204,9 +204,6 @@ def pointer(wrapper: Any, kind: str) -> int:
     return address
 
 
-_SENSE = 1 << STATUS.index("sense")
-
-
 class SapienStep(NativeStep):
     """Sim step of the robots of a pack: apply efforts, step, read, and check whether a robot has
     failed.
@@ -273,7 +270,7 @@ class SapienStep(NativeStep):
 
     def may_have_failed(self, status: int) -> bool:
         # A call also returns to Python for the sensors; that is not a failure.
-        failed = super().may_have_failed(status & ~_SENSE)
+        failed = super().may_have_failed(status & ~number("Status", "SENSE"))
         if self._sense is not None:
             self._sense()
         return failed
