@@ -20,11 +20,11 @@ from typing import Any
 import batchpid as bp
 from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.field_tables import Field, declared
-from batchpid.law.params import FIELDS as PARAMS
-from batchpid.motors.actuators import FIELDS as ACTUATORS
+from batchpid.law.params import LAW_FIELDS
+from batchpid.motors.actuators import ACTUATOR_FIELDS
 from batchpid.sim.findings import OF_FILES, OF_ROBOTS, FindingKind
 from batchpid.sim.options.groups import DEFAULT_ENGINE
-from batchpid.sim.options.options import GROUPS, OPTIONS, RunnerKeywords
+from batchpid.sim.options.options import OPTION_GROUPS, OPTIONS, RunnerKeywords
 from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
 
 DOCS = Path(__file__).parent
@@ -75,7 +75,7 @@ ADVANCED = (
 
 def option_texts() -> Iterator[tuple[str, str]]:
     """Yield the name and the text of each option of the Runner."""
-    for group in (RunnerKeywords, *GROUPS):
+    for group in (RunnerKeywords, *OPTION_GROUPS):
         for (name,), text in attributes(group):
             yield name, text
 
@@ -166,8 +166,8 @@ def tables() -> dict[tuple[str, str], str]:
     """Return the tables by page and name."""
     without = "joints", "joint_names", "dtype"
     return {
-        ("law.md", "params"): table(numpydoc(bp.make_params), PARAMS, without),
-        ("actuators.md", "actuators"): table(numpydoc(bp.make_actuators), ACTUATORS, without),
+        ("law.md", "params"): table(numpydoc(bp.make_params), LAW_FIELDS, without),
+        ("actuators.md", "actuators"): table(numpydoc(bp.make_actuators), ACTUATOR_FIELDS, without),
         ("randomization.md", "randomization"): table(
             attributes(Randomization), PHYSICAL | START | EVENTS, ("seed", "per"), off=False
         ),

@@ -1,6 +1,6 @@
 """Findings: oddities of a robot, repairs of its files, and causes for which a run does not settle.
 
-:data:`KINDS` lists every kind, and the tables in the guides are made from it.
+:data:`FINDING_KINDS` lists every kind, and the tables in the guides are made from it.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ OF_RUNS = (
          "run longer, hold the last setpoint, pass setpoint_rate, or raise the gains"),
 )  # fmt: skip
 """Kinds of findings about a run, besides those about a robot."""
-KINDS = {kind.code: kind for kind in (*OF_FILES, *OF_ROBOTS, *OF_RUNS)}
+FINDING_KINDS = {kind.code: kind for kind in (*OF_FILES, *OF_ROBOTS, *OF_RUNS)}
 """Every kind of finding, by its code."""
 
 
@@ -144,8 +144,8 @@ KINDS = {kind.code: kind for kind in (*OF_FILES, *OF_ROBOTS, *OF_RUNS)}
 class Finding:
     """Oddity of a joint, a link or the robot, and the remedy.
 
-    ``code`` is one of :data:`KINDS`. ``text`` and ``remedy`` are the same for all joints with one
-    cause; ``detail`` has the figures of this joint or link. ``envs`` and ``time`` [s] belong to
+    ``code`` is one of :data:`FINDING_KINDS`. ``text`` and ``remedy`` are the same for all joints
+    with one cause; ``detail`` has the figures of this joint or link. ``envs`` and ``time`` [s] belong to
     findings of a run (:meth:`batchpid.sim.Rollout.findings`): the envs that have it, the first one
     first, and when it began there.
     """
@@ -162,7 +162,7 @@ class Finding:
     @property
     def severity(self) -> str:
         """One of :data:`SEVERITIES`, that of the kind."""
-        return KINDS[self.code].severity
+        return FINDING_KINDS[self.code].severity
 
     @property
     def where(self) -> str:

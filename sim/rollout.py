@@ -435,7 +435,7 @@ def _check_successive(number: int, before: Rollout, after: Rollout) -> None:
         differences.append("time")
     if (before.tick, before.num_envs) != (after.tick, after.num_envs):
         differences.append("tick or number of envs")
-    for name in (each.name for each in fields(RunInfo)):
+    for name in (info_field.name for info_field in fields(RunInfo)):
         if name in _OF_PARTS or changes & _CHANGES.get(name, 0):
             continue
         one = getattr(before.info, name)
@@ -452,11 +452,11 @@ def _joined(parts: Sequence[Rows | None], shapes: Sequence[tuple[int, ...]]) -> 
     """Return the arrays of successive parts as one, with 0 for a part without; None if none has
     one.
     """
-    given = [part for part in parts if part is not None]
-    if not given:
+    present = [part for part in parts if part is not None]
+    if not present:
         return None
     tables = [
-        np.zeros(shape, given[0].dtype) if part is None else part
+        np.zeros(shape, present[0].dtype) if part is None else part
         for part, shape in zip(parts, shapes, strict=True)
     ]
     return np.concatenate(tables)

@@ -20,7 +20,7 @@ from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.robot_options import BAND, known_joints
+from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
 from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec
 from batchpid.task_space.frames import moved, pose_error
 from batchpid.task_space.native_law import BoundOSC
@@ -126,7 +126,7 @@ class OperationalSpace:
         damping = motors.viscous + np.array([joint.damping * modelled for joint in robot.joints])
         self._damping = damping[None] if damping.any() else None
         coulomb = motors.coulomb + robot.friction * modelled
-        band = np.array([BAND[unit] for unit in robot.units])
+        band = np.array([FRICTION_BAND[unit] for unit in robot.units])
         self._known_friction = (coulomb[None], band[None]) if coulomb.any() else None
         # A setpoint has the pose (7), then the optional twist, acceleration and wrench (6 each),
         # then single joints.

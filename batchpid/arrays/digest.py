@@ -16,7 +16,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array
 from batchpid.errors import InvalidArgumentError
 
-_KINDS = "biufcSU"
+_DTYPE_KINDS = "biufcSU"
 """Kinds of dtypes whose bytes are their content: no objects."""
 _PADDED = (np.longdouble, np.clongdouble)
 """Types whose bytes hold padding, which is not content."""
@@ -45,7 +45,7 @@ def _digest(value: Any, where: str) -> bytes:
         # Byte order and strides do not change the digest.
         array = np.asarray(value)
         dtype = array.dtype.newbyteorder("<")
-        if dtype.kind in _KINDS and dtype.type not in _PADDED:
+        if dtype.kind in _DTYPE_KINDS and dtype.type not in _PADDED:
             content = array.astype(dtype, order="C", copy=False).tobytes()
             return _hashed(f"{dtype.str} {array.shape}", content)
     title = f"{kind.__module__}.{kind.__qualname__}"

@@ -41,7 +41,7 @@ P = ParamSpec("P")
 R = TypeVar("R", bound="Record")
 T = TypeVar("T")
 MOST_JOINTS = 100_000
-WIDTH = 130
+LINE_WIDTH = 130
 """Longest line of a representation."""
 Ends = tuple[Array, Array]
 """A lower and an upper limit, each None for none."""
@@ -355,7 +355,10 @@ def summary(name: str, parts: Iterable[str]) -> str:
     """Return ``name(part, part, ...)``, on as many lines as needed."""
     return "\n".join(
         textwrap.wrap(
-            f"{name}({', '.join(parts)})", WIDTH, subsequent_indent="    ", break_on_hyphens=False
+            f"{name}({', '.join(parts)})",
+            LINE_WIDTH,
+            subsequent_indent="    ",
+            break_on_hyphens=False,
         )
     )
 

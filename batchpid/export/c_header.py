@@ -22,8 +22,7 @@ from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.trees import is_leaf, leaves, parts, structure
 from batchpid.checks.validate import choice, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.c_plan import plan_functions
-from batchpid.export.c_rigid_body import rigid_body
+from batchpid.export.c_functions import plan_functions, rigid_body
 from batchpid.export.c_step import Dialect, comment, helpers, statements
 from batchpid.export.differences import Exported, check_one_env
 from batchpid.law import pid

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -100,6 +101,20 @@ class Dialect(NamedTuple):
     def loop(self) -> str:
         """Beginning of a loop over the joints."""
         return f"  for (int j = 0; j < {self.size}; ++j) {{\n"
+
+    def translated(self, file: str, **parts: str) -> str:
+        """Return the text of a file in this folder, which has the prefix "batchpid" and double
+        numbers, in this dialect; ``parts`` replace the comments ``/* [name] */``.
+        """
+        text = (Path(__file__).parent / file).read_text()
+        words = {"batchpid": self.prefix, "BATCHPID": self.prefix.upper(), "double": self.type}
+        _, text = text.split("*/\n\n", 1)  # without the comment on the file
+        text = re.sub(r"batchpid|BATCHPID|\bdouble\b", lambda match: words[match[0]], text)
+        text = re.sub(r"\b(\d+\.\d+|(?:sin|cos|ceil)(?=\())", rf"\1{self.suffix}", text)
+        for name, part in parts.items():
+            before, after = re.split(rf" */\* \[{name}\] \*/\n", text)
+            text = before + part + after
+        return f"{text}\n"
 
     def number(self, value: float) -> str:
         """Return a number of the dtype as a literal that reads back as the same number."""

@@ -18,18 +18,16 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.law.anti_windup import named
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.implicit import as_explicit
-from batchpid.law.params import FIELDS as LAW_FIELDS
-from batchpid.law.params import PIDParams
-from batchpid.motors.actuators import FIELDS, Actuators
-from batchpid.motors.guard import FIELDS as GUARD_FIELDS
-from batchpid.motors.guard import Guard
+from batchpid.law.params import LAW_FIELDS, PIDParams
+from batchpid.motors.actuators import ACTUATOR_FIELDS, Actuators
+from batchpid.motors.guard import GUARD_FIELDS, Guard
 
 SAME = {
     "effort_rate_limit": "the change of the effort is not limited",
     "setpoint_weight": "P acts on the whole setpoint (b = 1), so steps overshoot more",
     "derivative_filter_time": "no filter",
 }
-OPTIONS = {
+LOST_OPTIONS = {
     "ros2_control": SAME
     | {
         "deadband": "stops the integral alone, and P acts on the whole error",
@@ -52,7 +50,7 @@ WRITTEN |= {"effort_limit", "saturation_effort", "no_load_speed"}
 
 NEUTRAL = {
     name: float(field.neutral)
-    for fields in (LAW_FIELDS, FIELDS, GUARD_FIELDS)
+    for fields in (LAW_FIELDS, ACTUATOR_FIELDS, GUARD_FIELDS)
     for name, field in fields.items()
     if name != "anti_windup"
 }
@@ -204,7 +202,7 @@ def differences(
     The mask ``driven`` has the joints that the target drives.
     """
     rows = _mjcf(law) if target == "mjcf" else _ros2_control(law)
-    for option, text in OPTIONS[target].items():
+    for option, text in LOST_OPTIONS[target].items():
         rows[f"{option}: {text}"] = law.has(option)
     sentences = list(law.conversions)
     for sentence, mask in rows.items():
@@ -263,7 +261,7 @@ def _mjcf(law: Law) -> dict[str, Bool]:
     guarded = derives & (places | law.has("rate"))
     turns = np.zeros(len(law.joints)) if law.guard.turns is None else law.guard.turns[0]
     written = WRITTEN if law.is_law else WRITTEN | {"strength", "bias"}
-    lacking = [effect for effect in FIELDS if effect not in written]
+    lacking = [effect for effect in ACTUATOR_FIELDS if effect not in written]
     return {
         "setpoint_weight_derivative: acts on the target's velocity alone (c = 1)": weighs,
         QUOTIENT: derives & (params.measurement_rate is None),

@@ -26,7 +26,7 @@ from batchpid.arrays.array_types import Document
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.differences import Exported, Law, differences, export_law
 from batchpid.io import documents
-from batchpid.law.params import FIELDS, PIDParams
+from batchpid.law.params import LAW_FIELDS, PIDParams
 
 TYPE = "joint_trajectory_controller/JointTrajectoryController"
 LEAVES = {
@@ -104,7 +104,7 @@ def _gains(law: Law, at: int) -> Document:
     for key, option in LEAVES.items():
         leaf = getattr(params, option)
         if leaf is None:
-            gains[key] = FIELDS[option].neutral
+            gains[key] = LAW_FIELDS[option].neutral
         else:
             gains[key] = documents.plain(leaf[:, at])
     # The target would refuse the whole file when it starts.

@@ -29,9 +29,9 @@ from batchpid.arrays.records import Record
 from batchpid.checks.validate import choice, file_path, instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.law.params import FIELDS, PIDParams, make_params
+from batchpid.law.params import LAW_FIELDS, PIDParams, make_params
 
-R = TypeVar("R", bound=Record)
+R = TypeVar("R", bound="Record")
 
 SUFFIXES = {".yaml": "yaml", ".yml": "yaml", ".json": "json"}
 
@@ -400,7 +400,7 @@ PARAMS = _ParamsFile(
     PIDParams,
     make_params,
     ("dtype", *CHOICES),
-    FIELDS,
+    LAW_FIELDS,
     required=("kp",),
     gone=_GONE,
 )

@@ -73,7 +73,7 @@ def track(
     if measurement_rate is None:
         rate = zero
     else:
-        rate = -measurement_rate
+        rate = zero - measurement_rate
     if setpoint_rate is not None:
         rate = rate + weighted_rate(k, setpoint_rate)
     # The law solved for its integral: I = u - P - D - feedforward, with the derivative filter

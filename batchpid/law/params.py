@@ -71,7 +71,7 @@ class _ParamsFields(NamedTuple):
     """ImplicitLaw(): the law acts on the predicted end of the step; off: on its beginning."""
 
 
-FIELDS = declared(_ParamsFields, Field) | {"anti_windup": Field(neutral="none")}
+LAW_FIELDS = declared(_ParamsFields, Field) | {"anti_windup": Field(neutral="none")}
 """Options of a joint."""
 
 
@@ -86,7 +86,7 @@ class PIDParams(Record, _ParamsFields):
 
     __slots__ = ()
     NAME = "params"
-    FIELDS = FIELDS
+    FIELDS = LAW_FIELDS
 
     def options(self) -> Document:
         """Return the options that are on, as arguments of :func:`make_params` that build these
@@ -97,7 +97,7 @@ class PIDParams(Record, _ParamsFields):
         """
         options: Document = {}
         for name, leaf in self.leaves().items():
-            if name in FIELDS:
+            if name in LAW_FIELDS:
                 options[name] = leaf if is_traced(leaf) else np.array(leaf)
         for name, chosen in CHOICES.items():
             kind = type(getattr(self, name))
@@ -148,7 +148,7 @@ class PIDParams(Record, _ParamsFields):
                 raise InvalidArgumentError(f"params.{name}", problem, remedy="use one dtype")
 
 
-@with_fields(*FIELDS, *DEFAULTS)
+@with_fields(*LAW_FIELDS, *DEFAULTS)
 def make_params(
     joints: int,
     kp: Array,
@@ -238,15 +238,15 @@ def make_params(
     if kp is None:
         remedy = "give the proportional gain, 0 for none"
         raise InvalidArgumentError("kp", "is missing", remedy=remedy)
-    leaves: Document = {name: build.array(name, options[name], FIELDS[name]) for name in GAINS}
-    leaves |= build.options({name: FIELDS[name] for name in PLAIN}, options)
+    leaves: Document = {name: build.array(name, options[name], LAW_FIELDS[name]) for name in GAINS}
+    leaves |= build.options({name: LAW_FIELDS[name] for name in PLAIN}, options)
     for name, chosen in CHOICES.items():
         leaves[name] = chosen[choice(name, options.get(name, DEFAULTS[name]), chosen)]
     # The implicit law predicts with kd, so it needs one, 0 as well.
     if leaves["discretization"] is not None:
         _check_implicit(leaves["gain_units"], leaves["derivative_filter_time"])
         if kd is None:
-            leaves["kd"] = build.array("kd", 0.0, FIELDS["kd"])
+            leaves["kd"] = build.array("kd", 0.0, LAW_FIELDS["kd"])
     effort = build.limits("effort_limit", "effort_min", "effort_max", options)
     integral = build.limits("integral_limit", "integral_min", "integral_max", options)
     # The joints may have different strategies: each becomes an array of the joints that use it, or
@@ -260,7 +260,7 @@ def make_params(
     )
     is_everywhere = conditional is not None and conditional.all()
     # A choice is not an array.
-    for name in FIELDS & leaves.keys():
+    for name in LAW_FIELDS & leaves.keys():
         leaves[name] = build.freeze(leaves[name])
     return PIDParams(
         **leaves,

@@ -65,11 +65,11 @@ class _ActuatorsFields(NamedTuple):
     """Of the noise: two words (1, 2) uint32, the lower one first; None without noise."""
 
 
-FIELDS = declared(_ActuatorsFields, Field)
+ACTUATOR_FIELDS = declared(_ActuatorsFields, Field)
 """Declared fields of all effects that are one number for each joint."""
-MOTOR_SIDE = in_group(FIELDS, "motor")
+MOTOR_SIDE = in_group(ACTUATOR_FIELDS, "motor")
 """Effects between the commanded and the delivered effort."""
-JOINT_SIDE = in_group(FIELDS, "joint")
+JOINT_SIDE = in_group(ACTUATOR_FIELDS, "joint")
 """Effects on the joint instead of the signals: :class:`batchpid.sim.Runner` simulates them in the
 robot's joints.
 """
@@ -77,7 +77,7 @@ DRIVEN = tuple(name for name in JOINT_SIDE if name != "load_friction")
 """Effects on joints under the engine's drives, whose effort is unknown; friction by load needs the
 effort.
 """
-SENSOR_SIDE = in_group(FIELDS, "sensor")
+SENSOR_SIDE = in_group(ACTUATOR_FIELDS, "sensor")
 """Effects between the joint's state and its measurement."""
 DELAYS = ("command_delay", "sensor_delay")
 NOISES = ("position_noise", "velocity_noise")
@@ -93,7 +93,7 @@ class Actuators(Record, _ActuatorsFields):
 
     __slots__ = ()
     NAME = "actuators"
-    FIELDS = FIELDS
+    FIELDS = ACTUATOR_FIELDS
     WHOLE = ("max_delay", "seed")
 
     @property
@@ -109,7 +109,7 @@ class Actuators(Record, _ActuatorsFields):
     @property
     def is_ideal(self) -> bool:
         """True if every effect is off."""
-        return FIELDS.keys().isdisjoint(self.leaves())
+        return ACTUATOR_FIELDS.keys().isdisjoint(self.leaves())
 
     def joint_side(self) -> Actuators:
         """Return the friction and reflected inertia alone, which also joints of ideal motors and
@@ -154,7 +154,7 @@ class Actuators(Record, _ActuatorsFields):
         return array_summary(self._replace(seed=None), "envs", "joints")
 
 
-@with_fields(*FIELDS)
+@with_fields(*ACTUATOR_FIELDS)
 def make_actuators(
     joints: int,
     *,
@@ -230,7 +230,7 @@ def make_actuators(
         Naming the option, joint, env and value.
     """
     build = LeafBuilder(joints, joint_names, dtype, effects.values())
-    leaves = build.options(FIELDS, effects)
+    leaves = build.options(ACTUATOR_FIELDS, effects)
     # Friction at rest counts only where it is more than in motion; without it no speed ends it.
     if leaves["static"] is None and effects.get("static") is not None:
         leaves["stribeck"] = None
@@ -292,8 +292,10 @@ class _ActuatorStateFields(NamedTuple):
     """Commanded efforts, latest first (envs, samples, joints) [N m or N]."""
     effort: Array = None
     """Effort behind the lag (envs, joints) [N m or N]."""
-    sensor: Array = None
-    """Positions and velocities at the sensor, latest first (envs, samples, 2 joints)."""
+    position: Array = None
+    """Positions at the sensor, latest first (envs, samples, joints) [rad or m]."""
+    velocity: Array = None
+    """Velocities there, latest first (envs, samples, joints) [rad/s or m/s]."""
     encoder: Array = None
     """Position of the sensor's side of the play (envs, joints) [rad or m]."""
     key: Array = None
@@ -331,13 +333,8 @@ def _resized(old: Array, new: Array) -> Array:
     """Return a history of the length of another; other arrays as they are."""
     if old.ndim < 3 or old.shape == new.shape:
         return old
-    xp = old.__array_namespace__()
-    samples = new.shape[1]
-    if samples < old.shape[1]:
-        return old[:, :samples].copy()
     # Before its oldest sample a signal is taken as constant.
-    oldest = xp.broadcast_to(old[:, -1:], (old.shape[0], samples - old.shape[1], old.shape[2]))
-    return xp.concatenate((old, oldest), axis=1)
+    return old[:, np.minimum(np.arange(new.shape[1]), old.shape[1] - 1)]
 
 
 ACTUATORS = RecordFile(
@@ -345,7 +342,7 @@ ACTUATORS = RecordFile(
     Actuators,
     make_actuators,
     ("dtype", "seed", "max_delay"),
-    {**FIELDS, "continuous": Field(neutral=False)},
+    {**ACTUATOR_FIELDS, "continuous": Field(neutral=False)},
     partial=True,
 )
 dumps_actuators = ACTUATORS.dumps

@@ -1,5 +1,5 @@
-r"""Coulomb friction with stiction, and viscous damping: pure functions on (envs, joints), for NumPy
-and JAX.
+r"""Coulomb friction with stiction, and viscous damping: pure functions on (envs, joints), or any
+other leading axes, for NumPy and JAX.
 
 With the motor's effort tau, the load h (gravity and more), the mass matrix M, viscous damping B and
 Coulomb friction F, a joint moves by M dv/dt = tau - h - B v - f, with f = F sgn(v) while it moves
@@ -36,8 +36,8 @@ effort, here the effort of the motor::
 
 With K = J / dt one joint stops in one step (deadbeat), and up to 4/3 of that is stable. Coupled
 joints share it: with the correlations C_ij = A_ij / sqrt(A_ii A_jj) of A = (M + dt B)^-1, J_j = 1 /
-(A_jj sum_i |C_ij|) keeps the eigenvalues of A J within [0, 1], by Gershgorin's theorem. SHARE of K
-is left for inertias that change between two refreshes.
+(A_jj sum_i |C_ij|) keeps the eigenvalues of A J within [0, 1], by Gershgorin's theorem.
+DEADBEAT_SHARE of K leaves room for inertias that change between two refreshes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
 from batchpid.checks.validate import check_time_step
 
-SHARE = 0.7
+DEADBEAT_SHARE = 0.7
 """Share of the deadbeat gain K that is used."""
 LOOKAHEAD = 0.1
 """Time ahead at which the setpoint is taken to determine the direction of motion [s]."""
@@ -159,21 +159,22 @@ def refresh(
     check_time_step(dt)
     if friction.coulomb is None:
         return state
-    xp = namespace(mass_matrix, *friction)
+    xp = namespace(mass_matrix, *friction, *state)
     rubs = xp.zeros_like(state.effort) + friction.most > 0
     implicit = (0.0 if friction.viscous is None else friction.viscous) + damping + dt * stiffness
     implicit = xp.zeros_like(state.effort) + implicit
-    diagonal = implicit[:, :, None] * xp.eye(implicit.shape[-1], dtype=implicit.dtype)[None]
+    eye = xp.broadcast_to(xp.eye(implicit.shape[-1], dtype=implicit.dtype), mass_matrix.shape)
+    diagonal = implicit[..., None] * eye
     inverse = xp.linalg.inv(mass_matrix + dt * diagonal)
     # The diagonal is what each joint shows while the others are free.
-    mobility = xp.einsum("ejj->ej", inverse)
+    mobility = xp.diagonal(inverse, axis1=-2, axis2=-1)
     scale = xp.sqrt(mobility)
     # Coupled joints share the gain, by Gershgorin: see above.
-    correlation = xp.abs(inverse) / (scale[:, :, None] * scale[:, None, :])
-    shared = (correlation * rubs.astype(correlation.dtype)[:, None, :]).sum(-1)
+    correlation = xp.abs(inverse) / (scale[..., :, None] * scale[..., None, :])
+    shared = (correlation * rubs.astype(correlation.dtype)[..., None, :]).sum(-1)
     k = xp.where(
         rubs,
-        SHARE / (dt * mobility * xp.where(rubs, shared, 1.0)),
+        DEADBEAT_SHARE / (dt * mobility * xp.where(rubs, shared, 1.0)),
         0.0,
     )
     w = 1 - dt * implicit * mobility

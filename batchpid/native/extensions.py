@@ -109,12 +109,11 @@ OPERATIONS = (
     "subtract_multiply",
     "clip",
     "push",
-    "take",
     "gather",
     "take_row",
 )
 """Operations of programs. program.h describes those that no array library has."""
-ROW_WISE = ("row_minimum", "matrix_vector", "push", "take", "gather", "take_row")
+ROW_WISE = ("row_minimum", "matrix_vector", "push", "gather", "take_row")
 """Operations whose result at a number depends on other numbers of its row, or on a table."""
 MOST_OPERANDS = 48
 """Largest number of operands, and of results, of a fused segment."""

@@ -72,19 +72,19 @@ def header() -> str:
 
 def _function(number: int, packed: bytes) -> str:
     """Return the pass of a segment."""
-    read, kept, *code = np.frombuffer(packed, np.int32).tolist()
-    operations = [code[start : start + 4] for start in range(0, len(code) - kept, 4)]
+    read, count, *code = np.frombuffer(packed, np.int32).tolist()
+    operations = [code[start : start + 4] for start in range(0, len(code) - count, 4)]
     pointers = [f"*x{i} = x[{i}].data + at * x[{i}].step" for i in range(read)]
     lines = [f"T const v{i} = x{i}[i];" for i in range(read)]
     for value, (operation, *operands) in enumerate(operations, read):
         names = ", ".join(f"v{operand}" for operand in operands)
         lines.append(f"T const v{value} = result_of<Code({operation}), T>({names});")
     # All operands are read before a result is written: they may share memory.
-    lines += [f"y{i}[i] = v{value};" for i, value in enumerate(code[-kept:])]
-    results = [f"*y{i} = y[{i}] + start" for i in range(kept)]
+    lines += [f"y{i}[i] = v{value};" for i, value in enumerate(code[-count:])]
+    results = [f"*y{i} = y[{i}] + start" for i in range(count)]
     return _PASS.format(
         number=number,
-        code=", ".join(map(str, (read, kept, *code))),
+        code=", ".join(map(str, (read, count, *code))),
         pointers=", ".join(pointers),
         results=", ".join(results),
         lines="\n      ".join(lines),

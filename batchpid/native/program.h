@@ -35,8 +35,7 @@ using Index = std::ptrdiff_t;
 // ADD_SUBTRACT       (a + b) - c
 // SUBTRACT_MULTIPLY  (a - b) c
 // CLIP               min(max(a, b), c)
-// PUSH               history, in place: b, or b and c, as its latest sample; the oldest one is lost
-// TAKE               numbers of a table, at the places b in the whole of it
+// PUSH               history, in place: b as its latest sample; the oldest one is lost
 // GATHER             columns b of each row of a
 // TAKE_ROW           numbers of a table, in row b of the rows of each env and column
 
@@ -45,7 +44,7 @@ struct Operation {
 };
 
 // Shapes of constants and inputs: (), (1, columns), (rows, 1), (rows, columns), (rows, numbers of a table).
-// A table is a matrix (columns, columns), or a history (samples, columns or 2 columns) with the latest sample first.
+// A table is a matrix (columns, columns), or a history (samples, columns) with the latest sample first.
 enum class Shape : std::int32_t { NUMBER, ROW, COLUMN, FULL, TABLE };
 
 struct Input {
@@ -201,14 +200,9 @@ BATCHPID_INLINE void apply(Program const &program, Code code, Index first, Index
     case PUSH:
       for (Index row = 0; row < n; row += columns) {
         T *latest = const_cast<T *>(x.data) + (first + row) / columns * x.step, *end = latest + x.step;
-        bool const is_pair = z.data != x.data;
-        std::copy_backward(latest, end - (is_pair ? 2 : 1) * columns, end);
+        std::copy_backward(latest, end - columns, end);
         std::copy_n(y.data + (y.step ? row : row % program.chunk), columns, latest);
-        if (is_pair) std::copy_n(z.data + (z.step ? row : row % program.chunk), columns, latest + columns);
       }
-      break;
-    case TAKE:
-      for (Index i = 0; i < n; ++i) out[i] = x.data[static_cast<Index>(y.data[y.step ? i : i % program.chunk])];
       break;
     case TAKE_ROW:
       for (Index row = 0; row < n; row += columns) {  // a place beyond the table, or NaN, is one in it

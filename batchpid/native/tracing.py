@@ -15,7 +15,7 @@ from batchpid.arrays.array_types import Array, DType, Pytree
 from batchpid.arrays.trees import filled, leaves
 from batchpid.native.extensions import MASKS, MOST_OPERANDS, OPERATIONS, ROW_WISE
 
-_NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
+_OTHER_NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
 """Operations that have another name in NumPy."""
 
 
@@ -51,7 +51,7 @@ class Namespace:
         return result
 
     def __getattr__(self, name: str) -> Callable[..., Symbol]:
-        name = _NAMES.get(name, name)
+        name = _OTHER_NAMES.get(name, name)
         if name not in OPERATIONS:
             raise AttributeError(f"programs have no operation {name!r}")
         return lambda *values: self.apply(name, *values)
@@ -75,6 +75,8 @@ class Symbol:
 
     It can also be a matrix in each row, or a history of samples, which a program changes in place.
     """
+
+    ndim = 2
 
     def __init__(self, namespace: Namespace, is_mask: bool = False) -> None:
         self._namespace = namespace
@@ -342,20 +344,20 @@ def _segments(
             operand for _, operands, _ in inside for operand in operands if operand not in made
         )
         numbers = {symbol: number for number, symbol in enumerate([*read, *made])}
-        kept = [symbol for symbol in made if last_use.get(symbol, -1) >= end]
-        if len(inside) < 2 or len(read) > MOST_OPERANDS or len(kept) > MOST_OPERANDS:
+        results = [symbol for symbol in made if last_use.get(symbol, -1) >= end]
+        if len(inside) < 2 or len(read) > MOST_OPERANDS or len(results) > MOST_OPERANDS:
             continue
-        code = [len(read), len(kept)]
+        code = [len(read), len(results)]
         for name, operands, _ in inside:
             entries = [numbers[operand] for operand in operands]
             code += [OPERATIONS.index(name), *entries, *(2 * entries[:1])][:4]
-        code += [numbers[symbol] for symbol in kept]
+        code += [numbers[symbol] for symbol in results]
         yield Segment(
             first,
             end - first,
             _packed(code),
             _packed(places[symbol] for symbol in read),
-            _packed(places[symbol] for symbol in kept),
+            _packed(places[symbol] for symbol in results),
         )
 
 

@@ -28,7 +28,7 @@ from batchpid.arrays.records import LeafBuilder, Record, with_fields
 from batchpid.checks.validate import choice, integer, positive
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.documents import RecordFile
-from batchpid.motors.guard import FIELDS as GUARD_FIELDS
+from batchpid.motors.guard import GUARD_FIELDS
 
 LONGEST_HORIZON = 1000
 """Most rows of a chunk."""
@@ -70,7 +70,7 @@ class _PlanFields(NamedTuple):
     """Linear() or Held(); off: cubic."""
 
 
-FIELDS = declared(_PlanFields, Field)
+PLAN_FIELDS = declared(_PlanFields, Field)
 """Options of a joint."""
 
 
@@ -81,7 +81,7 @@ class Plan(Record, _PlanFields):
 
     __slots__ = ()
     NAME = "plan"
-    FIELDS = FIELDS
+    FIELDS = PLAN_FIELDS
 
     @property
     def horizon(self) -> int:
@@ -102,11 +102,11 @@ class Plan(Record, _PlanFields):
             "interpolation": next(n for n, one in INTERPOLATIONS.items() if type(one) is kind),
             "latest": np.flatnonzero(self.blended[0] == 0).tolist(),
             "dtype": np.dtype(self.dtype),
-            **{name: leaf for name, leaf in leaves.items() if name in FIELDS},
+            **{name: leaf for name, leaf in leaves.items() if name in PLAN_FIELDS},
         }
 
 
-@with_fields(*FIELDS)
+@with_fields(*PLAN_FIELDS)
 def make_plan(
     joints: int,
     *,
@@ -176,11 +176,11 @@ def make_plan(
             remedy = "leave it out, or choose another blend"
             raise InvalidArgumentError(name, f"has no effect with blend {blend!r}", remedy=remedy)
     if option and options.get(option) is None:
-        options[option] = FIELDS[option].default
-    leaves = build.options(FIELDS, options)
+        options[option] = PLAN_FIELDS[option].default
+    leaves = build.options(PLAN_FIELDS, options)
     # An ensemble stays one where m is 0.
     if option == "weight":
-        leaves["weight"] = build.array("weight", options["weight"], FIELDS["weight"])
+        leaves["weight"] = build.array("weight", options["weight"], PLAN_FIELDS["weight"])
         leaves["forgotten"] = 1.0 - np.exp(-leaves["weight"])
     horizon = integer("horizon", horizon, 1, LONGEST_HORIZON)
     newest = [integer("latest", joint, 0, build.joints - 1) for joint in latest]
@@ -200,7 +200,7 @@ PLANS = RecordFile(
     Plan,
     make_plan,
     ("period", "horizon", "blend", "interpolation", "latest", "dtype"),
-    FIELDS,
+    PLAN_FIELDS,
 )
 dumps_plan = PLANS.dumps
 loads_plan = PLANS.loads

@@ -10,7 +10,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array
 from batchpid.law.params import PIDParams
 from batchpid.motors.actuator_dynamics import MotorCoefficients, discretise, init
-from batchpid.motors.actuators import FIELDS, Actuators
+from batchpid.motors.actuators import ACTUATOR_FIELDS, Actuators
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.motors.guard import Guard
@@ -65,7 +65,7 @@ class Control(NamedTuple):
     def side(self, fields: Mapping[str, Any]) -> tuple[Actuators, MotorCoefficients]:
         """Return the actuators with the effects ``fields`` alone, and their coefficients."""
         assert self.actuators is not None
-        others = FIELDS.keys() - fields.keys()
+        others = ACTUATOR_FIELDS.keys() - fields.keys()
         half = self.actuators._replace(**dict.fromkeys(others))
         if not half.measures:
             half = half._replace(seed=None)

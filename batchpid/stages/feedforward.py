@@ -55,8 +55,8 @@ class Feedforward(Stage):
     def of(cls, control: Control) -> Self:
         if control.modelled is None:
             return cls(control.coupling, control.powered, None, None, None)
-        known = control.modelled, control.band, control.turns
-        return cls(control.coupling, control.powered, *known)
+        friction = control.modelled, control.band, control.turns
+        return cls(control.coupling, control.powered, *friction)
 
     def step(self, state: tuple[()], values: Values) -> Told:
         command, seen = values.command, values.seen

@@ -20,7 +20,7 @@ from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDyn
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_kinematics import prepared, read_point
 
-_RESULTS = {
+_LAW_RESULTS = {
     "effort": 0,
     "integral": 6,
     "limited": 0,
@@ -66,7 +66,8 @@ def law(
     if state.integral is not None:
         needed = (*wanted, "integral")
     results = [
-        np.empty((rows, size or dof)) if name in needed else None for name, size in _RESULTS.items()
+        np.empty((rows, size or dof)) if name in needed else None
+        for name, size in _LAW_RESULTS.items()
     ]
     fixed: tuple[Any, ...] = (k.frame is not None, *_WITHOUT_TREE)
     if tool is not None:
@@ -109,7 +110,7 @@ class BoundOSC:
     limited
         1 for joints whose effort the limits have changed in the last call, else 0 (envs, dof).
     address
-        Address of the call: ``control`` of :class:`batchpid.sim.engine.native.interface.Tick`.
+        Address of the call: ``control`` of Tick in tick.h.
     """
 
     def __init__(

@@ -31,7 +31,7 @@ _SIZES = {
     "bias": (-1,),
 }
 """Shapes of the results of :func:`kinematics`; -1 stands for the degrees of freedom."""
-_PLAIN = frozenset({np.ndarray, type(None)})
+_PLAIN_ARRAYS = frozenset({np.ndarray, type(None)})
 _DYNAMICS = {"mass_matrix", "bias"}
 """Results that the extension computes on a fixed base alone."""
 
@@ -196,7 +196,7 @@ def native_tree(native: ModuleType, tree: RigidTree) -> object:
 
 def for_rows(like: Array, *arrays: Array) -> ModuleType | None:
     """Return the extension if all arrays are NumPy's and ``like`` is (envs, columns), else None."""
-    plain = _PLAIN.issuperset(map(type, arrays)) or all(
+    plain = _PLAIN_ARRAYS.issuperset(map(type, arrays)) or all(
         x is None or isinstance(x, np.ndarray) for x in arrays
     )
     if plain and like.ndim == 2:

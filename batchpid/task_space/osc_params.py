@@ -94,7 +94,7 @@ class _OSCParamsFields(NamedTuple):
     """ImplicitLaw(): the gains act on the predicted end of the step; None: on its beginning."""
 
 
-FIELDS = declared(_OSCParamsFields, Field) | {
+OSC_FIELDS = declared(_OSCParamsFields, Field) | {
     "damping_ratio": Field("1", 1.0, group="axis", default=1.0),
     "posture_damping_ratio": Field("1", 1.0, group="joint", default=1.0),
     "effort_limit": Field("N m or N", math.inf, group="joint"),
@@ -119,13 +119,13 @@ class OSCParams(Record, _OSCParamsFields):
 
     __slots__ = ()
     NAME = "params"
-    FIELDS = FIELDS
+    FIELDS = OSC_FIELDS
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "axes")
 
 
-@with_fields(*FIELDS)
+@with_fields(*OSC_FIELDS)
 def make_osc_params(
     tree: RigidTree,
     *,
@@ -216,7 +216,7 @@ def make_osc_params(
 
 
 def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...]]) -> Document:
-    """Return the rows of all options of FIELDS, with their defaults; None stays.
+    """Return the rows of all options of OSC_FIELDS, with their defaults; None stays.
 
     Raises InvalidArgumentError for an option that is given, and has no effect.
     """
@@ -225,7 +225,7 @@ def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...
         kind: AxisKind = "joint" if group == "joint" else "entry"
         builders[group] = LeafBuilder(len(names), names, kind=kind)
     rows: Document = {}
-    for name, field in FIELDS.items():
+    for name, field in OSC_FIELDS.items():
         value: Any = options.get(name, field.default)
         if isinstance(field.neutral, bool) and value is not None:
             # Bools as 1.0 and 0.0.
@@ -233,11 +233,11 @@ def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...
             field = Field()
         if field.group in ("norm", "s0") and np.ndim(value) == 1:  # one number for each env
             value = np.reshape(value, (-1, 1))
-        rows[name] = builders[FIELDS[name].group].array(name, value, field)
+        rows[name] = builders[OSC_FIELDS[name].group].array(name, value, field)
     # An option without effect is nearly always a misunderstanding.
     for name, (other, is_given, reason) in WITHOUT_EFFECT.items():
         is_unused = (rows[other] is not None) == is_given
-        if is_unused and (rows[name] != FIELDS[name].default).any():
+        if is_unused and (rows[name] != OSC_FIELDS[name].default).any():
             remedy = "leave it out, or correct the other option"
             raise InvalidArgumentError(name, f"has no effect: {reason}", remedy=remedy)
     return rows

@@ -17,7 +17,7 @@ import tyro
 
 from batchpid.arrays.array_types import Document
 from batchpid.arrays.field_tables import Field, declared, plain
-from batchpid.sim.options.options import KINDS, OPTIONS, RunnerKeywords
+from batchpid.sim.options.options import OPTION_TYPES, OPTIONS, RunnerKeywords
 from batchpid.sim.robot.robot import Robot
 
 
@@ -42,13 +42,13 @@ OPTIONS_WITH_FLAG = {
 BOUNDS = declared(RunnerKeywords, Field)
 """Ranges of the options that are numbers."""
 NumEnvs = Annotated[int, BOUNDS["num_envs"], flag("Number of robots, one in each scene.")]
-GAINS = flag(
+GAINS_FLAG = flag(
     "Gains: tuned, designed, sapien-tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml"
     " or .json) that `batchpid tune` or batchpid.save_params wrote. Default: tuned where the robot"
     " has them, else designed.",
     "NAME|FILE",
 )
-Gains = Annotated[str | None, GAINS]
+Gains = Annotated[str | None, GAINS_FLAG]
 Randomize = Annotated[
     Path | None,
     flag(
@@ -100,12 +100,12 @@ def record_of(
         notes = get_args(kind)
         if Robot in (kind, *notes):
             rows.append(("robot", ROBOT, field(default=None)))
-        elif any(isinstance(note, type(GAINS)) for note in notes):
+        elif any(isinstance(note, type(GAINS_FLAG)) for note in notes):
             default = parameter.default
             is_required = default is inspect.Parameter.empty
             rows.append((name, kind, field() if is_required else field(default=default)))
     for name in options:
-        kind = get_args(KINDS[name])[0]
+        kind = get_args(OPTION_TYPES[name])[0]
         kind = Annotated[kind, BOUNDS.get(name), flag(OPTIONS[name].flag)]
         rows.append((name, kind, field(default=OPTIONS_WITH_FLAG[name])))
     rows += [(name, LOADING[name], field(default=None)) for name in loading]

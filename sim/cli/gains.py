@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot, tuning
-from batchpid.sim.cli.flags import GAINS, Randomize, flag
+from batchpid.sim.cli.flags import GAINS_FLAG, Randomize, flag
 from batchpid.sim.options.groups import EngineName
 from batchpid.sim.tuning.evaluation import load_randomization
 
@@ -40,7 +40,7 @@ def tune(
 
 def compare(
     robot: Robot,
-    gains: Annotated[tuple[str, ...], GAINS] = (),
+    gains: Annotated[tuple[str, ...], GAINS_FLAG] = (),
     moves: Annotated[
         int,
         Field(low=1, high=100_000),

@@ -15,7 +15,7 @@ from batchpid.sim.cli.flags import Gains, flag
 from batchpid.sim.diagnosis.text import table
 from batchpid.sim.findings import summary
 from batchpid.sim.geometry.inertia import DENSITY
-from batchpid.sim.robot.parts import HEADERS, joint_rows
+from batchpid.sim.robot.parts import JOINT_HEADERS, joint_rows
 from batchpid.sim.tuning.gain_sets import GainSet, gain_set, gain_table
 
 SOURCES = {
@@ -64,7 +64,7 @@ class Inspection:
         joints = list(robot.joints)
         if self.all:
             joints += [joint for joint in robot.tables.joints if not joint.moves]
-        lines.append("\n" + table(list(joint_rows(joints)), HEADERS, "lllrrrrrl"))
+        lines.append("\n" + table(list(joint_rows(joints)), JOINT_HEADERS, "lllrrrrrl"))
         rows = []
         for name, link in masses.items():
             mass = f"{link.mass:.4g} kg" if link.mass else "none"

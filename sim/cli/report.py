@@ -26,7 +26,7 @@ SHORTEST = 1.0
 """Shortest run in which envs should settle [s]."""
 LISTED = 8
 """Envs that a line lists."""
-AXES = {"x": "m", "y": "m", "z": "m", "rx": "rad", "ry": "rad", "rz": "rad"}
+AXIS_UNITS = {"x": "m", "y": "m", "z": "m", "rx": "rad", "ry": "rad", "rz": "rad"}
 """Axes of the error of a pose, with their units."""
 COLUMNS = {
     "first_error": ("first error", "{:.2g}"),
@@ -38,7 +38,7 @@ COLUMNS = {
     "saturation_share": ("saturated", "{:.0%}"),
 }
 """Figures in the table of a run, with headers and styles."""
-ABOUT = """\
+ROLLOUT_NOTES = """\
 final error: the largest in the last tenth of the run; following error: the largest |qpos - setpoint| at the ends of
 ticks; settled: within 2 % of the move for good; overshoot: of joints that settled; saturated: share of samples
 """
@@ -95,7 +95,7 @@ class RunReport:
         if rollout.tool_pose is not None:
             error = np.abs(pose_error(rollout.setpoint[..., :7], rollout.tool_pose.astype(float)))
             figures = {"first_error": error[0], "final_error": error[ends].max(0)}
-            return list(AXES), list(AXES.values()), figures
+            return list(AXIS_UNITS), list(AXIS_UNITS.values()), figures
         has_effort = rollout.info.control != "drive"
         # A setpoint that moves is followed; one that is held is a step, with a settling time.
         if not self.is_held:
@@ -128,7 +128,7 @@ class RunReport:
             self.backend,
             speed_line(self.rollout.num_envs, self.seconds, self.timestep, self.wall) + "\n",
             table(rows, headers, "l" + "r" * len(shown)),
-            ABOUT,
+            ROLLOUT_NOTES,
             *self._unsettled_lines(),
             *(f"Note: {note}" for note in self.notes),
         ]

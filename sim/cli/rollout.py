@@ -21,9 +21,9 @@ from batchpid.sim.cli.report import RunReport
 from batchpid.sim.tuning.evaluation import load_randomization
 from batchpid.sim.tuning.gain_sets import gain_set
 
-SUBSTEPS = 20
+SETPOINT_SUBSTEPS = 20
 """Sim steps of a tick, from one sample to the next, to a setpoint."""
-SPREAD = 0.3
+START_SPREAD = 0.3
 """Largest distance of a start pose from the first one [rad or m]."""
 Seconds = Annotated[
     float | None,
@@ -147,9 +147,9 @@ def rollout(
     else:
         goal = goal if setpoint is None else setpoint
         row = array("setpoint", goal, (1, len(columns)), columns, kind="entry")[0]
-        options["substeps"] = SUBSTEPS
+        options["substeps"] = SETPOINT_SUBSTEPS
         # The metrics of a step need two ticks.
-        ticks = max(2, round((seconds or 2.0) / (timestep * SUBSTEPS)))
+        ticks = max(2, round((seconds or 2.0) / (timestep * SETPOINT_SUBSTEPS)))
         setpoints = np.tile(row, (ticks, 1))
         if robot.settings is not None and setpoint is None:
             notes += robot.settings.notes
@@ -158,7 +158,7 @@ def rollout(
         # The speed is that of the run alone, without the start of processes.
         began = time.perf_counter()
         # A start off the trajectory would count as an error of following.
-        start = start_poses(robot, num_envs, SPREAD if trajectory is None else 0.0, center)
+        start = start_poses(robot, num_envs, START_SPREAD if trajectory is None else 0.0, center)
         runner.reset(start, seed=None if randomization is None else 0)
         result = runner.rollout(setpoints, progress=progress, **further)
         wall = time.perf_counter() - began

@@ -19,13 +19,13 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.preflight import touching_links
-from batchpid.sim.findings import KINDS, LIMIT_TOLERANCE, Finding, Findings
+from batchpid.sim.findings import FINDING_KINDS, LIMIT_TOLERANCE, Finding, Findings
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
     from batchpid.sim.rollout import Rollout
 
-BAND = 0.02  # half width of the settling band, as a share of the move
+SETTLING_SHARE = 0.02  # half width of the settling band, as a share of the move
 EXAMINED = 100  # envs at most
 TAIL = 0.2  # last share of the run, by which joints are judged
 TOUCH = 3e-3  # distance below which links touch, within the accuracy of meshes [m]
@@ -101,7 +101,7 @@ def _finding(
             detail = f"{fault.joint}: {fault.cause}"
     numbers = tuple(envs[rows].tolist())
     time = times.min()
-    kind = KINDS[rule.code]
+    kind = FINDING_KINDS[rule.code]
     return Finding(kind.code, kind.when, kind.done, name, None, detail, numbers, time)
 
 
@@ -126,7 +126,7 @@ class _Run:
         turns = np.rint(error / TURN) * robot.continuous
         self.error = error - TURN * turns
         """Last setpoint minus each position (ticks, envs, dof) [rad or m]."""
-        self.band = np.maximum(BAND * np.abs(self.error[0]), absolute_band(robot))
+        self.band = np.maximum(SETTLING_SHARE * np.abs(self.error[0]), absolute_band(robot))
         """Half width of the settling band [rad or m]."""
         outside = (np.abs(self.error[-1]) > self.band) | self.failed | self.out_of_reach
         self.unsettled: Bool = outside & robot.independent

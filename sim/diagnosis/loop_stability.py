@@ -86,9 +86,9 @@ def _loop(
         loop["mass_matrix"] = eye[None]
     else:
         # The law knows the damping, too, as part of its matrix.
-        known = robot.actuators or bp.Actuators()
-        implicit = coupling.reduced_damping(robot.damping + table(known.viscous)[0])
-        model = matrix(known.armature)[:1] + timestep * eye * implicit
+        described = robot.actuators or bp.Actuators()
+        implicit = coupling.reduced_damping(robot.damping + table(described.viscous)[0])
+        model = matrix(described.armature)[:1] + timestep * eye * implicit
         plant = matrix(motors.armature) + timestep * eye * damping[:, None]
         loop |= {"mass_matrix": plant, "model": strength[..., None] * model}
     loop["filter_time"] = column(params.derivative_filter_time)

@@ -22,7 +22,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
-from batchpid.sim.findings import KINDS, LIMIT_TOLERANCE, SEVERITIES, Finding, Findings
+from batchpid.sim.findings import FINDING_KINDS, LIMIT_TOLERANCE, SEVERITIES, Finding, Findings
 from batchpid.sim.geometry.inertia import LEAST_MASS, triangle_excess
 from batchpid.sim.geometry.shapes import hull_share
 
@@ -81,7 +81,7 @@ def check(
     plan = _Plan(robot, start, goal, params, timestep)
     findings = [*robot.repairs, *robot.reading.srdf.findings]
     for oddity in ODDITIES:
-        kind = KINDS[oddity.code]
+        kind = FINDING_KINDS[oddity.code]
         for place in oddity.places(plan):
             text = place.text or kind.when
             remedy = place.remedy or kind.done

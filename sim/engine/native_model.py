@@ -10,18 +10,20 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.motors.coupling import Coupling
-from batchpid.motors.friction import SHARE, Friction, FrictionState
+from batchpid.motors.friction import DEADBEAT_SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import number, structure
-from batchpid.sim.engine.protocol import CompiledModel, EnginePack
 from batchpid.task_space.rigid_tree import RigidTree
+
+if TYPE_CHECKING:
+    from batchpid.sim.engine.protocol import EnginePack
 
 
 def passive_force(
@@ -160,7 +162,7 @@ class NativeRefresh:
 
     def __init__(
         self,
-        model: CompiledModel,
+        model: NativeModel,
         size: int,
         armature: Float64,
         friction: Friction,
@@ -184,7 +186,7 @@ class NativeRefresh:
         arrays |= coupling.native()
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
         self._structure = structure("Refresh")(
-            model=model.address, timestep=timestep, share=SHARE, steps=steps, **addresses
+            model=model.address, timestep=timestep, share=DEADBEAT_SHARE, steps=steps, **addresses
         )
         self._kept = model, arrays
 
@@ -207,7 +209,7 @@ class NativeStep:
     program.
 
     ``arrays`` and ``fields`` fill a Group of sim_step.h; a joint speed beyond ``speed_limit``
-    (dof,) shows in the status. Implements :class:`batchpid.sim.engine.protocol.CompiledStep`.
+    (dof,) shows in the status.
     """
 
     def __init__(
@@ -267,5 +269,5 @@ def passive_force_of(pack: EnginePack, natively: bool) -> Callable[..., Float64]
     every executor takes them from it, since the engines' and NumPy's differ in the last bits.
     """
     if natively:
-        return NativeModel(pack, "fixed" if pack.spec.fixed_base else "held").passive_force
+        return pack.force_model.passive_force
     return lambda *state: passive_force(pack.rigid_tree.held, *state)

@@ -10,19 +10,31 @@ it.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.util import find_spec
 from sys import modules
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
+import numpy as np
+
+import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.validate import choice
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.errors import InvalidArgumentError, MissingDependencyError, SingleOwner
 from batchpid.io.packages import imported
 from batchpid.motors import Actuators
-from batchpid.motors.friction import Friction
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.engine.coupled_joints import ConstraintEfforts
+from batchpid.sim.engine.native_model import NativeModel, NativeStep, passive_force_of
+from batchpid.sim.engine.scene_spec import (
+    SceneSpec,
+    Variation,
+    VariedMasses,
+    added_friction,
+    own_friction,
+)
 from batchpid.sim.findings import Finding
 from batchpid.sim.robot.robot import Robot
 from batchpid.task_space.rigid_tree import RigidTree
@@ -38,36 +50,15 @@ Capability = Literal["build", "partial_force", "base_state", "complete_state", "
 """
 
 
-class CompiledStep(Protocol):
-    """Sim step of a pack as one native call."""
-
-    def prepare(self) -> int:
-        """Return the address of the native group for the next steps."""
-
-    def __call__(self, *arrays: Float64) -> int:
-        """Do one sim step on the arrays effort, qpos, qvel and passive force (envs, dof); return
-        the status.
-        """
-
-    def may_have_failed(self, status: int) -> bool:
-        """Return whether an env may have failed in the last sim step, which had this status.
-
-        The sensors of links are read here, where native code does not. RuntimeError if the engine
-        has failed.
-        """
+BASE_AT_REST = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
+"""Pose and twist of a base at rest at the origin."""
 
 
-class CompiledModel(Protocol):
-    """Rigid-body model of robots in native code."""
+class EnginePack(SingleOwner, ABC):
+    """M envs with a robot of ``spec`` each, numbered from ``first_env``, read and written as arrays
+    (M, dof), in the order of its joints, SI units.
 
-    @property
-    def address(self) -> int:
-        """Address of the model, for structures of the extension."""
-
-
-class EnginePack(Protocol):
-    """M envs with a robot of ``spec`` each, read and written as arrays (M, dof), in the order of
-    its joints, SI units.
+    ``variation`` holds the robots' differences from the model, one row for each.
 
     A method that returns an array returns a new one. The motion of an env depends on its own rows
     only, not on other envs of the pack or their number.
@@ -91,28 +82,120 @@ class EnginePack(Protocol):
         Whether native code does the sim steps, by :meth:`compiled_step`.
     content
         Digest of the content that the user's ``build`` added to each env (M,); empty without one.
+    calls
+        Object that is replaced when earlier results of :meth:`compiled_step` become invalid.
     """
 
-    spec: SceneSpec
-    size: int
-    dof: int
-    first_env: int
     qf: Rows
-    content: Rows
-    friction: Friction
-    armature: Float64
-    steps_natively: bool
+    calls: object
+
+    def __init__(
+        self,
+        spec: SceneSpec,
+        size: int,
+        first_env: int,
+        variation: Variation | None,
+        natively: bool,
+    ) -> None:
+        self.spec = spec
+        self.size = size
+        self.first_env = first_env
+        self.steps_natively = natively
+        self.dof, self._variation = len(spec.joints), variation or Variation()
+        self._masses = VariedMasses(spec, size, self._variation)
+        self._suspended: Bool = np.zeros(size, bool)
+        self.content = np.zeros(0, np.int64)
+        self.friction = own_friction(spec, self._variation)
+        armature = self._variation.armature  # vary() changes its rows
+        self.armature = self._motors = np.zeros((1, self.dof)) if armature is None else armature
+        self._constraint: ConstraintEfforts | None = None
 
     @property
     def rigid_tree(self) -> RigidTree:
-        """Tree of the robots of ``spec`` as the engine has them, all joints independent."""
+        """Tree of the robots as the engine has them, all joints independent."""
+        return self.spec.rigid_tree
 
+    @property
+    def _is_model(self) -> bool:
+        """Whether the robots have the masses and the gravity of the model."""
+        return not self._masses.added and self._variation.gravity is None
+
+    @cached_property
+    def joint_model(self) -> NativeModel:
+        """Native model of :meth:`joint_mass_matrix`."""
+        model = NativeModel(self, "fixed" if self.spec.fixed_base else "free")
+        if self._masses.added:
+            model.vary(range(self.size), self.size, self._masses.added)
+        return model
+
+    @cached_property
+    def force_model(self) -> NativeModel:
+        """Native model of the passive force, for compiled steps that do not read it in the
+        engine.
+        """
+        return NativeModel(self, "fixed" if self.spec.fixed_base else "held")
+
+    def joint_mass_matrix(self, qpos: Rows) -> Float64:
+        """Return the mass matrices of the joints at ``qpos`` (M, dof, dof) [kg m^2 or kg]; a
+        floating base moves with them.
+        """
+        if self.steps_natively:
+            return self.joint_model.mass_matrix(qpos)
+        added = self._masses.added
+        return ts.mass_matrix(
+            self.rigid_tree, qpos, self.rigid_tree.varied(added) if added else None
+        )
+
+    @cached_property
+    def _passive_force(self) -> Callable[..., Float64]:
+        return passive_force_of(self, self.steps_natively)
+
+    def _model_force(self, gravity: bool, coriolis: bool) -> Float64:
+        """Return the passive force, computed from the model."""
+        state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
+        return self._passive_force(*state)
+
+    @property
+    def _constraint_address(self) -> int | None:
+        return None if self._constraint is None else self._constraint.address
+
+    def _change(self, rows: Sequence[int], variation: Variation) -> None:
+        """Set the differences of the robots ``rows`` from the model, in the fields that vary."""
+        for mine, new in zip(self._variation, variation, strict=True):
+            if mine is not None:
+                mine[rows] = new
+
+    def _change_model(self, rows: Sequence[int]) -> None:
+        """Update the masses of the robots ``rows`` in the native code's model."""
+        if self._masses.added and "joint_model" in self.__dict__:
+            self.joint_model.vary(rows, self.size, self._masses.added)
+
+    def _add_joints(self, actuators: Actuators | None) -> Float64:
+        """Set friction and armature of ``actuators``; return the inertia that the engine has to add
+        to the joints.
+        """
+        self.friction = added_friction(own_friction(self.spec, self._variation), actuators)
+        added = None if actuators is None else actuators.armature
+        self.armature = self._motors + (0.0 if added is None else added)
+        viscous = self.friction.viscous
+        implicit: Float64 = self.armature + self.spec.timestep * (
+            0.0 if viscous is None else viscous
+        )
+        if self._constraint is not None:
+            self._constraint.implicit[...] = implicit
+        return implicit
+
+    # What each engine does in its own way.
+
+    @abstractmethod
     def read_qpos(self) -> Float64:
         """Return the joint positions [rad or m]."""
 
+    @abstractmethod
     def read_qvel(self) -> Float64:
         """Return the joint velocities [rad/s or m/s]."""
 
+    @abstractmethod
     def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N].
 
@@ -121,22 +204,17 @@ class EnginePack(Protocol):
         the base.
         """
 
-    def joint_mass_matrix(self, qpos: Rows) -> Float64:
-        """Return the joints' effective mass matrices at ``qpos`` (M, dof, dof) [kg m^2 or kg],
-        variation included.
-
-        On a floating base they are Schur complements: the base's six degrees of freedom are
-        eliminated.
-        """
-
+    @abstractmethod
     def write_qf(self, effort: Rows) -> None:
         """Apply joint efforts [N m or N]. They persist until written again."""
 
+    @abstractmethod
     def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are
         coupled.
         """
 
+    @abstractmethod
     def step(self) -> None:
         """Do one sim step of every env, with the constraint efforts of the last
         :meth:`update_constraint`.
@@ -144,6 +222,7 @@ class EnginePack(Protocol):
         A non-finite state raises no error: the loop detects it in its next reading.
         """
 
+    @abstractmethod
     def read_base(self) -> Float64:
         """Return pose and twist of floating bases in the world (M, 13), a new array: those of the
         root link's origin.
@@ -151,6 +230,7 @@ class EnginePack(Protocol):
         Position [m], quaternion (w, x, y, z), linear and angular velocity [m/s, rad/s].
         """
 
+    @abstractmethod
     def read_base_motion(self) -> Float64 | None:
         """Return gravity and the rate at which floating bases turn [m/s^2, rad/s], both in their
         own axes (M, 6).
@@ -158,11 +238,13 @@ class EnginePack(Protocol):
         Gravity is that of ``spec``. None for fixed bases.
         """
 
+    @abstractmethod
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         """Add ``twists`` (len(rows), 6) [m/s, rad/s] to those of floating bases, as
         :meth:`read_base` has them.
         """
 
+    @abstractmethod
     def take_sensed(self) -> dict[str, Float64]:
         """Return the sums of the link sensors over all sim steps since the last call, and reset
         them.
@@ -172,6 +254,7 @@ class EnginePack(Protocol):
         that were placed meanwhile, since then.
         """
 
+    @abstractmethod
     def write_state(
         self,
         rows: Sequence[int],
@@ -188,16 +271,19 @@ class EnginePack(Protocol):
         again.
         """
 
+    @abstractmethod
     def suspend(self, mask: Bool) -> None:
         """Apply zero effort and no gravity to the robots of ``mask`` (M,); restore both for the
         others.
         """
 
+    @abstractmethod
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
         """Add friction, damping and reflected inertia of ``actuators`` to the description's, for
         ``rows`` or all.
         """
 
+    @abstractmethod
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
         """Change the robots ``rows`` to ``variation``, one row for each, in a pack that was made
         with a variation.
@@ -205,6 +291,7 @@ class EnginePack(Protocol):
         Next the loop calls :meth:`write_joints` and :meth:`write_state` for them.
         """
 
+    @abstractmethod
     def read_state(self) -> Float64:
         """Return the state of every env (M, values) for a snapshot; only the engine can interpret
         it.
@@ -212,6 +299,7 @@ class EnginePack(Protocol):
         A row determines all later steps of a new pack. Values beyond the size of its env are NaN.
         """
 
+    @abstractmethod
     def write_state_rows(self, states: Float64) -> None:
         """Put all envs into the states that :meth:`read_state` returned. Incomplete states need a
         new pack.
@@ -220,6 +308,7 @@ class EnginePack(Protocol):
         afterwards.
         """
 
+    @abstractmethod
     def read_poses(self, names: Sequence[str] | None = None) -> list[Rows]:
         """Return the poses of the entities that ``build`` returned in each env (poses, 7): x, y, z
         [m], quaternion w, x, y, z.
@@ -227,6 +316,7 @@ class EnginePack(Protocol):
         With ``names``, those of these bodies of the file of ``spec``, in float64.
         """
 
+    @abstractmethod
     def strays(self) -> Bool:
         """Return the envs (M,) with a floating base, or an object of a file, that is not finite or
         beyond FARTHEST.
@@ -234,32 +324,32 @@ class EnginePack(Protocol):
 
     # The drives of the joints: PD control that the engine integrates implicitly.
 
+    @abstractmethod
     def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
         """Set the drive of every joint; each argument broadcasts to (M, dof) [N m/rad, N m s/rad, N
         m, or N/m, ...].
         """
 
+    @abstractmethod
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
 
     # Sim steps in native code, where they are native.
 
+    @abstractmethod
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether a compiled step reads this part of the passive force; otherwise call
         :meth:`passive_force`.
         """
 
-    @property
-    def calls(self) -> object:
-        """Object that is replaced when earlier results of :meth:`compiled_step` become invalid."""
-
+    @abstractmethod
     def compiled_step(
         self,
         gravity: bool,
         coriolis: bool,
         speed_limit: Float64 | None,
         drives: bool = False,
-    ) -> CompiledStep:
+    ) -> NativeStep:
         """Return the sim step of the present robots.
 
         ``gravity`` and ``coriolis`` select the parts of the passive force that it reads; without
@@ -267,18 +357,7 @@ class EnginePack(Protocol):
         ``drives`` the targets of the drives may move within a tick.
         """
 
-    @property
-    def joint_model(self) -> CompiledModel:
-        """Native model of :meth:`joint_mass_matrix`, the same object for the life of the
-        pack.
-        """
-
-    @property
-    def force_model(self) -> CompiledModel:
-        """Native model of :meth:`passive_force`, for compiled steps that do not read
-        this force.
-        """
-
+    @abstractmethod
     def close(self) -> None:
         """Free the envs. The pack cannot be used afterwards."""
 

@@ -21,13 +21,13 @@ from batchpid.sim.geometry.shapes import Shape, add_geom
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 
-NEAR = 0.02
+NEAR_DISTANCE = 0.02
 """Distance [m] below which two shapes are near each other."""
 GROUND = ""
 """Name of the ground."""
 _ANY = 1e6
 """Distance [m] beyond that of all bodies."""
-_FARTHEST = 1.0
+_FARTHEST_PAIR = 1.0
 """Largest distance [m] between shapes that is computed."""
 
 
@@ -101,9 +101,9 @@ class Contacts:
         names = [*(shape.owner for shape in self._shapes), GROUND]
         self._owners = [(names[a], names[b]) for a, b in pairs]
 
-    def near(self, qpos: Rows, within: float = NEAR) -> Iterator[Near]:
+    def near(self, qpos: Rows, within: float = NEAR_DISTANCE) -> Iterator[Near]:
         """Yield the pairs of shapes that are closer than ``within`` [m], at one pose (dof,)."""
-        gaps = self._gaps(np.asarray(qpos)[None], max(within, NEAR))[0]
+        gaps = self._gaps(np.asarray(qpos)[None], max(within, NEAR_DISTANCE))[0]
         for row in np.flatnonzero(gaps < within).tolist():
             yield Near(*self._owners[row], float(gaps[row]))
 
@@ -111,7 +111,7 @@ class Contacts:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground
         (n,).
         """
-        gaps = self._gaps(np.asarray(qpos), max(clearance, NEAR))
+        gaps = self._gaps(np.asarray(qpos), max(clearance, NEAR_DISTANCE))
         return np.asarray((gaps < clearance).any(axis=1))
 
     def height(self, qpos: Rows, base_too: bool = False) -> float:
@@ -161,7 +161,7 @@ class Contacts:
                 self._put(centers[row], turns[row])
                 for pair in np.flatnonzero(exact[row]).tolist():
                     one, other = self._pairs[pair].tolist()
-                    gaps[row, pair] = self._distance(one, other, _FARTHEST)
+                    gaps[row, pair] = self._distance(one, other, _FARTHEST_PAIR)
         return gaps
 
     def _frames(self, qpos: Rows) -> tuple[Float64, Float64]:

@@ -21,12 +21,12 @@ from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
 from batchpid.io.packages import imported
 
-LARGEST = 1e18
+LARGEST_NUMBER = 1e18
 """Largest magnitude of a number of a file, whose square fits in single precision."""
 LFS_POINTER = b"version https://git-lfs"
 """Beginning of git-lfs's file in place of another."""
-FORMATS = (".stl", ".obj", ".dae", ".glb")
-SIZE_LIMIT = 2**27  # bytes of a mesh file
+MESH_FORMATS = (".stl", ".obj", ".dae", ".glb")
+MESH_SIZE_LIMIT = 2**27  # bytes of a mesh file
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attributes", "<u2")])
 """Row of a binary STL."""
 LFS_PROBLEM = "a git-lfs pointer instead of the mesh: run git lfs pull"
@@ -128,7 +128,7 @@ def check_mesh(path: Path) -> Mesh:
     """Return content and problem of a mesh file."""
     try:
         with open(path, "rb") as file:
-            data = file.read(SIZE_LIMIT + 1)
+            data = file.read(MESH_SIZE_LIMIT + 1)
     except OSError as error:
         return Mesh("", str(error))
     content = digest(data)
@@ -141,12 +141,12 @@ def check_mesh(path: Path) -> Mesh:
 def _problem(path: Path, data: bytes) -> str | None:
     """Return the reason for which the bytes of a mesh file cannot be used, or None."""
     suffix = path.suffix.lower()
-    if suffix not in FORMATS:
-        return f"format not among {', '.join(FORMATS)}"
+    if suffix not in MESH_FORMATS:
+        return f"format not among {', '.join(MESH_FORMATS)}"
     if not data:
         return "empty"
-    if len(data) > SIZE_LIMIT:
-        return f"larger than {SIZE_LIMIT >> 20} MiB"
+    if len(data) > MESH_SIZE_LIMIT:
+        return f"larger than {MESH_SIZE_LIMIT >> 20} MiB"
     if data.startswith(LFS_POINTER):
         return LFS_PROBLEM
     try:
@@ -163,9 +163,9 @@ def _problem(path: Path, data: bytes) -> str | None:
         return str(error) or type(error).__name__
     if not len(corners):
         return "damaged, or without faces"
-    if (np.abs(corners) <= LARGEST).all():
+    if (np.abs(corners) <= LARGEST_NUMBER).all():
         return None
-    return f"vertices beyond {LARGEST:g} m"
+    return f"vertices beyond {LARGEST_NUMBER:g} m"
 
 
 def parse_bytes(data: bytes, **options: bool) -> etree._Element:

@@ -19,7 +19,7 @@ from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.quantities import Observation
 
-SPREAD = 0.1
+EPISODE_SPREAD = 0.1
 """Largest distance of a joint from the robot's start pose at the beginning of an episode [rad or
 m].
 """
@@ -27,7 +27,7 @@ MARGIN = 0.05
 """Share of a joint's range, at each limit, in which no goal is drawn."""
 MAX_SPEED = 100.0
 """Joint speed that PhysX allows, and bound of the observed one [rad/s or m/s]."""
-FARTHEST = 1000.0
+BASE_BOUND = 1000.0
 """Bound of the observed position of a floating base [m]."""
 
 
@@ -130,7 +130,7 @@ class ReachVectorEnv(RobotVectorEnv):
         speed = np.full(len(names), MAX_SPEED)
         base = np.zeros(0)
         if not robot.fixed_base:
-            base = np.repeat([FARTHEST, 1.0, MAX_SPEED], [3, 4, 6])
+            base = np.repeat([BASE_BOUND, 1.0, MAX_SPEED], [3, 4, 6])
         low = np.concatenate([self.low - beyond, -speed, -base, self.low])
         high = np.concatenate([self.high + beyond, speed, base, self.high])
         observation = spaces.Box(low.astype(np.float32), high.astype(np.float32))
@@ -138,7 +138,7 @@ class ReachVectorEnv(RobotVectorEnv):
 
     def draw(self, env: int, random: np.random.Generator) -> Float64:
         """Draw a start near the robot's start pose, and a goal within the joint limits."""
-        start = self._start + random.uniform(-SPREAD, SPREAD, len(self._start))
+        start = self._start + random.uniform(-EPISODE_SPREAD, EPISODE_SPREAD, len(self._start))
         self._goal[env] = random.uniform(self.low + self._margin, self.high - self._margin)
         return self._of_robot(np.clip(wrap(start, self._turns, np), self.low, self.high))
 

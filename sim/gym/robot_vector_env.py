@@ -23,7 +23,7 @@ from batchpid.checks.validate import array, check_keywords, choice, env_mask, fl
 from batchpid.errors import CallOrderError, InvalidArgumentError, SingleOwner
 from batchpid.plan import make_plan
 from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
-from batchpid.sim.randomization.randomization import LARGEST
+from batchpid.sim.randomization.randomization import LARGEST_SEED
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
 from batchpid.sim.signals.quantities import Observation
@@ -295,9 +295,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         seeds: list[int] | None = None
         if seed is not None:
             if np.ndim(seed) == 0:
-                first = integer("seed", seed, 0, LARGEST - self.num_envs)
+                first = integer("seed", seed, 0, LARGEST_SEED - self.num_envs)
                 seed = range(first, first + self.num_envs)
-            seeds = [integer("seed", entry, 0, LARGEST) for entry in seed]  # type: ignore[union-attr]
+            seeds = [integer("seed", entry, 0, LARGEST_SEED) for entry in seed]  # type: ignore[union-attr]
             if len(seeds) != self.num_envs:
                 problem = f"has {len(seeds)} entries for {self.num_envs} envs"
                 remedy = "give an int, or one for each env"

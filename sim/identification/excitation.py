@@ -34,7 +34,7 @@ REACH = {"rad": 0.8, "m": 0.1}
 """Largest amplitude, by the joint's unit."""
 VELOCITY_SHARE, EFFORT_SHARE = 0.6, 0.7
 """Shares of the limits of velocity and effort that the motion takes."""
-CLEARANCE = 0.01
+MOTION_CLEARANCE = 0.01
 """Least distance of all links from contact [m]; half of the smallest one at the center, if that is
 less.
 """
@@ -144,7 +144,7 @@ def _obstacle(robot: Robot, motion: Trajectory) -> tuple[str, list[int]]:
             return f"joint {robot.joint_names[joints[0]]!r} {words}", joints
     # Links keep the distances of the center, or half of them where they are near there.
     contacts = robot.dynamics().contacts
-    clearance = CLEARANCE
+    clearance = MOTION_CLEARANCE
     for row, pose in enumerate(position):
         for first, second, distance in contacts.near(pose, clearance):
             if row == 0 and distance > 0:

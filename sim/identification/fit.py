@@ -129,8 +129,8 @@ def axes_of(hessian: Float64, scale: Float64) -> tuple[Float64, Float64]:
     An axis is a standard deviation long, within the bounds of its largest change over ``scale``
     (unknowns,).
     """
-    known, turn = np.linalg.eigh(hessian)
-    spans = 1 / np.sqrt(np.maximum(known, 1e-30))
+    precisions, turn = np.linalg.eigh(hessian)
+    spans = 1 / np.sqrt(np.maximum(precisions, 1e-30))
     axes = (turn * spans).T
     largest = np.abs(axes / scale).max(1, keepdims=True)
     return axes * np.clip(largest, LEAST_CHANGE, MOST_CHANGE) / largest, spans

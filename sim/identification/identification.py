@@ -36,15 +36,15 @@ from batchpid.sim.identification.trials import fit, with_effects
 from batchpid.sim.identification.unknowns import (
     BASIC,
     EXTRAS,
-    KINDS,
     SENDER,
+    UNKNOWN_KINDS,
     Unknowns,
     kinds_of,
 )
 from batchpid.sim.options.groups import Compensation
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.robot_options import BAND, known_joints
+from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
 
 STILL = {"rad": 1e-3, "m": 1e-4}
 """Standard deviation of the positions up to which a joint did not move."""
@@ -143,9 +143,9 @@ def identify(
             for guess in guesses:
                 unknowns = _unknowns(robot, data, guess, kinds, place, share)
                 starts.setdefault((place, share), []).append(Problem(data, windows, unknowns, run))
-        found = with_effects(fit(starts, evaluations, progress), evaluations, progress)
+        solution = with_effects(fit(starts, evaluations, progress), evaluations, progress)
     # Worker processes end with the fit.
-    return Identification(found._replace(problem=replace(found.problem, run=map)), still)
+    return Identification(solution._replace(problem=replace(solution.problem, run=map)), still)
 
 
 def _payload_links(robot: Robot, name: str | None) -> list[str | None]:
@@ -237,7 +237,7 @@ def _prepared(
     modelled = None
     friction = (robot.friction + known_joints(robot).coulomb)[joints]
     if is_friction and friction.any():
-        band = np.array([BAND[robot.units[joint]] for joint in joints])
+        band = np.array([FRICTION_BAND[robot.units[joint]] for joint in joints])
         turns = robot.continuous[joints] / TURN
         modelled = {"modelled": friction, "band": band, "turns": turns}
     plants = dict[Robot, Plant]()
@@ -369,7 +369,7 @@ def _unknowns(
         starts["setpoint_lag"] = np.zeros(1)
     for name in extras:
         kinds += kinds_of(name)
-        if KINDS[kinds[-1]].target == "law" and drive.params is None:
+        if UNKNOWN_KINDS[kinds[-1]].target == "law" and drive.params is None:
             problem = "is of a law, and the logs hold efforts"
             remedy = "leave it out, or give the params of the law"
             raise InvalidArgumentError("extras", problem, value=name, remedy=remedy)

@@ -28,7 +28,7 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.sim.identification.fit import Iterate, Solution, axes_of, iterate, linearised
 from batchpid.sim.identification.problem import Problem
 
-FIRST_CHANGE = 0.005
+FIRST_PASS_CHANGE = 0.005
 """Change of each unknown in the first pass, over its value or typical size."""
 PASSES = 4
 """Most passes."""
@@ -46,7 +46,7 @@ LEAST_DEVIATION = 5e-3
 """Least standard deviation over the value: two engines differ by as much."""
 SHOWN = 0.7
 """Standard deviation by the data, over the prior's, from which an unknown is not shown."""
-ALIKE = 0.8
+ALIKE_CORRELATION = 0.8
 """Correlation from which one unknown cannot be told from another."""
 
 
@@ -98,7 +98,7 @@ def certainty(problem: Problem, solution: Solution) -> Certainty:
     root = lengths[:, None] * axes * np.sqrt(np.maximum(spans, 0.0))
     alone = inverse(data + FAINT_WEIGHT * np.eye(len(point)))
     faint = np.sqrt(np.diagonal(alone))
-    alike = np.abs(alone) > ALIKE * np.outer(faint, faint)
+    alike = np.abs(alone) > ALIKE_CORRELATION * np.outer(faint, faint)
     return Certainty(deviation, root, faint < SHOWN, alike, colored)
 
 
@@ -110,7 +110,7 @@ def _information(problem: Problem, solution: Solution) -> tuple[Float64, Float64
     low, high = problem.unknowns.bounds
     prior = problem.unknowns.spread(point)
     scale = np.maximum(np.abs(point), 1.0)
-    axes = np.diag(FIRST_CHANGE * scale)
+    axes = np.diag(FIRST_PASS_CHANGE * scale)
     spans = np.ones(len(point))
     for _ in range(PASSES):
         changes = np.clip(np.vstack([point + axes, point - axes]), low, high) - point

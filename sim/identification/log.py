@@ -20,13 +20,13 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
 
 CommandKind = Literal["setpoint", "effort"]
-BEYOND = 0.3, 0.05
+LIMIT_MARGINS = 0.3, 0.05
 """Distances [rad], [m] beyond a joint limit at which a position counts as given in another
 unit.
 """
 MIN_ROWS, MIN_SECONDS = 50, 0.2
 """Least number of rows and length [s] of a stretch."""
-LONGEST = 0.05
+LONGEST_PERIOD = 0.05
 """Longest period of the rows [s]."""
 GAP, PERIODS = 0.1, 5.0
 """Least length of a gap, in seconds and in median periods of the rows; the longer one applies."""
@@ -143,7 +143,7 @@ def checked(robot: Robot, log: Log, resets: Sequence[int] = ()) -> list[Log]:
     log = _in_order(log)
     period = float(np.median(np.diff(log.time))) if len(log.time) > 1 else 0.0
     units = "time is in seconds, or the column is time_ms, time_us or time_ns"
-    if period > LONGEST:
+    if period > LONGEST_PERIOD:
         problem = f"has one row per {period:.3g} s, too few to see friction and delay"
         raise log.error(problem, f"record at 100 Hz or more; {units}")
     gaps = np.flatnonzero(np.diff(log.time) > max(GAP, PERIODS * period)) + 1
@@ -220,7 +220,7 @@ def _unwrapped(robot: Robot, log: Log) -> Log:
         remedy = "give positions in rad, log more rows per second, or remove wrong rows"
         raise log.error(f"{problem} {steps[row, column]:.3g} rad", remedy)
     # Positions far beyond the limits are in another unit; those that wrap are within a turn.
-    margin = np.where(revolute, *BEYOND)
+    margin = np.where(revolute, *LIMIT_MARGINS)
     low = robot.lower[joints]
     high = robot.upper[joints]
     beyond = (log.qpos < low - margin) | (log.qpos > high + margin)

@@ -34,7 +34,7 @@ from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
 
-QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
+LOG_QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
 HDF5 = (".h5", ".hdf5")
 UNITS = {
@@ -133,7 +133,7 @@ def _read(
             log = log.with_remark(remark)
         return checked(robot, log, cuts)
     file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
-    columns, numbers = read_csv(path, (*QUANTITIES, "time"))
+    columns, numbers = read_csv(path, (*LOG_QUANTITIES, "time"))
     sources = _sources(robot, str(path), columns, reading.columns)
     columns = {name: scale * columns[column] for name, (column, scale) in sources.items()}
     log = _build(robot, str(path), columns, columns, kind, reading)
@@ -276,7 +276,7 @@ def _build(
         if proposed := _proposed(robot, columns):
             remedy = f"name its columns (--columns {proposed})"
         raise error(source, problem, remedy)
-    by = columns_by_joint(robot, source, columns | commands, QUANTITIES)
+    by = columns_by_joint(robot, source, columns | commands, LOG_QUANTITIES)
     if by["feedforward"]:
         remedy = "log the complete efforts, without the columns of the feedforward"
         raise error(source, "has a feedforward, which a fit does not simulate", remedy)
@@ -323,14 +323,14 @@ def _read_bag(
     Messages are merged by the names of joints: each joint has the samples of all messages that name
     it. Rows are at the stamps of the joint with most positions.
     """
-    found = _samples(path, reading)
+    columns = _samples(path, reading)
     samples = dict[str, dict[int, float]]()
     # Other devices publish joints of their own.
     others = set[str]()
-    for name, (column, scale) in _sources(robot, str(path), found, reading.columns).items():
+    for name, (column, scale) in _sources(robot, str(path), columns, reading.columns).items():
         joint = name.partition(":")[2]
         if joint in robot.joint_names:
-            samples[name] = {stamp: scale * value for stamp, value in found[column].items()}
+            samples[name] = {stamp: scale * value for stamp, value in columns[column].items()}
         else:
             others.add(joint)
     quantities = ("setpoint:", "effort:") if reading.command_topic else ("measured_effort:",)
@@ -378,10 +378,10 @@ def _read_bag(
     stamps = stamps[(stamps >= first) & (stamps <= last)]
     commands = {"time": (stamps - first) / 1e9}
     for column in driven:
-        known, values = tables[column]
-        commands[column] = np.interp(stamps, known, values)
+        sent, values = tables[column]
+        commands[column] = np.interp(stamps, sent, values)
         if reading.hold:
-            commands[column] = values[np.searchsorted(known, stamps, "right") - 1]
+            commands[column] = values[np.searchsorted(sent, stamps, "right") - 1]
     return positions, commands, np.searchsorted(times, cuts).tolist()
 
 

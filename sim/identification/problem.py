@@ -41,7 +41,7 @@ ENVS = 2048
 """Most simulations at once."""
 STATE_STEPS = 1e-3, 1e-2
 """Changes of initial positions and velocities."""
-FARTHEST = 3.0
+RESIDUAL_BOUND = 3.0
 """Bound of the residuals [rad or m], reached where a simulation diverges."""
 RESOLUTION = 1e-5
 """Least size of residuals [rad or m]: encoders show no less."""
@@ -106,7 +106,9 @@ class Problem:
         tables = [np.zeros((0, joints, count))] * len(self.windows)
         for group, positions in zip(groups, self.run(_simulated, tasks), strict=True):
             for number, table in zip(group, positions, strict=True):
-                errors = np.clip(self.windows[number].measured - table, -FARTHEST, FARTHEST)
+                errors = np.clip(
+                    self.windows[number].measured - table, -RESIDUAL_BOUND, RESIDUAL_BOUND
+                )
                 errors[1:] -= errors[0]
                 tables[number] = _projected(np.moveaxis(errors, 0, 2), count)
         return tables

@@ -38,17 +38,17 @@ VALUES = "armature", "damping", "friction", "strength", "bias", "cost"
 """Results for a joint."""
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
-DELAYS = np.arange(0.0, 0.03, 1e-3)
-LOOP_DELAYS = DELAYS[:9]
+EFFORT_DELAYS = np.arange(0.0, 0.03, 1e-3)
+LOOP_DELAYS = EFFORT_DELAYS[:9]
 SETPOINT_DELAYS = np.arange(-0.05, 0.06, 5e-3)
 """Delays that are tried [s]: of logged efforts, of the efforts of a PID law, and of setpoints. A
 delay of setpoints is negative where they were logged late. Loops have short delays of efforts.
 """
-EDGE = 0.15
+EDGE_SECONDS = 0.15
 """Time left out at both ends of a log, where the filter begins [s]."""
-LONGEST = 60.0
+LONGEST_PART = 60.0
 """Length of a log that is used [s]."""
-MOST_ROWS = 4000
+MOST_REGRESSION_ROWS = 4000
 """Most rows of a regression."""
 STRENGTHS = 0.2, 3.0
 """Strengths beyond which a log is suspected to mean something else."""
@@ -56,17 +56,17 @@ MOVES = 0.4
 """Speed, over its root mean square, below which a joint may stick."""
 WEIGHT = 0.02
 """Weight of the prior at strength 1, over the effort's size."""
-BEYOND = 3.0
+OTHER_UNIT_RATIO = 3.0
 """Effort over the robot's limit from which it looks like another unit."""
 EVIDENCE = 0.7
 """Least decrease of the cost for another reading of a log to be reported."""
 WORST = -1.0
 """Largest cost of a reading that is reported."""
-ALIKE = 1.4
+ALIKE_COSTS = 1.4
 """Difference of costs below which two explanations count as equally good: a factor of 2 in the
 residuals.
 """
-TRIED = 10.0
+TRIED_SECONDS = 10.0
 """Other readings are tried on this first part of a log [s]."""
 LEAST_SHARE = 0.05
 """Share of a joint's effort that moves the links, below which its strength is not identifiable: the
@@ -146,11 +146,11 @@ def regress(data: Sequence[LogData]) -> list[Guess]:
     """Return the motors of logs at the delays of the least cost, the best first: one guess for each
     delay of the setpoints that explains the efforts about as well.
     """
-    every = 1 + sum(len(part.motion.qpos) for part in data) // MOST_ROWS
+    every = 1 + sum(len(part.motion.qpos) for part in data) // MOST_REGRESSION_ROWS
     cutoff = min(_cutoff(part.log) for part in data)
     shifts, delays = SETPOINT_DELAYS, LOOP_DELAYS
     if data[0].drive.params is None:
-        shifts, delays = np.zeros(1), DELAYS
+        shifts, delays = np.zeros(1), EFFORT_DELAYS
     tables = [_table(part, delays, every, cutoff) for part in data]
     *columns, efforts = (np.concatenate(parts, axis=-2) for parts in zip(*tables, strict=True))
     speed = np.abs(columns[2])
@@ -167,7 +167,7 @@ def regress(data: Sequence[LogData]) -> list[Guess]:
         guesses.append(Guess(values, values.pop("cost")))
     # Logs show the sum of both delays; armature and damping can hide how it is divided.
     guesses.sort(key=attrgetter("cost"))
-    alike = [guess for guess in guesses if guess.cost < guesses[0].cost + ALIKE]
+    alike = [guess for guess in guesses if guess.cost < guesses[0].cost + ALIKE_COSTS]
     # Setpoints that were logged late are the last explanation.
     usual = [guess for guess in alike if guess.values["setpoint_delay"][0] > -1e-9]
     best = dict[float, Guess]()
@@ -187,9 +187,9 @@ def _table(
     """
     dt = part.drive.timestep
     # The beginning of a long log is enough for a start.
-    motion = Motion(*(table[: round(LONGEST / dt)] for table in part.motion))
+    motion = Motion(*(table[: round(LONGEST_PART / dt)] for table in part.motion))
     part = part._replace(motion=motion)
-    edge = min(round(EDGE / dt), len(motion.qpos) // 5)
+    edge = min(round(EDGE_SECONDS / dt), len(motion.qpos) // 5)
     rows = np.arange(edge, len(motion.qpos) - edge, every)
     links = _force(part, motion.qpos[rows], motion.qvel[rows], motion.qacc[rows])
     efforts = _commanded(part)
@@ -288,9 +288,11 @@ def better_reading(
     """
     log = data.log
     limits = robot.effort_limit[list(log.joints)]
-    beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > BEYOND * limits
+    beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > OTHER_UNIT_RATIO * limits
     if guess.odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
-        begin = log.part(log.time < log.time[0] + TRIED, log.command_time < log.time[0] + TRIED)
+        begin = log.part(
+            log.time < log.time[0] + TRIED_SECONDS, log.command_time < log.time[0] + TRIED_SECONDS
+        )
         names = [robot.joint_names[joint] for joint in log.joints]
         costs = dict[str, float]()
         for words, on_qpos, on_command in _readings(log.kind, names, guess.odd):
@@ -302,7 +304,7 @@ def better_reading(
         present = costs.pop("")
         best = min(costs.values())
         if best < min(present - EVIDENCE, WORST):
-            return next(words for words, cost in costs.items() if cost < best + ALIKE)
+            return next(words for words, cost in costs.items() if cost < best + ALIKE_COSTS)
     delay = float(guess.values["setpoint_delay"][0])
     if delay < -1e-9:
         return f"setpoints that were logged about {-1e3 * delay:.0f} ms late"

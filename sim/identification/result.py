@@ -21,7 +21,7 @@ from batchpid.sim.identification.intervals import INTERVAL
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.simulator import LogControl, changed_params
 from batchpid.sim.identification.trials import Fit
-from batchpid.sim.identification.unknowns import KINDS, Unknown, Unknowns, least_value
+from batchpid.sim.identification.unknowns import UNKNOWN_KINDS, Unknown, Unknowns, least_value
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import load_robot_actuators
 from batchpid.sim.robot.urdf_export import to_urdf
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
-NEAR = 1e-6
+AT_BOUND = 1e-6
 """Distance from a bound, over the typical size, at which a value is there."""
 EXPLAINS = 0.5
 """Share of the position error of the robot as described that a file may leave."""
@@ -144,7 +144,7 @@ class Identification:
     def at_bounds(self) -> list[str]:
         """Unknowns whose value, with the description's, is at its bound."""
         low, high = self.unknowns.bounds
-        is_held = (self._point <= low + NEAR) | (self._point >= high - NEAR)
+        is_held = (self._point <= low + AT_BOUND) | (self._point >= high - AT_BOUND)
         return [self._name(entry) for entry in self.unknowns.only(is_held).entries]
 
     def interval(
@@ -154,8 +154,8 @@ class Identification:
         identify it.
 
         Friction and damping include the description's. ``kind`` is a name of
-        :data:`batchpid.sim.identification.unknowns.KINDS`, ``joint`` the number of a joint among
-        :attr:`joints`, the name of a link for "mass", None for "delay", "setpoint_delay" and
+        :data:`batchpid.sim.identification.unknowns.UNKNOWN_KINDS`, ``joint`` the number of a joint
+        among :attr:`joints`, the name of a link for "mass", None for "delay", "setpoint_delay" and
         "payload".
 
         Raises
@@ -326,7 +326,7 @@ def _cell(
 ) -> str:
     """Return a value with its interval, or its bound where the interval is wider than itself."""
     half = high - value
-    if half > abs(value) and KINDS[kind].positive:
+    if half > abs(value) and UNKNOWN_KINDS[kind].positive:
         return f"< {high:.2g}"
     # As many digits as the first one of the interval has, and one more.
     digits = np.log10(max(abs(value), half) / half)
@@ -336,7 +336,7 @@ def _cell(
 def _of_all_joints(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
     """Return the fields of actuators (n, dof) with ``values`` (n, unknowns)."""
     fields = dict[str, Float64]()
-    neutral = {kind.field: kind.neutral for kind in KINDS.values()}
+    neutral = {kind.field: kind.neutral for kind in UNKNOWN_KINDS.values()}
     for name, table in unknowns.tables(values, "motor").items():
         fields[name] = np.full((len(values), unknowns.robot.dof), neutral[name])
         fields[name][:, unknowns.joints] = table
@@ -373,8 +373,8 @@ def draw_motors(
         region = documents.read(path)["about"][KEY]
         entries = []
         for kind, place in region["unknowns"]:
-            joint = robot.joint_names.index(place) if KINDS[kind].per == "joint" else None
-            least = max(least_value(robot, kind, joint or 0), 1e-3 * KINDS[kind].neutral)
+            joint = robot.joint_names.index(place) if UNKNOWN_KINDS[kind].per == "joint" else None
+            least = max(least_value(robot, kind, joint or 0), 1e-3 * UNKNOWN_KINDS[kind].neutral)
             entries.append(Unknown(kind, joint, 0.0, 1.0, least))
         root = np.array(region["root"], float)
         normal = np.random.default_rng(seed).normal(size=(count, root.shape[1]))

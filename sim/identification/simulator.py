@@ -162,8 +162,8 @@ class _Poses:
         self.tree = tree
         self.qpos = np.zeros((rows, tree.dof))
         self.qvel = np.zeros_like(self.qpos)
-        wanted = "mass_matrix", "bias"
-        self._native = native_rows.bound(tree, wanted, self.qpos, self.qvel, 0)
+        quantities = "mass_matrix", "bias"
+        self._native = native_rows.bound(tree, quantities, self.qpos, self.qvel, 0)
 
     def at(self, qpos: Float64, qvel: Float64, columns: Any) -> tuple[Float64, Float64]:
         """Return mass matrices (rows, dof, dof) and forces (rows, dof) at ``qpos`` and ``qvel``
@@ -295,8 +295,8 @@ class SimulatedControl:
             self._values = self._values._replace(inertia=(np.array(gain), np.array(memory)))
         rest = [stage for stage in stages if stage.name in states]
         self._stages = running(rest)
-        kept = tuple([states[stage.name] for stage in rest])
-        self._states = mapped(lambda leaf: np.array(leaf, order="C"), kept)
+        remaining = tuple([states[stage.name] for stage in rest])
+        self._states = mapped(lambda leaf: np.array(leaf, order="C"), remaining)
         self._program: StageProgram | None = None
         if not obstacle():
             inputs = self._values._replace(model=Model())

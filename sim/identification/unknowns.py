@@ -40,7 +40,7 @@ class Kind(NamedTuple):
     """Largest value."""
 
 
-KINDS = {
+UNKNOWN_KINDS = {
     "armature": Kind("motor", "joint", "inertia", 4.0, field="armature"),
     "damping": Kind("motor", "joint", "damping", 4.0, field="viscous"),
     "friction": Kind("motor", "joint", "effort", 4.0, field="coulomb"),
@@ -109,7 +109,7 @@ def least_value(robot: Robot, kind: str, joint: int) -> float:
     """
     if kind in DESCRIBED:
         return -float(getattr(robot, DESCRIBED[kind])[joint])
-    return 0.0 if KINDS[kind].positive else -np.inf
+    return 0.0 if UNKNOWN_KINDS[kind].positive else -np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ class Unknowns:
         """
         entries = list(self.entries)
         for name in kinds:
-            kind = KINDS[name]
+            kind = UNKNOWN_KINDS[name]
             if kind.per == "link":
                 entries += [Unknown(name, None, 1.0, 1.0, 0.0, link) for link in self.links]
                 continue
@@ -163,7 +163,7 @@ class Unknowns:
     @cached_property
     def kinds(self) -> list[Kind]:
         """Kind of each unknown."""
-        return [KINDS[entry.kind] for entry in self.entries]
+        return [UNKNOWN_KINDS[entry.kind] for entry in self.entries]
 
     @cached_property
     def sizes(self) -> Float64:

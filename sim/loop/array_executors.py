@@ -14,7 +14,8 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Float64, Pytree, Rows
 from batchpid.arrays.jax_settings import precision
 from batchpid.arrays.trees import filled, leaves, structure
-from batchpid.sim.engine.protocol import CompiledStep, EnginePack
+from batchpid.sim.engine.native_model import NativeStep
+from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.custom import controller_errors
 from batchpid.sim.loop.faults import is_near
 from batchpid.sim.loop.group_control import GroupControl
@@ -131,7 +132,7 @@ class EngineSteps:
         """Whether the native sim step reads the passive force."""
         if self._is_native:
             self.native_force = self.reads_force and setup.pack.steps_read_force(*self._parts)
-        self._step: CompiledStep | None = None
+        self._step: NativeStep | None = None
         self._bound: object = None
 
     def measure(self) -> Measured:
@@ -158,7 +159,7 @@ class EngineSteps:
             passive = self._passive_force(qpos)
         return Measured(qpos, qvel, passive), step.may_have_failed(status)
 
-    def compiled(self) -> CompiledStep:
+    def compiled(self) -> NativeStep:
         """Return the native sim step of the present robots."""
         pack = self._pack
         if self._step is None or self._bound is not pack.calls:
@@ -184,7 +185,7 @@ One program then serves all groups, and the results of an env do not depend on i
 """
 
 
-_KEPT = ("measured", "timestep", "step", "model", "matrix", "inertia")
+_KEPT_VALUES = ("measured", "timestep", "step", "model", "matrix", "inertia")
 """Values that stages in programs do not change."""
 
 
@@ -237,11 +238,11 @@ class JAXExecutor(NumPyExecutor):
                 if program is None:
                     changed, values = stepped(stages[part], states[part], values)
                 else:
-                    given = states[part], _without(values, "model")
-                    results = program(*jax.tree.map(self._padded, given))
+                    inputs = states[part], _without(values, "model")
+                    results = program(*jax.tree.map(self._padded, inputs))
                     changed, after = jax.tree.map(lambda rows: np.asarray(rows)[:size], results)
-                    kept = {name: getattr(values, name) for name in _KEPT}
-                    values = after._replace(**kept)
+                    unchanged = {name: getattr(values, name) for name in _KEPT_VALUES}
+                    values = after._replace(**unchanged)
                 new += changed
         self._states = tuple(new)
         return values
@@ -273,6 +274,6 @@ def _compiled(stages: Any) -> Any:
     def step(constants: list[Array], states: States, values: Values) -> tuple[States, Values]:
         values = values._replace(model=Model())
         states, values = stepped(filled(stages, iter(constants)), states, values)
-        return states, _without(values, *_KEPT)
+        return states, _without(values, *_KEPT_VALUES)
 
     return jax.jit(step, compiler_options={"xla_cpu_multi_thread_eigen": False})

@@ -146,8 +146,8 @@ class ClosedLoop:
             return xp.broadcast_to(part, (len(qpos), width))
 
         rates = setpoint_rate, setpoint_acceleration
-        given = Command(setpoint, *rates, 0.0 if feedforward is None else feedforward)
-        command = Command(*map(rows, given))
+        inputs = Command(setpoint, *rates, 0.0 if feedforward is None else feedforward)
+        command = Command(*map(rows, inputs))
         stages = stages_of(self.control)
         episode = state.episode
 

@@ -30,7 +30,7 @@ from batchpid.sim.randomization.distributions import Draws
 from batchpid.stages.stage import States, adopted, by_name, placed, started
 from batchpid.stages.values import Command, Measured, Values
 
-_RESULTS = ("effort", "saturated", "guarded")
+_TICK_RESULTS = ("effort", "saturated", "guarded")
 """Results of a sim step that are observed, by name."""
 
 
@@ -282,7 +282,7 @@ class EnvGroup:
     def _take_results(self) -> None:
         outputs = self._executor.results()
         results = outputs.motor, outputs.saturated, outputs.guarded
-        for name, rows in zip(_RESULTS, results, strict=True):
+        for name, rows in zip(_TICK_RESULTS, results, strict=True):
             getattr(self._last, name)[...] = False if rows is None else rows
 
     def _push(self, substeps: int) -> None:
@@ -302,7 +302,7 @@ class EnvGroup:
         observation, last = rows.observation, self._last
         observation.qpos[...] = self._executor.qpos()
         observation.qvel[...] = self.pack.read_qvel()
-        for name in _RESULTS:
+        for name in _TICK_RESULTS:
             getattr(observation, name)[...] = getattr(last, name)
         if observation.base_pose is not None and observation.base_twist is not None:
             pose, twist = np.split(self.pack.read_base(), [7], axis=1)

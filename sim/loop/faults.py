@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Bool, Float64, Rows
-from batchpid.sim.engine.model_pack import ORIGIN
 from batchpid.sim.engine.native.interface import FARTHEST
-from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.engine.protocol import BASE_AT_REST, EnginePack
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.options.groups import FaultAction
 
@@ -42,7 +41,7 @@ so new causes are appended at the end.
 COMMAND_CAUSES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
 """Causes in an entry of the command, which need not be a joint."""
 
-LONGEST = 10_000
+MOST_EVENTS = 10_000
 """Largest number of faults in a log."""
 NO_STEP = -1
 """Sim step of the last fault of an env that has none."""
@@ -91,7 +90,7 @@ class FaultWarning(UserWarning):
 
 
 class FaultLog:
-    """Last :data:`LONGEST` faults of a runner's envs. Immutable; methods return a modified copy.
+    """Last :data:`MOST_EVENTS` faults of a runner's envs. Immutable; methods return a copy.
 
     ``read`` returns the last fault of an env in the arrays of a tick.
     """
@@ -125,7 +124,7 @@ class FaultLog:
             return self
         log = self.restored(steps)
         events = [self._read(env, arrays) for env in new]
-        log.events = (*self.events, *events)[-LONGEST:]
+        log.events = (*self.events, *events)[-MOST_EVENTS:]
         return log
 
 
@@ -151,7 +150,7 @@ class FaultContainment:
         self.suspends = action == "hold"
         self.suspended, self.failed, self._unplaced = (np.zeros(size, bool) for _ in range(3))
         self.start_qpos, self.start_qvel, self.suspended_qpos = np.zeros((3, size, dof))
-        self.start_base = np.tile(ORIGIN, (size, 1))
+        self.start_base = np.tile(BASE_AT_REST, (size, 1))
         self.step = np.full(size, NO_STEP)
         self.joint, self.cause = np.zeros((2, size), int)
 

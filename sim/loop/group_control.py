@@ -27,7 +27,7 @@ from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint
-from batchpid.sim.robot.robot_options import BAND, known_joints
+from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.stages import Control, Stage, stages_of
 from batchpid.stages.friction import REFRESH_STEPS
@@ -100,17 +100,17 @@ def control_of(
     engine and law know.
     """
     compensated = options.compensate.split("+")
-    known = known_joints(options.robot)
+    described = known_joints(options.robot)
     turns = np.array([joint.continuous / TURN for joint in joints])
-    modelled = np.array([joint.friction * share for joint in joints]) + known.coulomb
+    modelled = np.array([joint.friction * share for joint in joints]) + described.coulomb
     free = np.array([joint.name in (options.free_joints or ()) for joint in joints])
     modelled[free] = 0.0
     has_modelled = "friction" in compensated and options.sets_positions and modelled.any()
     armature = None
     damping = np.array([joint.damping for joint in joints])
     if options.robot.actuators is not None:
-        armature = known.armature
-        damping = damping + known.viscous
+        armature = described.armature
+        damping = damping + described.viscous
     return Control(
         timestep=options.timestep,
         envs=envs.stop - envs.start,
@@ -126,7 +126,7 @@ def control_of(
         coriolis="coriolis" in compensated,
         powered=1.0 - free if free.any() else None,
         modelled=modelled if has_modelled else None,
-        band=np.array([BAND[joint.unit] for joint in joints]),
+        band=np.array([FRICTION_BAND[joint.unit] for joint in joints]),
         turns=turns if turns.any() else None,
         armature=armature,
         damping=damping if damping.any() else None,

@@ -69,8 +69,8 @@ class TreePlant:
     def step(self, state: tuple[Array, Array], effort: Array) -> tuple[Array, Array]:
         """Return the state after a time step under ``effort`` (envs, dof) [N m or N]."""
         qpos, qvel = state
-        found = evaluated(self.tree, ("mass_matrix", "bias"), qpos, qvel, bodies=self.bodies)
-        matrix, bias = found["mass_matrix"], found["bias"]
+        dynamics = evaluated(self.tree, ("mass_matrix", "bias"), qpos, qvel, bodies=self.bodies)
+        matrix, bias = dynamics["mass_matrix"], dynamics["bias"]
         xp = namespace(matrix)
         eye = xp.eye(matrix.shape[-1], dtype=matrix.dtype)
         matrix = matrix + self.inertia[..., None] * eye

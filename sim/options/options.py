@@ -57,7 +57,7 @@ from batchpid.sim.tool_space import OperationalSpace
 
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
-GROUPS = (Scene, Timing, Control, Faults, Workers)
+OPTION_GROUPS = (Scene, Timing, Control, Faults, Workers)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,7 +78,7 @@ class RunnerKeywords(Scene, Timing, Control, Faults, Workers):
 
 OPTIONS = declared(RunnerKeywords, Option)
 """Where each argument is kept and shown."""
-KINDS: dict[str, Kind] = get_type_hints(RunnerKeywords, include_extras=True)
+OPTION_TYPES: dict[str, Kind] = get_type_hints(RunnerKeywords, include_extras=True)
 """Declared type of each argument, with its bounds."""
 
 
@@ -111,7 +111,7 @@ class RunnerOptions(RunnerKeywords):
         values["num_envs"] = checked_option("num_envs", self.num_envs)
         remedy = "load one with Robot.load('panda') or a URDF path"
         robot = instance("robot", self.robot, Robot, remedy)
-        for group in GROUPS:
+        for group in OPTION_GROUPS:
             options = group(**{entry.name: values[entry.name] for entry in fields(group)})
             values.update(vars(options.fit(robot)))
         # What follows takes options of several groups, in an order in which each is fitted once.
@@ -352,7 +352,7 @@ def checked_option(name: str, value: object) -> Any:
 
     Raises InvalidArgumentError if a number is out of bounds, or the value is of another type.
     """
-    return plain(name, KINDS[name], value)
+    return plain(name, OPTION_TYPES[name], value)
 
 
 def _plain(value: Any) -> object:

@@ -11,10 +11,9 @@ from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN
-from batchpid.motors.actuators import DELAYS, NOISES
-from batchpid.motors.actuators import FIELDS as OF_ACTUATORS
+from batchpid.motors.actuators import ACTUATOR_FIELDS, DELAYS, NOISES
 from batchpid.sim.randomization.distributions import Field, elements, nominal_values, parts
-from batchpid.sim.randomization.randomization import EVENTS, FIELDS, Randomization
+from batchpid.sim.randomization.randomization import EVENTS, RANDOMIZED_FIELDS, Randomization
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 
@@ -31,7 +30,7 @@ def check_robot(randomization: Randomization, robot: Robot, mjcf: MjcfFile | Non
     _check_events(randomization, robot)
     # check_params and prepared_actuators check the groups.
     for name, field in randomization.distributions.items():
-        if name not in FIELDS:
+        if name not in RANDOMIZED_FIELDS:
             continue
         columns = elements(name, robot)
         for _, _, part in parts(name, field, columns):
@@ -39,7 +38,7 @@ def check_robot(randomization: Randomization, robot: Robot, mjcf: MjcfFile | Non
                 problem = "is 0, which cannot be scaled"
                 raise InvalidArgumentError(name, problem, remedy="use operation 'add'")
         for rows in _outermost(name, field, columns, nominal_values(name, robot, mjcf)[None]):
-            FIELDS[name].checked(name, rows[0], columns, kind="entry")
+            RANDOMIZED_FIELDS[name].checked(name, rows[0], columns, kind="entry")
     if randomization.damping is not None and robot.dissipation != "urdf":
         problem = "cannot be drawn: the engine sets it with this dissipation"
         remedy = "load with dissipation='urdf'"
@@ -117,7 +116,7 @@ def prepared_actuators(
         delay = float(nominal.max_delay[0, 0])
     for name, field in drawn.items():
         argument = f"actuators.{name}"
-        declared = OF_ACTUATORS[choice("actuators", name, OF_ACTUATORS)]
+        declared = ACTUATOR_FIELDS[choice("actuators", name, ACTUATOR_FIELDS)]
         if control == "drive" and name not in DRIVEN:
             problem = "has no effect on PhysX's drives"
             remedy = f"use control 'pid', or draw only {', '.join(DRIVEN)}"

@@ -178,7 +178,7 @@ class Choice(Distribution):
         return np.array(self.values)[generator.integers(len(self.values), size=size)]
 
 
-KINDS: dict[str, type[Distribution]] = {
+DISTRIBUTIONS: dict[str, type[Distribution]] = {
     kind.kind: kind for kind in (Uniform, LogUniform, Normal, Choice)
 }
 """Distributions by their name in a file."""
@@ -198,7 +198,7 @@ def read_distribution(name: str, value: object) -> Distribution:
     else:
         options = {}
     problem = "is not a distribution"
-    for kind, distribution in KINDS.items():
+    for kind, distribution in DISTRIBUTIONS.items():
         if kind not in options:
             continue
         numbers = options.pop(kind)
@@ -214,7 +214,7 @@ def read_distribution(name: str, value: object) -> Distribution:
         except TypeError as error:
             problem = f"is not a distribution: {error}"
         break
-    remedy = f"write e.g. {{uniform: [0, 1], operation: add}}; kinds: {', '.join(KINDS)}"
+    remedy = f"write e.g. {{uniform: [0, 1], operation: add}}; kinds: {', '.join(DISTRIBUTIONS)}"
     raise InvalidArgumentError(name, problem, value=value, remedy=remedy)
 
 
@@ -274,7 +274,7 @@ def generators(
 
 Field = Distribution | Mapping[str, Distribution]
 """Distribution for all joints or links, or one for each of those that are named."""
-GROUPS = ("params", "actuators")
+FIELD_GROUPS = ("params", "actuators")
 """Fields that are mappings, by name of a further field."""
 SINGLE = ("payload", "ground_friction", "push_interval")
 """Fields of one value."""

@@ -25,7 +25,7 @@ from batchpid.checks.validate import choice, instance, integer, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
 from batchpid.sim.randomization.distributions import (
-    GROUPS,
+    FIELD_GROUPS,
     SINGLE,
     Distribution,
     Draws,
@@ -39,8 +39,8 @@ from batchpid.sim.randomization.distributions import (
 )
 from batchpid.sim.robot.robot import Robot
 
-T = TypeVar("T", bp.PIDParams, bp.Actuators | None)
-LARGEST = 2**63 - 1
+Drawn = TypeVar("Drawn", bp.PIDParams, bp.Actuators | None)
+LARGEST_SEED = 2**63 - 1
 OF_JOINTS = ("bias", *JOINT_SIDE)
 """Fields of the actuators that followers do not have."""
 
@@ -114,9 +114,9 @@ class Randomization:
 
     def __post_init__(self) -> None:
         # The class is frozen; its __dict__ is not. Mappings stay as they are now.
-        vars(self).update(_copied(vars(self)), seed=integer("seed", self.seed, 0, LARGEST))
+        vars(self).update(_copied(vars(self)), seed=integer("seed", self.seed, 0, LARGEST_SEED))
         choice("per", self.per, ("episode", "env"))
-        for group in GROUPS:
+        for group in FIELD_GROUPS:
             mapping(group, getattr(self, group))
         for name, value in self.distributions.items():
             distributions: list[object] = [value]
@@ -130,8 +130,8 @@ class Randomization:
     @property
     def distributions(self) -> dict[str, Field]:
         """Fields that are drawn, by name; fields of a group as "group.name"."""
-        values = {name: getattr(self, name) for name in FIELDS}
-        for group in GROUPS:
+        values = {name: getattr(self, name) for name in RANDOMIZED_FIELDS}
+        for group in FIELD_GROUPS:
             values |= {f"{group}.{name}": value for name, value in getattr(self, group).items()}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -250,10 +250,10 @@ class Randomization:
     def randomized(
         self,
         group: str,
-        record: T,
+        record: Drawn,
         draws: Draws | None,
         robot: Robot,
-    ) -> T:
+    ) -> Drawn:
         """Return params or actuators, the fields of the ``group``, with the draws applied: one row
         for each env; the same if nothing is drawn for them.
 
@@ -309,9 +309,9 @@ class Randomization:
         values: Document = dict(mapping("randomization", document))
         for name, value in values.items():
             choice("randomization", name, names)
-            if name in FIELDS:
+            if name in RANDOMIZED_FIELDS:
                 values[name] = read_field(name, value)
-            if name in GROUPS:
+            if name in FIELD_GROUPS:
                 group = mapping(name, value).items()
                 values[name] = {key: read_field(f"{name}.{key}", part) for key, part in group}
         return cls(**values)
@@ -331,10 +331,10 @@ def _copied(value: Any, plain: bool = False) -> Any:
     return value
 
 
-FIELDS = declared(Randomization, Bounds)
-PHYSICAL = in_group(FIELDS, "robot")
+RANDOMIZED_FIELDS = declared(Randomization, Bounds)
+PHYSICAL = in_group(RANDOMIZED_FIELDS, "robot")
 """Fields that change the simulated robot."""
-START = in_group(FIELDS, "start")
+START = in_group(RANDOMIZED_FIELDS, "start")
 """Fields that change the state at a reset."""
-EVENTS = in_group(FIELDS, "event")
+EVENTS = in_group(RANDOMIZED_FIELDS, "event")
 """Fields that change the state during an episode."""

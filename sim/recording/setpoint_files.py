@@ -32,10 +32,10 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
 from batchpid.trajectories import Trajectory
 
-QUANTITIES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
-SHARE = 0.2
+SETPOINT_QUANTITIES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
+TIME_TOLERANCE = 0.2
 """Largest error of a time, over the time step: times of files are rounded."""
-LONGEST = 1.0
+LONGEST_ROW_TIME = 1.0
 """Longest time from row to row [s]."""
 STEP = 2.0
 """Speed of a setpoint, in velocity limits, above which its change over a tick counts as a step."""
@@ -76,7 +76,7 @@ def error(
 
 
 def read_csv(
-    path: Path, quantities: Sequence[str] = QUANTITIES
+    path: Path, quantities: Sequence[str] = SETPOINT_QUANTITIES
 ) -> tuple[dict[str, Float64], list[int]]:
     """Return the columns of a CSV file by name, and the line of each row.
 
@@ -176,7 +176,9 @@ def setpoint_csv(robot: Robot, motion: Trajectory) -> str:
 
     A log may keep the columns of the rates: ``batchpid identify`` ignores them.
     """
-    names = [f"{quantity}:{name}" for quantity in QUANTITIES[:2] for name in robot.joint_names]
+    names = [
+        f"{quantity}:{name}" for quantity in SETPOINT_QUANTITIES[:2] for name in robot.joint_names
+    ]
     rows = np.column_stack([motion.time - motion.time[0], motion.position, motion.velocity])
     text = io.StringIO()
     # A name may hold separators and quotation marks.
@@ -252,18 +254,20 @@ def _tables(
     """Return a finite table (rows, dof) for each quantity of the file; followers without column
     have 0.
     """
-    names = f"columns are time, {', '.join(f'{quantity}:JOINT' for quantity in QUANTITIES)}"
+    names = (
+        f"columns are time, {', '.join(f'{quantity}:JOINT' for quantity in SETPOINT_QUANTITIES)}"
+    )
     if "time" not in columns:
         raise error(source, "has no column 'time', in seconds", names)
     for name, values in columns.items():
-        if name != "time" and name.partition(":")[0] not in QUANTITIES:
+        if name != "time" and name.partition(":")[0] not in SETPOINT_QUANTITIES:
             raise error(source, f"has the unknown column {name!r}", f"remove it; {names}")
         finite = np.isfinite(values)
         if not finite.all():
             problem = f"line {lines[finite.argmin()]}, column {name!r} is empty or not finite"
             raise error(source, problem, "give the number")
     tables = {}
-    for quantity, by_joint in columns_by_joint(robot, source, columns, QUANTITIES).items():
+    for quantity, by_joint in columns_by_joint(robot, source, columns, SETPOINT_QUANTITIES).items():
         if quantity != "setpoint" and not by_joint:
             continue
         tables[quantity] = np.zeros((len(lines), robot.dof))
@@ -288,14 +292,14 @@ def _substeps(
     """
     # The median, since a row may be missing. Times of files are rounded.
     period = float(np.median(np.diff(time) if len(time) > 1 else time))
-    if abs(period) > LONGEST:
-        remedy = f"give one every {LONGEST:g} s at least; time is in seconds"
+    if abs(period) > LONGEST_ROW_TIME:
+        remedy = f"give one every {LONGEST_ROW_TIME:g} s at least; time is in seconds"
         raise error(source, f"has rows every {period:g} s", remedy)
     substeps = max(1, round(period / timestep))
     dt = substeps * timestep
     first = int(time[0] > 0.5 * dt)
     expected = dt * np.arange(first, first + len(time))
-    late = np.abs(time - expected) > SHARE * timestep
+    late = np.abs(time - expected) > TIME_TOLERANCE * timestep
     if late.any():
         row = int(late.argmax())
         problem = f"line {lines[row]}: time is {time[row]:.9g} s, and not {expected[row]:.9g} s"

@@ -200,7 +200,7 @@ class MjcfFile:
     friction: float = 1.0
 
 
-HEADERS = (
+JOINT_HEADERS = (
     "",
     "joint",
     "type",
@@ -214,7 +214,7 @@ HEADERS = (
 
 
 def joint_rows(joints: Iterable[Joint]) -> Iterator[list[str]]:
-    """Yield the cells of each joint under :data:`HEADERS`. Moving joints are numbered as in
+    """Yield the cells of each joint under :data:`JOINT_HEADERS`. Moving joints are numbered as in
     qpos.
     """
     index = 0

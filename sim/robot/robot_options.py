@@ -20,7 +20,7 @@ from batchpid.sim.robot.parts import Joint
 if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
 
-BAND = {"rad": 1e-4, "m": 2e-5}
+FRICTION_BAND = {"rad": 1e-4, "m": 2e-5}
 """Half width, by the joint's unit, of the band in which the compensation of friction is less than
 the friction.
 """

@@ -20,7 +20,7 @@ from batchpid.checks.validate import is_name
 from batchpid.errors import RobotError
 from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.inertia import MOMENTS, SMALLEST, from_entries, possible_inertia
-from batchpid.sim.geometry.mesh_files import LARGEST, check_mesh, find_mesh
+from batchpid.sim.geometry.mesh_files import LARGEST_NUMBER, check_mesh, find_mesh
 from batchpid.sim.geometry.shapes import Shape
 from batchpid.sim.robot.mjcf.model import unique
 from batchpid.sim.robot.mjcf.reader import read_mjcf
@@ -414,7 +414,7 @@ class _Reader:
             limits[f"{key}_limit"] = values[0]
         if placeholders:
             text = f"<limit {' '.join(placeholders)}> is a placeholder or not within"
-            text += f" +-{LARGEST:g}: no limit"
+            text += f" +-{LARGEST_NUMBER:g}: no limit"
             self._warn("limits", text, "give <limit effort= velocity=> of the motor", name)
         # A guard has one limit for both.
         braking = limits.pop("deceleration_limit")
@@ -433,8 +433,8 @@ class _Reader:
         for key, endless in (("lower", -math.inf), ("upper", math.inf)):
             values = numbers(limit, key, "0", limit=True)
             if values is None:
-                text = f"<limit {key}={_text(limit, key)!r}> is not a number within +-{LARGEST:g}:"
-                text += f" no {key} limit"
+                text = f"<limit {key}={_text(limit, key)!r}> is not a number within"
+                text += f" +-{LARGEST_NUMBER:g}: no {key} limit"
                 self._warn("limits", text, GIVE_RANGE, name)
                 values = (endless,)
             ends.append(values[0])
@@ -508,10 +508,8 @@ class _Reader:
             center, turn = read_origin(inertial, "")
         value = numbers(mass, "value", "0")
         if value is None or value[0] < 0 or 0 < value[0] < SMALLEST:
-            text = (
-                f"<mass value={_text(mass, 'value')!r}> is no mass from {SMALLEST:g} to {LARGEST:g}"
-            )
-            text += ": it counts as missing"
+            text = f"<mass value={_text(mass, 'value')!r}> is no mass from {SMALLEST:g} to"
+            text += f" {LARGEST_NUMBER:g}: it counts as missing"
             self._warn("inertia", text, "give a mass > 0 [kg]", link=body.name)
             return body
         if value[0] == 0:

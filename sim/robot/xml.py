@@ -16,9 +16,9 @@ from lxml import etree
 
 from batchpid.errors import RobotError
 from batchpid.sim.findings import Finding
-from batchpid.sim.geometry.mesh_files import LARGEST, LFS_POINTER, parse_bytes
+from batchpid.sim.geometry.mesh_files import LARGEST_NUMBER, LFS_POINTER, parse_bytes
 
-SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
+XML_SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
 MOST_PREFIXES = 100  # of namespaces that nobody declared
 
 
@@ -27,16 +27,16 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
     instructions.
 
     A file that is almost XML is read by :func:`_lenient`, which appends a finding to ``repairs``.
-    Raises RobotError if the file cannot be read, is larger than SIZE_LIMIT, is not well-formed, or
-    has a DTD.
+    Raises RobotError if the file cannot be read, is larger than XML_SIZE_LIMIT, is not well-formed,
+    or has a DTD.
     """
     try:
         with open(path, "rb") as file:
-            data = file.read(SIZE_LIMIT + 1)
+            data = file.read(XML_SIZE_LIMIT + 1)
         # One byte more than allowed is read, and no more.
-        if len(data) > SIZE_LIMIT:
+        if len(data) > XML_SIZE_LIMIT:
             raise RobotError(
-                f"{path}: larger than {SIZE_LIMIT >> 20} MiB; remove what the robot does not need"
+                f"{path}: larger than {XML_SIZE_LIMIT >> 20} MiB; remove what the robot does not need"
             )
         if data.startswith(LFS_POINTER):
             raise RobotError(f"{path}: a git-lfs pointer instead of the file; run git lfs pull")
@@ -122,7 +122,8 @@ def numbers(
     """Return the numbers in an attribute, as many as there are in ``default``, which replaces a
     missing or empty one; commas may stand between them.
 
-    None unless they are finite and at most LARGEST in magnitude; a joint ``limit`` may be infinite.
+    None unless they are finite and at most LARGEST_NUMBER in magnitude; a joint ``limit`` may be
+    infinite.
     """
     text = ("" if element is None else element.get(key, "").strip()) or default
     count = len(default.split())
@@ -136,7 +137,7 @@ def numbers(
     # Python alone reads 1_0 and digits of other scripts as numbers.
     if len(values) != count or "_" in text or not text.isascii():
         return None
-    if all(abs(value) <= LARGEST or (limit and math.isinf(value)) for value in values):
+    if all(abs(value) <= LARGEST_NUMBER or (limit and math.isinf(value)) for value in values):
         return values
     return None
 
@@ -147,7 +148,7 @@ def fault(element: etree._Element | None, key: str, default: str) -> str | None:
         return None
     count = len(default.split())
     need = f"{count} finite number" + "s" * (count > 1)
-    within = f"within +-{LARGEST:g}"
+    within = f"within +-{LARGEST_NUMBER:g}"
     return f"<{element.tag} {key}={element.get(key)!r}> needs {need} {within}"
 
 

@@ -14,8 +14,8 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.checks.validate import array, at_least, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.engine.model_pack import ORIGIN
 from batchpid.sim.engine.native.interface import FARTHEST
+from batchpid.sim.engine.protocol import BASE_AT_REST
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot_model import base_start
 from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS
@@ -86,8 +86,8 @@ def read_chunks(
     """
     assert options.plan is not None
     (name, value), *rates = inputs.items()
-    for rate, given in rates[:2]:
-        if given is not None:
+    for rate, table in rates[:2]:
+        if table is not None:
             problem = "has no effect with a plan, which makes the rates"
             raise InvalidArgumentError(rate, problem, remedy="leave it out")
     joints = options.robot.joint_names
@@ -200,7 +200,7 @@ def base_rows(
                 remedy = "leave it out, or load the robot with fixed_base=False"
                 raise InvalidArgumentError(name, problem, remedy=remedy)
         return None
-    rows = np.tile(ORIGIN, (options.num_envs, 1))
+    rows = np.tile(BASE_AT_REST, (options.num_envs, 1))
     pose = rows[:, :7]
     parts = (pose, POSE_UNITS), (rows[:, 7:], TWIST_UNITS)
     for (name, value), (part, units) in zip(inputs.items(), parts, strict=True):

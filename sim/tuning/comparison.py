@@ -28,7 +28,7 @@ from batchpid.sim.tuning.moves import random_moves, tutorial_move
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-HEADERS = (
+COMPARISON_HEADERS = (
     "gains",
     "settling",
     "following error",
@@ -37,7 +37,7 @@ HEADERS = (
     "chatter",
     "settled /\nin time",
 )
-ABOUT = """\
+COMPARISON_NOTES = """\
 Median / worst over the arm's joints and all moves, made as steps of the setpoint. following error: largest
 |qpos - setpoint| of a joint [rad or m] on the same moves as smooth motions, with setpoint rates. overshoot: of joints
 that settled. chatter: variation of the effort over that of the smooth move. settled / in time: moves of which every
@@ -61,8 +61,12 @@ class Comparison:
         # Fingers need not settle: the figures are those of the arm.
         names = {None, *np.array(robot.joint_names)[arm_joints(robot)]}
         lines = [
-            table([self._row(evaluation) for evaluation in self.evaluations], HEADERS, "lrrrrrr"),
-            ABOUT,
+            table(
+                [self._row(evaluation) for evaluation in self.evaluations],
+                COMPARISON_HEADERS,
+                "lrrrrrr",
+            ),
+            COMPARISON_NOTES,
         ]
         for evaluation in self.evaluations:
             findings = evaluation.rollout.findings(robot)

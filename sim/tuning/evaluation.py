@@ -37,7 +37,7 @@ from batchpid.sim.tuning.moves import (
 )
 from batchpid.trajectories import minimum_jerk
 
-SUBSTEPS = 5
+EVALUATION_SUBSTEPS = 5
 """Sim steps of a tick: an odd number, so that an effort that alternates from step to step shows in
 the samples.
 """
@@ -230,7 +230,7 @@ def evaluate_gains(
     :class:`batchpid.sim.Runner`. With ``follow`` the moves are made once more, as smooth motions of
     :func:`smooth_durations`, of which the first ``seconds`` are run, with setpoint rates.
     """
-    options = {"substeps": SUBSTEPS, **runner_options}
+    options = {"substeps": EVALUATION_SUBSTEPS, **runner_options}
     with Runner(robot, len(moves.start), params=params, **options) as runner:
         rollout, metrics = run_moves(runner, moves, seconds)
         followed = None

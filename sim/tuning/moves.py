@@ -32,13 +32,13 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.trajectories import minimum_jerk
 
-KINDS = ("large", "small", "one joint", "all alike")
+MOVE_KINDS = ("large", "small", "one joint", "all alike")
 """Kinds of random moves, in turn: up to ``size``; up to a tenth of it; of one joint; of all joints
 by one fraction.
 """
 MAX_OVERSHOOT = 0.05
 """Overshoot that a good move may have, as a fraction of it."""
-LONGEST = 1.0
+LONGEST_MOVE = 1.0
 """Shortest duration [s] above which a random move is too hard for the effort limits to be drawn."""
 SMOOTH_VELOCITY = 0.5
 SMOOTH_EFFORT = 0.7
@@ -51,7 +51,7 @@ LINE = 24
 """Points of a move's line."""
 SAMPLES = 200
 """Samples of the effort in a smooth motion."""
-EDGE = 0.02
+EDGE_SHARE = 0.02
 """Distance of a move from the joint limits, as a share of the range."""
 PATIENCE = 50
 """Draws in vain after which moves get smaller."""
@@ -59,9 +59,9 @@ EASY = 0.6
 """Share of the effort limits up to which a pose is held easily."""
 STUCK = 0.9
 """Share of poses in which a joint cannot move by its effort limit, above which no move moves it."""
-TRIED = 200
+TRIED_POSES = 200
 """Poses that are tested for contact."""
-CLEARANCE = 1e-3
+TOUCH_DISTANCE = 1e-3
 """Distance of links below which they touch [m]."""
 ROOMY = 1e-2
 """Distance of links that are well apart [m]."""
@@ -108,8 +108,8 @@ def random_moves(
     and 5 % beyond it.
 
     Starts are uniform over :meth:`Robot.sample`, 2 % off the limits; targets within ``size`` [rad,
-    or m but at most the whole range] of them, by the :data:`KINDS` in turn. The effort limits allow
-    each move within LONGEST, and hold its ends. If few poses are free of contact, as with many
+    or m but at most the whole range] of them, by the :data:`MOVE_KINDS` in turn. The effort limits
+    allow each move within LONGEST_MOVE, and hold its ends. If few poses are free of contact, as with many
     fingers or legs, or if the robot is weak, moves lie nearer to its start pose, or to the pose
     that it holds most easily: after every 50 rejected draws, the range of starts and steps is
     halved. ``ground`` says whether there is one at height 0, by default as
@@ -127,13 +127,13 @@ def random_moves(
     dynamics = robot.dynamics(ground)
     poses = robot.sample(1000, seed=0)
     reach = np.ptp(poses, axis=0)
-    low = robot.lower + EDGE * reach
-    high = robot.upper - EDGE * reach
+    low = robot.lower + EDGE_SHARE * reach
+    high = robot.upper - EDGE_SHARE * reach
     line = np.linspace(0, 1 + MAX_OVERSHOOT, LINE)[:, None]
     center, movable = easy_pose(robot, dynamics, poses[:200])
-    clearance = CLEARANCE
+    clearance = TOUCH_DISTANCE
     # Around a pose in contact, only deeper contact can be avoided.
-    if dynamics.in_contact(center[None], CLEARANCE)[0]:
+    if dynamics.in_contact(center[None], TOUCH_DISTANCE)[0]:
         clearance = 0.0
     moves = list[Moves]()
     share = 1.0
@@ -152,7 +152,7 @@ def random_moves(
         # Start, then a step of the next kind.
         pose = robot.sample(1, seed=int(rng.integers(2**31)))[0]
         start = np.clip(center + share * (pose - center), low, high)
-        kind = KINDS[len(moves) % len(KINDS)]
+        kind = MOVE_KINDS[len(moves) % len(MOVE_KINDS)]
         step = rng.uniform(-1, 1, robot.dof)
         joint = robot.coupling.leader[rng.integers(robot.dof)]
         if kind == "small":
@@ -168,7 +168,7 @@ def random_moves(
         # The ends are tested first: most moves in contact are so at an end.
         path = move.start + line * (move.target - move.start)
         touches = any(dynamics.in_contact(q, clearance).any() for q in (path[[0, -1]], path))
-        if touches or shortest_durations(robot, move)[0] > LONGEST:
+        if touches or shortest_durations(robot, move)[0] > LONGEST_MOVE:
             in_vain += 1
         else:
             moves.append(move)
@@ -189,7 +189,7 @@ def easy_pose(
 
     It is the start pose if its links are well apart and the effort limits hold it easily. Otherwise
     it is the pose of the least effort whose links are well apart, among ``poses`` and others
-    between these and the start pose; if none of the first :data:`TRIED` is, the start pose.
+    between these and the start pose; if none of the first :data:`TRIED_POSES` is, the start pose.
     """
 
     def shares(qpos: Float64) -> Float64:
@@ -204,7 +204,7 @@ def easy_pose(
     candidates = robot.coupled(np.vstack([robot.start[None], *near]))
     # Contact takes long to compute. A stable order has the start first among the easy poses.
     order = np.argsort(np.maximum(shares(candidates).max(1), EASY), kind="stable")
-    for pose in candidates[order[:TRIED]]:
+    for pose in candidates[order[:TRIED_POSES]]:
         if not dynamics.in_contact(pose[None], ROOMY)[0]:
             return pose, movable
     return robot.start, movable

@@ -35,7 +35,7 @@ from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.candidates import FACTORS, Candidates
 from batchpid.sim.tuning.comparison import Comparison, compare
-from batchpid.sim.tuning.evaluation import SUBSTEPS, reseeded
+from batchpid.sim.tuning.evaluation import EVALUATION_SUBSTEPS, reseeded
 from batchpid.sim.tuning.gain_sets import GainSet, gain_table
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
@@ -188,7 +188,7 @@ def tune(
     build = runner_options.get("build")
     # Options of all rollouts; the search adds fast ones where moves are free of contact.
     scene: Document = {"engine": engine, "workers": workers, **runner_options}
-    options: Document = {"substeps": SUBSTEPS, **scene}
+    options: Document = {"substeps": EVALUATION_SUBSTEPS, **scene}
 
     differs = randomization is not None or robot.actuators is not None or motors is not None
     unseen = None

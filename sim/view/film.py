@@ -37,7 +37,7 @@ _GRID = "#d5dae2"
 _BACKGROUND = "#f4f6f9"
 _NEAREST = 0.05
 """Distance from the camera below which nothing is drawn [m]."""
-_FARTHEST = 100.0
+_FARTHEST_POINT = 100.0
 """Distance from the middle of a picture beyond which nothing is drawn, in half heights."""
 _CELL = 1.5
 """Edge of the cubes that keep one vertex of a mesh [pixels]."""
@@ -81,7 +81,7 @@ class Painter:
         corners = self._corners(self._scene.place(qpos, base_pose))
         places, depth = self._project(corners)
         # A triangle far outside the picture, or of a pose that is not a number, is not drawn.
-        near = (np.abs(places) < _FARTHEST).all(axis=(1, 2))
+        near = (np.abs(places) < _FARTHEST_POINT).all(axis=(1, 2))
         visible = np.flatnonzero(near & (depth > _NEAREST).all(axis=1))
         order = visible[np.argsort(-depth[visible].mean(axis=1))]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

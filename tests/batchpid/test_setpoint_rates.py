@@ -1,6 +1,4 @@
-"""Setpoints whose rate is given: followed with full weight, without a bump, through the turns of
-continuous joints.
-"""
+"""Setpoints whose rate is given: followed with full weight, without a bump."""
 
 from __future__ import annotations
 
@@ -63,28 +61,3 @@ def test_to_begin_and_to_end_with_rates_makes_no_bump(b, seed, implicit, turns):
     moved = (1 - b) * np.asarray(k.kp) * DT * np.abs(rate) if implicit else 0.0
     assert (np.abs(rated.p - none.p) <= 1.001 * moved + 1e-12 * np.abs(none.p)).all()
     np.testing.assert_array_equal(rated.i, none.i)
-
-
-@pytest.mark.parametrize("options", [{}, IMPLICIT])
-def test_a_continuous_joint_follows_through_its_turns(options):
-    """Positions in [-pi, pi] give the efforts of those that go on."""
-    rng, shape = np.random.default_rng(0), (30, 2)
-    weights = rng.uniform(0, 1, shape)
-    wound, wrapped = (
-        bp.make_params(2, **GAINS, setpoint_weight=weights, continuous=turns, **options)
-        for turns in (False, True)
-    )
-    speed, start = rng.uniform(-40, 40, shape), rng.uniform(-3, 3, shape)
-    behind = rng.normal(scale=0.05, size=(300, *shape))
-    states = [bp.init(wound, start), bp.init(wrapped, (start + np.pi) % (2 * np.pi) - np.pi)]
-    both = [bp.discretise(params, 0.01)._replace(gain_units=None) for params in (wound, wrapped)]
-    for step in range(300):
-        r = start + speed * 0.01 * step
-        rows = []
-        for at, k in enumerate(both):
-            turn = (lambda x: x) if at == 0 else (lambda x: (x + np.pi) % (2 * np.pi) - np.pi)
-            states[at], terms = bp.advance(
-                k, states[at], turn(r), turn(r - behind[step]), setpoint_rate=speed
-            )
-            rows.append(terms.effort)
-        np.testing.assert_allclose(rows[1], rows[0], rtol=1e-9, atol=1e-6)

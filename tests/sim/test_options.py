@@ -23,7 +23,7 @@ import batchpid.sim
 from batchpid.errors import MissingDependencyError
 from batchpid.sim import Runner, RunnerOptions
 from batchpid.sim.cli import parse
-from batchpid.sim.options.options import GROUPS, RunnerKeywords
+from batchpid.sim.options.options import OPTION_GROUPS, RunnerKeywords
 
 PANDA = load_bundled("panda")
 OWN = bp.make_actuators(PANDA.dof, coulomb=0.3, armature=0.05, command_delay=0.002)
@@ -73,7 +73,7 @@ def test_a_flag_of_an_option_has_its_default_and_reaches_the_runner():
 
 def test_every_option_is_documented_where_it_is_declared():
     texts = {}
-    for group in (*GROUPS, RunnerKeywords):
+    for group in (*OPTION_GROUPS, RunnerKeywords):
         for declaration, text in pairwise(ast.parse(inspect.getsource(group)).body[0].body):
             if isinstance(declaration, ast.AnnAssign):
                 texts[declaration.target.id] = text

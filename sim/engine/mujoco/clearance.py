@@ -9,6 +9,7 @@ Models of MJCF files can hold any element, so MuJoCo checks all of their contact
 from __future__ import annotations
 
 import ctypes
+from collections import defaultdict
 from collections.abc import Sequence
 from functools import cache, lru_cache
 from typing import Any
@@ -19,8 +20,6 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
-from batchpid.sim.engine.mujoco.speed_bounds import speed_bounds
-from batchpid.sim.engine.mujoco.vectors import aligned
 from batchpid.sim.engine.native.interface import WIDTH, structure
 
 Arrays = dict[str, NDArray[Any]]
@@ -33,6 +32,22 @@ _BEGINNING = 4096
 """Number of bytes at the start of ``mjModel`` that are searched for its options; ``mjModel`` is
 larger.
 """
+
+_LONGEST = 10.0
+"""Largest position of a sliding joint in which bounds of speeds hold [m]."""
+_BEYOND = 0.01
+"""Distance beyond the limits of a sliding joint up to which they hold [m]: limits are soft."""
+_ALIGNMENT = 64
+"""Alignment of vectors in memory [bytes]."""
+
+
+def aligned(*shape: int) -> Float64:
+    """Return an array of zeros whose memory begins where a vector may."""
+    size = 8 * int(np.prod(shape))
+    memory = np.zeros(size + _ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % _ALIGNMENT
+    rows: Float64 = memory[start : start + size].view(np.float64).reshape(shape)
+    return rows
 
 
 @lru_cache(maxsize=8)
@@ -104,48 +119,56 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:
     """
     model = robot.model
     dof = len(robot.joints)
-    bodies = model.dof_bodyid[robot.qvel]
-    # The joint above each body: bodies that are welded to another move with it.
-    joint = np.full(model.nbody, -1)
-    joint[bodies] = np.arange(dof)
-    joint = joint[model.body_weldid]
-    parents = joint[model.body_parentid[bodies]]
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    numbers = np.full(model.nbody, -1)
+    numbers[model.dof_bodyid[robot.qvel]] = np.arange(dof)
+    axes = model.jnt_axis[model.dof_jntid[robot.qvel]]
+    # Balls in the frame of the body to which their carriers are welded: center and radius.
+    balls = defaultdict[int, list[list[float]]](list)
 
-    def local(points: Float64, carriers: NDArray[Any]) -> Float64:
-        """Return world points in the frames of the bodies to which their carriers are welded."""
-        tops = model.body_weldid[carriers]
-        turns = data.xmat[tops].reshape(-1, 3, 3)
-        places: Float64 = np.einsum("nji,nj->ni", turns, points - data.xpos[tops])
-        return places
+    def add(point: Float64, radius: float, carrier: int) -> None:
+        top = int(model.body_weldid[carrier])
+        place = (point - data.xpos[top]) @ data.xmat[top].reshape(3, 3)
+        balls[top].append([*place, radius])
 
-    centers = local(data.geom_xpos, model.geom_bodyid)
-    bounds, travel = speed_bounds(
-        robot.joints,
-        parents,
-        local(data.xpos[bodies], model.body_parentid[bodies]),
-        model.jnt_axis[model.dof_jntid[robot.qvel]],
-        joint[model.geom_bodyid],
-        np.column_stack([centers, model.geom_rbound]),
-    )
-    moved = np.zeros((model.nbody, dof), bool)
-    for at, parent in enumerate(parents):
+    for place, radius, body in zip(
+        data.geom_xpos, model.geom_rbound, model.geom_bodyid, strict=True
+    ):
+        add(place, radius, body)
+    arms = np.ones(dof + 2)
+    travel = np.tile([[-np.inf], [np.inf]], (1, dof))
+    # From the last body to the base: a ball around the origin of a body contains all that it
+    # carries at any pose, and is carried by the body above.
+    for body in reversed(range(1, model.nbody)):
+        if model.body_weldid[body] != body:
+            continue
+        points = np.reshape(balls[body], (-1, 4))
+        reach = (np.linalg.norm(points[:, :3], axis=1) + points[:, 3]).max(initial=0.0)
+        at = numbers[body]
+        if at < 0:  # a floating base
+            arms[dof + 1] = reach
+            continue
+        joint = robot.joints[at]
+        if joint.unit == "m":
+            limits = np.clip([joint.lower, joint.upper], -_LONGEST, _LONGEST)
+            travel[:, at] = limits + np.array([-_BEYOND, _BEYOND])
+            reach += np.abs(travel[:, at]).max()
+        else:
+            # A hinge moves a point by its distance from the axis.
+            across = np.linalg.norm(np.cross(points[:, :3], axes[at]), axis=1)
+            arms[at] = (across + points[:, 3]).max(initial=0.0)
+        add(data.xpos[body], reach, model.body_parentid[body])
+    floats = robot.base is not None
+    moved = np.zeros((model.nbody, dof + 2 * floats), bool)
+    for body in range(1, model.nbody):
         # What moves a body moves its children.
-        if parent >= 0:
-            moved[bodies[at]] = moved[bodies[parent]]
-        moved[bodies[at], at] = True
-    moved = moved[model.body_weldid]
-    if robot.base is not None:
-        floats = np.repeat(model.body_weldid[:, None] > 0, 2, axis=1)
-        moved = np.hstack([moved, floats])
-        bounds = np.insert(bounds, dof, 1.0)
-    arms = bounds[: moved.shape[1]]
-    return np.where(
-        moved[pairs[:, 0]] != moved[pairs[:, 1]],
-        arms,
-        0.0,
-    ), travel
+        moved[body] = moved[model.body_parentid[body]]
+        moved[body, dof:] = model.body_weldid[body] > 0
+        if numbers[body] >= 0:
+            moved[body, numbers[body]] = True
+    differs = moved[pairs[:, 0]] != moved[pairs[:, 1]]
+    return np.where(differs, arms[: moved.shape[1]], 0.0), travel
 
 
 @cache

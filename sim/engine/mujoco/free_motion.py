@@ -16,41 +16,43 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel, Rows
-from batchpid.sim.engine.mujoco.clearance import touching_pairs
+from batchpid.sim.engine.mujoco.clearance import aligned, touching_pairs
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
-from batchpid.sim.engine.mujoco.vectors import aligned, table
 from batchpid.sim.engine.native.interface import FARTHEST, WIDTH, number, structure
 from batchpid.sim.engine.native_model import NativeModel
 
-_COUNTS = 7, 0, 3
-"""Numbers of contacts by which the place of this number in ``mjData`` is found."""
+_COUNT = 37
+"""Number of contacts by which its place in ``mjData`` is found: no other number there is equal."""
 
 
 @cache
 def place_of_contacts() -> int | None:
-    """Return the offset of the number of contacts in ``mjData`` [bytes], found by its values; None
+    """Return the offset of the number of contacts in ``mjData`` [bytes], found by its value; None
     if it is ambiguous.
     """
-    ball = '<body pos="{} 0 {}"><freejoint/><geom size="0.1"/></body>'
-    plane = '<geom type="plane" size="0 0 1"/>'
-    places = np.arange(0)
-    for attempt, count in enumerate(_COUNTS):
-        heights = np.where(np.arange(max(_COUNTS)) < count, 0.05, 1.0)
-        balls = "".join(ball.format(*place) for place in enumerate(heights))
-        model = mujoco.MjModel.from_xml_string(
-            f"<mujoco><worldbody>{plane}{balls}</worldbody></mujoco>"
-        )
-        # Each ball on the plane would be an island.
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
-        data = mujoco.MjData(model)
-        mujoco.mj_fwdPosition(model, data)
-        # The number lies between these two arrays of the structure.
-        start = data.solver_fwdinv.ctypes.data
-        size = data.energy.ctypes.data - start
-        numbers = np.frombuffer(ctypes.string_at(start, size), np.int32)
-        equal = start - data._address + 4 * np.flatnonzero(numbers == count)
-        places = equal if attempt == 0 else np.intersect1d(places, equal)
-    return int(places[0]) if len(places) == 1 else None
+    planes = _COUNT * '<geom type="plane" size="0 0 1"/>'
+    ball = '<body pos="0 0 0.05"><freejoint/><geom size="0.1"/></body>'
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody>{planes}{ball}</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    # The number lies between these two arrays of the structure.
+    start = data.solver_fwdinv.ctypes.data
+    size = data.energy.ctypes.data - start
+    places = np.flatnonzero(np.frombuffer(ctypes.string_at(start, size), np.int32) == _COUNT)
+    return start - data._address + 4 * int(places[0]) if len(places) == 1 else None
+
+
+def _table(rows: Rows, size: int) -> Float64:
+    """Return ``rows`` (size | 1, columns) in blocks (blocks, columns, WIDTH)."""
+    blocks = -(-size // WIDTH)
+    out = aligned(blocks, rows.shape[1], WIDTH)
+    padded = np.broadcast_to(rows, (size, rows.shape[1]))[
+        np.minimum(np.arange(blocks * WIDTH), size - 1)
+    ]
+    out[...] = padded.reshape(blocks, WIDTH, -1).swapaxes(1, 2)
+    return out
 
 
 class FreeMotions:
@@ -109,7 +111,7 @@ class FreeMotions:
             "weight": [model.dof_invweight0[at] for model in kinds],
             "gravity": [model.opt.gravity for model in kinds],
         }
-        self._arrays |= {name: table(np.array(rows), self.size) for name, rows in columns.items()}
+        self._arrays |= {name: _table(np.array(rows), self.size) for name, rows in columns.items()}
         # In place, since native code has the address.
         self._structure.model = self._rigid.address
         for name, array in self._arrays.items():

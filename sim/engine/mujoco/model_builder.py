@@ -56,7 +56,7 @@ others.
 """
 _SPARSE_FROM = 18
 """Number of velocities from which on a sparse Jacobian is faster: measured on robots that stand."""
-_FARTHEST = 1e10
+_INFINITE_LIMIT = 1e10
 """Limit in place of an infinite one on one side [rad or m]."""
 
 
@@ -271,7 +271,7 @@ def _add_links(scene: MjSpec, spec: SceneSpec) -> dict[str, str]:
 def _add_joint(body: Any, joint: Joint, spec: SceneSpec) -> None:
     """Add a degree of freedom to a body."""
     ends = np.array([joint.lower, joint.upper])
-    lower, upper = np.clip(ends, -_FARTHEST, _FARTHEST)
+    lower, upper = np.clip(ends, -_INFINITE_LIMIT, _INFINITE_LIMIT)
     body.add_joint(
         name=joint.name,
         type=getattr(mujoco.mjtJoint, f"mjJNT_{'SLIDE' if joint.unit == 'm' else 'HINGE'}"),

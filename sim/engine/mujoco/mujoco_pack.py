@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Bool, Float64, MjData, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.model_pack import ORIGIN, ModelPack
 from batchpid.sim.engine.mujoco.data_pool import STATE, DataPool, rest
 from batchpid.sim.engine.mujoco.file_scene import check_links
 from batchpid.sim.engine.mujoco.free_motion import FreeMotions, place_of_contacts
@@ -34,13 +33,13 @@ from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel, passive_force
 from batchpid.sim.engine.physics import SOLVERS
-from batchpid.sim.engine.protocol import Engine
+from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import CONTACT_FRICTION
 from batchpid.task_space.frames import matrix_of, rotate, unrotate
 
-_KEPT = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
+_KEPT_STATE = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
 """Parts of the state in snapshots: all but the targets of drives, which every tick writes."""
 _LEAST_FRICTION = 1e-5
 """Smallest coefficient of friction in MuJoCo."""
@@ -48,11 +47,8 @@ _JOINTS = ("dof_armature", "dof_damping", "actuator_biasprm", "actuator_forceran
 """Fields of ``mujoco.MjModel`` that joints and drives change."""
 
 
-class MujocoPack(ModelPack):
-    """M robots of ``spec``. Arrays are (M, dof), in the order of ``spec.joints``, SI units.
-
-    Implements :class:`batchpid.sim.engine.protocol.EnginePack`.
-    """
+class MujocoPack(EnginePack):
+    """Pack of robots in MuJoCo."""
 
     def __init__(
         self,
@@ -118,8 +114,8 @@ class MujocoPack(ModelPack):
         if self._free is None:
             return self._pool.take(self.models, self.rows)
         data = self._pool.lend(self._free)
-        for row, (model, own) in enumerate(zip(self.models, data, strict=True)):
-            self._free.show(row, model, own)
+        for row, (model, robot_data) in enumerate(zip(self.models, data, strict=True)):
+            self._free.show(row, model, robot_data)
         return data
 
     def _update(self, rows: Iterable[int]) -> None:
@@ -128,7 +124,7 @@ class MujocoPack(ModelPack):
             self._evaluate(rows)
         else:
             self._free.use(self.models)
-        self._calls: object = object()
+        self.calls = object()
         self._own_step: MujocoStep | None = None
 
     def _evaluate(self, rows: Iterable[int]) -> None:
@@ -200,10 +196,6 @@ class MujocoPack(ModelPack):
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         return gravity and coriolis and self._is_model
-
-    @property
-    def calls(self) -> object:
-        return self._calls
 
     def compiled_step(
         self,
@@ -320,7 +312,7 @@ class MujocoPack(ModelPack):
         """Write the states of robots ``rows`` to their data."""
         everyone = self._pool.take(self.models, self.rows, rows)
         floats = self._robot.base is not None
-        bases = np.tile(ORIGIN, (len(rows), 1)) if base is None else base.copy()
+        bases = np.tile(BASE_AT_REST, (len(rows), 1)) if base is None else base.copy()
         at, moves = self._robot.base or (0, 0)
         # MuJoCo's angular velocities are in the body's axes.
         bases[:, 10:] = np.einsum(
@@ -478,7 +470,7 @@ class MujocoPack(ModelPack):
 
     def state_sizes(self) -> list[int]:
         """Return the number of values in the state of each robot."""
-        return [mujoco.mj_stateSize(self._robot.model, _KEPT)] * self.size
+        return [mujoco.mj_stateSize(self._robot.model, _KEPT_STATE)] * self.size
 
     @cached_property
     def _columns(self) -> list[NDArray[np.intp]]:
@@ -493,7 +485,7 @@ class MujocoPack(ModelPack):
         }
         # The parts of a state are in the order of their bits.
         return [
-            mujoco.mj_stateSize(robot.model, _KEPT & (int(part) - 1)) + place
+            mujoco.mj_stateSize(robot.model, _KEPT_STATE & (int(part) - 1)) + place
             for part, place in places.items()
         ]
 
@@ -501,7 +493,7 @@ class MujocoPack(ModelPack):
         """Return the state of each robot (M, values), in MuJoCo's order."""
         if self._free is not None:
             start = np.empty(self.state_sizes()[0])
-            mujoco.mj_extractState(self._robot.model, self.rows[0], STATE, start, _KEPT)
+            mujoco.mj_extractState(self._robot.model, self.rows[0], STATE, start, _KEPT_STATE)
             states = np.tile(start, (self.size, 1))
             parts = self._free.time[:, None], *self._free.read(), self.qf
             for columns, values in zip(self._columns, parts, strict=True):
@@ -509,7 +501,7 @@ class MujocoPack(ModelPack):
             return states
         states = np.empty((self.size, self.state_sizes()[0]))
         for model, data, state in zip(self.models, self.data, states, strict=True):
-            mujoco.mj_getState(model, data, state, _KEPT)
+            mujoco.mj_getState(model, data, state, _KEPT_STATE)
         return states
 
     def write_state_rows(self, states: Float64) -> None:
@@ -519,7 +511,7 @@ class MujocoPack(ModelPack):
             self._free.time[:] = time[:, 0]
             return
         for model, data, state in zip(self.models, self.data, states, strict=True):
-            mujoco.mj_setState(model, data, state, _KEPT)
+            mujoco.mj_setState(model, data, state, _KEPT_STATE)
         self._update(range(self.size))
 
     def read_poses(self, names: Sequence[str] | None = None) -> list[Rows]:

@@ -34,7 +34,7 @@ FUNCTIONS = {
 """
 CLOCK = "mjcb_time"
 """Variable of the library that holds its clock."""
-FIELDS = (
+ROW_FIELDS = (
     ("qpos", "qpos"),
     ("qvel", "qvel"),
     ("applied", "qfrc_applied"),
@@ -119,7 +119,9 @@ class MujocoStep(NativeStep):
         dof = len(robot.qpos)
         addresses = dict(functions() or {})
         kinematics = addresses.pop("kinematics")
-        tables = {name: [getattr(row, field).ctypes.data for row in data] for name, field in FIELDS}
+        tables = {
+            name: [getattr(row, field).ctypes.data for row in data] for name, field in ROW_FIELDS
+        }
         tables["models"] = [model._address for model in models]
         tables["data"] = [row._address for row in data]
         tables["contacts"] = [row._address + (place_of_contacts() or 0) for row in data]

@@ -22,90 +22,6 @@ PyObject *type_info(PyObject *, PyObject *argument) {
   return PyCapsule_New(const_cast<std::type_info *>(info), typeid(std::type_info).name(), nullptr);
 }
 
-// gateway(functions, robots, systems, dof): addresses and pointers as integers, one system for each robot; the caller
-// keeps the objects alive.
-PyObject *make_gateway(PyObject *, PyObject *arguments) {
-  PyObject *functions, *robots, *systems;
-  Py_ssize_t dof;
-  if (!PyArg_ParseTuple(arguments, "OOOn", &functions, &robots, &systems, &dof)) return nullptr;
-  std::vector<char *> addresses;
-  auto gateway = std::make_unique<Gateway>();
-  gateway->dof = dof;
-  if (!pointers(functions, addresses) || !pointers(robots, gateway->robots) || !pointers(systems, gateway->systems)) {
-    return nullptr;
-  }
-  static_assert(sizeof(Functions) == 9 * sizeof(void *));
-  if (addresses.size() != 9 || gateway->systems.size() != gateway->robots.size()) {
-    PyErr_SetString(PyExc_ValueError, "needs nine functions, and a system for each robot");
-    return nullptr;
-  }
-  std::memcpy(&gateway->functions, addresses.data(), sizeof(Functions));
-  return capsule_of(std::move(gateway));
-}
-
-// address(gateway): of the Gateway, which lives as long as the capsule.
-PyObject *address(PyObject *, PyObject *capsule) {
-  Gateway *gateway = held<Gateway>(capsule);
-  return gateway == nullptr ? nullptr : PyLong_FromVoidPtr(gateway);
-}
-
-// Copy one vector of each robot into the rows of an array.
-template <class Get>
-PyObject *read_rows(PyObject *capsule, PyObject *array, Get get) {
-  Gateway *gateway = held<Gateway>(capsule);
-  if (gateway == nullptr) return nullptr;
-  auto const count = static_cast<Py_ssize_t>(gateway->robots.size()) * gateway->dof;
-  Buffer out;
-  if (!out.open(array, count, sizeof(double), PyBUF_WRITABLE | PyBUF_C_CONTIGUOUS)) return nullptr;
-  return without_gil([&] {
-    double *to = out.as<double>();
-    for (Articulation *robot : gateway->robots) {
-      copy_row(get(gateway->functions, robot), to, gateway->dof);
-      to += gateway->dof;
-    }
-  });
-}
-
-PyObject *read_qpos(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  return read_rows(arguments[0], arguments[1], [](Functions const &f, Articulation *robot) { return f.get_qpos(robot); });
-}
-
-PyObject *read_qvel(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  return read_rows(arguments[0], arguments[1], [](Functions const &f, Articulation *robot) { return f.get_qvel(robot); });
-}
-
-// passive_force(gateway, out, gravity, coriolis)
-PyObject *passive_force(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  bool const gravity = PyObject_IsTrue(arguments[2]) == 1, coriolis = PyObject_IsTrue(arguments[3]) == 1;
-  return read_rows(arguments[0], arguments[1], [=](Functions const &f, Articulation *robot) {
-    return f.compute_passive_force(robot, gravity, coriolis);
-  });
-}
-
-// write_qf(gateway, qf, skip): qf (robots, dof) of float; robots of the mask `skip` keep what they have.
-PyObject *write_qf(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  Gateway *gateway = held<Gateway>(arguments[0]);
-  if (gateway == nullptr) return nullptr;
-  auto const count = static_cast<Py_ssize_t>(gateway->robots.size());
-  Buffer qf, skip;
-  if (!qf.open(arguments[1], count * gateway->dof, sizeof(float), PyBUF_C_CONTIGUOUS)) return nullptr;
-  if (!skip.open(arguments[2], count, 1, PyBUF_C_CONTIGUOUS)) return nullptr;
-  return without_gil([&] {
-    for (Py_ssize_t row = 0; row < count; ++row) {
-      if (skip.as<char>()[row]) continue;
-      apply(gateway->functions, gateway->robots[row], qf.as<float>() + row * gateway->dof, gateway->dof);
-    }
-  });
-}
-
-PyObject *step(PyObject *, PyObject *capsule) {
-  Gateway *gateway = held<Gateway>(capsule);
-  if (gateway == nullptr) return nullptr;
-  return without_gil([&] {
-    for (System *system : gateway->systems) gateway->functions.step(system);
-  });
-}
-
 // Return the structure of Python at an address, or null with an exception.
 template <class T>
 T *structure(PyObject *address) {
@@ -149,7 +65,7 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
     if (!array.open(PyTuple_GetItem(arguments[2], i), numbers, 0, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) return nullptr;
     bound->outputs.push_back({array.as<void>(), array.itemsize() == 1});
   }
-  if (!tables_fit(program, program.rows, bound->inputs)) return misfit();
+  if (!tables_fit(program, bound->inputs)) return misfit();
   return capsule_of(std::move(bound));
 }
 
@@ -255,13 +171,6 @@ bool add_number(PyObject *numbers, char const *name, long value) {
 
 PyMethodDef METHODS[] = {
     {"type_info", type_info, METH_O, nullptr},
-    {"gateway", make_gateway, METH_VARARGS, nullptr},
-    {"address", address, METH_O, nullptr},
-    {"read_qpos", method(read_qpos), METH_FASTCALL, nullptr},
-    {"read_qvel", method(read_qvel), METH_FASTCALL, nullptr},
-    {"passive_force", method(passive_force), METH_FASTCALL, nullptr},
-    {"write_qf", method(write_qf), METH_FASTCALL, nullptr},
-    {"step", step, METH_O, nullptr},
     {"sim_step", method(step_group), METH_FASTCALL, nullptr},
     {"bind", method(bind), METH_FASTCALL, nullptr},
     {"bind_ticks", method(bind_ticks), METH_FASTCALL, nullptr},

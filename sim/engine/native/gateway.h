@@ -40,8 +40,8 @@ struct Vec3 {
   float x, y, z;
 };
 
-// Exported functions, in the order of SYMBOLS in interface.py.
-struct Functions {
+// Exported functions of SAPIEN.
+struct FOR_PYTHON Functions {
   VectorXf (*get_qpos)(Articulation *);
   VectorXf (*get_qvel)(Articulation *);
   VectorXf (*compute_passive_force)(Articulation *, bool gravity, bool coriolis);
@@ -51,15 +51,6 @@ struct Functions {
   void (*set_drive_velocity)(Joint *, float);
   RootPose (*get_root_pose)(Articulation *);
   Vec3 (*get_root_angular_velocity)(Articulation *);
-};
-
-struct Gateway {
-  static constexpr char CAPSULE[] = "batchpid.gateway";
-
-  Functions functions;
-  std::vector<Articulation *> robots;
-  std::vector<System *> systems;  // one for each robot
-  std::ptrdiff_t dof;
 };
 
 // Apply the efforts of one robot (dof,), which stay the caller's.
@@ -116,24 +107,6 @@ PyObject *on_doubles(PyObject *const *given, Py_ssize_t const (&counts)[N], std:
     data[i] = array.as<double>();
   }
   return without_gil([&] { work(data); }, result);
-}
-
-template <class T>
-bool pointers(PyObject *sequence, std::vector<T *> &out) {
-  Py_ssize_t const count = PySequence_Size(sequence);
-  if (count < 0) return false;
-  for (Py_ssize_t i = 0; i < count; ++i) {
-    PyObject *item = PySequence_GetItem(sequence, i);
-    if (item == nullptr) return false;
-    void *pointer = PyLong_AsVoidPtr(item);
-    Py_DECREF(item);
-    if (pointer == nullptr) {
-      if (!PyErr_Occurred()) PyErr_SetString(PyExc_ValueError, "a null pointer");
-      return false;
-    }
-    out.push_back(static_cast<T *>(pointer));
-  }
-  return true;
 }
 
 }  // namespace batchpid

@@ -20,18 +20,6 @@ from batchpid.native.extensions import (
     load,
 )
 
-SYMBOLS = (
-    "_ZN6sapien5physx17PhysxArticulation7getQposEv",
-    "_ZN6sapien5physx17PhysxArticulation7getQvelEv",
-    "_ZN6sapien5physx17PhysxArticulation19computePassiveForceEbb",
-    "_ZN6sapien5physx17PhysxArticulation5setQfERKN5Eigen6MatrixIfLin1ELi1ELi0ELin1ELi1EEE",
-    "_ZN6sapien5physx14PhysxSystemCpu4stepEv",
-    "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetPositionEf",
-    "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetVelocityEf",
-    "_ZN6sapien5physx17PhysxArticulation11getRootPoseEv",
-    "_ZN6sapien5physx17PhysxArticulation22getRootAngularVelocityEv",
-)
-"""Functions of SAPIEN, in the order of Functions in gateway.h."""
 WIDTH = 4
 """Number of robots in a vector."""
 FARTHEST = 1e6

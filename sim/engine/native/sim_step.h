@@ -16,11 +16,13 @@ enum Status : std::int32_t { NOT_FINITE = 1, TOO_FAST = 2, FAILED = 4, NO_NOISE 
 
 // Group of robots; Python fills in the fields and owns what they point to.
 struct FOR_PYTHON Group {
-  Gateway *gateway;
+  Functions const *functions;        // of SAPIEN
+  Articulation *const *articulations;  // (robots,): in SAPIEN
+  System *const *systems;            // (robots,): of each robot
   float *qf;                         // (robots, dof), constraint efforts included
   char const *skip;                  // (robots,): efforts are not applied
   double const *speed_limit;         // (dof,), or null
-  Mujoco const *mujoco;              // robots in MuJoCo, or null; then there is no gateway
+  Mujoco const *mujoco;              // robots in MuJoCo, or null
   Constraint const *constraint;      // of coupled joints, or null
   Joint *const *joints;              // (robots, dof): in SAPIEN, or null without targets of drives that move
   std::int64_t robots, dof;
@@ -35,17 +37,16 @@ inline void copy_row(VectorXf const &from, double *to, std::ptrdiff_t dof) {
 }
 
 // Add the constraint efforts of a robot in SAPIEN to qf (dof).
-inline void constrain_row(Group const &group, std::size_t row, float *qf) {
-  Gateway const &gateway = *group.gateway;
-  auto const at = static_cast<std::int64_t>(row), dof = group.dof;
-  VectorXf const qpos = gateway.functions.get_qpos(gateway.robots[row]);
-  VectorXf const qvel = gateway.functions.get_qvel(gateway.robots[row]);
+inline void constrain_row(Group const &group, std::int64_t row, float *qf) {
+  std::int64_t const dof = group.dof;
+  VectorXf const qpos = group.functions->get_qpos(group.articulations[row]);
+  VectorXf const qvel = group.functions->get_qvel(group.articulations[row]);
   if (qpos.size != dof || qvel.size != dof) throw std::bad_exception();
   thread_local std::vector<double> effort;
   effort.assign(qf, qf + dof);
-  std::copy(qf, qf + dof, group.constraint->asked + at * dof);
+  std::copy(qf, qf + dof, group.constraint->asked + row * dof);
   constrain(
-      *group.constraint, at, dof, effort.data(), [&](std::int64_t j) { return static_cast<double>(qpos.data[j]); },
+      *group.constraint, row, dof, effort.data(), [&](std::int64_t j) { return static_cast<double>(qpos.data[j]); },
       [&](std::int64_t j) { return static_cast<double>(qvel.data[j]); });
   for (std::int64_t j = 0; j < dof; ++j) qf[j] = static_cast<float>(effort[static_cast<std::size_t>(j)]);
 }
@@ -53,25 +54,24 @@ inline void constrain_row(Group const &group, std::size_t row, float *qf) {
 // One sim step of the robots in SAPIEN: apply efforts and read (robots, dof) each, robot by robot, each while it is in the
 // cache.
 inline void step_in_sapien(Group const &group, double const *effort, double *qpos, double *qvel, double *passive) {
-  Gateway const &gateway = *group.gateway;
-  Functions const &call = gateway.functions;
-  std::ptrdiff_t const dof = gateway.dof, all = group.robots * dof;
+  Functions const &call = *group.functions;
+  std::int64_t const dof = group.dof;
   bool const bears = group.gravity != 0 || group.coriolis != 0;
-  for (std::size_t row = 0; row < gateway.robots.size(); ++row) {
-    Articulation *robot = gateway.robots[row];
-    std::ptrdiff_t const at = static_cast<std::ptrdiff_t>(row) * dof;
+  for (std::int64_t row = 0; row < group.robots; ++row) {
+    Articulation *robot = group.articulations[row];
+    std::int64_t const at = row * dof;
     float *qf = group.qf + at;
-    for (std::ptrdiff_t joint = 0; joint < dof; ++joint) qf[joint] = static_cast<float>(effort[at + joint]);
+    for (std::int64_t joint = 0; joint < dof; ++joint) qf[joint] = static_cast<float>(effort[at + joint]);
     if (group.constraint != nullptr) constrain_row(group, row, qf);
     if (!group.skip[row]) apply(call, robot, qf, dof);
-    call.step(gateway.systems[row]);
+    call.step(group.systems[row]);
     copy_row(call.get_qpos(robot), qpos + at, dof);
     copy_row(call.get_qvel(robot), qvel + at, dof);
     if (bears) {
       copy_row(call.compute_passive_force(robot, group.gravity != 0, group.coriolis != 0), passive + at, dof);
     }
   }
-  if (!bears) std::fill_n(passive, all, 0.0);
+  if (!bears) std::fill_n(passive, group.robots * dof, 0.0);
 }
 
 // Robots of a block, and which of them a sim step moves.
@@ -274,7 +274,7 @@ inline void write_targets(Group const &group, double const *target, double const
   for (std::int64_t at = 0; at < group.robots * dof; ++at) {
     double const speed = rate == nullptr ? 0.0 : rate[at];
     if (group.mujoco == nullptr) {
-      Functions const &call = group.gateway->functions;
+      Functions const &call = *group.functions;
       call.set_drive_position(group.joints[at], static_cast<float>(target[at]));
       call.set_drive_velocity(group.joints[at], static_cast<float>(speed));
       continue;
@@ -317,8 +317,8 @@ inline void write_bases(Group const &group, double const *gravity, double *out) 
       std::copy_n(group.mujoco->qpos[row] + group.mujoco->base_qpos + 3, 4, q);
       std::copy_n(group.mujoco->qvel[row] + group.mujoco->base_qvel + 3, 3, turning);
     } else {
-      Functions const &call = group.gateway->functions;
-      Articulation *robot = group.gateway->robots[static_cast<std::size_t>(row)];
+      Functions const &call = *group.functions;
+      Articulation *robot = group.articulations[row];
       RootPose const pose = call.get_root_pose(robot);
       Vec3 const rate = call.get_root_angular_velocity(robot);
       std::copy_n(pose.wxyz, 4, q);
@@ -350,9 +350,7 @@ inline void update_constraint(Group const &group, double const *qpos, double con
   for (std::int64_t row = 0; row < group.robots && force == nullptr; ++row) {
     double *own = passive.data() + row * dof;
     if (group.mujoco == nullptr) {
-      Gateway const &gateway = *group.gateway;
-      copy_row(gateway.functions.compute_passive_force(gateway.robots[static_cast<std::size_t>(row)], true, true), own,
-               dof);
+      copy_row(group.functions->compute_passive_force(group.articulations[row], true, true), own, dof);
       continue;
     }
     FreeMotion const *free = group.mujoco->free;

@@ -1,14 +1,14 @@
-"""Calls into SAPIEN for all robots of a pack: reads, efforts, and steps of their systems.
+"""Sim step of all robots of a pack in SAPIEN as one call of the extension.
 
-Native calls are one call of the extension for all robots. The extension calls functions that
-SAPIEN's shared library exports, so that it compiles without SAPIEN. It depends on the layout of
-three of SAPIEN's types, which SAPIEN does not guarantee: see :data:`TESTED`.
+The extension calls functions that SAPIEN's shared library exports, so that it compiles without
+SAPIEN. It depends on the layout of three of SAPIEN's types, which SAPIEN does not guarantee: see
+:data:`TESTED`.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,10 @@ import numpy as np
 import sapien
 from sapien.physx import PhysxArticulation, PhysxCpuSystem
 
-from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import SWITCH, extension
-from batchpid.sim.engine.native.interface import SYMBOLS, number
+from batchpid.sim.engine.native.interface import number, structure
 from batchpid.sim.engine.native_model import NativeStep
 
 TESTED = ("3.0.3",)
@@ -30,6 +30,18 @@ The gateway repeats the layout of three types of SAPIEN (gateway.h). No header p
 names of the functions do not contain the type that they return: a version that changes it would
 corrupt memory.
 """
+SYMBOLS = {
+    "get_qpos": "_ZN6sapien5physx17PhysxArticulation7getQposEv",
+    "get_qvel": "_ZN6sapien5physx17PhysxArticulation7getQvelEv",
+    "compute_passive_force": "_ZN6sapien5physx17PhysxArticulation19computePassiveForceEbb",
+    "set_qf": "_ZN6sapien5physx17PhysxArticulation5setQfERKN5Eigen6MatrixIfLin1ELi1ELi0ELin1ELi1EEE",
+    "step": "_ZN6sapien5physx14PhysxSystemCpu4stepEv",
+    "set_drive_position": "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetPositionEf",
+    "set_drive_velocity": "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetVelocityEf",
+    "get_root_pose": "_ZN6sapien5physx17PhysxArticulation11getRootPoseEv",
+    "get_root_angular_velocity": "_ZN6sapien5physx17PhysxArticulation22getRootAngularVelocityEv",
+}
+"""Functions of SAPIEN, by their names in Functions of gateway.h."""
 
 
 def obstacle() -> str:
@@ -46,8 +58,10 @@ def obstacle() -> str:
 
 
 @cache
-def functions() -> tuple[int, ...]:
-    """Return the addresses of the exported functions; AttributeError names one that is missing."""
+def functions() -> Any:
+    """Return Functions of gateway.h with the exported functions; AttributeError names one that is
+    missing.
+    """
     folder = Path(sapien.__file__).parent
     paths = [
         path
@@ -57,69 +71,11 @@ def functions() -> tuple[int, ...]:
     if len(paths) != 1:
         raise OSError("libsapien.so is missing, or there is more than one")
     library = ctypes.CDLL(str(paths[0]))
-    return tuple(
-        ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value or 0 for symbol in SYMBOLS
-    )
-
-
-class PythonCalls:
-    """One Python call for each robot and quantity, as arrays (M, dof) in SAPIEN's order, SI units.
-
-    ``qf`` (M, dof) of float32 are the efforts that :meth:`write_qf` applies, except to the robots
-    of ``skip`` (M,). No call follows :meth:`close`. The native calls are tested against these.
-    """
-
-    def __init__(
-        self,
-        robots: Sequence[PhysxArticulation],
-        systems: Sequence[PhysxCpuSystem],
-        qf: Float32,
-        skip: Bool,
-    ) -> None:
-        # Bound methods and kept row views: looking them up, or slicing, costs as much as the calls.
-        self._shape = qf.shape
-        self._get_qpos = [robot.get_qpos for robot in robots]
-        self._get_qvel = [robot.get_qvel for robot in robots]
-        self._passive_force = [robot.compute_passive_force for robot in robots]
-        rows = zip(robots, qf, skip, strict=True)
-        self._set_qf = [(robot.set_qf, row) for robot, row, skipped in rows if not skipped]
-        self._steps = [system.step for system in systems]
-
-    def qpos(self) -> Float64:
-        """Return the joint positions, a new array."""
-        return self._table(get() for get in self._get_qpos)
-
-    def qvel(self) -> Float64:
-        """Return the joint velocities, a new array."""
-        return self._table(get() for get in self._get_qvel)
-
-    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
-        """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new
-        array.
-        """
-        return self._table(compute(gravity, coriolis) for compute in self._passive_force)
-
-    def _table(self, rows: Iterable[Float32]) -> Float64:
-        # After close() there are no rows.
-        return np.array([*rows], np.float64).reshape(self._shape)
-
-    def write_qf(self) -> None:
-        """Apply the efforts in ``qf``."""
-        for set_qf, row in self._set_qf:
-            set_qf(row)
-
-    def step(self) -> None:
-        """Do one sim step of every system."""
-        for step in self._steps:
-            step()
-
-    def close(self) -> None:
-        """Drop the references to robots and systems, so that they can be freed."""
-        self._get_qpos = []
-        self._get_qvel = []
-        self._passive_force = []
-        self._set_qf = []
-        self._steps = []
+    addresses = {
+        name: ctypes.cast(getattr(library, symbol), ctypes.c_void_p)
+        for name, symbol in SYMBOLS.items()
+    }
+    return structure("Functions")(**addresses)
 
 
 _ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
@@ -129,62 +85,6 @@ _capsule_name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(
 _capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
     ("PyCapsule_GetPointer", ctypes.pythonapi)
 )
-
-
-class NativeCalls:
-    """Calls of :class:`PythonCalls`, each for all robots at once; RuntimeError if SAPIEN fails."""
-
-    def __init__(
-        self,
-        robots: Sequence[PhysxArticulation],
-        systems: Sequence[PhysxCpuSystem],
-        qf: Float32,
-        skip: Bool,
-    ) -> None:
-        self._objects = [*robots], [*systems]  # kept alive, since the gateway has their pointers
-        pointers = [
-            [pointer(item, kind) for item in items]
-            for kind, items in (("robot", robots), ("system", systems))
-        ]
-        self._native = extension("_gateway")
-        self.gateway = self._native.gateway(functions(), *pointers, qf.shape[1])
-        # The pack's own arrays, which native code reads at each call.
-        self.qf, self.skip = qf, skip
-
-    def qpos(self) -> Float64:
-        """Return the joint positions, a new array."""
-        rows = np.empty(self.qf.shape)
-        self._native.read_qpos(self.gateway, rows)
-        return rows
-
-    def qvel(self) -> Float64:
-        """Return the joint velocities, a new array."""
-        rows = np.empty(self.qf.shape)
-        self._native.read_qvel(self.gateway, rows)
-        return rows
-
-    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
-        """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new
-        array.
-        """
-        rows = np.empty(self.qf.shape)
-        self._native.passive_force(self.gateway, rows, gravity, coriolis)
-        return rows
-
-    def write_qf(self) -> None:
-        """Apply the efforts in ``qf``."""
-        self._native.write_qf(self.gateway, self.qf, self.skip)
-
-    def step(self) -> None:
-        """Do one sim step of every system."""
-        self._native.step(self.gateway)
-
-    def close(self) -> None:
-        """Release robots and systems."""
-        self._objects = [], []
-
-
-EngineCalls = PythonCalls | NativeCalls
 
 
 def pointer(wrapper: Any, kind: str) -> int:
@@ -210,56 +110,52 @@ class SapienStep(NativeStep):
 
     Parameters
     ----------
-    calls
-        Present calls of the pack, which have to be native.
+    robots, systems
+        Articulation and PhysX system of each robot.
+    arrays
+        ``qf`` (robots, dof), the efforts last applied, and the mask ``skip`` (robots,) of the robots
+        to which none are applied.
     stepped
         Mask of the robots that did a sim step (robots,), set in place.
-    gravity, coriolis
-        Parts of the passive force that is read; without both it is zero.
-    velocities
-        Whether to read velocities; otherwise they are zero.
     speed_limit
         Joint speed beyond which the status says so (dof,), or None.
-    constraint
-        Address of the constraint of coupled joints, or None.
     joints
-        Joints of all robots, if the targets of their drives move within a tick.
+        Joints of all robots, if the targets of their drives move within a tick; else empty.
     sense
         Function that reads the sensors of the links after a sim step, or None. Native code returns
         to Python for it after each sim step, since Python drops exceptions of functions that C
         calls.
+    fields
+        Parts of the passive force that is read, and address of the constraint: see
+        Group of sim_step.h.
     """
 
     def __init__(
         self,
-        calls: EngineCalls,
+        robots: Sequence[PhysxArticulation],
+        systems: Sequence[PhysxCpuSystem],
+        arrays: Mapping[str, Rows],
         stepped: Bool,
-        gravity: bool,
-        coriolis: bool,
         speed_limit: Float64 | None,
-        constraint: int | None = None,
-        joints: Sequence[object] | None = None,
-        sense: Callable[[], None] | None = None,
+        joints: Sequence[object],
+        sense: Callable[[], None] | None,
+        **fields: object,
     ) -> None:
-        assert isinstance(calls, NativeCalls)
         self._stepped = stepped
-        self._calls = calls
         self._sense = sense
-        arrays: dict[str, Rows] = {"qf": calls.qf, "skip": calls.skip}
-        if joints is not None:
-            arrays["joints"] = np.array([pointer(joint, "joint") for joint in joints], np.uint64)
-        robots, dof = calls.qf.shape
-        super().__init__(
-            robots,
-            dof,
-            arrays,
-            speed_limit,
-            gateway=extension("_gateway").address(calls.gateway),
-            gravity=gravity,
-            coriolis=coriolis,
-            constraint=constraint,
-            senses=sense is not None,
-        )
+        pointers = {}
+        for name, kind, objects in (
+            ("articulations", "robot", robots),
+            ("systems", "system", systems),
+            ("joints", "joint", joints),
+        ):
+            if objects:
+                pointers[name] = np.array([pointer(item, kind) for item in objects], np.uint64)
+        size, dof = arrays["qf"].shape
+        senses = sense is not None
+        address = ctypes.addressof(functions())
+        arrays = {**arrays, **pointers}
+        super().__init__(size, dof, arrays, speed_limit, senses=senses, functions=address, **fields)
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension that does a sim

@@ -99,8 +99,8 @@ def filter_words(spec: SceneSpec) -> tuple[dict[str, Words], frozenset[Pair]]:
             free.add(frozenset((first, second)))
         elif bodies[first] == bodies[second]:
             ignored.add(frozenset((first, second)))
-    kept = {pair for pair in ignored if pair <= set(links)} - free
-    return collision_groups(links, kept, free)
+    pairs = {pair for pair in ignored if pair <= set(links)} - free
+    return collision_groups(links, pairs, free)
 
 
 def collision_groups(

@@ -12,7 +12,7 @@ that is the whole interface between loop and engine.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -23,10 +23,9 @@ from sapien import Pose, physx
 from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.model_pack import ORIGIN, ModelPack
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.physics import PHYSICS
-from batchpid.sim.engine.protocol import Engine
+from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
 from batchpid.sim.engine.sapien.building import (
     RESTITUTION,
     build_scene,
@@ -36,13 +35,7 @@ from batchpid.sim.engine.sapien.building import (
     rounded_tree,
     set_inertia,
 )
-from batchpid.sim.engine.sapien.calls import (
-    EngineCalls,
-    NativeCalls,
-    PythonCalls,
-    SapienStep,
-    obstacle,
-)
+from batchpid.sim.engine.sapien.calls import SapienStep, obstacle
 from batchpid.sim.engine.sapien.limits import refusals, shortfalls
 from batchpid.sim.engine.sapien.sapien_sensors import SapienLinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
@@ -52,22 +45,14 @@ from batchpid.task_space.frames import matrix_of, unrotate
 from batchpid.task_space.rigid_tree import RigidTree
 
 
-class Pack(ModelPack):
-    """M scenes of ``spec``. Arrays are (M, dof), in SAPIEN's order, SI units.
+class Pack(EnginePack):
+    """Pack of scenes in SAPIEN.
 
     Attributes
     ----------
     robots, systems
         SAPIEN's articulation and PhysX system of each scene; a robot that is placed may be rebuilt
         in a new system.
-    qf
-        Efforts last written, in the engine's precision, without the efforts of a coupling.
-    friction
-        Friction and damping that the loop has to apply to the joints.
-    armature
-        Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg].
-    steps_natively
-        Whether the calls into the engine are native.
     """
 
     def __init__(
@@ -142,31 +127,26 @@ class Pack(ModelPack):
         return scene, robot
 
     def _bind(self) -> None:
-        """Prepare the calls of every sim step, for the present robots and systems."""
-        robots = self.robots
-        self._joints = [joint for robot in robots for joint in robot.active_joints]
-        make = NativeCalls if robots and self.steps_natively else PythonCalls
-        # After close() there are no robots, and the arrays are empty.
-        size = len(robots)
-        self._calls: EngineCalls = make(
-            robots, self.systems, self._joint_qf[:size], self._suspended[:size]
-        )
+        """Use the present robots and systems in the next sim steps."""
+        self._joints = [joint for robot in self.robots for joint in robot.active_joints]
+        self.calls = object()
 
     def step(self) -> None:
         """Do one sim step of every scene, with constraint efforts on coupled joints."""
         if self._constraint is not None:
-            qpos = self._calls.qpos()
-            qvel = self._calls.qvel()
-            self._joint_qf[...] = self._constraint.apply(self.qf, qpos, qvel)
-            self._calls.write_qf()
+            qpos = self.read_qpos()
+            self._joint_qf[...] = self._constraint.apply(self.qf, qpos, self.read_qvel())
+            self._apply(self._joint_qf)
         self._stepped[...] = True
-        self._calls.step()
+        for system in self.systems:
+            system.step()
         if self._sensors is not None:
             self._sensors.add()
 
-    @property
-    def calls(self) -> EngineCalls:
-        return self._calls
+    def _apply(self, qf: Float32) -> None:
+        """Apply efforts to the joints."""
+        for row in np.flatnonzero(~self._suspended):
+            self.robots[row].set_qf(qf[row])
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         # To compute a force, PhysX overwrites the joint forces that the sensors read after the
@@ -180,23 +160,23 @@ class Pack(ModelPack):
         speed_limit: Float64 | None,
         drives: bool = False,
     ) -> SapienStep:
-        joints = self._joints if drives else None
-        sense = None if self._sensors is None else self._sensors.add
         return SapienStep(
-            self.calls,
+            self.robots,
+            self.systems,
+            {"qf": self._joint_qf, "skip": self._suspended},
             self._stepped,
-            gravity,
-            coriolis,
             speed_limit,
-            self._constraint_address,
-            joints,
-            sense,
+            self._joints if drives else [],
+            None if self._sensors is None else self._sensors.add,
+            gravity=gravity,
+            coriolis=coriolis,
+            constraint=self._constraint_address,
         )
 
     def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         if self._constraint is not None:
-            passive = self._calls.passive_force(True, True)
-            self._constraint.update(self.joint_mass_matrix, self._calls.qpos(), passive, rows)
+            passive = self._own_force(True, True)
+            self._constraint.update(self.joint_mass_matrix, self.read_qpos(), passive, rows)
 
     @cached_property
     def rigid_tree(self) -> RigidTree:
@@ -219,8 +199,8 @@ class Pack(ModelPack):
         drives = [[_read_drive(joint) for joint in self.robots[row].active_joints] for row in rows]
         # First the old robots are freed: new ones in other memory make every later sim step a tenth
         # slower.
-        self._calls.close()
         self._joints = []
+        self.calls = None
         for row in rows:
             self._scenes[row].clear()
             self._scenes[row] = self.robots[row] = self.systems[row] = None
@@ -241,20 +221,28 @@ class Pack(ModelPack):
         self._bind()
 
     def read_qpos(self) -> Float64:
-        return self._calls.qpos()
+        return self._table(robot.get_qpos() for robot in self.robots)
 
     def read_qvel(self) -> Float64:
-        return self._calls.qvel()
+        return self._table(robot.get_qvel() for robot in self.robots)
+
+    def _own_force(self, gravity: bool, coriolis: bool) -> Float64:
+        """Return the passive force by SAPIEN."""
+        return self._table(robot.compute_passive_force(gravity, coriolis) for robot in self.robots)
+
+    def _table(self, rows: Iterable[Float32]) -> Float64:
+        # After close() there are no rows.
+        return np.array([*rows], np.float64).reshape(len(self.robots), self.dof)
 
     def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         if self.steps_read_force(gravity, coriolis):
-            return self._calls.passive_force(gravity, coriolis)
+            return self._own_force(gravity, coriolis)
         return self._model_force(gravity, coriolis)
 
     def write_qf(self, effort: Rows) -> None:
         self.qf[...] = effort
         if self._constraint is None:
-            self._calls.write_qf()
+            self._apply(self.qf)
 
     def strays(self) -> Bool:
         """Return the robots (M,) whose floating base is not finite or beyond FARTHEST."""
@@ -314,7 +302,7 @@ class Pack(ModelPack):
         their efforts become zero, and the content of their scenes is reset.
         """
         bases = (
-            np.tile(ORIGIN, (len(rows), 1))
+            np.tile(BASE_AT_REST, (len(rows), 1))
             if base is None
             else self._moved_to_origin(rows, base, 1.0)
         )

@@ -42,7 +42,7 @@ _STATE = (
     "children",
 )
 """Properties that a snapshot holds, or that follow from others."""
-_PLAIN = (bool, int, float, str, tuple, list, dict, np.ndarray)
+_PLAIN_TYPES = (bool, int, float, str, tuple, list, dict, np.ndarray)
 
 
 class _HeadlessBuilder(ActorBuilder):
@@ -186,7 +186,7 @@ def _describe(part: object) -> Document:
             value = _describe(value)
         elif name == "collision_shapes":
             value = [_describe(shape) for shape in value]
-        if isinstance(value, _PLAIN):
+        if isinstance(value, _PLAIN_TYPES):
             properties[name] = value
     return properties
 

@@ -37,7 +37,7 @@ from batchpid.sim.robot.tables import (
 )
 from batchpid.task_space.frames import about, compose, matrix_of, rotate
 
-_KINDS: dict[int, tuple[ShapeKind, int]] = {
+_SHAPE_KINDS: dict[int, tuple[ShapeKind, int]] = {
     mujoco.mjtGeom.mjGEOM_SPHERE: ("sphere", 1),
     mujoco.mjtGeom.mjGEOM_BOX: ("box", 3),
     mujoco.mjtGeom.mjGEOM_CAPSULE: ("capsule", 2),
@@ -211,8 +211,8 @@ class TableReader:
         shape_type = int(model.geom_type[geom])
         place = model.geom_pos[geom] - anchor
         turn = model.geom_quat[geom].copy()
-        if shape_type in _KINDS:
-            kind, count = _KINDS[shape_type]
+        if shape_type in _SHAPE_KINDS:
+            kind, count = _SHAPE_KINDS[shape_type]
             size = tuple(model.geom_size[geom, :count].tolist())
             return Shape(link, link, kind, size, place, turn)
         if shape_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID:  # which PhysX does not have

@@ -14,7 +14,7 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 import batchpid as bp
 from batchpid.sim import Finding, Robot
-from batchpid.sim.findings import KINDS, SEVERITIES
+from batchpid.sim.findings import FINDING_KINDS, SEVERITIES
 
 BOX = '<collision><geometry><box size="{0} {0} {0}"/></geometry></collision>'
 COLLISION = BOX.format(0.1)
@@ -174,9 +174,9 @@ def test_every_kind_of_finding_has_a_case():
     """In these tables, and for params, setpoints and tools in the tests below and beside it."""
     cases = {code for _, code, _ in REPAIRED.values()} | {case.code for case in RUNS.values()}
     cases |= {code for _, _, code, _ in ODDITIES.values()}
-    assert cases | {"missing-mesh", "continuous", "unstable", "out-of-reach"} == set(KINDS)
-    assert {kind.severity for kind in KINDS.values()} == set(SEVERITIES)
-    assert len(KINDS) <= 30
+    assert cases | {"missing-mesh", "continuous", "unstable", "out-of-reach"} == set(FINDING_KINDS)
+    assert {kind.severity for kind in FINDING_KINDS.values()} == set(SEVERITIES)
+    assert len(FINDING_KINDS) <= 30
 
 
 def test_links_without_mass_are_reported_where_they_are_bodies(tmp_path):

@@ -89,7 +89,7 @@ def test_worker_processes_give_no_warning_of_their_own(monkeypatch, panda, capfd
         ),
         (
             "SYMBOLS",
-            ("_ZN6sapien4noneEv",),
+            {"step": "_ZN6sapien4noneEv"},
             r"SAPIEN \S+ has another library: .*_ZN6sapien4noneEv; install sapien==",
         ),
     ],
