@@ -26,9 +26,6 @@ SOURCES = {
 }
 """Words for the sources of masses."""
 NO_GROUND = "No ground: links other than the fixed base reach it at the start pose."
-LEGS = "A robot with legs? Its base is fixed: --base free, or fixed_base=False, puts it on a floor."
-LIMB = 3
-"""Joints of the shortest limb."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +78,6 @@ class Inspection:
             ground = "Ground at height 0."
         else:
             ground = NO_GROUND
-        # A robot that hangs in the air by its trunk settles, and nothing else would say so.
-        if robot.fixed_base and limbs(robot) > 1:
-            ground = f"{ground} {LEGS}"
         if not pairs:
             return [_fill(f"{ground} All links collide.")]
         reasons = Counter(pair.reason for pair in pairs)
@@ -115,21 +109,6 @@ def inspect_robot(
     checked = robot.check(params=chosen.params, setpoint=robot.target, control=chosen.control)
     of_gains = [finding for finding in checked if finding not in findings]
     return Inspection(robot, findings, chosen, of_gains, all)
-
-
-def limbs(robot: Robot) -> int:
-    """Return how many chains of :data:`LIMB` or more joints leave the root link."""
-    above = {joint.child_link: joint for joint in robot.tables.joints}
-    sizes = Counter[str]()
-    # Of each joint, the first moving joint on the way from the root.
-    for joint in robot.joints:
-        first = joint.name
-        link = joint.parent_link
-        while link in above:
-            first = above[link].name if above[link].moves else first
-            link = above[link].parent_link
-        sizes[first] += 1
-    return sum(size >= LIMB for size in sizes.values())
 
 
 def sentences(findings: Iterable[Finding]) -> list[str]:

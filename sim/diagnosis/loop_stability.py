@@ -18,7 +18,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.errors import InvalidArgumentError, warn
-from batchpid.law.implicit import as_explicit
+from batchpid.law.coefficients import as_explicit
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot

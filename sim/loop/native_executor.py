@@ -8,7 +8,7 @@ have a native function: see tick.h.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,21 +22,8 @@ from batchpid.sim.engine.native.interface import number, structure
 from batchpid.sim.loop.array_executors import COUPLING_STEPS, EngineSteps
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.loop.group_control import GroupControl, native_obstacle
-from batchpid.stages.stage import StageProgram, States, by_name, recalled, running
+from batchpid.stages.stage import StageProgram, States, recalled, running
 from batchpid.stages.values import Command, Measured, Outputs, Step, Values
-
-
-class Table(NamedTuple):
-    """Commands and observations of the ticks of a run, and arrays of its last observation."""
-
-    arrays: Arrays
-    """(ticks, envs, ...), the same in every run."""
-    effort: NDArray[np.float32]
-    """Effort of the last tick (envs, dof), as are the next two."""
-    saturated: NDArray[np.bool_]
-    guarded: NDArray[np.bool_]
-    fault: FaultArrays
-    """Last fault of each env (envs,)."""
 
 
 class Buffers(NamedTuple):
@@ -52,9 +39,10 @@ class Buffers(NamedTuple):
 class TickProgram:
     """Stages and arrays of the ticks of a group.
 
-    ``reads_force`` says whether the engine's sim step reads the passive force, ``moves`` whether
-    joint setpoints move within a tick, and ``noise`` is that of positions and velocities in a sim
-    step.
+    ``copies`` returns the copies before and after each tick, between tables (ticks, M, ...) and
+    arrays of a sim step: commands are tables of float64. ``reads_force`` says whether the engine's
+    sim step reads the passive force, ``moves`` whether joint setpoints move within a tick, and
+    ``noise`` is that of positions and velocities in a sim step.
 
     Attributes
     ----------
@@ -66,19 +54,21 @@ class TickProgram:
         Results of the last sim step.
     control
         Native controller, or None.
+    buffers
+        Arrays of a sim step.
     """
 
     def __init__(
         self,
         setup: GroupControl,
         buffers: Buffers,
-        table: Table,
+        copies: Callable[[TickProgram], list[tuple[Rows, Rows]]],
         noise: Pytree,
         reads_force: bool,
         moves: bool,
     ) -> None:
         _, pack, control, _, model = setup
-        self._setup, self._buffers = setup, buffers
+        self._setup, self.buffers = setup, buffers
         self.pack, self.model = pack, model
         self._native = native.extension("_gateway")
         self._programs, self._stages = list[Any](), list[Any]()
@@ -114,10 +104,11 @@ class TickProgram:
         self.place(qf=self.outputs.qf)
         stages = (structure("Stage") * len(self._stages))(*self._stages)
         self.tick.stages, self.tick.stage_count = ctypes.addressof(stages), len(stages)
-        transfers = self._transfers(table)
+        pairs = [self._transfer(*pair) for pair in copies(self)]
+        transfers = (structure("Transfer") * len(pairs))(*pairs)
         self.tick.transfers = ctypes.addressof(transfers)
         self.tick.transfer_count = len(transfers)
-        self._references += stages, transfers, table
+        self._references += stages, transfers
         self.bound = self._native.bind_ticks(tuple(self._programs), ctypes.addressof(self.tick))
 
     # -- for stages in C++
@@ -151,43 +142,6 @@ class TickProgram:
         self._references.append(array)
         return array.ctypes.data
 
-    # -- commands and observations
-
-    def _transfers(self, table: Table) -> Any:
-        """Return the copies between the tables of the ticks and the arrays of a sim step."""
-        command, seen, fault = table.arrays
-        outputs = self.outputs
-        measured = self._buffers.measured
-        none = np.zeros(measured.qpos.shape, bool)
-        copies: list[tuple[Rows, Rows]] = [
-            (seen.qpos, measured.qpos),
-            (seen.qvel, measured.qvel),
-            (seen.effort, outputs.motor),
-            (seen.ok, np.ones(len(none), bool)),
-            # One row, which each tick overwrites.
-            (table.effort[None], outputs.motor),
-            *zip(fault, table.fault, strict=True),
-        ]
-        for name in ("saturated", "guarded"):
-            mask = getattr(outputs, name)
-            if mask is None:
-                mask = none
-            copies.append((getattr(seen, name), mask))
-            copies.append((getattr(table, name)[None], mask))
-        if seen.base_pose is not None and seen.base_twist is not None:
-            pose = np.zeros((len(none), 7))
-            twist = np.zeros((len(none), 6))
-            self.place(base_pose=pose, base_twist=twist)
-            copies += (seen.base_pose, pose), (seen.base_twist, twist)
-        if seen.starved is not None:
-            states = by_name(self._setup.stages, self._buffers.states)
-            copies.append((seen.starved, states["plan"].starved))
-        transfers = [self._transfer(rows, row) for rows, row in copies]
-        for rows, row in zip(command, self._buffers.command, strict=True):
-            if row is not None:
-                transfers.append(self._transfer(rows, row))
-        return (structure("Transfer") * len(transfers))(*transfers)
-
     def _transfer(self, table: Rows, row: Rows) -> Any:
         """Return a copy between a row (M, ...) and the first of the ticks of ``table``."""
         # Of arrays of numbers only commands have tables in double precision.
@@ -212,7 +166,7 @@ class TickProgram:
         """Add the stages; return the results after them."""
         setup = self._setup
         waiting = list[tuple[Any, Pytree]]()
-        for stage, state in zip(setup.stages, self._buffers.states, strict=True):
+        for stage, state in zip(setup.stages, self.buffers.states, strict=True):
             if not stage.native:
                 waiting.append((stage, state))
                 continue
@@ -227,7 +181,8 @@ class TickProgram:
             self._add_stage("TARGETS", int(moves or setup.moves_drives))
         if not setup.control.coupling.is_identity:
             self._add_stage("CONSTRAINT", COUPLING_STEPS)
-        self._add_stage("ENGINE")
+        if setup.pack.steps_natively:
+            self._add_stage("ENGINE")
         return outputs
 
     def _add_program(
@@ -239,7 +194,7 @@ class TickProgram:
         if not pairs:
             return values
         stages, states = zip(*pairs, strict=True)
-        made = StageProgram(stages, states, values, self._buffers.before.shape, passes)
+        made = StageProgram(stages, states, values, self.buffers.before.shape, passes)
         if made.outputs:
             # Native code sets the addresses of the noise, which is another in each sim step.
             drawn = [id(block) for block in leaves(values.noise)]
@@ -275,6 +230,19 @@ def _row_size(array: Rows) -> int:
         return 0
     size: int = array[0].size
     return size
+
+
+class Table(NamedTuple):
+    """Commands and observations of the ticks of a run, and arrays of its last observation."""
+
+    arrays: Arrays
+    """(ticks, envs, ...), the same in every run."""
+    effort: NDArray[np.float32]
+    """Effort of the last tick (envs, dof), as are the next two."""
+    saturated: NDArray[np.bool_]
+    guarded: NDArray[np.bool_]
+    fault: FaultArrays
+    """Last fault of each env (envs,)."""
 
 
 class NativeExecutor:
@@ -382,7 +350,7 @@ class NativeExecutor:
             self._programs[moves] = program = TickProgram(
                 self.setup,
                 self._buffers,
-                self._table,
+                self._copies,
                 noise,
                 self._engine.native_force,
                 moves,
@@ -392,6 +360,38 @@ class NativeExecutor:
                 self._replace("law", program.control.state)
         self._program = program = self._programs[moves]
         program.tick.tick, program.tick.step = tick, step
+
+    def _copies(self, program: TickProgram) -> list[tuple[Rows, Rows]]:
+        """Return the copies between the tables of the ticks and the arrays of a sim step."""
+        table = self._table
+        command, seen, fault = table.arrays
+        outputs = program.outputs
+        measured = self._buffers.measured
+        none = np.zeros(measured.qpos.shape, bool)
+        copies: list[tuple[Rows, Rows]] = [
+            (seen.qpos, measured.qpos),
+            (seen.qvel, measured.qvel),
+            (seen.effort, outputs.motor),
+            (seen.ok, np.ones(len(none), bool)),
+            # One row, which each tick overwrites.
+            (table.effort[None], outputs.motor),
+            *zip(fault, table.fault, strict=True),
+        ]
+        for name in ("saturated", "guarded"):
+            mask = getattr(outputs, name)
+            if mask is None:
+                mask = none
+            copies.append((getattr(seen, name), mask))
+            copies.append((getattr(table, name)[None], mask))
+        if seen.base_pose is not None and seen.base_twist is not None:
+            pose = np.zeros((len(none), 7))
+            twist = np.zeros((len(none), 6))
+            program.place(base_pose=pose, base_twist=twist)
+            copies += (seen.base_pose, pose), (seen.base_twist, twist)
+        if seen.starved is not None:
+            copies.append((seen.starved, self._buffers.states[self._places["plan"]].starved))
+        pairs = zip(command, self._buffers.command, strict=True)
+        return copies + [(rows, row) for rows, row in pairs if row is not None]
 
     def complete(self) -> tuple[int, int]:
         """Complete ticks that ran: return the first tick that is not observed, and its sim steps

@@ -24,7 +24,7 @@ from batchpid.arrays.records import frozen
 from batchpid.checks.validate import AxisKind, instance
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.law.computed_torque import check_gain_units
-from batchpid.law.input_checks import check_drive
+from batchpid.law.state import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction

@@ -16,7 +16,7 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
-from batchpid.io.packages import imported
+from batchpid.io.files import imported
 from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.mesh_files import find_mesh, read_mesh
 from batchpid.sim.geometry.shapes import Shape, convex_hull
