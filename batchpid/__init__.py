@@ -43,7 +43,7 @@ from batchpid.io.documents import (
     loads_params,
     save_params,
 )
-from batchpid.io.packages import attributes_of
+from batchpid.io.files import attributes_of
 from batchpid.law.bumpless import track
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams, make_params

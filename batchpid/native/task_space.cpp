@@ -209,50 +209,12 @@ PyObject *search(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
-// Arrays of `move`; the first two are changed.
-enum Move { AT, RATE, INERTIA, PUSH, ADDED, LOWER_END, UPPER_END, MOVE };
-
-// Step joints: sim/identification/simulator.py.
-FOR_EACH_PROCESSOR void write_move(std::int64_t rows, std::int64_t joints, double dt, Tables const &table) {
-  auto const n = static_cast<std::size_t>(joints);
-  std::vector<Lanes> columns[MOVE], room(n * n);
-  for (int i = 0; i < MOVE; ++i) columns[i].resize(i == INERTIA ? n * n : n);
-  std::vector<Lanes> &inverse = columns[INERTIA];
-  auto &[q, v, matrix, push, added, low, high] = columns;
-  for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    for (int i = 0; i < MOVE; ++i) table[i].load(first, columns[i].data());
-    for (std::int64_t j = 0; j < joints; ++j) matrix[j * joints + j] += added[j];
-    invert(joints, inverse.data(), room.data());
-    for (std::int64_t j = 0; j < joints; ++j) {
-      v[j] += dt * along(&inverse[j * joints], push.data(), joints);
-      Lanes const end = q[j] + dt * v[j];
-      v[j] = zero_outside(v[j], low[j], end, high[j]);
-      q[j] = at_most(at_least(end, low[j]), high[j]);
-    }
-    for (int i : {AT, RATE}) table[i].store(first, columns[i].data());
-  }
-}
-
-// move(rows, joints, dt, *arrays)
-PyObject *move(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  std::int64_t const rows = PyLong_AsLong(arguments[0]), joints = PyLong_AsLong(arguments[1]);
-  double const dt = PyFloat_AsDouble(arguments[2]);
-  if (PyErr_Occurred()) return nullptr;
-  Tables table;
-  std::int64_t const others[] = {joints * joints, joints, joints, joints, joints};
-  if (!table.open_all(arguments + 3, {joints, joints}, rows, 0)) return nullptr;
-  if (!table.open_all(arguments + 3 + INERTIA, others, rows, MOVE)) return nullptr;
-  write_move(rows, joints, dt, table);
-  Py_RETURN_NONE;
-}
-
 PyMethodDef METHODS[] = {
     {"tree", make_tree, METH_VARARGS, nullptr},
     {"kinematics", method(kinematics), METH_FASTCALL, nullptr},
     {"law", method(law), METH_FASTCALL, nullptr},
     {"bind", method(bind), METH_FASTCALL, nullptr},
     {"search", method(search), METH_FASTCALL, nullptr},
-    {"move", method(move), METH_FASTCALL, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 

@@ -138,7 +138,8 @@ class _Run:
         command = self.info.own_command
         end: Float64 = self.qpos[-1]
         if command is None and self.info.control != "effort":
-            return self.robot.coupled(self.rollout.setpoint[-1])
+            goal: Float64 = self.robot.coupling.positions(self.rollout.setpoint[-1])
+            return goal
         if (
             command is None
             or command.size != 7
@@ -148,7 +149,7 @@ class _Run:
             return end
         pose = self.rollout.setpoint[-1, :, :7].copy()
         pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-        tree = self.robot.rigid_tree
+        tree = self.robot.kinematic_tree()
         start = np.nan_to_num(end)
         solution = ts.inverse_kinematics(tree, self.info.tool, pose, start, on_failure="return")
         self.out_of_reach = ~np.asarray(solution.success)[:, None]
@@ -232,7 +233,9 @@ class _Run:
             moves = [steps[env], *np.diag(steps[env])] if before else []
             pressed = set[str]()
             for move in moves:
-                after = touching_links(self.robot, self.robot.coupled(end + move), ground, TOUCH)
+                after = touching_links(
+                    self.robot, self.robot.coupling.positions(end + move), ground, TOUCH
+                )
                 pressed |= {pair for pair in before if after.get(pair, TOUCH) < before[pair] - 1e-4}
             links[env] = min(pressed, key=before.__getitem__, default="")
         return links

@@ -23,8 +23,13 @@ from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
 from batchpid.sim.findings import FINDING_KINDS, LIMIT_TOLERANCE, SEVERITIES, Finding, Findings
-from batchpid.sim.geometry.inertia import LEAST_MASS, triangle_excess
-from batchpid.sim.geometry.shapes import hull_share
+from batchpid.sim.geometry.shapes import (
+    LEAST_MASS,
+    extent,
+    hull_share,
+    inertia_of,
+    triangle_excess,
+)
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
@@ -79,7 +84,7 @@ def check(
         # Gains of a drive are not sampled, and its errors do not wrap.
         params = params if control == "pid" else None
     plan = _Plan(robot, start, goal, params, timestep)
-    findings = [*robot.repairs, *robot.reading.srdf.findings]
+    findings = list(robot.repairs)
     for oddity in ODDITIES:
         kind = FINDING_KINDS[oddity.code]
         for place in oddity.places(plan):
@@ -125,7 +130,9 @@ class _Plan:
         """Length [m] of the longest chain of joints, slides extended."""
         robot = self.robot
         length: dict[str, float] = defaultdict(float)
-        for joint, link in zip(robot.tables.joints, robot.links[1:], strict=True):  # parents first
+        for joint, link in zip(
+            robot.tables.joints, robot.tables.bodies[1:], strict=True
+        ):  # parents first
             ends = (joint.lower, joint.upper) if joint.type == "prismatic" else ()
             travel = max((abs(end) for end in ends if np.isfinite(end)), default=0.0)
             offset = float(np.linalg.norm(link.position)) + travel
@@ -150,8 +157,8 @@ def touching_links(
 
 def _odd_sizes(plan: _Plan) -> Iterator[Place]:
     """Yield links whose shapes are larger than the robot, or the robot if all are tiny."""
-    masses = plan.robot.link_masses
-    sizes = {name: mass.size for name, mass in masses.items() if mass.size > 0}
+    tables = plan.robot.tables
+    sizes = {name: size for name in tables.links if (size := extent(tables.shapes_of(name)))}
     of_chain = f"the robot's chain of joints is {plan.chain:.3g} m long"
     for name, size in sizes.items():
         if size > LARGEST_SHAPES * max(plan.chain, SHORTEST_CHAIN):
@@ -178,7 +185,7 @@ def _odd_angles(plan: _Plan) -> Iterator[Place]:
 
 def _odd_inertia(plan: _Plan) -> Iterator[Place]:
     """Yield links with a principal moment above the sum of the others."""
-    for link in plan.robot.links:
+    for link in plan.robot.tables.bodies:
         excess = triangle_excess(link.inertia) if link.mass else 0.0
         if excess > LEAST_EXCESS:
             text = "no body has such an inertia tensor, a moment above the sum of the others"
@@ -191,17 +198,22 @@ def _massless(plan: _Plan) -> Iterator[Place]:
     robot = plan.robot
     bodies = {name: place.link for name, place in robot.bodies.items()}
     root = bodies[robot.tables.joints[0].parent_link]
-    masses = robot.link_masses
-    loaded = {bodies[name] for name, mass in masses.items() if mass.mass > LEAST_MASS}
+    masses = {link.name: link.mass for link in robot.tables.bodies}
+    shaped = dict[str, float]()
+    for name, mass in masses.items():
+        if not mass and (shapes := robot.tables.shapes_of(name)):
+            shaped[name] = inertia_of(shapes).mass
+    masses |= shaped
+    loaded = {bodies[name] for name, mass in masses.items() if mass > LEAST_MASS}
     # Bodies with mass in them, or in the links that they carry.
     for joint in reversed(robot.tables.joints):
         if bodies[joint.child_link] in loaded:
             loaded.add(bodies[joint.parent_link])
-    for name, mass in masses.items():
+    for name in masses:
         if robot.fixed_base and bodies[name] == root:
             continue
-        if mass.source == "shapes":
-            yield Place(link=name, detail=f"{mass.mass:.3g} kg")
+        if name in shaped:
+            yield Place(link=name, detail=f"{shaped[name]:.3g} kg")
         elif name == bodies[name] and name not in loaded:
             yield Place(link=name, detail="1e-6 kg")
 
@@ -220,7 +232,7 @@ def _touching(plan: _Plan) -> Iterator[Place]:
     robot = plan.robot
     # A floating base starts on its ground, which is no fault.
     ground = robot.fixed_base and robot.has_ground
-    goal = robot.target if plan.goal is None else robot.coupled(plan.goal)
+    goal = robot.target if plan.goal is None else robot.coupling.positions(plan.goal)
     for name, qpos in (("start pose", plan.start), ("setpoint", goal)):
         pairs = touching_links(robot, qpos, ground, 0.0)
         if pairs:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import DEADBEAT_SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import BASES, STATUS, Group, ModelStruct, Refresh
+from batchpid.sim.engine.native.interface import BASES, STATUS, WIDTH, Group, ModelStruct, Refresh
 from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:
@@ -56,17 +56,50 @@ def passive_force(
     return np.asarray(force, np.float64)
 
 
+ALIGNMENT = 64
+"""Alignment of vectors in memory [bytes]."""
+
+
+def aligned(*shape: int) -> Float64:
+    """Return an array of zeros whose memory begins where a vector may."""
+    size = 8 * int(np.prod(shape))
+    memory = np.zeros(size + ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % ALIGNMENT
+    rows: Float64 = memory[start : start + size].view(np.float64).reshape(shape)
+    return rows
+
+
+def table(rows: Rows, size: int) -> Float64:
+    """Return ``rows`` (size | 1, columns) in blocks (blocks, columns, WIDTH), as lanes of native
+    code read them.
+    """
+    blocks = -(-size // WIDTH)
+    out = aligned(blocks, rows.shape[1], WIDTH)
+    numbers = np.minimum(np.arange(blocks * WIDTH), size - 1)
+    padded = np.broadcast_to(rows, (size, rows.shape[1]))[numbers]
+    out[...] = padded.reshape(blocks, WIDTH, -1).swapaxes(1, 2)
+    return out
+
+
+class HasTree(Protocol):
+    """Robots of one kind."""
+
+    @property
+    def rigid_tree(self) -> RigidTree:
+        """Their tree."""
+
+
 class NativeModel:
-    """Model of the robots of ``pack``, without their variation, on a base of this kind of
-    :data:`BASES`.
+    """Model of the robots of ``pack``, on a base of this kind of :data:`BASES`, with ``inertias``
+    (robots, dof + 1, 13) where they differ: :meth:`RigidTree.inertias`.
     """
 
-    def __init__(self, pack: EnginePack, base: str = "fixed") -> None:
+    def __init__(self, pack: HasTree, base: str = "fixed", inertias: Float64 | None = None) -> None:
         # The pack's tree is read at the first use: SAPIEN has to build a robot for it.
         self._pack = pack
         self._base = base
         self._native = native.extension("_gateway")
-        self._inertias: Float64 | None = None
+        self._inertias = inertias
 
     @cached_property
     def _structure(self) -> tuple[ModelStruct, Any]:
@@ -82,7 +115,9 @@ class NativeModel:
             "varies": self._inertias is not None,
             "base": BASES.index(self._base),
         }
-        return ModelStruct(gravity=self._pack.spec.gravity, **numbers, **addresses), arrays
+        return ModelStruct(
+            gravity=tuple(self._pack.rigid_tree.bodies.gravity), **numbers, **addresses
+        ), arrays
 
     @property
     def address(self) -> int:

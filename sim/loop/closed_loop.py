@@ -19,7 +19,6 @@ from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.group_control import control_of
 from batchpid.sim.loop.tree_plant import TreePlant
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control, stages_of
 from batchpid.stages.stage import States, placed, started, stepped
@@ -99,7 +98,7 @@ class ClosedLoop:
         plant = self._placed(qpos, qvel)
         xp = namespace(*self.plant.read(plant))
         episode = xp.zeros(self.control.envs, int)
-        values = self._values(plant, Command(None), Step(0, 1), episode)
+        values = self.values(plant, Command(None), Step(0, 1), episode)
         return LoopState(plant, started(stages_of(self.control), values), episode)
 
     def reset(
@@ -113,7 +112,7 @@ class ClosedLoop:
         mask = xp.ones(self.control.envs, bool) if mask is None else xp.asarray(mask)
         episode = state.episode + mask
         plant = replace_envs(state.plant, fresh, mask)
-        values = self._values(plant, Command(None), Step(0, 1), episode)
+        values = self.values(plant, Command(None), Step(0, 1), episode)
         return LoopState(
             plant, placed(stages_of(self.control), state.stages, values, mask), episode
         )
@@ -154,7 +153,7 @@ class ClosedLoop:
         def sim_step(carry: Any, index: Array) -> tuple[Any, Outputs]:
             plant, states = carry
             step = Step(index, substeps, self.control.left(index, substeps))
-            values = self._values(plant, command, step, episode)
+            values = self.values(plant, command, step, episode)
             states, values = stepped(stages, states, values)
             return (self.plant.step(plant, values.outputs.qf), states), values.outputs
 
@@ -184,7 +183,7 @@ class ClosedLoop:
         place, rate = (xp.broadcast_to(xp.asarray(rows, float), shape) for rows in (start, rest))
         return self.plant.init(place, rate)
 
-    def _values(
+    def values(
         self,
         plant: Pytree,
         command: Command,
@@ -201,8 +200,11 @@ class ClosedLoop:
                 return 0.0 * qpos
             return bias(tree, qpos, qvel if control.coriolis else 0.0 * qvel)
 
+        # The joints show the masses of the plant.
+        bodies = getattr(self.plant, "bodies", None)
+
         def joint_matrix(qpos: Array) -> Array:
-            matrix = mass_matrix(tree, qpos)
+            matrix = mass_matrix(tree, qpos, bodies)
             motors = control.actuators
             if motors is None or motors.armature is None:
                 return matrix
@@ -276,7 +278,7 @@ def closed_loop(
         friction,
         slice(0, num_envs),
         controller and _Traced(controller),
-        DISSIPATION[scene.dissipation].modelled,
+        scene.dissipation == "urdf",
     )
     tree = robot.kinematic_tree(armature=np.zeros(robot.dof)).held
     if plant is None:

@@ -24,8 +24,7 @@ from batchpid.sim.loop.env_parts import ActingDraws, LinkSensors, Pushes, variat
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
 from batchpid.sim.loop.group_control import GroupControl
 from batchpid.sim.loop.jax_executor import JAXExecutor
-from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
-from batchpid.sim.loop.native_program import Table
+from batchpid.sim.loop.native_executor import NativeExecutor, Table, run_ticks, runs_natively
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws

@@ -23,9 +23,9 @@ from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, pass
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.parts import DISSIPATION, Joint
+from batchpid.sim.robot.merging import coupling_of
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
+from batchpid.sim.robot.tables import Joint
 from batchpid.stages import Control, Stage, stages_of
 from batchpid.stages.friction import REFRESH_STEPS
 from batchpid.stages.program import StageProgram
@@ -65,7 +65,7 @@ class GroupControl(NamedTuple):
             pack.friction,
             slice(first, first + pack.size),
             controller,
-            DISSIPATION[scene.dissipation].modelled,
+            scene.dissipation == "urdf",
         )
         return cls(options, pack, control, stages_of(control), model_functions(pack, control))
 
@@ -100,15 +100,15 @@ def control_of(
     compensated = options.compensate.split("+")
     described = known_joints(options.robot)
     turns = np.array([joint.continuous / TURN for joint in joints])
-    modelled = np.array([joint.friction * share for joint in joints]) + described.coulomb
+    modelled = np.array([joint.friction * share for joint in joints]) + described["coulomb"]
     free = np.array([joint.name in (options.free_joints or ()) for joint in joints])
     modelled[free] = 0.0
     has_modelled = "friction" in compensated and options.sets_positions and modelled.any()
     armature = None
     damping = np.array([joint.damping for joint in joints])
     if options.robot.actuators is not None:
-        armature = described.armature
-        damping = damping + described.viscous
+        armature = described["armature"]
+        damping = damping + described["viscous"]
     return Control(
         timestep=options.timestep,
         envs=envs.stop - envs.start,

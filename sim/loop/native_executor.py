@@ -5,23 +5,38 @@ needs Python.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, Pytree, Rows
 from batchpid.arrays.trees import flatten, leaves, mapped, rebuilt_as
 from batchpid.motors import ActuatorState
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
+from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.loop.backend import native_obstacle
 from batchpid.sim.loop.group_control import GroupControl
-from batchpid.sim.loop.native_program import Buffers, Table, TickProgram
+from batchpid.sim.loop.native_program import Buffers, TickProgram
 from batchpid.sim.loop.numpy_executor import EngineSteps
 from batchpid.stages.stage import States, running
 from batchpid.stages.values import Command, Measured, Outputs
 
 _NO_NOISE = 1 << interface.STATUS.index("no_noise")
+
+
+class Table(NamedTuple):
+    """Commands and observations of the ticks of a run, and arrays of its last observation."""
+
+    arrays: Arrays
+    """(ticks, envs, ...), the same in every run."""
+    effort: NDArray[np.float32]
+    """Effort of the last tick (envs, dof), as are the next two."""
+    saturated: NDArray[np.bool_]
+    guarded: NDArray[np.bool_]
+    fault: FaultArrays
+    """Last fault of each env (envs,)."""
 
 
 class NativeExecutor:
@@ -129,7 +144,7 @@ class NativeExecutor:
             self._programs[moves] = program = TickProgram(
                 self.setup,
                 self._buffers,
-                self._table,
+                self._copies,
                 noise,
                 self._engine.native_force,
                 moves,
@@ -139,6 +154,38 @@ class NativeExecutor:
                 self._replace("law", program.control.state)
         self._program = program = self._programs[moves]
         program.tick.tick, program.tick.step = tick, step
+
+    def _copies(self, program: TickProgram) -> list[tuple[Rows, Rows]]:
+        """Return the copies between the tables of the ticks and the arrays of a sim step."""
+        table = self._table
+        command, seen, fault = table.arrays
+        outputs = program.outputs
+        measured = self._buffers.measured
+        none = np.zeros(measured.qpos.shape, bool)
+        copies: list[tuple[Rows, Rows]] = [
+            (seen.qpos, measured.qpos),
+            (seen.qvel, measured.qvel),
+            (seen.effort, outputs.motor),
+            (seen.ok, np.ones(len(none), bool)),
+            # One row, which each tick overwrites.
+            (table.effort[None], outputs.motor),
+            *zip(fault, table.fault, strict=True),
+        ]
+        for name in ("saturated", "guarded"):
+            mask = getattr(outputs, name)
+            if mask is None:
+                mask = none
+            copies.append((getattr(seen, name), mask))
+            copies.append((getattr(table, name)[None], mask))
+        if seen.base_pose is not None and seen.base_twist is not None:
+            pose = np.zeros((len(none), 7))
+            twist = np.zeros((len(none), 6))
+            program.place(base_pose=pose, base_twist=twist)
+            copies += (seen.base_pose, pose), (seen.base_twist, twist)
+        if seen.starved is not None:
+            copies.append((seen.starved, self._buffers.states[self._places["plan"]].starved))
+        pairs = zip(command, self._buffers.command, strict=True)
+        return copies + [(rows, row) for rows, row in pairs if row is not None]
 
     def complete(self) -> tuple[int, int]:
         """Complete ticks that ran: return the first tick that is not observed, and its sim steps

@@ -7,34 +7,20 @@ have a native function.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import DType, Pytree, Rows
 from batchpid.arrays.trees import leaves
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
-from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.loop.group_control import GroupControl
 from batchpid.sim.loop.numpy_executor import COUPLING_STEPS
 from batchpid.stages.program import StageProgram
-from batchpid.stages.stage import States, by_name, recalled
+from batchpid.stages.stage import States, recalled
 from batchpid.stages.values import Command, Measured, Outputs, Step, Values
-
-
-class Table(NamedTuple):
-    """Commands and observations of the ticks of a run, and arrays of its last observation."""
-
-    arrays: Arrays
-    """(ticks, envs, ...), the same in every run."""
-    effort: NDArray[np.float32]
-    """Effort of the last tick (envs, dof), as are the next two."""
-    saturated: NDArray[np.bool_]
-    guarded: NDArray[np.bool_]
-    fault: FaultArrays
-    """Last fault of each env (envs,)."""
 
 
 class Buffers(NamedTuple):
@@ -50,9 +36,10 @@ class Buffers(NamedTuple):
 class TickProgram:
     """Stages and arrays of the ticks of a group.
 
-    ``reads_force`` says whether the engine's sim step reads the passive force, ``moves`` whether
-    joint setpoints move within a tick, and ``noise`` is that of positions and velocities in a sim
-    step.
+    ``copies`` returns the copies before and after each tick, between tables (ticks, M, ...) and
+    arrays of a sim step: commands are tables of float64. ``reads_force`` says whether the engine's
+    sim step reads the passive force, ``moves`` whether joint setpoints move within a tick, and
+    ``noise`` is that of positions and velocities in a sim step.
 
     Attributes
     ----------
@@ -64,19 +51,21 @@ class TickProgram:
         Results of the last sim step.
     control
         Native controller, or None.
+    buffers
+        Arrays of a sim step.
     """
 
     def __init__(
         self,
         setup: GroupControl,
         buffers: Buffers,
-        table: Table,
+        copies: Callable[[TickProgram], list[tuple[Rows, Rows]]],
         noise: Pytree,
         reads_force: bool,
         moves: bool,
     ) -> None:
         _, pack, control, _, model = setup
-        self._setup, self._buffers = setup, buffers
+        self._setup, self.buffers = setup, buffers
         self.pack, self.model = pack, model
         self._native = native.extension("_gateway")
         self._programs, self._stages = list[Any](), list[interface.Stage]()
@@ -112,10 +101,11 @@ class TickProgram:
         self.place(qf=self.outputs.qf)
         stages = (interface.Stage * len(self._stages))(*self._stages)
         self.tick.stages, self.tick.stage_count = ctypes.addressof(stages), len(stages)
-        transfers = self._transfers(table)
+        pairs = [self._transfer(*pair) for pair in copies(self)]
+        transfers = (interface.Transfer * len(pairs))(*pairs)
         self.tick.transfers = ctypes.addressof(transfers)
         self.tick.transfer_count = len(transfers)
-        self._references += stages, transfers, table
+        self._references += stages, transfers
         self.bound = self._native.bind_ticks(tuple(self._programs), ctypes.addressof(self.tick))
 
     # -- for stages in C++
@@ -149,43 +139,6 @@ class TickProgram:
         self._references.append(array)
         return array.ctypes.data
 
-    # -- commands and observations
-
-    def _transfers(self, table: Table) -> ctypes.Array[interface.Transfer]:
-        """Return the copies between the tables of the ticks and the arrays of a sim step."""
-        command, seen, fault = table.arrays
-        outputs = self.outputs
-        measured = self._buffers.measured
-        none = np.zeros(measured.qpos.shape, bool)
-        copies: list[tuple[Rows, Rows]] = [
-            (seen.qpos, measured.qpos),
-            (seen.qvel, measured.qvel),
-            (seen.effort, outputs.motor),
-            (seen.ok, np.ones(len(none), bool)),
-            # One row, which each tick overwrites.
-            (table.effort[None], outputs.motor),
-            *zip(fault, table.fault, strict=True),
-        ]
-        for name in ("saturated", "guarded"):
-            mask = getattr(outputs, name)
-            if mask is None:
-                mask = none
-            copies.append((getattr(seen, name), mask))
-            copies.append((getattr(table, name)[None], mask))
-        if seen.base_pose is not None and seen.base_twist is not None:
-            pose = np.zeros((len(none), 7))
-            twist = np.zeros((len(none), 6))
-            self.place(base_pose=pose, base_twist=twist)
-            copies += (seen.base_pose, pose), (seen.base_twist, twist)
-        if seen.starved is not None:
-            states = by_name(self._setup.stages, self._buffers.states)
-            copies.append((seen.starved, states["plan"].starved))
-        transfers = [self._transfer(rows, row) for rows, row in copies]
-        for rows, row in zip(command, self._buffers.command, strict=True):
-            if row is not None:
-                transfers.append(self._transfer(rows, row))
-        return (interface.Transfer * len(transfers))(*transfers)
-
     def _transfer(self, table: Rows, row: Rows) -> interface.Transfer:
         """Return a copy between a row (M, ...) and the first of the ticks of ``table``."""
         # Of arrays of numbers only commands have tables in double precision.
@@ -210,7 +163,7 @@ class TickProgram:
         """Add the stages; return the results after them."""
         setup = self._setup
         waiting = list[tuple[Any, Pytree]]()
-        for stage, state in zip(setup.stages, self._buffers.states, strict=True):
+        for stage, state in zip(setup.stages, self.buffers.states, strict=True):
             if not stage.native:
                 waiting.append((stage, state))
                 continue
@@ -225,7 +178,8 @@ class TickProgram:
             self._add_stage("targets", int(moves or setup.moves_drives))
         if not setup.control.coupling.is_identity:
             self._add_stage("constraint", COUPLING_STEPS)
-        self._add_stage("engine")
+        if setup.pack.steps_natively:
+            self._add_stage("engine")
         return outputs
 
     def _add_program(
@@ -237,7 +191,7 @@ class TickProgram:
         if not pairs:
             return values
         stages, states = zip(*pairs, strict=True)
-        made = StageProgram(stages, states, values, self._buffers.before.shape, passes)
+        made = StageProgram(stages, states, values, self.buffers.before.shape, passes)
         if made.outputs:
             # Native code sets the addresses of the noise, which is another in each sim step.
             drawn = [id(block) for block in leaves(values.noise)]

@@ -27,8 +27,8 @@ from batchpid.sim.engine.protocol import Engine, load_engine, require
 from batchpid.sim.randomization.checks import check_robot
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.merging import place_links
-from batchpid.sim.robot.parts import MjcfFile
-from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot import Robot, link_tree
+from batchpid.sim.robot.tables import MjcfFile
 from batchpid.sim.signals.quantities import own_command
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.stages import Stage, fit_stages
@@ -209,7 +209,7 @@ class Scene(OptionGroup):
         engine = self.load_engine()
         if not engine.is_physics(self.physics):
             choice("physics", self.physics, engine.physics)
-        if robot.dissipation == "sapien":
+        if robot.source.dissipation == "sapien":
             require(engine, "sapien_dissipation", "robot")
         # MuJoCo compiles a scene as a whole: it has no content of the caller's own.
         if self.build is not None:
@@ -275,7 +275,7 @@ class Scene(OptionGroup):
         if not links:
             return None
         # SAPIEN reports its damping of links among the contacts.
-        if self.engine == "sapien" and robot.dissipation == "sapien":
+        if self.engine == "sapien" and robot.source.dissipation == "sapien":
             problem = "need a robot without SAPIEN's link damping, which acts like a contact"
             remedy = "load the robot with dissipation='urdf'"
             raise InvalidArgumentError(argument, problem, remedy=remedy)
@@ -283,7 +283,7 @@ class Scene(OptionGroup):
         bodies = place_links(robot.tables, links if argument == "wrenches" else ())
         root = next(place.link for place in bodies.values())
         for link in links:
-            choice(argument, link, [link.name for link in robot.links])
+            choice(argument, link, list(robot.bodies))
             if bodies[link].link == root and (argument == "wrenches" or robot.fixed_base):
                 problem = f"names {link!r}, which no joint moves"
                 remedy = "name a link beyond a joint"
@@ -423,7 +423,7 @@ class Control(OptionGroup):
                 remedy = "load the robot with fixed_base=True, or control its joints"
                 raise InvalidArgumentError("control", problem, remedy=remedy)
             if tool is None:
-                tool = robot.rigid_tree.tool
+                tool = link_tree(robot).tool
             # From here on it is a controller like the caller's own.
             control = OperationalSpace(robot, choice("tool", tool, robot.kinematic_tree().links))
         elif callable(control) and callable(getattr(control, "init", None)):

@@ -206,7 +206,7 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
     source = str(path)
     columns, lines = read_csv(path)
     tables = _tables(robot, source, columns, lines)
-    tables["setpoint"] = robot.coupled(tables["setpoint"])
+    tables["setpoint"] = robot.coupling.positions(tables["setpoint"])
     substeps, at_zero = _substeps(source, columns["time"], lines, timestep)
     start = None
     if at_zero:

@@ -1,12 +1,9 @@
 """Robot: a URDF or MJCF file, parsed once and checked: joints, limits and defaults, checks and
 gains. Nothing here depends on an engine.
-
-Longer than 350 lines because it is one class, which users meet first.
 """
 
 from __future__ import annotations
 
-import os
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,36 +15,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import batchpid as bp
-from batchpid import assets
 from batchpid.arrays.array_types import Bool, Document, Float64
 from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.checks.validate import check_keywords, choice, file_path, flag
-from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
+from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.findings import Finding, Findings, report
-from batchpid.sim.robot.merging import merge_links, place_links
-from batchpid.sim.robot.mimics import couple, coupling_of
-from batchpid.sim.robot.parts import (
-    DISSIPATION,
-    Joint,
-    LinkMass,
-    MjcfFile,
-    Placement,
-    Reading,
-    Settings,
-    Srdf,
+from batchpid.sim.robot.merging import body_tree, couple, coupling_of, merge_links, place_links
+from batchpid.sim.robot.reading import (
+    bundled_robots,
+    find_robot,
+    read_robot,
+    read_settings,
+    with_srdf,
 )
-from batchpid.sim.robot.robot_model import RobotModel
+from batchpid.sim.robot.robot_model import RobotModel, SelfContact, self_contact
 from batchpid.sim.robot.robot_options import load_robot_actuators, setpoint_guard
-from batchpid.sim.robot.self_collision import SELF_COLLISION, SelfContact, read_srdf, self_contact
-from batchpid.sim.robot.simulated_links import body_tree, link_masses
-from batchpid.sim.robot.tables import Body, Tables
-from batchpid.sim.robot.urdf import read_robot
+from batchpid.sim.robot.tables import Joint, MjcfFile, Placement, Settings, Source, Tables
 from batchpid.task_space.rigid_tree import RigidTree
 
-_ASSETS = Path(assets.__file__).parent
 DESIGN_HZ = 1.7
 """Bandwidth of :meth:`Robot.designed` with the mass matrix."""
 STANDING_HZ = 3.0
@@ -88,42 +76,52 @@ class Robot:
     """Robot as its file describes it; every array is in the order of ``joint_names``. Load one with
     :meth:`load`.
 
-    ``tables`` are its bodies and shapes as in the file, after ``repairs``. ``joints`` are the
-    degrees of freedom, the joints of ``tables`` that move. ``settings`` come from a bundled robot,
-    ``mjcf`` from an MJCF file, else None. ``reading`` is what else the file says, and how it was
-    read. ``actuators`` are its motors and sensors, None for ideal ones.
+    ``source`` is what the reader found. ``joints`` are the degrees of freedom, the joints of
+    ``tables`` that move, with limits, friction and damping of followers moved to their leaders.
+    ``settings`` come from a bundled robot, else None. ``actuators`` are its motors and sensors, None
+    for ideal ones.
     """
 
-    name: str
-    path: Path
-    tables: Tables
-    repairs: tuple[Finding, ...]
+    source: Source
     joints: tuple[Joint, ...]
-    fixed_base: bool
-    dissipation: str
-    reading: Reading
     settings: Settings | None
-    mjcf: MjcfFile | None = None
     actuators: bp.Actuators | None = None
 
     def __repr__(self) -> str:
-        total = sum(body.mass for body in self.links)
-        owners = {shape.owner for shape in self.tables.shapes}
-        shaped = sum(not body.mass and body.name in owners for body in self.links)
-        mass = f"{total:.4g} kg"
-        if shaped:
-            by_shapes = f"{shaped} links with the mass of shapes"
-            mass = f"{mass} and {by_shapes}" if total else by_shapes
         joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
-        head = (
-            f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
-        )
+        mass = f"{sum(body.mass for body in self.tables.bodies):.4g} kg"
+        head = f"Robot({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
         return f"{head}\n  joints={joints})"
 
     @property
-    def links(self) -> tuple[Body, ...]:
-        """Links of the file, with mass and the joint above, breadth first."""
-        return self.tables.bodies
+    def name(self) -> str:
+        """Name in the file, else the file's."""
+        return self.source.name
+
+    @property
+    def path(self) -> Path:
+        """Path of the file."""
+        return self.source.path
+
+    @property
+    def tables(self) -> Tables:
+        """Bodies, shapes and visuals as in the file, after the repairs."""
+        return self.source.tables
+
+    @property
+    def repairs(self) -> tuple[Finding, ...]:
+        """Findings of reading the file."""
+        return self.source.repairs
+
+    @property
+    def fixed_base(self) -> bool:
+        """False if the base floats."""
+        return self.source.fixed_base
+
+    @property
+    def mjcf(self) -> MjcfFile | None:
+        """MJCF file that MuJoCo simulates, None for a URDF."""
+        return self.source.mjcf
 
     @cached_property
     def bodies(self) -> Mapping[str, Placement]:
@@ -202,10 +200,8 @@ class Robot:
         """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien": PhysX
         has its own.
         """
-        return (
-            np.array([joint.friction for joint in self.joints])
-            * DISSIPATION[self.dissipation].modelled
-        )
+        modelled = self.source.dissipation == "urdf"
+        return np.array([joint.friction for joint in self.joints]) * modelled
 
     @cached_property
     def coupling(self) -> Coupling:
@@ -217,11 +213,6 @@ class Robot:
         """Mask (dof,) of the joints that are not followers."""
         return self.coupling.independent
 
-    def coupled(self, qpos: ArrayLike) -> Float64:
-        """Return ``qpos`` (..., dof) with the followers moved to match their leaders."""
-        positions: Float64 = self.coupling.positions(np.asarray(qpos, np.float64))
-        return positions
-
     @property
     def start(self) -> Float64:
         """Start pose (dof,) [rad or m]: the bundled settings' or the file's, else zero, clipped to
@@ -229,10 +220,10 @@ class Robot:
         """
         if self.settings is not None:
             return self.settings.start.copy()
-        defaults = self.reading.defaults
-        return self.coupled(
-            np.clip(0.0 if defaults is None else defaults.start, self.lower, self.upper)
-        )
+        start = self.source.start
+        pose = np.clip(0.0 if start is None else start, self.lower, self.upper)
+        coupled: Float64 = self.coupling.positions(pose)
+        return coupled
 
     @property
     def target(self) -> Float64:
@@ -255,12 +246,15 @@ class Robot:
         model = self.dynamics(ground=self.fixed_base and self.has_ground)
         for share in TARGET_SHARES:
             ways = share * np.linspace(0.2, 1.0, 5)[:, None] * move
-            poses = self.coupled(np.clip(self.start + ways, self.lower, self.upper))
+            poses = np.clip(self.start + ways, self.lower, self.upper)
+            poses = self.coupling.positions(poses)
             if not model.in_contact(poses).any():
-                free: Float64 = poses[-1]
-                return free
-        # Links touch at the start already, which is a finding.
-        return self.coupled(self.start + move)
+                break
+        else:
+            # Links touch at the start already, which is a finding.
+            poses = self.coupling.positions((self.start + move)[None])
+        target: Float64 = poses[-1]
+        return target
 
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's
@@ -294,22 +288,9 @@ class Robot:
         # A joint without limits would have no range to draw from.
         low = np.maximum(self.lower, self.start - np.pi)
         high = np.minimum(self.upper, self.start + np.pi)
-        return self.coupled(np.random.default_rng(seed).uniform(low, high, (count, self.dof)))
-
-    @cached_property
-    def rigid_tree(self) -> RigidTree:
-        """Tree of every link of the URDF, merged ones included, with the coupling and limits of the
-        joints.
-
-        Raises RobotError if a link's mass comes from its shapes, and a mesh cannot be read.
-        """
-        low, high = np.where(
-            self.continuous,
-            [[-np.inf], [np.inf]],
-            [self.lower, self.upper],
-        )
-        tree = body_tree(self.tables, self.fixed_base)
-        return replace(tree, coupling=self.coupling, lower=low, upper=high)
+        poses = np.random.default_rng(seed).uniform(low, high, (count, self.dof))
+        coupled: Float64 = self.coupling.positions(poses)
+        return coupled
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof),
@@ -333,48 +314,12 @@ class Robot:
         """
         return self_contact(self)
 
-    @cached_property
-    def link_masses(self) -> Mapping[str, LinkMass]:
-        """Simulated mass of every link of the URDF, by name, computed at the first use."""
-        return link_masses(self.tables, self.repairs)
-
-    @property
-    def ignored_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of links that do not collide."""
-        return tuple((pair.first, pair.second) for pair in self.self_contact.pairs)
-
     @property
     def has_ground(self) -> bool:
         """True if scenes have a ground by default; False if a fixed base is so low that links start
         in it.
         """
         return not self.self_contact.reaches_ground
-
-    def describe(self) -> Document:
-        """Return a description of the simulated robot as plain values, equal for robots of equal
-        content.
-
-        The tables with the collision meshes, the .srdf, and the settings of a bundled robot
-        are given by digests. The actuators are left out.
-        """
-        srdf, defaults = self.reading.srdf, self.reading.defaults
-        return {
-            "robot": self.name,
-            "content": self.digest,
-            "srdf": digest(srdf.disabled, srdf.enabled),
-            "settings": digest(self.settings) if defaults is None else digest(defaults),
-            "mjcf": None if self.mjcf is None else digest(replace(self.mjcf, path="")),
-            "self_collision": self.reading.self_collision,
-            "dissipation": self.dissipation,
-            "fixed_base": self.fixed_base,
-            "base_start": self.reading.base_start,
-        }
-
-    @cached_property
-    def digest(self) -> str:
-        """Digest of bodies, joints and shapes, with the content of mesh files in place of paths."""
-        shapes = [shape._replace(file="") for shape in self.tables.shapes]
-        return digest(self.tables.bodies, shapes, self.joints)
 
     @classmethod
     def load(
@@ -389,7 +334,7 @@ class Robot:
         actuators: bp.Actuators | str | Path | None = None,
         strict: bool = False,
     ) -> Robot:
-        """Load a bundled robot by name (``Robot.bundled()``), or any URDF or MJCF file by path.
+        """Load a bundled robot by name (:meth:`bundled`), or any URDF or MJCF file by path.
 
         Parameters
         ----------
@@ -432,8 +377,8 @@ class Robot:
             An option has none of the values above.
         """
         choice("missing_meshes", missing_meshes, ("error", "skip"))
-        choice("dissipation", dissipation, DISSIPATION)
-        choice("self_collision", self_collision, SELF_COLLISION)
+        choice("dissipation", dissipation, ("urdf", "sapien"))
+        choice("self_collision", self_collision, ("auto", "urdf", "none"))
         fixed_base = None if fixed_base is None else flag("fixed_base", fixed_base)
         strict = flag("strict", strict)
         if not isinstance(package_dirs, list | tuple):
@@ -443,7 +388,7 @@ class Robot:
             )
         # Options are checked before a file is read, so that a wrong one is not hidden by a fault of
         # the file.
-        path = _find(name_or_path)
+        path = find_robot(name_or_path)
         folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
         source = read_robot(path, fixed_base, folders, missing_meshes)
         report(path, source.repairs, strict)
@@ -452,24 +397,9 @@ class Robot:
             raise RobotError(
                 f"{path}: a robot without moving joints cannot be controlled; check the joint types"
             )
-        beside = path.with_suffix(".srdf")
-        srdf = Srdf()
-        if os.path.isfile(beside):
-            srdf = read_srdf(beside, source.tables.links)
-        srdf = srdf._replace(disabled=(*source.pairs, *srdf.disabled))
-        bundled = path.parent == _ASSETS
-        robot = cls(
-            source.name,
-            path,
-            source.tables,
-            source.repairs,
-            joints,
-            source.fixed_base,
-            dissipation,
-            Reading(self_collision, srdf, folders, source.defaults, source.base_start),
-            _read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
-            source.mjcf,
-        )
+        source = with_srdf(source)
+        source = source._replace(self_collision=self_collision, dissipation=dissipation)
+        robot = cls(source, joints, read_settings(path, joints))
         motors = source.actuators if actuators is None else actuators
         if motors is None:
             return robot
@@ -478,7 +408,7 @@ class Robot:
     @staticmethod
     def bundled() -> tuple[str, ...]:
         """Return the names of the robots that ship with batchpid."""
-        return tuple(sorted(path.stem for path in _ASSETS.glob("*.urdf")))
+        return bundled_robots()
 
     def check(
         self,
@@ -618,12 +548,7 @@ class Robot:
                 f"{self.path}: {problem}; load the robot with fixed_base=True, or control its"
                 " joints"
             )
-        return replace(self.rigid_tree, **(own_options | options))
-
-    @property
-    def has_tuned(self) -> bool:
-        """True if tuned params ship with the robot, for :meth:`tuned`."""
-        return self.settings is not None and self.path.with_suffix(".tuned.yaml").is_file()
+        return replace(link_tree(self), **(own_options | options))
 
     def tuned(self) -> bp.PIDParams:
         """Return the tuned params of a bundled robot; see docs/choosing-gains.md.
@@ -633,10 +558,11 @@ class Robot:
         InvalidArgumentError
             The robot is not bundled.
         """
-        if not self.has_tuned:
+        file = tuned_file(self)
+        if file is None:
             remedy = "use robot.designed(), or search for gains with: batchpid tune"
             raise InvalidArgumentError("robot", f"{self.name!r} has no tuned gains", remedy=remedy)
-        return bp.load_params(self.path.with_suffix(".tuned.yaml"), self.joint_names)[0]
+        return bp.load_params(file, self.joint_names)[0]
 
     def mjcf_gains(self) -> bp.PIDParams:
         """Return params with the gains of the servos of an MJCF file: kp, ki and kd, on the
@@ -651,53 +577,67 @@ class Robot:
         InvalidArgumentError
             The robot is not from an MJCF file, or that has no servos.
         """
-        defaults = self.reading.defaults
-        if defaults is None or defaults.kp is None:
+        gains = self.source.gains
+        if gains is None:
             problem = (
                 f"{self.name!r} has no servos of an MJCF file (<position>, or <general> with an"
                 " affine bias)"
             )
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
-        gains = {name: getattr(defaults, name) for name in ("kp", "ki", "kd", "integral_limit")}
         # MuJoCo's integral grows during saturation, up to its limit.
         return self.params(**gains, anti_windup="none", measurement_rate="measured")
 
 
 @lru_cache(maxsize=8)
 def _model(robot: Robot, ground: bool) -> RobotModel:
-    ignored = frozenset(map(frozenset, robot.ignored_pairs))
+    ignored = frozenset(map(frozenset, robot.self_contact.ignored))
     # Merged, since the engines simulate merged links, too.
     simulated = merge_links(robot.tables)
     return RobotModel(body_tree(simulated), robot.coupling, simulated, ignored, ground)
 
 
-def _find(name_or_path: str | Path) -> Path:
-    path = Path(os.path.expanduser(file_path("name_or_path", name_or_path)))
-    if str(name_or_path) in Robot.bundled():
-        return _ASSETS / f"{name_or_path}.urdf"
-    if os.path.isdir(
-        path
-    ):  # pathlib's methods raise other errors for names that are too long or start with ~
-        raise RobotNotFoundError(f"{path} is a folder; pass the path of a URDF or MJCF file in it")
-    if os.path.exists(path):  # also a pipe, such as /dev/stdin
-        return path.absolute()
-    raise RobotNotFoundError(
-        f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a"
-        " file; check the spelling, or pass the path of a URDF or MJCF file"
-    )
+@lru_cache(maxsize=8)
+def link_tree(robot: Robot) -> RigidTree:
+    """Return the tree of every link of the file, merged ones included, with the coupling and limits
+    of the joints.
+
+    Raises RobotError if a link's mass comes from its shapes, and a mesh cannot be read.
+    """
+    limits = np.where(robot.continuous, [[-np.inf], [np.inf]], [robot.lower, robot.upper])
+    tree = body_tree(robot.tables, robot.fixed_base)
+    return replace(tree, coupling=robot.coupling, lower=limits[0], upper=limits[1])
 
 
-def _read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings:
-    import yaml  # here, so that `batchpid --help` does not load it
+def tuned_file(robot: Robot) -> Path | None:
+    """Return the file of the tuned params that ship with a robot, None without one."""
+    file = robot.path.with_suffix(".tuned.yaml")
+    return file if robot.settings is not None and file.is_file() else None
 
-    data = yaml.safe_load(path.read_text())
-    rows = [data["joints"][joint.name] for joint in joints]
-    keys = ("start", "target", "kp", "ki", "kd")
-    columns = {key: read_only(np.array([row[key] for row in rows], float)) for key in keys}
-    return Settings(
-        **columns,
-        drive_stiffness=float(data["drive"]["stiffness"]),
-        drive_damping=float(data["drive"]["damping"]),
-        rate_hz=float(data["rate_hz"]),
-        notes=tuple(data.get("notes", ())),
-    )
+
+def describe(robot: Robot) -> Document:
+    """Return a description of the simulated robot as plain values, equal for robots of equal
+    content.
+
+    The tables with the collision meshes, the pairs that do not collide, and the settings of a
+    bundled robot are given by digests. The actuators are left out.
+    """
+    source = robot.source
+    return {
+        "robot": robot.name,
+        "content": content(robot),
+        "srdf": digest(source.disabled, source.enabled),
+        "settings": digest(robot.settings, source.start, source.gains),
+        "mjcf": None if robot.mjcf is None else digest(replace(robot.mjcf, path="")),
+        "self_collision": source.self_collision,
+        "dissipation": source.dissipation,
+        "fixed_base": robot.fixed_base,
+        "base_start": source.base_start,
+    }
+
+
+def content(robot: Robot) -> str:
+    """Return the digest of bodies, joints and shapes, with the content of mesh files in place of
+    their paths.
+    """
+    shapes = [shape._replace(file="") for shape in robot.tables.shapes]
+    return digest(robot.tables.bodies, shapes, robot.joints)

@@ -1,14 +1,22 @@
 """Model of one robot at given poses: dynamics by :mod:`batchpid.task_space`, contacts from its
-collision shapes.
+collision shapes, and the pairs of links that do not collide.
 
 The rigid tree has the simulated bodies in double precision. SAPIEN's tree has single precision.
+
+Pairs that do not collide come from an .srdf, or from the links' distances at sampled poses. MoveIt's
+setup assistant finds the pairs that its planners leave out of collision checks in this way (D.
+Coleman et al., "Reducing the barrier to entry of complex robotic software: a MoveIt! case study", J.
+Softw. Eng. Robotics 5, 2014).
 """
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from itertools import combinations, product
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -16,9 +24,24 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.geometry.distances import Contacts
-from batchpid.sim.robot.tables import Tables
+from batchpid.sim.robot.merging import body_tree, merge_links, rigid_bodies
+from batchpid.sim.robot.tables import DisabledPair, Joint, Tables
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
+
+if TYPE_CHECKING:
+    from batchpid.sim.robot.robot import Robot
+
+SELF_COLLISION = ("auto", "urdf", "none")
+"""Values of the option ``self_collision`` of :meth:`batchpid.sim.Robot.load`."""
+ALWAYS = 0.95
+"""Share of sampled poses beyond which a pair counts as always in contact; MoveIt's."""
+GAP = 1e-3
+"""Distance [m] that counts as contact: links built to glide along each other never come apart, and
+PhysX pushes links apart that just touch at the start.
+"""
+SAMPLES = 200
+"""Number of sampled poses; MoveIt's."""
 
 
 class RobotModel:
@@ -148,22 +171,117 @@ class RobotModel:
         return self.contacts.in_contact(qpos, clearance)
 
 
-def base_start(robot: Any, qpos: Float64, ground: bool) -> Float64:
+def base_start(robot: Robot, qpos: Float64, ground: bool) -> Float64:
     """Return the pose (7,) from which a floating base starts with its joints at ``qpos`` (dof,).
 
     It is the file's, with the lowest point of the robot as high as at the start pose of the joints.
     If the file does not place the base, it is upright at the origin. On a ``ground`` at height 0
     the lowest point is then on the ground, and otherwise not below.
     """
-    pose = np.array(robot.reading.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64)
+    pose = np.array(robot.source.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64)
     model = robot.dynamics()
     # The ground is met by any link, the base included.
     height = model.contacts.height(np.nan_to_num(qpos), base_too=True)
     if not np.isfinite(height):
         return pose
-    if robot.reading.base_start is not None:
+    if robot.source.base_start is not None:
         lowest = pose[2] + model.contacts.height(robot.start, base_too=True)
         pose[2] = (max(lowest, 0.0) if ground else lowest) - height
     elif ground:
         pose[2] = -height
     return pose
+
+
+class SelfContact(NamedTuple):
+    """Contact of a robot's links with each other and with the ground.
+
+    ``pairs`` do not collide. ``reaches_ground`` is True if a link other than the base touches the
+    ground at the start pose.
+    """
+
+    pairs: tuple[DisabledPair, ...]
+    reaches_ground: bool
+
+    @property
+    def ignored(self) -> tuple[tuple[str, str], ...]:
+        """Names of the links of the pairs."""
+        return tuple((pair.first, pair.second) for pair in self.pairs)
+
+
+def disabled_pairs(
+    order: Sequence[str],
+    adjacent: Iterable[frozenset[str]],
+    rest: Iterable[frozenset[str]],
+    samples: Sequence[Collection[frozenset[str]]],
+) -> tuple[DisabledPair, ...]:
+    """Return the pairs that do not collide, each with the first of its reasons, in ``order`` of the
+    links.
+
+    ``adjacent`` are neighbours, ``rest`` the pairs in contact at rest, ``samples`` those in contact
+    at each pose.
+    """
+    touches = Counter(pair for sample in samples for pair in sample)
+    always = (pair for pair, count in touches.items() if count > ALWAYS * len(samples))
+    reasons: dict[frozenset[str], str] = {}
+    for reason, pairs in (("Adjacent", adjacent), ("Default", rest), ("Always", always)):
+        for pair in pairs:
+            reasons.setdefault(pair, reason)
+    number = {link: index for index, link in enumerate(order)}
+    ordered = ((sorted(pair, key=number.__getitem__), reason) for pair, reason in reasons.items())
+    listed = [DisabledPair(first, second, reason) for (first, second), reason in ordered]
+    return tuple(sorted(listed, key=lambda pair: (number[pair.first], number[pair.second])))
+
+
+def self_contact(robot: Robot) -> SelfContact:
+    """Return the pairs of links of a robot that do not collide, under its option ``self_collision``
+    and its .srdf.
+
+    Deterministic: the poses are seeded. Raises RobotError for a mesh that cannot be read.
+    """
+    solid = list(dict.fromkeys(shape.owner for shape in robot.tables.shapes))
+    bodies = rigid_bodies(robot.tables.joints)
+    simulated = merge_links(robot.tables)
+    tree = body_tree(simulated, robot.fixed_base)
+    contacts = Contacts(tree, simulated.shapes, frozenset(), ground=False)
+    computed: tuple[DisabledPair, ...] = ()
+    if robot.source.self_collision == "none":
+        computed = tuple(DisabledPair(*pair, "User") for pair in combinations(solid, 2))
+    elif robot.source.self_collision == "auto" and len({bodies[link] for link in solid}) > 1:
+        # The first pose is the start; the others judge how often a pair touches.
+        rest, *close = [
+            {frozenset(near[:2]) for near in contacts.near(qpos, GAP)}
+            for qpos in (robot.start, *robot.sample(SAMPLES, seed=0))
+        ]
+        computed = disabled_pairs(solid, _adjacent_links(robot.tables.joints, solid), rest, close)
+    # The .srdf comes last, so that its reason holds.
+    listed = {pair.links: pair for pair in (*computed, *robot.source.disabled)}
+    pairs = (
+        pair
+        for links, pair in listed.items()
+        if links not in robot.source.enabled and links <= set(solid)
+    )
+    return SelfContact(
+        pairs=tuple(pairs),
+        reaches_ground=robot.fixed_base and contacts.height(robot.start) < GAP,
+    )
+
+
+def _adjacent_links(joints: Iterable[Joint], solid: Collection[str]) -> list[frozenset[str]]:
+    """Return the pairs of links with shapes, ``solid``, whose rigid bodies are neighbours.
+
+    Neighbours are connected by a joint, or by a chain of joints and bodies without shapes.
+    """
+    joints = list(joints)
+    bodies = rigid_bodies(joints)
+    parents = {joint.child_link: bodies[joint.parent_link] for joint in joints if joint.moves}
+    members = defaultdict(list)
+    for link, body in bodies.items():
+        if link in solid:
+            members[body].append(link)
+    pairs = []
+    for body, links in members.items():
+        parent = parents.get(body)
+        while parent is not None and parent not in members:
+            parent = parents.get(parent)
+        pairs += [frozenset(pair) for pair in product(links, members.get(parent or "", ()))]
+    return pairs

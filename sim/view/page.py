@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from batchpid.errors import MissingDependencyError
-from batchpid.io.packages import uninterrupted
+from batchpid.io.files import uninterrupted
 from batchpid.sim.findings import summary
 from batchpid.sim.rollout import Rollout
 from batchpid.sim.view.panel import Panel

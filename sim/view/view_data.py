@@ -17,7 +17,7 @@ from batchpid.arrays.digest import digest
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot import Robot, content
 from batchpid.sim.rollout import Rollout, RunInfo
 from batchpid.sim.runner.runner import Runner
 from batchpid.sim.signals.quantities import Observation
@@ -81,7 +81,7 @@ class LiveSimulation:
         """
         joints = slice(None) if joint is None else joint
         self.setpoint[:, joints] = position
-        self.setpoint = self.robot.coupled(self.setpoint)
+        self.setpoint = self.robot.coupling.positions(self.setpoint)
 
     def randomize_setpoints(self) -> None:
         """Draw a setpoint for each env, within the joint limits and 1 rad (or m) of the start
@@ -204,7 +204,7 @@ def recorded_robot(rollout: Rollout) -> Robot:
     # Another robot may have the name of a bundled one.
     if info.robot in Robot.bundled():
         bundled = Robot.load(info.robot, fixed_base=info.fixed_base)
-        if info.digest in (None, bundled.digest):
+        if info.digest in (None, content(bundled)):
             return bundled
     if info.urdf is None:
         problem = f"{info.robot!r} is not bundled, and the recording holds no description of it"

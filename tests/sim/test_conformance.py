@@ -304,7 +304,7 @@ def commands(case: tuple[str, str], runner: Runner) -> dict[str, np.ndarray]:
     if runner.control == "effort":
         setpoint = 0.3 * noise * np.minimum(robot.effort_limit, 50.0)
     elif start.tool_pose is None:
-        setpoint = robot.coupled(
+        setpoint = robot.coupling.positions(
             np.clip(robot.start + 0.2 * noise, robot.lower + 1e-3, robot.upper - 1e-3)
         )
     else:

@@ -446,7 +446,7 @@ def test_an_exception_of_another_signal_handler_closes_the_runner(sensors) -> No
         raise TimeoutError
 
     robot = Robot.load("quadruped", fixed_base=False) if sensors else ROBOT
-    options = {"contacts": [robot.links[-1].name], "engine": "sapien"} if sensors else {}
+    options = {"contacts": [robot.tables.bodies[-1].name], "engine": "sapien"} if sensors else {}
     with (
         Runner(robot, 2, workers=int(not sensors), **options) as runner,
         handler(signal.SIGALRM, fail),

@@ -126,7 +126,7 @@ def test_kinematics_and_dynamics_are_those_of_the_leaders(feature, native, monke
     tree, g, own = robot.kinematic_tree(), robot.coupling.matrix, robot.independent
     free = replace(tree, coupling=None)
     rng = np.random.default_rng(0)
-    qpos = robot.coupled(rng.normal(size=(5, robot.dof)))
+    qpos = robot.coupling.positions(rng.normal(size=(5, robot.dof)))
     qvel, qacc = (robot.coupling.rates(rng.normal(size=(5, robot.dof))) for _ in range(2))
     close = functools.partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
     close(ts.jacobian(tree, qpos, "l8")[..., own], ts.jacobian(free, qpos, "l8") @ g)
@@ -142,8 +142,8 @@ def test_kinematics_and_dynamics_are_those_of_the_leaders(feature, native, monke
     ):
         assert not unused.any()
     goal = ts.link_poses(tree, qpos, ["l8"])[:, 0]
-    found = ts.inverse_kinematics(tree, "l8", goal, robot.coupled(qpos + 0.1))
-    close(found.qpos, robot.coupled(found.qpos))
+    found = ts.inverse_kinematics(tree, "l8", goal, robot.coupling.positions(qpos + 0.1))
+    close(found.qpos, robot.coupling.positions(found.qpos))
     close(ts.link_poses(tree, found.qpos, ["l8"])[:, 0, :3], goal[:, :3], atol=2e-5)
 
 
@@ -172,8 +172,8 @@ def test_every_feature_is_in_an_exported_description(feature, kind, tmp_path):
         robot.fixed_base,
         tuple(robot.continuous),
     )
-    qpos = robot.coupled(np.random.default_rng(0).normal(size=(4, robot.dof)))
-    np.testing.assert_allclose(other.coupled(qpos), qpos, atol=1e-6)
+    qpos = robot.coupling.positions(np.random.default_rng(0).normal(size=(4, robot.dof)))
+    np.testing.assert_allclose(other.coupling.positions(qpos), qpos, atol=1e-6)
     np.testing.assert_allclose(
         other.mass_matrix(qpos), robot.mass_matrix(qpos), rtol=1e-5, atol=1e-6
     )
@@ -191,7 +191,7 @@ def test_every_feature_is_identified_or_refused(feature, tmp_path):
     motors = bp.make_actuators(robot.dof, armature=0.05, coulomb=1.0, viscous=2.0)
     with Runner(robot, 1, workers=0, ground=False, params=params, actuators=motors) as runner:
         runner.reset(start)
-        run = runner.rollout(robot.coupled(start + swing)[:, None])
+        run = runner.rollout(robot.coupling.positions(start + swing)[:, None])
     assert run.ok.all()
     path = write_recording(run, tmp_path / "run.h5")
     try:
@@ -210,7 +210,7 @@ def test_every_feature_is_identified_or_refused(feature, tmp_path):
 def test_every_feature_is_in_the_dynamics_of_the_c_header(feature, tmp_path):
     robot = robot_with(feature)
     n, rng = robot.dof, np.random.default_rng(0)
-    qpos, qvel = robot.coupled(rng.normal(size=(4, n))), rng.normal(size=(4, n))
+    qpos, qvel = robot.coupling.positions(rng.normal(size=(4, n))), rng.normal(size=(4, n))
     try:
         tree = robot.kinematic_tree()
         header = to_c(

@@ -48,7 +48,7 @@ class NowhereElse(Thermal):
 
 
 FREE = robot_with("floating base")
-SAPIENS_OWN = dataclasses.replace(ARM, dissipation="sapien")
+SAPIENS_OWN = dataclasses.replace(ARM, source=ARM.source._replace(dissipation="sapien"))
 ROW, ROWS, NAN = np.zeros(DOF), np.zeros((N, DOF)), np.array([[0.0, 0.0], [np.nan, 0.0]])
 
 

@@ -16,10 +16,10 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel, Rows
-from batchpid.sim.engine.mujoco.clearance import aligned, touching_pairs
+from batchpid.sim.engine.mujoco.clearance import touching_pairs
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import CONTACT, FARTHEST, WIDTH, FreeMotion
-from batchpid.sim.engine.native_model import NativeModel
+from batchpid.sim.engine.native_model import NativeModel, aligned, table
 
 _NONE, _SOME, _UNKNOWN = range(len(CONTACT))
 _COUNT = 37
@@ -43,17 +43,6 @@ def place_of_contacts() -> int | None:
     size = data.energy.ctypes.data - start
     places = np.flatnonzero(np.frombuffer(ctypes.string_at(start, size), np.int32) == _COUNT)
     return start - data._address + 4 * int(places[0]) if len(places) == 1 else None
-
-
-def _table(rows: Rows, size: int) -> Float64:
-    """Return ``rows`` (size | 1, columns) in blocks (blocks, columns, WIDTH)."""
-    blocks = -(-size // WIDTH)
-    out = aligned(blocks, rows.shape[1], WIDTH)
-    padded = np.broadcast_to(rows, (size, rows.shape[1]))[
-        np.minimum(np.arange(blocks * WIDTH), size - 1)
-    ]
-    out[...] = padded.reshape(blocks, WIDTH, -1).swapaxes(1, 2)
-    return out
 
 
 class FreeMotions:
@@ -112,7 +101,7 @@ class FreeMotions:
             "weight": [model.dof_invweight0[at] for model in kinds],
             "gravity": [model.opt.gravity for model in kinds],
         }
-        self._arrays |= {name: _table(np.array(rows), self.size) for name, rows in columns.items()}
+        self._arrays |= {name: table(np.array(rows), self.size) for name, rows in columns.items()}
         # In place, since native code has the address.
         self._structure.model = self._rigid.address
         for name, array in self._arrays.items():

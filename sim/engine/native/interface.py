@@ -73,6 +73,7 @@ class Group(ctypes.Structure):
             "mujoco",
             "constraint",
             "joints",
+            "lanes",
         ),
         *_all(ctypes.c_int64, "robots", "dof"),
         *_all(ctypes.c_int32, "gravity", "coriolis", "senses"),
