@@ -15,7 +15,8 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.robot import Robot, content
+from batchpid.sim.robot.reading import content
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.rollout import Rollout, RunInfo
 from batchpid.sim.runner.runner import Runner
 from batchpid.sim.signals.quantities import Observation
