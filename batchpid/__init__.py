@@ -95,7 +95,7 @@ __all__ = [
     "track",
 ]
 
-_MODULES = ("export", "metrics", "sim", "task_space", "trajectories")
+_MODULES = ("export", "metrics", "sim", "stages", "task_space", "trajectories")
 """Public modules, which are imported when they are used."""
 __getattr__ = attributes_of(__name__, _MODULES)
 
