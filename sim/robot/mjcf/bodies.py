@@ -24,7 +24,7 @@ from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.sim.findings import Finding, Notes
 from batchpid.sim.geometry.shapes import Shape, ShapeKind, possible_inertia
 from batchpid.sim.robot.mjcf.model import RobotInFile, can_collide, label
-from batchpid.sim.robot.mjcf.motors import Couplings, Motors
+from batchpid.sim.robot.mjcf.motors import Couplings, JointMotors
 from batchpid.sim.robot.tables import (
     NO_TURN,
     ORIGIN,
@@ -61,7 +61,7 @@ class TableReader:
         model: MjModel,
         robot: RobotInFile,
         notes: Notes,
-        motors: Motors,
+        motors: JointMotors,
     ) -> None:
         self._model = model
         self._robot = robot
