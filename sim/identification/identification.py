@@ -42,7 +42,8 @@ from batchpid.sim.identification.unknowns import (
     kinds_of,
 )
 from batchpid.sim.options.groups import Compensation
-from batchpid.sim.robot.robot import Robot, link_tree
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
 from batchpid.stages import Control
 from batchpid.task_space.tree_quantities import mass_matrix

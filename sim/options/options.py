@@ -29,20 +29,19 @@ from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction
 from batchpid.sim.options.groups import (
-    Control,
     Controller,
     ControlMode,
-    Faults,
+    ControlOptions,
     Option,
     Place,
     Ray,
-    Scene,
-    Timing,
-    Workers,
+    SceneOptions,
+    WorkerOptions,
     option,
 )
 from batchpid.sim.randomization.checks import check_params, prepared_actuators
-from batchpid.sim.robot.robot import Robot, describe, tuned_file
+from batchpid.sim.robot.reading import describe, tuned_file
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import fit_actuators, fit_guard, known_joints
 from batchpid.sim.robot.tables import MjcfFile
 from batchpid.sim.signals.quantities import (
@@ -57,11 +56,11 @@ from batchpid.sim.tool_space import OperationalSpace
 
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
-OPTION_GROUPS = (Scene, Timing, Control, Faults, Workers)
+OPTION_GROUPS = (SceneOptions, ControlOptions, WorkerOptions)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RunnerKeywords(Scene, Timing, Control, Faults, Workers):
+class RunnerKeywords(SceneOptions, ControlOptions, WorkerOptions):
     """Arguments of a :class:`batchpid.sim.Runner`, as they are passed; all but the first two may be
     left out.
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampled_loop import spectral_radius
 
 import batchpid as bp
-from batchpid import spectral_radius, stability_bound
+from batchpid import stability_bound
 from batchpid.gains import pid_from_inertia
 from batchpid.metrics import step_metrics
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampled_loop import spectral_radius
 
 import batchpid as bp
-from batchpid import spectral_radius
 from batchpid.errors import InvalidArgumentError
 from batchpid.export import to_ros2_control
 from batchpid.law import advance_with_mass_matrix, as_explicit

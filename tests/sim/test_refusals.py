@@ -100,7 +100,6 @@ ENTRIES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "BatchPID.reset": (PID.reset, {"measurement": ROWS}),
     "BatchPID.track": (PID.track, SAMPLE | {"effort": ROWS}),
     "stability_bound": (bp.stability_bound, BOUND),
-    "spectral_radius": (bp.spectral_radius, BOUND | {"ki": 1.0}),
     "load_params": (bp.load_params, {"path": "none.yaml"}),
     "Robot.load": (Robot.load, {"name_or_path": "panda"}),
     "Robot.params": (ARM.params, {"kp": 1.0}),
