@@ -118,9 +118,9 @@ def _of_base(
     """Return the inertias of the base (1, rows), and M_bb (rows, 6, 6), linear parts first: the
     momenta of the whole robot under the motions of its base.
     """
-    one = [leaf[None] for leaf in (bodies.base_mass, bodies.base_center, bodies.base_tensor)]
+    center, tensor = bodies.base_center[None], bodies.base_tensor[None]
     frame = xp.eye(3, 4, dtype=bodies.mass.dtype)[None, ..., None]
-    base = _inertias(one[0][:, 0], *one[1:], frame)
+    base = _inertias(bodies.base_mass, center, tensor, frame)
     # Composites of the joints on the base contain all bodies but the base itself.
     robot = [_on_base(tree, part)[None] + own for part, own in zip(whole, base, strict=True)]
     unit = xp.eye(6, dtype=bodies.mass.dtype)[..., None]

@@ -75,8 +75,8 @@ def evaluated(
         if v is None:
             velocities = None
         else:
-            rates = v.reshape(-1, tree.dof).T
-            velocities = velocities_of(tree, of_robots, motions, rates, xp, turning)
+            speeds = v.reshape(-1, tree.dof).T
+            velocities = velocities_of(tree, of_robots, motions, speeds, xp, turning)
         if link is not None:
             tool = tool_frame(tree, of_robots, motions, index, place)
             results["pose"] = pose_of(tool)
