@@ -10,7 +10,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,10 +22,8 @@ from batchpid.io.files import write_atomically
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.drawing import plot, view
-from batchpid.sim.cli.excite import excite_joints
-from batchpid.sim.cli.export import ENDINGS, export
-from batchpid.sim.cli.gains import compare, tune
-from batchpid.sim.cli.identify import identify_logs
+from batchpid.sim.cli.gains import ENDINGS, compare, export, tune
+from batchpid.sim.cli.identify import excite_joints, identify_logs
 from batchpid.sim.cli.inspect import inspect_robot
 from batchpid.sim.cli.rollout import demo, rollout
 from batchpid.sim.engine.protocol import load_engine
@@ -282,18 +280,17 @@ def bar(label: str, unit: str = "it") -> Progress[Any]:
     return partial(tqdm, desc=label, unit=unit, delay=1.0, leave=False, dynamic_ncols=True)
 
 
-def _lines(label: str, unit: str, items: Iterable[T]) -> Iterator[T]:
+def _lines(label: str, unit: str, items: Collection[T]) -> Iterator[T]:
     """Yield ``items``, with lines about how many are done."""
     began = time.monotonic()
     due = began + FIRST_SECONDS
-    total = f" of {len(items)}" if isinstance(items, Sized) else ""
+    total = len(items)
     for count, item in enumerate(items):
         now = time.monotonic()
         if now >= due and count:
             due = now + LINE_SECONDS
-            left = ""
-            if isinstance(items, Sized):
-                left = f", about {(now - began) * (len(items) / count - 1):.0f} s left"
-            text = f"{label}: {count}{total} {unit}, {now - began:.0f} s{left}"
-            print(f"batchpid: {text}", file=sys.stderr, flush=True)
+            spent = now - began
+            left = spent * (total / count - 1)
+            text = f"{count} of {total} {unit}, {spent:.0f} s, about {left:.0f} s left"
+            print(f"batchpid: {label}: {text}", file=sys.stderr, flush=True)
         yield item

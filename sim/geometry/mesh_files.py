@@ -19,7 +19,7 @@ from lxml import etree
 
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
-from batchpid.io.packages import imported
+from batchpid.io.files import imported
 
 LARGEST_NUMBER = 1e18
 """Largest magnitude of a number of a file, whose square fits in single precision."""

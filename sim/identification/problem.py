@@ -37,7 +37,7 @@ MOST_WINDOWS = 500
 """Largest number of windows; if there are more, evenly spaced ones are used."""
 MOST_ROWS = 40_000
 """Largest number of rows of all logs; if there are more, evenly spaced ones are used."""
-ENVS = 2048
+ENVS = 1024
 """Most simulations at once."""
 STATE_STEPS = 1e-3, 1e-2
 """Changes of initial positions and velocities."""
@@ -84,7 +84,7 @@ class Problem:
         fitted rows are evaluated if ``held_out``, and are empty otherwise.
         """
         joints = self.windows[0].measured.shape[1]
-        free = free_states and self.data[0].drive.params is None
+        free = free_states and self.data[0].drive.mode == "effort"
         shifts = np.diag(np.repeat(STATE_STEPS, joints * free))
         # Rows: the point, each change of it, a change of each initial state.
         moved = point[None] if changes is None else np.vstack([point, point + changes])
@@ -118,7 +118,7 @@ class Problem:
         parts = [self.data[self.windows[number].log] for number in group]
         stretches = [self.windows[number].stretch for number in group]
         drive = parts[0].drive
-        if drive.params is not None:
+        if drive.mode == "pid":
             # A column of rows: other options are equal in all logs of a group.
             rows: Any = zip(*[part.drive.params for part in parts * len(points)], strict=True)
             leaves: Any = [
@@ -199,7 +199,7 @@ def windows_of(data: Sequence[LogData]) -> list[Window]:
         split = round(share * total)
         length = total
         starts = [0]
-        if part.drive.params is None:
+        if part.drive.mode == "effort":
             # Windows of the fitted part, then of the held-out part; the filter begins at the edge.
             edge = round(0.05 / dt)
             first = max(split + 1, edge)
@@ -225,7 +225,7 @@ def _window(
     log, motion, _, drive = data
     dt = drive.timestep
     settle = 0.0
-    if drive.params is not None:
+    if drive.mode == "pid":
         settle = min(SETTLE, 0.2 * log.seconds) / dt
     place = (log.time - log.time[0]) / dt
     rows = np.flatnonzero((place > first + settle + 1e-6) & (place <= last + 1e-6))[::every]

@@ -24,15 +24,13 @@ import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.motors.actuators import Actuators
+from batchpid.motors.friction import Friction
 from batchpid.sim.identification.log import Log, interpolated
-from batchpid.sim.identification.simulator import (
-    Dynamics,
-    LogControl,
-    Plant,
-    PlantCandidates,
-    SimulatedControl,
-)
+from batchpid.sim.identification.simulator import Candidates, Plant
+from batchpid.sim.loop.loop_run import LoopRun, Playback
 from batchpid.sim.robot.robot import Robot
+from batchpid.stages import Control
+from batchpid.task_space.tree_quantities import inverse_dynamics
 
 VALUES = "armature", "damping", "friction", "strength", "bias", "cost"
 """Results for a joint."""
@@ -46,7 +44,7 @@ delay of setpoints is negative where they were logged late. Loops have short del
 """
 EDGE_SECONDS = 0.15
 """Time left out at both ends of a log, where the filter begins [s]."""
-LONGEST_PART = 60.0
+LONGEST_PART = 30.0
 """Length of a log that is used [s]."""
 MOST_REGRESSION_ROWS = 4000
 """Most rows of a regression."""
@@ -91,7 +89,7 @@ class LogData(NamedTuple):
     log: Log
     motion: Motion
     plant: Plant
-    drive: LogControl
+    drive: Control
 
 
 class Guess(NamedTuple):
@@ -149,7 +147,7 @@ def regress(data: Sequence[LogData]) -> list[Guess]:
     every = 1 + sum(len(part.motion.qpos) for part in data) // MOST_REGRESSION_ROWS
     cutoff = min(_cutoff(part.log) for part in data)
     shifts, delays = SETPOINT_DELAYS, LOOP_DELAYS
-    if data[0].drive.params is None:
+    if data[0].drive.mode == "effort":
         shifts, delays = np.zeros(1), EFFORT_DELAYS
     tables = [_table(part, delays, every, cutoff) for part in data]
     *columns, efforts = (np.concatenate(parts, axis=-2) for parts in zip(*tables, strict=True))
@@ -193,14 +191,14 @@ def _table(
     rows = np.arange(edge, len(motion.qpos) - edge, every)
     links = _force(part, motion.qpos[rows], motion.qvel[rows], motion.qacc[rows])
     efforts = _commanded(part)
-    if part.drive.compensate != "none":
-        speed = 0.0 if part.drive.compensate == "gravity" else 1.0
+    if part.drive.gravity:
+        speed = float(part.drive.coriolis)
         compensation = _force(part, motion.qpos, speed * motion.qvel, 0 * motion.qacc)
-        if part.drive.through:
-            efforts = efforts + compensation
-        else:
+        if part.drive.further:
             links -= compensation[rows]
-    if part.drive.params is None:
+        else:
+            efforts = efforts + compensation
+    if part.drive.mode == "effort":
         efforts = lowpass(efforts[0], cutoff, dt)[None]
     time = dt * np.arange(len(motion.qpos))
     late = [[interpolated(time[rows] - delay, time, u) for delay in delays] for u in efforts]
@@ -216,35 +214,31 @@ def _force(
     qacc: Float64,
 ) -> Float64:
     """Return the efforts (rows, joints) that the links need to move so, without motors."""
-    dynamics = Dynamics(
-        part.plant,
-        {},
-        np.array(qpos),
-        np.array(qvel),
-    )
-    return dynamics.force + (dynamics.matrix @ qacc[..., None])[..., 0]
+    plant = part.plant
+    state = map(plant.spread, (qpos, qvel, qacc))
+    return np.asarray(inverse_dynamics(plant.tree, *state)[:, plant.columns], float)
 
 
 def _commanded(part: LogData) -> Float64:
     """Return logged efforts (1, steps, joints), or the law's along a motion (setpoint delays,
     steps, joints).
     """
-    motion, drive = part.motion, part.drive
-    if drive.params is None:
+    motion, drive, plant = part.motion, part.drive, part.plant
+    if drive.mode == "effort":
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
     none = np.zeros(count)
-    ideal = PlantCandidates(Actuators(), {}, none, none, {})
-    q, v = (np.repeat(table[:, None], count, axis=1) for table in motion[:2])
-    dynamics = Dynamics(part.plant, {}, q[0], v[0])
-    qpos, qvel = q[0].copy(), v[0].copy()
-    control = SimulatedControl(drive, ideal, dynamics, qpos, qvel)
+    alone = drive._replace(gravity=False, coriolis=False, further=())
+    loop = plant.loop(alone, Candidates(Actuators(), {}, none, none, {}, {}))
+    loop = replace(loop, control=loop.control._replace(friction=Friction()))
+    tables = [np.repeat(plant.spread(table)[:, None], count, axis=1) for table in motion[:2]]
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)
-    efforts = np.empty(q.shape)
-    for step in range(steps):
-        control.command[...] = motion.command[np.clip(step - late, 0, steps - 1)]
-        qpos[...], qvel[...] = q[step], v[step]
-        efforts[step] = control.advance()
+    setpoints = motion.command[np.clip(np.arange(steps)[:, None] - late, 0, steps - 1)]
+    moving = loop.changed(plant=Playback(*tables))
+    run = LoopRun(moving, tables[0][0], tables[1][0], plant.spread(setpoints[0]), steps)
+    run.setpoints[...] = plant.spread(setpoints)
+    run.run(steps)
+    efforts: Float64 = run.effort[..., plant.columns]
     return efforts.swapaxes(0, 1)
 
 

@@ -19,7 +19,6 @@ from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.group_control import control_of
 from batchpid.sim.loop.tree_plant import DYNAMICS, TreePlant
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control, stages_of
 from batchpid.stages.stage import States, placed, started, stepped
@@ -99,7 +98,7 @@ class ClosedLoop:
         plant = self._placed(qpos, qvel)
         xp = namespace(*self.plant.read(plant))
         episode = xp.zeros(self.control.envs, int)
-        values = self._values(plant, Command(None), Step(0, 1), episode)
+        values = self.values(plant, Command(None), Step(0, 1), episode)
         return LoopState(plant, started(stages_of(self.control), values), episode)
 
     def reset(
@@ -113,7 +112,7 @@ class ClosedLoop:
         mask = xp.ones(self.control.envs, bool) if mask is None else xp.asarray(mask)
         episode = state.episode + mask
         plant = replace_envs(state.plant, fresh, mask)
-        values = self._values(plant, Command(None), Step(0, 1), episode)
+        values = self.values(plant, Command(None), Step(0, 1), episode)
         return LoopState(
             plant, placed(stages_of(self.control), state.stages, values, mask), episode
         )
@@ -156,7 +155,7 @@ class ClosedLoop:
             step = Step(index, substeps, self.control.left(index, substeps))
             # The law and the robots have the same dynamics, computed once.
             shared = evaluated(self.tree, DYNAMICS, *self.plant.read(plant))
-            values = self._values(plant, command, step, episode, shared["bias"])
+            values = self.values(plant, command, step, episode, shared["bias"])
             states, values = stepped(stages, states, values)
             if isinstance(self.plant, TreePlant):
                 plant = self.plant.step(plant, values.outputs.qf, shared)
@@ -190,7 +189,7 @@ class ClosedLoop:
         place, rate = (xp.broadcast_to(xp.asarray(rows, float), shape) for rows in (start, rest))
         return self.plant.init(place, rate)
 
-    def _values(
+    def values(
         self,
         plant: Pytree,
         command: Command,
@@ -210,8 +209,11 @@ class ClosedLoop:
                 return 0.0 * qpos
             return bias(tree, qpos, qvel if control.coriolis else 0.0 * qvel)
 
+        # The joints show the masses of the plant.
+        bodies = getattr(self.plant, "bodies", None)
+
         def joint_matrix(qpos: Array) -> Array:
-            matrix = mass_matrix(tree, qpos)
+            matrix = mass_matrix(tree, qpos, bodies)
             motors = control.actuators
             if motors is None or motors.armature is None:
                 return matrix
@@ -287,7 +289,7 @@ def closed_loop(
         friction,
         slice(0, num_envs),
         controller and _Traced(controller),
-        DISSIPATION[scene.dissipation].modelled,
+        scene.dissipation == "urdf",
     )
     tree = robot.kinematic_tree(armature=np.zeros(robot.dof)).held
     if plant is None:

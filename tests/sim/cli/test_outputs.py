@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from pathlib import Path
 
 import pytest
 from commands_that_write import SHORT, WORDS, output, output_flags
-from tiny_urdf import one_joint
 
-from batchpid.sim.cli import parse
 from batchpid.sim.cli.commands import COMMANDS
-
-MJCF = "<mujoco><worldbody><body><joint name='a'/><geom size='.1'/></body></worldbody></mujoco>"
 
 
 @pytest.fixture
@@ -46,13 +41,6 @@ def test_an_existing_output_is_refused_before_the_run(
     assert "another name" in complaint
     assert [each.name for each in tmp_path.iterdir()] == [path.name]
     assert path.read_text() == "kept"
-
-
-def test_every_command_with_outputs_has_force():
-    assert WORDS.keys() == {name for name, _ in output_flags()}
-    fields = {name: dataclasses.fields(command.record()) for name, command in COMMANDS.items()}
-    have = {name for name in fields if "force" in {field.name for field in fields[name]}}
-    assert have == WORDS.keys()
 
 
 @pytest.mark.slow
@@ -121,26 +109,3 @@ def test_a_file_that_a_command_reads_is_never_replaced(
         ), complaint
         assert (tmp_path / file).read_text() == "kept"
         path.unlink()
-
-
-@pytest.mark.parametrize(("target", "file"), [("urdf", "arm.urdf"), ("mjcf", "arm.xml")])
-def test_an_export_does_not_replace_its_robot(target, file, batchpid, tmp_path):
-    text = MJCF if file.endswith("xml") else one_joint()
-    (path := tmp_path / file).write_text(text)
-    status, _, complaint = batchpid("export", path, "--to", target, "--out", path, "--force")
-    assert (status, "out: is a file to read" in complaint, path.read_text()) == (2, True, text)
-
-
-def test_make_can_repeat_its_runs():
-    makefile = (Path(__file__).parents[3] / "Makefile").read_text().replace("\\\n", "")
-    runs = [
-        line.partition(" -m batchpid ")[2].split()
-        for line in makefile.splitlines()
-        if " -m batchpid " in line
-    ]
-    assert {words[0] for words in runs} == {"demo"}
-    assert all("--force" in words for words in runs)
-    demo = next(words for words in runs if words[0] == "demo")
-    assert demo.pop() == "$(ARGS)"  # last, so that they win
-    _, command = parse([*demo, "--picture", "mine.png"])
-    assert (command.force, command.picture) == (True, Path("mine.png"))
