@@ -248,8 +248,6 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     ``table`` has (rows,) the effort that the links need, acceleration, speed, its sign, and the
     effort of the motor.
     """
-    from scipy.optimize import nnls
-
     target, *motion, effort = table
     columns: Any = np.stack([*(-column for column in motion), effort, target], axis=1)
     # The bias is the mean of what is left, so that the others are found without it.
@@ -261,11 +259,51 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     prior = np.sqrt(len(target)) * weight * size[3] + 1e-12
     rows = np.vstack([columns, [0.0, 0.0, 0.0, prior, prior]])
     triangle: Any = np.linalg.qr(rows / np.append(size[:4], 1.0), mode="r")
-    values = nnls(triangle[:, :4], triangle[:, 4])[0] / size[:4]
+    least = np.zeros(4)
+    values = bounded_solution(triangle[:, :4], triangle[:, 4], least, least + np.inf) / size[:4]
     residual = columns[:, 4] - columns[:, :4] @ values
     bias = center[4] - center[:4] @ values
     motor = (values[3] * size[3]) ** 2 + 1e-3 * size[4] ** 2
     return [*values, bias, float(np.log((residual**2).mean() / motor + 1e-12))]
+
+
+def bounded_solution(
+    rows: Float64,
+    target: Float64,
+    low: Float64,
+    high: Float64,
+) -> Float64:
+    """Return the x (n,) between ``low`` <= 0 and ``high`` >= 0 that minimises |rows x - target|.
+
+    From 0 on, x goes to the minimum over its free entries, or to the first bound in between, whose
+    entry is then held; at a minimum the entry is freed that the gradient drives off its bound the
+    most (P. B. Stark and R. L. Parker, "Bounded-variable least squares", 1995).
+    """
+    x = np.zeros(len(low))
+    free = low < high
+    movable = free.copy()
+    for _ in range(10 * len(x)):
+        aim = x.copy()
+        rest = target - rows[:, ~free] @ x[~free]
+        aim[free] = np.linalg.lstsq(rows[:, free], rest, rcond=None)[0]
+        ends = np.where(aim < low, low, high)
+        beyond = free & ((aim < low) | (aim > high))
+        if beyond.any():
+            steps = np.full(len(x), np.inf)
+            steps[beyond] = ((ends - x)[beyond] / (aim - x)[beyond]).clip(0.0)
+            first = steps == steps.min()
+            x += steps.min() * (aim - x)
+            x[first] = ends[first]
+            free &= ~first
+            continue
+        x = aim
+        push = rows.T @ (target - rows @ x)
+        inward = movable & ~free & np.where(x <= low, push > 0, push < 0)
+        size = np.linalg.norm(rows, axis=0) * np.linalg.norm(target)
+        if not (np.abs(push)[inward] > 1e-12 * size[inward]).any():
+            break
+        free[np.argmax(np.abs(push) * inward)] = True
+    return x
 
 
 def better_reading(
