@@ -352,14 +352,6 @@ def within(
     return rows
 
 
-def joint_speeds(
-    argument: str, value: ArrayLike, joint_names: Sequence[str]
-) -> NDArray[np.float64]:
-    """Return ``value`` as one positive number per joint (dof,)."""
-    rows = array(argument, value, (1, len(joint_names)), joint_names)
-    return at_least(argument, rows[0].copy(), 0.0, joint_names, above=True)
-
-
 def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_]:
     """Return ``value`` as one bool per env (envs,), a copy."""
     mask = read_array(argument, value, "b").copy()

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import DType, Rows
-from batchpid.native.extensions import PROGRAM, StaleExtensionError, load
+from batchpid.errors import warn
+from batchpid.native.extensions import PROGRAM, TASK_SPACE, Extension, StaleExtensionError, load
 from batchpid.native.tracing import Trace
 
 NUMBERS_PER_THREAD = 2**17
@@ -145,3 +146,32 @@ class ArrayProgram:
         new = (self.shape, self.dtype)
         fixed = self._program, self.shape[0], tuple(inputs), tuple(outputs)
         return partial(native.call, native.bind(*fixed, given, full, new, self._threads))
+
+
+SWITCH = "BATCHPID_NATIVE"
+"""Environment variable: "0" switches native code off."""
+
+
+def obstacle(*extensions: Extension) -> str:
+    """Return why native code is not used, "" if it is; a faulty installation gives one
+    RuntimeWarning per process.
+
+    ``extensions`` are needed besides the extensions of this package.
+    """
+    if os.environ.get(SWITCH) == "0":
+        return f"native code is switched off by {SWITCH}=0"
+    return _fault((PROGRAM, TASK_SPACE)) or _fault(extensions)
+
+
+@cache
+def _fault(extensions: tuple[Extension, ...]) -> str:
+    try:
+        for extension in extensions:
+            load(extension)
+        interpreter()
+    except StaleExtensionError as error:
+        warn(f"native code is not used, only Python: {error}", RuntimeWarning)
+        return str(error)
+    except ModuleNotFoundError as error:
+        return str(error)
+    return ""

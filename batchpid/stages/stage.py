@@ -10,13 +10,19 @@ restart of some envs is :func:`started` under a mask, and a native program is a 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, ClassVar, NamedTuple, Self
+
+import numpy as np
 
 from batchpid.arrays.array_types import Array, Pytree
-from batchpid.arrays.elementwise import replace_envs
+from batchpid.arrays.elementwise import namespace, replace_envs
+from batchpid.arrays.trees import filled, leaves, mapped, structure
+from batchpid.native.array_program import ArrayProgram
+from batchpid.native.tracing import Trace, trace_trees
 from batchpid.stages.control import Control
-from batchpid.stages.values import Told, Values
+from batchpid.stages.values import Outputs, Told, Values
 
 States = tuple[Pytree, ...]
 """State of each stage, a tree of arrays (M, ...)."""
@@ -34,7 +40,7 @@ class Stage:
     after: ClassVar[str]
     """Name of the stage before it, for a stage of the caller's."""
     native: ClassVar[str] = ""
-    """Kind of stage in tick.h that replaces ``step`` in native code; "": a trace of ``step`` runs."""
+    """Entry of StageKind in tick.h that replaces ``step`` in native code; "": a trace of ``step`` runs."""
     calls_model: ClassVar[bool] = False
     """Whether ``step`` calls functions of the robots' model, which no program has."""
     is_brief: ClassVar[bool] = False
@@ -136,3 +142,133 @@ def by_name(stages: Iterable[Any], states: States) -> dict[str, Pytree]:
     """Return the states by the names of their stages, as a snapshot holds them."""
     pairs = zip(stages, states, strict=True)
     return {stage.name: state for stage, state in pairs if not stage.is_brief}
+
+
+@dataclass(frozen=True)
+class Last(Stage):
+    """Keeps ``qf`` and ``motor`` for the stages of the caller, which find them in
+    :attr:`.Values.last`.
+    """
+
+    name = "last"
+
+    @classmethod
+    def of(cls, control: Control) -> Self | None:
+        return cls() if control.further else None
+
+    def init(self, values: Values) -> Told:
+        qpos = values.measured.qpos
+        zero = namespace(qpos).zeros_like(qpos)
+        return Outputs(qf=zero, motor=zero), values
+
+    def step(self, state: Outputs, values: Values) -> Told:
+        outputs = values.outputs
+        return Outputs(qf=outputs.qf, motor=outputs.motor), values
+
+
+class StageProgram:
+    """Stages, their states, and the values before them, whose arrays it reads.
+
+    It changes the arrays of ``states`` in place. It makes new arrays for the ``values`` that it
+    changes: for the outputs alone, or with ``passes`` for all, which stages after it read.
+
+    Attributes
+    ----------
+    values
+        The values after the stages.
+    program, inputs, outputs
+        The program and its arrays.
+
+    Raises
+    ------
+    AttributeError, AssertionError, TypeError
+        A stage uses an operation that programs do not have.
+    """
+
+    def __init__(
+        self,
+        stages: Sequence[Any],
+        states: States,
+        values: Values,
+        shape: tuple[int, int],
+        passes: bool = False,
+    ) -> None:
+        constants = mapped(_split, running(stages))
+        # Programs have no keys of noise, counts, or state of a controller.
+        states = mapped(_number, tuple(states))
+        state, self.inputs = leaves(states), leaves((states, values))
+        histories = tuple([array.ndim == 3 for array in state])
+        traced = _trace(histories, passes, *map(structure, (constants, states, values)))
+        masks = traced.program.masks
+        self.outputs = [np.zeros(shape, bool if is_mask else float) for is_mask in masks]
+        for array, place in zip(state, traced.places, strict=False):  # the state comes first
+            if place >= len(self.inputs):
+                self.outputs[place - len(self.inputs)] = array
+        arrays = [*self.inputs, *self.outputs]
+        _, after = filled(traced.changed, iter([arrays[place] for place in traced.places]))
+        self.values = after._replace(noise=None) if passes else values._replace(outputs=after)
+        self.program = ArrayProgram(traced.program, leaves(constants), len(self.inputs), shape)
+
+    def __call__(self) -> None:
+        """Run the program on its arrays."""
+        self.program(*self.inputs, out=self.outputs)
+
+
+class _Traced(NamedTuple):
+    """Program of consecutive stages."""
+
+    program: Trace
+    changed: Pytree
+    """Structure of the states and the values after it."""
+    places: tuple[int, ...]
+    """Index of each of their arrays: inputs first, then results."""
+
+
+@lru_cache(maxsize=64)
+def _trace(
+    histories: tuple[bool, ...],
+    passes: bool,
+    constants: Any,
+    states: Any,
+    values: Any,
+) -> _Traced:
+    """Return the program of stages.
+
+    The last three are structures of the stages, their states and the values before them.
+    ``histories`` says which arrays of the states are histories, which a program changes in place.
+    """
+    count = len(leaves((states, values)))
+    parts: list[Any] = []
+
+    def function(stages: Any, states: States, values: Values) -> list[Any]:
+        numbers = {symbol: number for number, symbol in enumerate(leaves((states, values)))}
+        new, after = stepped(stages, states, values)
+        changed = new, after if passes else after.outputs
+        outputs = set(map(id, leaves(after.outputs)))
+        results, places = list[Any](), list[int]()
+        for at, leaf in enumerate(leaves(changed)):
+            is_state = at < len(histories)
+            number = numbers.get(leaf)
+            if is_state and (number == at or histories[at]):
+                places.append(at)
+            # An output that is an input is copied, since the next sim step changes the input.
+            elif number is not None and not is_state and id(leaf) not in outputs:
+                places.append(number)
+            else:
+                places.append(count + len(results))
+                results.append(leaf)
+        parts[:] = structure(changed), tuple(places)
+        return results
+
+    program = trace_trees(function, constants, states, values)
+    return _Traced(program, *parts)
+
+
+def _number(array: Array) -> Any:
+    """Return an array of numbers in double precision; None for another."""
+    return array if array.dtype == np.float64 else None
+
+
+def _split(array: Array) -> Any:
+    """Return an array (n, envs, dof) as a tuple of n arrays, and other arrays unchanged."""
+    return tuple(array) if array.ndim == 3 else array

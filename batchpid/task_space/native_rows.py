@@ -19,7 +19,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Float64
-from batchpid.native.availability import SWITCH, obstacle
+from batchpid.native.array_program import SWITCH, obstacle
 from batchpid.native.extensions import KINEMATICS, TASK_SPACE, load
 from batchpid.task_space.rigid_tree import RigidTree
 

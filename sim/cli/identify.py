@@ -18,7 +18,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 from batchpid.sim import Robot
 from batchpid.sim.cli.flags import flag
-from batchpid.sim.diagnosis.text import table
+from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.options.groups import Compensation
 from batchpid.trajectories import Trajectory

@@ -20,8 +20,13 @@ from batchpid.checks.validate import array
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Robot, Rollout, write_recording
 from batchpid.sim.cli.flags import BOUNDS, Gains, NumEnvs, Randomize, flag
-from batchpid.sim.diagnosis.causes import settled_envs
-from batchpid.sim.diagnosis.text import cause_lines, median_and_worst, overshoot_of_settled, table
+from batchpid.sim.diagnosis.causes import (
+    cause_lines,
+    median_and_worst,
+    overshoot_of_settled,
+    settled_envs,
+    table,
+)
 from batchpid.sim.tuning.evaluation import (
     following_error,
     load_randomization,
@@ -142,7 +147,7 @@ def rollout(
     if control == "osc":
         _refuse("gains", gains, "are for the control of joints")
         _refuse("trajectory", trajectory, "has joint setpoints, and excludes --control osc")
-        operational = OperationalSpace(robot, robot.rigid_tree.tool, posture=robot.target)
+        operational = OperationalSpace(robot, robot.kinematic_tree().tool, posture=robot.target)
         options["control"] = operational
         columns = operational.command.names
         goal = operational.tool_pose(robot.target)
@@ -216,7 +221,8 @@ def start_poses(
     reach = np.minimum(spread, (robot.upper - robot.lower) / 4)
     poses = center + reach * random.uniform(-1.0, 1.0, (num_envs, robot.dof))
     poses[0] = center
-    return robot.coupled(np.clip(poses, robot.lower, robot.upper))
+    coupled: Float64 = robot.coupling.positions(np.clip(poses, robot.lower, robot.upper))
+    return coupled
 
 
 def _refuse(name: str, value: Any, problem: str) -> None:

@@ -41,8 +41,8 @@ from batchpid.sim.identification.unknowns import (
     kinds_of,
 )
 from batchpid.sim.options.groups import Compensation
-from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
 from batchpid.stages import Control
 from batchpid.task_space.tree_quantities import mass_matrix
@@ -153,7 +153,7 @@ def _payload_links(robot: Robot, name: str | None) -> list[str | None]:
     """Return the links where a payload may be: the one with a ``name``, or the last link with a
     mass that is fixed behind the tool, and the tool.
     """
-    tree = robot.rigid_tree
+    tree = link_tree(robot)
     if name is not None:
         return [choice("payload_link", name, tree.links)]
     body = tree.link_bodies[tree.index(tree.tool)]
@@ -236,7 +236,7 @@ def _prepared(
     free = (qpos.min(0) < robot.lower[joints]) | (qpos.max(0) > robot.upper[joints])
     # A Runner compensates the friction of the description and of the robot's motors, too.
     modelled = {}
-    friction = (robot.friction + known_joints(robot).coulomb)[joints]
+    friction = (robot.friction + known_joints(robot)["coulomb"])[joints]
     if "friction" in compensated and friction.any():
         band = np.array([FRICTION_BAND[robot.units[joint]] for joint in joints])
         turns = robot.continuous[joints] / TURN
@@ -276,8 +276,7 @@ def _own_timestep(log: Log) -> float:
 
 def _resting(robot: Robot, start: Float64) -> Robot:
     """Return ``robot`` with the start pose ``start`` (dof,)."""
-    reading = robot.reading._replace(defaults=FileDefaults(start))
-    return replace(robot, settings=None, reading=reading)
+    return replace(robot, settings=None, source=robot.source._replace(start=start))
 
 
 def _option(

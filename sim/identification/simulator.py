@@ -24,6 +24,7 @@ from batchpid.sim.loop.closed_loop import ClosedLoop
 from batchpid.sim.loop.loop_run import LoopRun
 from batchpid.sim.loop.tree_plant import TreePlant
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.stages import Control, Stage, Told, Values
 from batchpid.task_space.frames import SpatialInertia, spatial_matrix
 from batchpid.task_space.tree_quantities import mass_matrix
@@ -129,7 +130,7 @@ class Plant:
             leader = number[coupling.leader[joint]]
             ratio = coupling.multiplier[joint]
             followers.append(Follower(number[joint], leader, ratio, coupling.offset[joint]))
-        tree = robot.rigid_tree.fixed_at(coupling.positions(robot.start), moves)
+        tree = link_tree(robot).fixed_at(coupling.positions(robot.start), moves)
         self.tree = replace(tree, coupling=Coupling.of(tree.dof, followers))
         """Rigid tree of the logged joints and their followers."""
         self.joints = len(logged)

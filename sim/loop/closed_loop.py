@@ -19,7 +19,6 @@ from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.group_control import control_of
 from batchpid.sim.loop.tree_plant import TreePlant
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control, stages_of
 from batchpid.stages.stage import States, placed, started, stepped
@@ -279,7 +278,7 @@ def closed_loop(
         friction,
         slice(0, num_envs),
         controller and _Traced(controller),
-        DISSIPATION[scene.dissipation].modelled,
+        scene.dissipation == "urdf",
     )
     tree = robot.kinematic_tree(armature=np.zeros(robot.dof)).held
     if plant is None:

@@ -12,11 +12,11 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import WIDTH, FreeMotion, Group
+from batchpid.sim.engine.native.interface import WIDTH, structure
 from batchpid.sim.engine.native_model import NativeModel, NativeRefresh, aligned, table
 from batchpid.sim.loop.closed_loop import ClosedLoop, LoopState
 from batchpid.sim.loop.group_control import GroupControl
-from batchpid.sim.loop.native_program import Buffers, TickProgram
+from batchpid.sim.loop.native_executor import Buffers, TickProgram
 from batchpid.sim.loop.tree_plant import IMPEDANCE, TreePlant
 from batchpid.stages import stages_of
 from batchpid.stages.friction import REFRESH_STEPS
@@ -143,7 +143,7 @@ class Lanes:
         self.steps_natively = isinstance(plant, TreePlant)
         self._control = loop.control
         self._start = qpos, qvel
-        self._group = Group(robots=self.size, dof=self.dof)
+        self._group = structure("Group")(robots=self.size, dof=self.dof)
         if not isinstance(plant, TreePlant):
             return
         if plant.bodies.mass.ndim > 2:
@@ -162,7 +162,7 @@ class Lanes:
             "low": plant.low,
             "high": plant.high,
         }
-        free = FreeMotion(
+        free = structure("FreeMotion")(
             model=self.joint_model.address,
             stiffness=(most * plant.limit_time) ** -2.0,
             rate_gain=2.0 / (most * plant.limit_time),

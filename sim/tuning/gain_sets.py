@@ -10,8 +10,9 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.diagnosis.text import table
+from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.options.groups import ControlMode
+from batchpid.sim.robot.reading import tuned_file
 from batchpid.sim.robot.robot import Robot
 
 
@@ -25,7 +26,7 @@ class GainSet(NamedTuple):
 
 def default_gains(robot: Robot) -> str:
     """Return the name of the gains that a robot has by default."""
-    if robot.has_tuned:
+    if tuned_file(robot) is not None:
         return "tuned"
     return "designed"
 

@@ -32,6 +32,7 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import package_versions
 from batchpid.sim.options.groups import DEFAULT_ENGINE, EngineName
 from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.robot.reading import describe
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.candidates import FACTORS, Candidates
 from batchpid.sim.tuning.evaluation import EVALUATION_SUBSTEPS, Comparison, compare, reseeded
@@ -236,7 +237,7 @@ def tune(
     best = int(finalists[np.argmin(final_costs)])
 
     settings: Document = {
-        **robot.describe(),
+        **describe(robot),
         "seed": seed,
         "generations": len(history),
         "population": population,

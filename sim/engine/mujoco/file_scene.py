@@ -19,10 +19,10 @@ from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.findings import Notes
-from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.merging import coupling_of
 from batchpid.sim.robot.mjcf.model import RobotInFile, compile_scene
 from batchpid.sim.robot.mjcf.reader import home
-from batchpid.sim.robot.parts import MjcfFile
+from batchpid.sim.robot.tables import MjcfFile
 from batchpid.task_space.frames import inverse, matrix_of, rotate
 
 REMOVED = ("tuples", "sensors", "actuators", "keys", "cameras", "lights")

@@ -22,17 +22,19 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.sim.findings import Finding, Notes
-from batchpid.sim.geometry.inertia import possible_inertia
-from batchpid.sim.geometry.shapes import Shape, ShapeKind
-from batchpid.sim.robot.mjcf.model import RobotInFile, can_collide, label, unique
+from batchpid.sim.geometry.shapes import Shape, ShapeKind, possible_inertia
+from batchpid.sim.robot.mjcf.model import RobotInFile, can_collide, label
 from batchpid.sim.robot.mjcf.motors import Couplings, Motors
-from batchpid.sim.robot.parts import DisabledPair, Joint, Mimic
 from batchpid.sim.robot.tables import (
     NO_TURN,
     ORIGIN,
     Body,
+    DisabledPair,
+    Joint,
+    Mimic,
     Tables,
     breadth_first,
+    unique,
     without_mass,
 )
 from batchpid.task_space.frames import about, compose, matrix_of, rotate

@@ -20,6 +20,7 @@ from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
 from batchpid.sim.findings import Finding, Notes
+from batchpid.sim.robot.tables import unique
 
 PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 _PREFIXES = (
@@ -178,17 +179,6 @@ def can_collide(model: MjModel, geom: int) -> bool:
     """Return whether a geom collides with anything, by its masks or in a ``<pair>``."""
     paired = geom in model.pair_geom1 or geom in model.pair_geom2
     return bool(model.geom_contype[geom] | model.geom_conaffinity[geom]) or paired
-
-
-def unique(name: str, names: set[str]) -> str:
-    """Return ``name``, with a number if it is one of ``names``, and add it to them."""
-    new = name
-    number = 2
-    while new in names:
-        new = f"{name}_{number}"
-        number += 1
-    names.add(new)
-    return new
 
 
 class RobotInFile:

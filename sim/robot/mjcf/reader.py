@@ -12,6 +12,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Document, Float64, MjModel
 from batchpid.arrays.elementwise import read_only
+from batchpid.errors import RobotError
 from batchpid.motors import make_actuators
 from batchpid.sim.findings import Finding, Notes
 from batchpid.sim.robot.mjcf.bodies import TableReader, excluded_pairs
@@ -24,8 +25,7 @@ from batchpid.sim.robot.mjcf.model import (
     label,
 )
 from batchpid.sim.robot.mjcf.motors import read_couplings, read_motors
-from batchpid.sim.robot.parts import FileDefaults, MjcfFile
-from batchpid.sim.robot.tables import Source
+from batchpid.sim.robot.tables import MjcfFile, Source
 from batchpid.task_space.rigid_tree import GRAVITY
 
 _KEYFRAME = "home"
@@ -44,15 +44,34 @@ _SWITCHES = (
 def read_mjcf(
     path: Path,
     name: str,
+    findings: list[Finding],
     fixed_base: bool | None,
     missing_meshes: str,
 ) -> Source:
-    """Return the content of the MJCF file at ``path`` as the robot ``name``.
+    """Return the content of the MJCF file at ``path`` as the robot ``name``, with ``findings`` of
+    reading the file.
 
     For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses
     the file, it has a ball joint or several robots, or missing meshes are refused.
     """
-    notes = Notes([], [])
+    # MuJoCo opens the file by its path, and workers do so again.
+    if not path.is_file():
+        raise RobotError(f"{path}: an MJCF file is read several times; save it as a file first")
+    try:
+        return _read(path, name, Notes(findings, []), fixed_base, missing_meshes)
+    except UnicodeDecodeError as error:
+        raise RobotError(
+            f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
+        ) from error
+
+
+def _read(
+    path: Path,
+    name: str,
+    notes: Notes,
+    fixed_base: bool | None,
+    missing_meshes: str,
+) -> Source:
     compiled = compile_file(path, missing_meshes, notes.repairs)
     model = compiled.model
     robot = RobotInFile(model, path, notes)
@@ -77,13 +96,10 @@ def read_mjcf(
     def column(values: Mapping[str, float], missing: float = 0.0) -> Float64:
         return read_only(np.array([values.get(joint, missing) for joint in joints], np.float64))
 
-    gains = {"kp": motors.kp, "ki": motors.ki, "kd": motors.kd}
-    columns = {name: column(gain) for name, gain in gains.items()}
+    gains = {name: column(getattr(motors, name)) for name in ("kp", "ki", "kd")}
     # A file of motors alone has no gains to offer.
-    if any(gain.any() for gain in columns.values()):
-        columns["integral_limit"] = column(motors.integral_limit, np.inf)
-    else:
-        columns = {}
+    has_gains = any(gain.any() for gain in gains.values())
+    gains["integral_limit"] = column(motors.integral_limit, np.inf)
     effects: Document = {"armature": column(motors.armature), "lag": column(motors.lag)}
     for effect in ("saturation_effort", "no_load_speed"):
         effects[effect] = column(getattr(motors, effect), np.inf)
@@ -91,14 +107,16 @@ def read_mjcf(
     if joints:
         actuators = make_actuators(len(joints), **effects)
     return Source(
+        path,
         name,
         tables,
         tuple(notes.repairs),
         fixed_base,
         base_start,
+        column(start),
+        gains if has_gains else None,
         mjcf=_file(path, compiled, robot, fixed_base, notes.losses),
-        pairs=excluded_pairs(model, reader.solid),
-        defaults=FileDefaults(column(start), **columns),
+        disabled=excluded_pairs(model, reader.solid),
         actuators=actuators if actuators is not None and actuators.num_joints else None,
     )
 

@@ -16,7 +16,7 @@ def moves(robot, count=N, seed=0):
     """Return starts (count, dof) and smooth moves from there at half the velocity limits."""
     low, high = np.maximum(robot.lower, -2.5), np.minimum(robot.upper, 2.5)
     share = np.random.default_rng(seed).uniform(0.4, 0.6, (2, count, robot.dof))
-    start, target = robot.coupled(low + share * (high - low))
+    start, target = robot.coupling.positions(low + share * (high - low))
     move = minimum_jerk(start, target, DT, max_velocity=0.5 * robot.velocity_limit)
     return start, move.hold(0.2)
 

@@ -15,6 +15,7 @@ from batchpid.sim import Robot
 from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.sapien.building import build_scene, new_system
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.task_space.frames import about, compose, from_rpy, matrix_of, rotate, to_rpy
 
 ODD = """<robot name="odd">
@@ -55,10 +56,15 @@ def random_qpos(robot, count):
 
 def test_link_poses_are_those_of_sapien(robot):
     spec = SceneSpec(
-        robot.tables, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["accurate"], ground=False
+        robot.tables,
+        robot.self_contact.ignored,
+        robot.joints,
+        1e-3,
+        PHYSICS["accurate"],
+        ground=False,
     )
     _scene, reference = build_scene(spec, new_system(spec))
-    tree, qpos = robot.rigid_tree, random_qpos(robot, 20)
+    tree, qpos = link_tree(robot), random_qpos(robot, 20)
     ours = ts.link_poses(tree, qpos)
     assert ours.shape == (20, len(tree.links), 7)
     for k, row in enumerate(qpos):
@@ -75,7 +81,7 @@ def test_the_tool_is_the_hand_or_the_end_of_the_chain(panda, jaco2, tmp_path):
         (jaco2, "j2s7s300_link_7"),
         (odd_robot(tmp_path), "mid"),
     ):
-        assert robot.rigid_tree.tool == tool
+        assert link_tree(robot).tool == tool
 
 
 angles = st.floats(-7, 7)

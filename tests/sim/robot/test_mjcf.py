@@ -17,7 +17,8 @@ from batchpid.sim import Robot, Runner, to_urdf
 from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.protocol import SceneSpec
-from batchpid.sim.view.surfaces import surfaces
+from batchpid.sim.robot.reading import describe
+from batchpid.sim.view.scene import surfaces
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
@@ -112,7 +113,7 @@ def spec_of(robot, **options):
         "ground": False,
     } | options
     return SceneSpec(
-        robot.tables, robot.ignored_pairs, robot.joints, 5e-4, SOLVERS["accurate"], **options
+        robot.tables, robot.self_contact.ignored, robot.joints, 5e-4, SOLVERS["accurate"], **options
     )
 
 
@@ -154,8 +155,8 @@ def test_joints_are_those_of_the_file(load):
     np.testing.assert_array_equal(robot.start, [0.7, 0.1, 0.2])
     np.testing.assert_allclose(load(CHAIN).start, [0.2, 0, np.deg2rad(30), 0])
     assert (
-        robot.describe()["settings"]
-        != load(ARM.replace('qpos=".7', 'qpos=".6')).describe()["settings"]
+        describe(robot)["settings"]
+        != describe(load(ARM.replace('qpos=".7', 'qpos=".6')))["settings"]
     )
 
 
@@ -248,7 +249,7 @@ def test_an_srdf_has_the_last_word(load, tmp_path):
     (tmp_path / "robot.srdf").write_text(
         '<robot><enable_collisions link1="base" link2="fore"/></robot>'
     )
-    assert load(ARM, self_collision="urdf").ignored_pairs == ()
+    assert load(ARM, self_collision="urdf").self_contact.ignored == ()
 
 
 def test_links_of_a_split_body_keep_their_pairs(load):

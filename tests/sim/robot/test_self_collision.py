@@ -135,7 +135,7 @@ def test_pairs_that_physx_cannot_hold_collide_in_sapien_alone(tmp_path):
     lines = (f'<disable_collisions link1="l{a}" link2="l{b}"/>' for a, b in pairs)
     write(tmp_path, robot(*lines), "test.srdf")
     loaded = Robot.load(path, self_collision="urdf")
-    assert len(loaded.ignored_pairs) == len(pairs)
+    assert len(loaded.self_contact.ignored) == len(pairs)
     assert loaded.check(engine="mujoco") == loaded.check()
     left = [found for found in loaded.check(engine="sapien") if found.code == "engine"]
     assert 0 < len(left) < len(pairs)
@@ -156,7 +156,9 @@ def test_a_base_that_is_fixed_too_low_has_no_ground(tmp_path):
 
 
 def spec_of(loaded):
-    return SceneSpec(loaded.tables, loaded.ignored_pairs, loaded.joints, 1e-3, None, ground=False)
+    return SceneSpec(
+        loaded.tables, loaded.self_contact.ignored, loaded.joints, 1e-3, None, ground=False
+    )
 
 
 @given(st.integers(0, 2**32))

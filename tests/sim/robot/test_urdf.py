@@ -130,7 +130,7 @@ def test_the_limit_of_links_is_that_of_one_engine(tmp_path):
 def test_links_of_one_rigid_body_count_once(tmp_path):
     frames = (link(f"f{n}", "") + joint(f"k{n}", "arm", f"f{n}", "fixed", "") for n in range(300))
     path = write(tmp_path, robot(BASE, ARM, HINGE, *frames))
-    assert len(Robot.load(path).links) == 302
+    assert len(Robot.load(path).tables.links) == 302
 
 
 def test_parts_that_sapien_needs_are_added_and_those_that_it_does_not_need_are_removed(tmp_path):
@@ -149,7 +149,7 @@ def test_parts_that_sapien_needs_are_added_and_those_that_it_does_not_need_are_r
             robot(*parts, *joints, fixed, default, "<transmission/>", "<sensor><camera/></sensor>"),
         )
     )
-    assert all(link.mass for link in odd.links)
+    assert all(link.mass for link in odd.tables.bodies)
     with Runner(odd, 1, workers=0, params=odd.params(kp=1.0), ground=False) as runner:
         assert runner.step([0.1, 0.1]).ok.all()
 
