@@ -13,11 +13,11 @@ from typing import Annotated
 
 from batchpid.sim import Finding, Robot
 from batchpid.sim.cli.flags import Gains, flag
-from batchpid.sim.diagnosis.text import table
+from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.findings import summary
 from batchpid.sim.geometry.shapes import DENSITY
 from batchpid.sim.robot.merging import link_inertias
-from batchpid.sim.robot.robot import tuned_file
+from batchpid.sim.robot.reading import tuned_file
 from batchpid.sim.robot.tables import Body, Joint
 from batchpid.sim.tuning.gain_sets import GainSet, gain_set, gain_table
 

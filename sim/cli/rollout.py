@@ -20,8 +20,13 @@ from batchpid.checks.validate import array
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Robot, Rollout, write_recording
 from batchpid.sim.cli.flags import BOUNDS, Gains, NumEnvs, Randomize, flag
-from batchpid.sim.diagnosis.causes import settled_envs
-from batchpid.sim.diagnosis.text import cause_lines, median_and_worst, overshoot_of_settled, table
+from batchpid.sim.diagnosis.causes import (
+    cause_lines,
+    median_and_worst,
+    overshoot_of_settled,
+    settled_envs,
+    table,
+)
 from batchpid.sim.tuning.evaluation import (
     following_error,
     load_randomization,

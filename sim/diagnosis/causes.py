@@ -2,20 +2,22 @@
 
 A joint has settled if it ends within its band: 2 % of its move, and 1e-3 rad or 1e-4 m at least.
 :data:`RULES` is the table of causes; an env has the first that fits one of its joints outside their
-bands.
+bands. The functions at the end write reports of runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tabulate import tabulate
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Bool, Float64
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.preflight import touching_links
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 SETTLING_SHARE = 0.02  # half width of the settling band, as a share of the move
 EXAMINED = 100  # envs at most
 TAIL = 0.2  # last share of the run, by which joints are judged
+MOST_CAUSES = 3  # of a report
 TOUCH = 3e-3  # distance below which links touch, within the accuracy of meshes [m]
 
 
@@ -299,3 +302,37 @@ RULES: tuple[Rule, ...] = (
     Rule("slow", lambda run: run.unsettled),
 )
 """Every cause, in the order in which they are tested and listed."""
+
+
+def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:
+    """Return ``rows`` under ``headers`` as text; ``align`` has one letter per column, "l" or
+    "r".
+    """
+    sides = tuple("left" if side == "l" else "right" for side in align)
+    return tabulate(rows, headers, disable_numparse=True, colalign=sides)
+
+
+def cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
+    """Yield a line for each of the first causes, the most likely first."""
+    for cause in findings[:MOST_CAUSES]:
+        yield f"WHY: {cause.where}: {cause.text} ({cause.figures}); {cause.remedy}."
+    if len(findings) > MOST_CAUSES:
+        yield f"and {len(findings) - MOST_CAUSES} more, which rollout.findings() lists."
+
+
+def overshoot_of_settled(overshoot: Rows, settling: Rows) -> Rows:
+    """Return the overshoots of joints that settled; NaN for the others, of which it says
+    nothing.
+    """
+    return np.where(np.isinf(settling) & np.isfinite(overshoot), np.nan, overshoot)
+
+
+def median_and_worst(figures: Rows, style: str) -> str:
+    """Return the median and the worst of ``figures``, "never" for infinity, and "-" where none is
+    defined.
+    """
+    if np.isnan(figures).all():
+        return "-"
+    # Infinite figures allow no interpolation between two of them.
+    quantiles = np.nanquantile(figures, [0.5, 1.0], method="higher")
+    return " / ".join("never" if math.isinf(value) else style.format(value) for value in quantiles)

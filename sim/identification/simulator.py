@@ -23,7 +23,8 @@ from batchpid.sim.engine.scene_spec import added_friction
 from batchpid.sim.loop.closed_loop import ClosedLoop
 from batchpid.sim.loop.loop_run import LoopRun
 from batchpid.sim.loop.tree_plant import TreePlant
-from batchpid.sim.robot.robot import Robot, link_tree
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.stages import Control, Stage, Told, Values
 from batchpid.task_space.frames import SpatialInertia, spatial_matrix
 from batchpid.task_space.tree_quantities import mass_matrix

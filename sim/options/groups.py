@@ -27,7 +27,8 @@ from batchpid.sim.engine.protocol import Engine, load_engine, require
 from batchpid.sim.randomization.checks import check_robot
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.merging import place_links
-from batchpid.sim.robot.robot import Robot, link_tree
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.sim.robot.tables import MjcfFile
 from batchpid.sim.signals.quantities import own_command
 from batchpid.sim.tool_space import OperationalSpace

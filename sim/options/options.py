@@ -40,7 +40,8 @@ from batchpid.sim.options.groups import (
     option,
 )
 from batchpid.sim.randomization.checks import check_params, prepared_actuators
-from batchpid.sim.robot.robot import Robot, describe, tuned_file
+from batchpid.sim.robot.reading import describe, tuned_file
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import fit_actuators, fit_guard, known_joints
 from batchpid.sim.robot.tables import MjcfFile
 from batchpid.sim.signals.quantities import (

@@ -37,7 +37,8 @@ from batchpid.sim.randomization.distributions import (
     parts,
     read_field,
 )
-from batchpid.sim.robot.robot import Robot, link_tree
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 
 Drawn = TypeVar("Drawn", bp.PIDParams, bp.Actuators | None)
 LARGEST_SEED = 2**63 - 1

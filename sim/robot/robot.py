@@ -7,7 +7,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +17,29 @@ from numpy.typing import ArrayLike
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Document, Float64
 from batchpid.arrays.choices import CHOICES
-from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.checks.validate import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.findings import Finding, Findings, report
-from batchpid.sim.robot.merging import body_tree, couple, coupling_of, merge_links, place_links
+from batchpid.sim.robot.merging import couple, coupling_of, place_links
 from batchpid.sim.robot.reading import (
     bundled_robots,
     find_robot,
     read_robot,
     read_settings,
+    tuned_file,
     with_srdf,
 )
-from batchpid.sim.robot.robot_model import RobotModel, SelfContact, self_contact
+from batchpid.sim.robot.robot_model import (
+    RobotModel,
+    SelfContact,
+    free_target,
+    link_tree,
+    model_of,
+    self_contact,
+    suggested_effort_limit,
+)
 from batchpid.sim.robot.robot_options import load_robot_actuators, setpoint_guard
 from batchpid.sim.robot.tables import Joint, MjcfFile, Placement, Settings, Source, Tables
 from batchpid.task_space.rigid_tree import RigidTree
@@ -42,33 +50,6 @@ STANDING_HZ = 3.0
 """Bandwidth of :meth:`Robot.designed` for a robot that stands: its weight sinks by about g / (2 pi
 STANDING_HZ)^2.
 """
-
-
-GRAVITY_MARGIN = 2.0  # of the effort that holds the joint still
-SPEED = 3.0  # [rad/s or m/s], at which the joint's damping is overcome
-ACCELERATION = 30.0  # [rad/s^2 or m/s^2] of all joints at once
-POSES = 50
-TARGET_SHARES = (1.0, -1.0, 0.5, -0.5, 0.2, -0.2)
-"""Shares of the first move that are tried for one without contact."""
-
-
-def suggested_effort_limit(
-    gravity: Float64,
-    mass_matrix: Float64,
-    friction: ArrayLike,
-    damping: ArrayLike,
-) -> Float64:
-    """Return an effort limit for each joint (dof,) [N m or N], from gravity (n, dof) and M (n, dof,
-    dof) at n poses.
-
-    It is 2 (max |g_j| + friction) + damping * 3 rad/s + max sum_k |M_jk| * 30 rad/s^2: twice the
-    effort that holds the joint still, plus the effort that accelerates all joints at once, in the
-    worst directions.
-    """
-    still = np.abs(gravity).max(0) + np.asarray(friction)
-    inertia = np.abs(mass_matrix).sum(2).max(0)
-    efforts: Float64 = GRAVITY_MARGIN * still + SPEED * np.asarray(damping) + ACCELERATION * inertia
-    return efforts
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,9 +106,7 @@ class Robot:
 
     @cached_property
     def bodies(self) -> Mapping[str, Placement]:
-        """Placement of every link, by name, in its simulated body: links joined by fixed joints are
-        one.
-        """
+        """Placement of every link in its simulated body: links joined by fixed joints are one."""
         return place_links(self.tables)
 
     @property
@@ -162,27 +141,18 @@ class Robot:
 
     @cached_property
     def design_effort_limit(self) -> Float64:
-        """Effort limits (dof,) [N m or N] of designed and tuned gains.
-
-        They are the URDF's, or :func:`batchpid.sim.robot.robot.suggested_effort_limit` where
-        it gives none.
+        """Effort limits (dof,) [N m or N] of designed and tuned gains: those of the URDF, or
+        :func:`batchpid.sim.robot.robot_model.suggested_effort_limit` where it gives none.
         """
         limits = self.effort_limit
         # The dynamics of 50 poses take time that most robots need not spend.
         if np.isfinite(limits).all():
             return read_only(limits)
-        qpos = self.sample(POSES)
-        mass_matrix = self.coupling.mass_matrix(self.dynamics().mass_matrix(qpos))
-        suggested = suggested_effort_limit(
-            self.dynamics().holding_efforts(qpos), mass_matrix, self.friction, self.damping
-        )
-        return read_only(np.where(np.isfinite(limits), limits, suggested))
+        return read_only(np.where(np.isfinite(limits), limits, suggested_effort_limit(self)))
 
     @property
     def velocity_limit(self) -> Float64:
-        """Velocity limits (dof,) [rad/s or m/s], infinite where the URDF gives none. No engine
-        enforces them.
-        """
+        """Velocity limits (dof,) [rad/s or m/s], infinite where the URDF gives none."""
         return np.array([joint.velocity_limit for joint in self.joints])
 
     @property
@@ -197,9 +167,7 @@ class Robot:
 
     @property
     def friction(self) -> Float64:
-        """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien": PhysX
-        has its own.
-        """
+        """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien"."""
         modelled = self.source.dissipation == "urdf"
         return np.array([joint.friction for joint in self.joints]) * modelled
 
@@ -215,9 +183,7 @@ class Robot:
 
     @property
     def start(self) -> Float64:
-        """Start pose (dof,) [rad or m]: the bundled settings' or the file's, else zero, clipped to
-        the joint limits.
-        """
+        """Start pose (dof,) [rad or m]: the bundled settings', the file's, or zero, in the limits."""
         if self.settings is not None:
             return self.settings.start.copy()
         start = self.source.start
@@ -235,26 +201,7 @@ class Robot:
         """
         if self.settings is not None:
             return self.settings.target.copy()
-        return self._free_target.copy()
-
-    @cached_property
-    def _free_target(self) -> Float64:
-        # Toward the farther limit, so that the move is inside.
-        above = self.upper - self.start
-        below = self.lower - self.start
-        move = np.clip(0.25 * np.where(above >= -below, above, below), -0.5, 0.5)
-        model = self.dynamics(ground=self.fixed_base and self.has_ground)
-        for share in TARGET_SHARES:
-            ways = share * np.linspace(0.2, 1.0, 5)[:, None] * move
-            poses = np.clip(self.start + ways, self.lower, self.upper)
-            poses = self.coupling.positions(poses)
-            if not model.in_contact(poses).any():
-                break
-        else:
-            # Links touch at the start already, which is a finding.
-            poses = self.coupling.positions((self.start + move)[None])
-        target: Float64 = poses[-1]
-        return target
+        return free_target(self).copy()
 
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's
@@ -262,12 +209,7 @@ class Robot:
 
         Effort limits and continuous joints come from the URDF and, for a bundled robot, kp, ki and
         kd from its settings; anti-windup is "conditional". ``options`` override these and add
-        others.
-
-        Raises
-        ------
-        InvalidArgumentError
-            The robot has no gains and ``options`` has no ``kp``.
+        others. Raises InvalidArgumentError if there is no ``kp``.
         """
         defaults: Document = {"joint_names": self.joint_names, "anti_windup": "conditional"}
         if self.continuous.any():
@@ -282,9 +224,7 @@ class Robot:
         return bp.make_params(joints=self.dof, **(defaults | options))
 
     def sample(self, count: int, seed: int = 0) -> Float64:
-        """Return seeded poses (count, dof), uniform within the limits and half a turn of the start;
-        followers match.
-        """
+        """Return seeded poses (count, dof), uniform within the limits and half a turn of the start."""
         # A joint without limits would have no range to draw from.
         low = np.maximum(self.lower, self.start - np.pi)
         high = np.minimum(self.upper, self.start + np.pi)
@@ -293,32 +233,24 @@ class Robot:
         return coupled
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
-        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof),
-        on a fixed base.
-        """
+        """Return the mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof), base fixed."""
         return self.dynamics().mass_matrix(np.atleast_2d(np.asarray(qpos, np.float64)))
 
     def dynamics(self, ground: bool | None = None) -> RobotModel:
         """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed
-        base.
-
-        ``ground``: whether there is a ground at height 0; default :attr:`has_ground`.
+        base. ``ground``: whether there is a ground at height 0; default :attr:`has_ground`.
         """
         has_ground = self.has_ground if ground is None else ground
-        return _model(self, has_ground)
+        return model_of(self, has_ground)
 
     @cached_property
     def self_contact(self) -> SelfContact:
-        """Pairs of links that do not collide, and contact with the ground, computed at the first
-        use.
-        """
+        """Pairs of links that do not collide, and contact with the ground."""
         return self_contact(self)
 
     @property
     def has_ground(self) -> bool:
-        """True if scenes have a ground by default; False if a fixed base is so low that links start
-        in it.
-        """
+        """True if scenes have a ground by default; False if links of a fixed base start in it."""
         return not self.self_contact.reaches_ground
 
     @classmethod
@@ -344,15 +276,13 @@ class Robot:
             ``"skip"`` to leave out collision shapes whose mesh is missing or cannot be read, or
             ``"error"``.
         dissipation
-            ``"urdf"``: joint friction and damping as the URDF says, in N m and N m s/rad, by the
-            model of :mod:`batchpid.motors.friction`; no link damping. ``"sapien"``: SAPIEN's
-            defaults, PhysX's joint friction 0.05 and link damping 0.05, for comparison with its
-            tutorial.
+            ``"urdf"``: joint friction and damping as the URDF says, by the model of
+            :mod:`batchpid.motors.friction`. ``"sapien"``: SAPIEN's defaults, PhysX's joint friction
+            0.05 and link damping 0.05, for comparison with its tutorial.
         fixed_base
-            True to fix the root link to the world. Default True, unless the file has a floating
-            base: the root of an MJCF file has a free joint, or the root of a URDF is a link without
-            mass and shapes and its only joint is floating: then the root is that joint's
-            child.
+            True to fix the root link to the world. Default True, unless the root of an MJCF file has
+            a free joint, or the root of a URDF is a link without mass and shapes whose only joint is
+            floating: then the root is that joint's child.
         self_collision
             ``"auto"``: links that are neighbours, or touch or overlap at the start pose or in
             nearly every sampled pose do not collide (:attr:`self_contact`). ``"urdf"``: all links
@@ -360,19 +290,19 @@ class Robot:
             pairs. ``"none"``: no link collides with another.
         actuators
             Motors and sensors that runners of this robot have by default:
-            :class:`batchpid.Actuators` of one row, or a file of :func:`batchpid.save_actuators`, in
-            which joints are matched by name. None: ideal ones, with the armature of an MJCF file.
+            :class:`batchpid.Actuators` of one row, or a file of :func:`batchpid.save_actuators`.
+            None: ideal ones, with the armature of an MJCF file.
         strict
-            True to refuse a file that needs repairs that change the motion, which are otherwise
-            made, with a warning, and listed by :meth:`check`.
+            True to refuse a file that needs repairs that change the motion; otherwise a warning
+            counts them, and :meth:`check` lists them.
 
         Raises
         ------
         RobotNotFoundError
             No bundled robot and no file of that name.
         RobotError
-            The file is neither a usable URDF nor a usable MJCF file; the message names the element
-            and the remedy. With ``strict``, it needs repairs, which the message lists.
+            The file is neither a usable URDF nor a usable MJCF file, or, with ``strict``, it needs
+            repairs.
         InvalidArgumentError
             An option has none of the values above.
         """
@@ -386,8 +316,7 @@ class Robot:
             raise InvalidArgumentError(
                 "package_dirs", problem, value=package_dirs, remedy="pass a list of paths"
             )
-        # Options are checked before a file is read, so that a wrong one is not hidden by a fault of
-        # the file.
+        # A wrong option is not hidden by a fault of the file.
         path = find_robot(name_or_path)
         folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
         source = read_robot(path, fixed_base, folders, missing_meshes)
@@ -426,22 +355,14 @@ class Robot:
         Parameters
         ----------
         params
-            PID parameters to check, too; default :meth:`params` if the robot has gains.
+            PID parameters to check, too; default :meth:`params` of a bundled robot.
         qpos, setpoint
-            Start pose (default :attr:`start`) and setpoint (default: none) to check, (dof,) [rad or
-            m].
-        timestep
-            Time step of control and simulation [s].
-        control
-            ``"pid"``, ``"drive"`` or ``"effort"``, as in :class:`batchpid.sim.Runner`.
+            Start pose (default :attr:`start`) and setpoint (default: none), (dof,) [rad or m].
+        timestep, control
+            As in :class:`batchpid.sim.Runner`: ``"pid"``, ``"drive"`` or ``"effort"``.
         engine
             ``"mujoco"`` or ``"sapien"``: add what this engine cannot run, and what it runs
-            otherwise than the file says. None: findings that hold in every engine.
-
-        Raises
-        ------
-        InvalidArgumentError
-            An argument has a wrong shape, type or range.
+            otherwise than the file says.
         """
         from batchpid.sim.diagnosis.preflight import check
 
@@ -459,22 +380,11 @@ class Robot:
         self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None
     ) -> bp.Guard:
         """Return the limits of setpoints: positions, and soft limits of ``safety_controller``, as
-        in the URDF.
+        in the URDF. Followers have none: they move with their leaders.
 
-        Followers have none: they move with their leaders.
-
-        Parameters
-        ----------
-        rate
-            Largest rate, scalar or (dof,) [rad/s or m/s]; default the URDF's velocity limits.
-        acceleration
-            Largest acceleration, scalar or (dof,) [rad/s^2 or m/s^2]; default the URDF's limits of
-            acceleration and deceleration (URDF 1.2), the smaller of both.
-
-        Raises
-        ------
-        InvalidArgumentError
-            A limit is not positive.
+        ``rate`` [rad/s or m/s] and ``acceleration`` [rad/s^2 or m/s^2] are scalars or (dof,), by
+        default the URDF's limits of velocity, and of acceleration or deceleration (URDF 1.2), the
+        smaller of both.
         """
         return setpoint_guard(self.joints, rate, acceleration)
 
@@ -489,74 +399,45 @@ class Robot:
         poles of that speed need. In other units the joints disturb each other, which three equal
         poles tolerate better.
 
-        Parameters
-        ----------
-        gain_units
-            ``"mass_matrix"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
-            ``"mass_matrix"``; on a floating base ``"effort"``, for legs that carry the base at the
-            start pose: the mass matrix is that of legs in the air, a twentieth.
-
-        Raises
-        ------
-        InvalidArgumentError
-            Unknown gain_units, or a mass matrix that is not positive definite.
+        ``gain_units`` are "mass_matrix" or "effort" (:mod:`batchpid.law.computed_torque`). Default
+        "mass_matrix"; on a floating base "effort", for legs that carry the base at the start pose:
+        the mass matrix is that of legs in the air, a twentieth. Raises InvalidArgumentError for a
+        mass matrix that is not positive definite.
         """
-        chosen = (
-            ("mass_matrix" if self.fixed_base else "effort") if gain_units is None else gain_units
-        )
-        gain_units = choice("gain_units", chosen, CHOICES["gain_units"])
+        if gain_units is None:
+            gain_units = "mass_matrix" if self.fixed_base else "effort"
+        choice("gain_units", gain_units, CHOICES["gain_units"])
         options: Document = {"gain_units": gain_units, "measurement_rate": "measured"}
         if gain_units == "effort" and not self.fixed_base:
-            return bp.design_gains(
-                self, STANDING_HZ, load=self.dynamics().standing_inertia(self.start), **options
-            )
+            load = self.dynamics().standing_inertia(self.start)
+            return bp.design_gains(self, STANDING_HZ, load=load, **options)
         if gain_units != "mass_matrix":
             return bp.design_gains(self, 2.25, **options)
-        return bp.design_gains(
-            self, DESIGN_HZ, 0.82, integral_time=4.5 / (2 * np.pi * DESIGN_HZ), **options
-        )
+        time = 4.5 / (2 * np.pi * DESIGN_HZ)
+        return bp.design_gains(self, DESIGN_HZ, 0.82, integral_time=time, **options)
 
     def kinematic_tree(self, **options: ArrayLike) -> RigidTree:
         """Return the kinematic tree of this robot, for :mod:`batchpid.task_space`, in float64.
 
-        No engine is needed.
+        It has every link of the file by name, merged ones included. Followers move with their
+        leaders. It has no friction and damping.
 
-        It knows every link of the URDF by name, merged ones included. Followers move with their
-        leaders (:attr:`coupling`). It has no friction and damping.
-
-        Parameters
-        ----------
-        options
-            ``armature`` (dof,) [kg m^2 or kg], by default the one in :attr:`actuators`; ``gravity``
-            (3,) [m/s^2].
-
-        Raises
-        ------
-        RobotError
-            The base is not fixed, or a mesh cannot be read of a link whose mass comes from its
-            collision shapes.
-        InvalidArgumentError
-            An option is not one of those above, or has a wrong shape or sign.
+        ``options`` are ``armature`` (dof,) [kg m^2 or kg], by default the one in :attr:`actuators`,
+        and ``gravity`` (3,) [m/s^2]. Raises RobotError if the base is not fixed, or a mesh cannot be
+        read of a link whose mass comes from its collision shapes.
         """
         check_keywords("kinematic_tree", options, ("armature", "gravity"))
         own_options = {}
         if self.actuators is not None and self.actuators.armature is not None:
             own_options["armature"] = np.asarray(self.actuators.armature, float)[0]
         if not self.fixed_base:
-            problem = "operational space and inverse kinematics need a robot with a fixed base"
-            raise RobotError(
-                f"{self.path}: {problem}; load the robot with fixed_base=True, or control its"
-                " joints"
-            )
+            problem = f"{self.path}: a kinematic tree needs a robot with a fixed base"
+            raise RobotError(f"{problem}; load it with fixed_base=True, or control its joints")
         return replace(link_tree(self), **(own_options | options))
 
     def tuned(self) -> bp.PIDParams:
-        """Return the tuned params of a bundled robot; see docs/choosing-gains.md.
-
-        Raises
-        ------
-        InvalidArgumentError
-            The robot is not bundled.
+        """Return the tuned params of a bundled robot; see docs/choosing-gains.md. Raises
+        InvalidArgumentError for another robot.
         """
         file = tuned_file(self)
         if file is None:
@@ -570,74 +451,11 @@ class Robot:
 
         Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of
         the servo's control; a velocity servo has kd alone. :meth:`guard` has the limits of their
-        setpoints.
-
-        Raises
-        ------
-        InvalidArgumentError
-            The robot is not from an MJCF file, or that has no servos.
+        setpoints. Raises InvalidArgumentError for a file without servos.
         """
         gains = self.source.gains
         if gains is None:
-            problem = (
-                f"{self.name!r} has no servos of an MJCF file (<position>, or <general> with an"
-                " affine bias)"
-            )
+            problem = f"{self.name!r} has no servos of an MJCF file"
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
         # MuJoCo's integral grows during saturation, up to its limit.
         return self.params(**gains, anti_windup="none", measurement_rate="measured")
-
-
-@lru_cache(maxsize=8)
-def _model(robot: Robot, ground: bool) -> RobotModel:
-    ignored = frozenset(map(frozenset, robot.self_contact.ignored))
-    # Merged, since the engines simulate merged links, too.
-    simulated = merge_links(robot.tables)
-    return RobotModel(body_tree(simulated), robot.coupling, simulated, ignored, ground)
-
-
-@lru_cache(maxsize=8)
-def link_tree(robot: Robot) -> RigidTree:
-    """Return the tree of every link of the file, merged ones included, with the coupling and limits
-    of the joints.
-
-    Raises RobotError if a link's mass comes from its shapes, and a mesh cannot be read.
-    """
-    limits = np.where(robot.continuous, [[-np.inf], [np.inf]], [robot.lower, robot.upper])
-    tree = body_tree(robot.tables, robot.fixed_base)
-    return replace(tree, coupling=robot.coupling, lower=limits[0], upper=limits[1])
-
-
-def tuned_file(robot: Robot) -> Path | None:
-    """Return the file of the tuned params that ship with a robot, None without one."""
-    file = robot.path.with_suffix(".tuned.yaml")
-    return file if robot.settings is not None and file.is_file() else None
-
-
-def describe(robot: Robot) -> Document:
-    """Return a description of the simulated robot as plain values, equal for robots of equal
-    content.
-
-    The tables with the collision meshes, the pairs that do not collide, and the settings of a
-    bundled robot are given by digests. The actuators are left out.
-    """
-    source = robot.source
-    return {
-        "robot": robot.name,
-        "content": content(robot),
-        "srdf": digest(source.disabled, source.enabled),
-        "settings": digest(robot.settings, source.start, source.gains),
-        "mjcf": None if robot.mjcf is None else digest(replace(robot.mjcf, path="")),
-        "self_collision": source.self_collision,
-        "dissipation": source.dissipation,
-        "fixed_base": robot.fixed_base,
-        "base_start": source.base_start,
-    }
-
-
-def content(robot: Robot) -> str:
-    """Return the digest of bodies, joints and shapes, with the content of mesh files in place of
-    their paths.
-    """
-    shapes = [shape._replace(file="") for shape in robot.tables.shapes]
-    return digest(robot.tables.bodies, shapes, robot.joints)

@@ -11,11 +11,11 @@ Softw. Eng. Robotics 5, 2014).
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property
-from itertools import combinations, product
+from functools import cached_property, lru_cache
+from itertools import combinations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -25,15 +25,22 @@ from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.geometry.distances import Contacts
 from batchpid.sim.robot.merging import body_tree, merge_links, rigid_bodies
-from batchpid.sim.robot.tables import DisabledPair, Joint, Tables
+from batchpid.sim.robot.tables import DisabledPair, Tables
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
 
-SELF_COLLISION = ("auto", "urdf", "none")
-"""Values of the option ``self_collision`` of :meth:`batchpid.sim.Robot.load`."""
+GRAVITY_MARGIN = 2.0
+"""Suggested limit over the effort that holds the joint still."""
+SPEED, ACCELERATION = 3.0, 30.0
+"""Speed [rad/s or m/s] at which the joint's damping is overcome, and acceleration [rad/s^2 or m/s^2]
+of all joints at once, of suggested limits.
+"""
+POSES = 50
+TARGET_SHARES = (1.0, -1.0, 0.5, -0.5, 0.2, -0.2)
+"""Shares of the first move that are tried for one without contact."""
 ALWAYS = 0.95
 """Share of sampled poses beyond which a pair counts as always in contact; MoveIt's."""
 GAP = 1e-3
@@ -171,6 +178,64 @@ class RobotModel:
         return self.contacts.in_contact(qpos, clearance)
 
 
+@lru_cache(maxsize=8)
+def model_of(robot: Robot, ground: bool) -> RobotModel:
+    """Return the model of a robot, with or without a ground."""
+    ignored = frozenset(map(frozenset, robot.self_contact.ignored))
+    # Merged, since the engines simulate merged links, too.
+    simulated = merge_links(robot.tables)
+    return RobotModel(body_tree(simulated), robot.coupling, simulated, ignored, ground)
+
+
+@lru_cache(maxsize=8)
+def link_tree(robot: Robot) -> RigidTree:
+    """Return the tree of every link of the file, merged ones included, with the coupling and limits
+    of the joints.
+
+    Raises RobotError if a link's mass comes from its shapes, and a mesh cannot be read.
+    """
+    limits = np.where(robot.continuous, [[-np.inf], [np.inf]], [robot.lower, robot.upper])
+    tree = body_tree(robot.tables, robot.fixed_base)
+    return replace(tree, coupling=robot.coupling, lower=limits[0], upper=limits[1])
+
+
+def suggested_effort_limit(robot: Robot) -> Float64:
+    """Return an effort limit for each joint (dof,) [N m or N], from gravity and M at POSES poses.
+
+    It is 2 (max |g_j| + friction) + damping * 3 rad/s + max sum_k |M_jk| * 30 rad/s^2: twice the
+    effort that holds the joint still, plus the effort that accelerates all joints at once, in the
+    worst directions.
+    """
+    qpos = robot.sample(POSES)
+    model = robot.dynamics()
+    still = np.abs(model.holding_efforts(qpos)).max(0) + robot.friction
+    inertia = np.abs(robot.coupling.mass_matrix(model.mass_matrix(qpos))).sum(2).max(0)
+    efforts: Float64 = GRAVITY_MARGIN * still + SPEED * robot.damping + ACCELERATION * inertia
+    return efforts
+
+
+@lru_cache(maxsize=8)
+def free_target(robot: Robot) -> Float64:
+    """Return the pose (dof,) for a first move of a robot without settings;
+    :attr:`batchpid.sim.Robot.target` describes it.
+    """
+    start = robot.start
+    # Toward the farther limit, so that the move is inside.
+    above = robot.upper - start
+    below = robot.lower - start
+    move = np.clip(0.25 * np.where(above >= -below, above, below), -0.5, 0.5)
+    model = robot.dynamics(ground=robot.fixed_base and robot.has_ground)
+    for share in TARGET_SHARES:
+        ways = share * np.linspace(0.2, 1.0, 5)[:, None] * move
+        poses = robot.coupling.positions(np.clip(start + ways, robot.lower, robot.upper))
+        if not model.in_contact(poses).any():
+            target: Float64 = poses[-1]
+            return target
+    # Links touch at the start already, which is a finding.
+    touching: Float64 = robot.coupling.positions(start + move)
+    return touching
+
+
 def base_start(robot: Robot, qpos: Float64, ground: bool) -> Float64:
     """Return the pose (7,) from which a floating base starts with its joints at ``qpos`` (dof,).
 
@@ -208,80 +273,63 @@ class SelfContact(NamedTuple):
         return tuple((pair.first, pair.second) for pair in self.pairs)
 
 
-def disabled_pairs(
-    order: Sequence[str],
-    adjacent: Iterable[frozenset[str]],
-    rest: Iterable[frozenset[str]],
-    samples: Sequence[Collection[frozenset[str]]],
-) -> tuple[DisabledPair, ...]:
-    """Return the pairs that do not collide, each with the first of its reasons, in ``order`` of the
-    links.
-
-    ``adjacent`` are neighbours, ``rest`` the pairs in contact at rest, ``samples`` those in contact
-    at each pose.
-    """
-    touches = Counter(pair for sample in samples for pair in sample)
-    always = (pair for pair, count in touches.items() if count > ALWAYS * len(samples))
-    reasons: dict[frozenset[str], str] = {}
-    for reason, pairs in (("Adjacent", adjacent), ("Default", rest), ("Always", always)):
-        for pair in pairs:
-            reasons.setdefault(pair, reason)
-    number = {link: index for index, link in enumerate(order)}
-    ordered = ((sorted(pair, key=number.__getitem__), reason) for pair, reason in reasons.items())
-    listed = [DisabledPair(first, second, reason) for (first, second), reason in ordered]
-    return tuple(sorted(listed, key=lambda pair: (number[pair.first], number[pair.second])))
-
-
 def self_contact(robot: Robot) -> SelfContact:
     """Return the pairs of links of a robot that do not collide, under its option ``self_collision``
     and its .srdf.
 
     Deterministic: the poses are seeded. Raises RobotError for a mesh that cannot be read.
     """
+    source = robot.source
     solid = list(dict.fromkeys(shape.owner for shape in robot.tables.shapes))
-    bodies = rigid_bodies(robot.tables.joints)
     simulated = merge_links(robot.tables)
     tree = body_tree(simulated, robot.fixed_base)
     contacts = Contacts(tree, simulated.shapes, frozenset(), ground=False)
-    computed: tuple[DisabledPair, ...] = ()
-    if robot.source.self_collision == "none":
-        computed = tuple(DisabledPair(*pair, "User") for pair in combinations(solid, 2))
-    elif robot.source.self_collision == "auto" and len({bodies[link] for link in solid}) > 1:
-        # The first pose is the start; the others judge how often a pair touches.
-        rest, *close = [
-            {frozenset(near[:2]) for near in contacts.near(qpos, GAP)}
-            for qpos in (robot.start, *robot.sample(SAMPLES, seed=0))
-        ]
-        computed = disabled_pairs(solid, _adjacent_links(robot.tables.joints, solid), rest, close)
+    computed: Iterable[DisabledPair] = ()
+    if source.self_collision == "none":
+        computed = (DisabledPair(*pair, "User") for pair in combinations(solid, 2))
+    elif source.self_collision == "auto":
+        computed = _touching_pairs(robot, contacts, solid)
     # The .srdf comes last, so that its reason holds.
-    listed = {pair.links: pair for pair in (*computed, *robot.source.disabled)}
-    pairs = (
-        pair
-        for links, pair in listed.items()
-        if links not in robot.source.enabled and links <= set(solid)
-    )
+    pairs = {pair.links: pair for pair in (*computed, *source.disabled)}
+    listed = (pairs[links] for links in pairs if links <= set(solid))
     return SelfContact(
-        pairs=tuple(pairs),
+        pairs=tuple(pair for pair in listed if pair.links not in source.enabled),
         reaches_ground=robot.fixed_base and contacts.height(robot.start) < GAP,
     )
 
 
-def _adjacent_links(joints: Iterable[Joint], solid: Collection[str]) -> list[frozenset[str]]:
-    """Return the pairs of links with shapes, ``solid``, whose rigid bodies are neighbours.
+def _touching_pairs(
+    robot: Robot, contacts: Contacts, solid: Sequence[str]
+) -> Iterator[DisabledPair]:
+    """Yield the pairs of the links with shapes, ``solid``, that touch by design, with the first of
+    their reasons.
 
-    Neighbours are connected by a joint, or by a chain of joints and bodies without shapes.
+    Neighbours are links whose rigid bodies are connected by a joint, or by a chain of joints and
+    bodies without shapes.
     """
-    joints = list(joints)
+    joints = robot.tables.joints
     bodies = rigid_bodies(joints)
+    shaped = {bodies[link] for link in solid}
+    if len(shaped) < 2:
+        return
     parents = {joint.child_link: bodies[joint.parent_link] for joint in joints if joint.moves}
-    members = defaultdict(list)
-    for link, body in bodies.items():
-        if link in solid:
-            members[body].append(link)
-    pairs = []
-    for body, links in members.items():
-        parent = parents.get(body)
-        while parent is not None and parent not in members:
-            parent = parents.get(parent)
-        pairs += [frozenset(pair) for pair in product(links, members.get(parent or "", ()))]
-    return pairs
+    above: dict[str, str | None] = {}
+    for link in solid:
+        body = parents.get(bodies[link])
+        while body is not None and body not in shaped:
+            body = parents.get(body)
+        above[link] = body
+    # The first pose is the start; the others judge how often a pair touches.
+    rest, *samples = [
+        {frozenset(near[:2]) for near in contacts.near(qpos, GAP)}
+        for qpos in (robot.start, *robot.sample(SAMPLES, seed=0))
+    ]
+    touches = Counter(pair for sample in samples for pair in sample)
+    for first, second in combinations(solid, 2):
+        pair = frozenset((first, second))
+        if above[first] == bodies[second] or above[second] == bodies[first]:
+            yield DisabledPair(first, second, "Adjacent")
+        elif pair in rest:
+            yield DisabledPair(first, second, "Default")
+        elif touches[pair] > ALWAYS * len(samples):
+            yield DisabledPair(first, second, "Always")

@@ -19,7 +19,8 @@ from batchpid.sim.geometry.mesh_files import find_mesh
 from batchpid.sim.geometry.shapes import MOMENTS, Shape, mesh_file
 from batchpid.sim.robot.merging import link_inertias
 from batchpid.sim.robot.reading import is_mjcf, read_robot
-from batchpid.sim.robot.robot import Robot, link_tree
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.sim.robot.tables import NO_TURN, Body
 from batchpid.sim.robot.urdf import UNUSED
 from batchpid.sim.robot.xml import parse_xml

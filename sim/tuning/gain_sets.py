@@ -10,9 +10,10 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.diagnosis.text import table
+from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.options.groups import ControlMode
-from batchpid.sim.robot.robot import Robot, tuned_file
+from batchpid.sim.robot.reading import tuned_file
+from batchpid.sim.robot.robot import Robot
 
 
 class GainSet(NamedTuple):

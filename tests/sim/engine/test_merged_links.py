@@ -11,7 +11,7 @@ from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Randomization, Robot, Runner, Uniform
-from batchpid.sim.robot.robot import link_tree
+from batchpid.sim.robot.robot_model import link_tree
 
 BOX = (
     '<collision><origin xyz="0.1 0 0" rpy="0.3 0 0"/><geometry><box size="0.1 0.2'

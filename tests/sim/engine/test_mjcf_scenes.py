@@ -16,7 +16,7 @@ from batchpid.sim.engine.mujoco.mujoco_pack import ENGINE
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.randomization.distributions import nominal_values
-from batchpid.sim.robot.robot import describe
+from batchpid.sim.robot.reading import describe
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits"

@@ -15,7 +15,7 @@ from tiny_urdf import random_tree, robot, write
 
 import batchpid.task_space as ts
 from batchpid.sim import Randomization, Robot, Runner, Uniform, to_urdf
-from batchpid.sim.robot.robot import link_tree
+from batchpid.sim.robot.robot_model import link_tree
 
 ENGINES = ("sapien", "mujoco")
 FREE = {"control": "effort", "compensate": "none", "ground": False, "workers": 0}

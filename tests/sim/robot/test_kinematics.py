@@ -15,7 +15,7 @@ from batchpid.sim import Robot
 from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.sapien.building import build_scene, new_system
-from batchpid.sim.robot.robot import link_tree
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.task_space.frames import about, compose, from_rpy, matrix_of, rotate, to_rpy
 
 ODD = """<robot name="odd">
