@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
-from importlib.util import find_spec
 from itertools import product
 from multiprocessing import get_context
 from typing import Any
@@ -18,7 +17,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import choice, flag, instance, integer, number
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.log import CommandKind, Log, checked
 from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.problem import Problem, windows_of
@@ -124,11 +123,7 @@ def identify(
     ------
     InvalidArgumentError
         An option is out of range or contradicts a recording, or a file holds no log of this robot.
-    MissingDependencyError
-        SciPy is missing.
     """
-    if find_spec("scipy") is None:
-        raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
     kinds = [choice("extras", name, EXTRAS) for name in dict.fromkeys(extras)]
     evaluations = integer("evaluations", evaluations, 2, 1000)

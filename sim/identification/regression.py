@@ -131,13 +131,19 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
     1 / (1 + (f / cutoff)^8).
     """
     # Less the line between its ends, and with its odd reflection, a column is smoothly periodic.
-    line = np.linspace(table[0], table[-1], len(table))
-    rest = table - line
+    # The transform of a length with large prime factors takes ten times as long: rows are added by
+    # odd reflection at the end.
+    count = len(table) - 1
+    length = min(factor << max(-(-count // factor) - 1, 0).bit_length() for factor in (4, 5, 6, 7))
+    added = 2 * table[-1] - table[max(2 * count - length, 0) : -1][::-1]
+    longer = np.concatenate([table, added])
+    line = np.linspace(longer[0], longer[-1], len(longer))
+    rest = longer - line
     period = np.concatenate([rest, -rest[-2:0:-1]])
     frequency = np.fft.rfftfreq(len(period), timestep)[:, None]
     spectrum = np.fft.rfft(period, axis=0) / (1 + (frequency / cutoff) ** 8)
     filtered = np.fft.irfft(spectrum, len(period), axis=0)
-    return np.ascontiguousarray(line + filtered[: len(table)])
+    return np.ascontiguousarray((line + filtered[: len(line)])[: len(table)])
 
 
 def regress(data: Sequence[LogData]) -> list[Guess]:
@@ -248,8 +254,6 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     ``table`` has (rows,) the effort that the links need, acceleration, speed, its sign, and the
     effort of the motor.
     """
-    from scipy.optimize import nnls
-
     target, *motion, effort = table
     columns: Any = np.stack([*(-column for column in motion), effort, target], axis=1)
     # The bias is the mean of what is left, so that the others are found without it.
@@ -261,11 +265,51 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     prior = np.sqrt(len(target)) * weight * size[3] + 1e-12
     rows = np.vstack([columns, [0.0, 0.0, 0.0, prior, prior]])
     triangle: Any = np.linalg.qr(rows / np.append(size[:4], 1.0), mode="r")
-    values = nnls(triangle[:, :4], triangle[:, 4])[0] / size[:4]
+    least = np.zeros(4)
+    values = bounded_solution(triangle[:, :4], triangle[:, 4], least, least + np.inf) / size[:4]
     residual = columns[:, 4] - columns[:, :4] @ values
     bias = center[4] - center[:4] @ values
     motor = (values[3] * size[3]) ** 2 + 1e-3 * size[4] ** 2
     return [*values, bias, float(np.log((residual**2).mean() / motor + 1e-12))]
+
+
+def bounded_solution(
+    rows: Float64,
+    target: Float64,
+    low: Float64,
+    high: Float64,
+) -> Float64:
+    """Return the x (n,) between ``low`` <= 0 and ``high`` >= 0 that minimises |rows x - target|.
+
+    From 0 on, x goes to the minimum over its free entries, or to the first bound in between, whose
+    entry is then held; at a minimum the entry is freed that the gradient drives off its bound the
+    most (P. B. Stark and R. L. Parker, "Bounded-variable least squares", 1995).
+    """
+    x = np.zeros(len(low))
+    free = low < high
+    movable = free.copy()
+    for _ in range(10 * len(x)):
+        aim = x.copy()
+        rest = target - rows[:, ~free] @ x[~free]
+        aim[free] = np.linalg.lstsq(rows[:, free], rest, rcond=None)[0]
+        ends = np.where(aim < low, low, high)
+        beyond = free & ((aim < low) | (aim > high))
+        if beyond.any():
+            steps = np.full(len(x), np.inf)
+            steps[beyond] = ((ends - x)[beyond] / (aim - x)[beyond]).clip(0.0)
+            first = steps == steps.min()
+            x += steps.min() * (aim - x)
+            x[first] = ends[first]
+            free &= ~first
+            continue
+        x = aim
+        push = rows.T @ (target - rows @ x)
+        inward = movable & ~free & np.where(x <= low, push > 0, push < 0)
+        size = np.linalg.norm(rows, axis=0) * np.linalg.norm(target)
+        if not (np.abs(push)[inward] > 1e-12 * size[inward]).any():
+            break
+        free[np.argmax(np.abs(push) * inward)] = True
+    return x
 
 
 def better_reading(

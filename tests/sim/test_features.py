@@ -29,7 +29,7 @@ PAIRS = [
     for pair in itertools.combinations(FEATURES, 2)
     if not joints_of(pair[0]) & joints_of(pair[1])
 ]
-CONTROLS = ["pid", "drive", "osc"]
+CONTROLS = ["pid", "drive", "osc", "effort"]
 REFUSED = {"floating base": {"osc"}}
 """Controls that refuse a feature; all others have to reach their goal."""
 
@@ -38,21 +38,31 @@ def reach(robot: Robot, control: str, engine: str) -> None:
     """Assert that the robot reaches its goal, within a turn of each continuous joint."""
     start, goal = poses(robot)
     options: dict = {"control": control}
+    setpoint, ticks, error = goal, 250, 0.02
     if control == "osc":
         options = {"control": OperationalSpace(robot, "l8", posture=goal)}
-    with_pose = control == "osc"
-    setpoint = ts.link_poses(robot.kinematic_tree(), goal, ["l8"])[0] if with_pose else goal
+        setpoint = ts.link_poses(robot.kinematic_tree(), goal, ["l8"])[0]
+    if control == "effort":
+        # The law is outside of the runner, whose setpoints are its efforts.
+        options["substeps"], ticks, error = 1, 3000, 0.03
+        params = robot.designed("effort").replace(measurement_rate="difference")
+        pid = bp.BatchPID(params, 1, 1 / 2000)
     with Runner(robot, 1, workers=0, engine=engine, ground=False, **options) as runner:
-        runner.reset(start)
-        seen = runner.rollout(np.tile(setpoint, (250, 1)))
+        seen = runner.reset(start)
+        if control == "effort":
+            for _ in range(ticks):
+                seen = runner.step(pid(goal[None], seen.qpos.astype(float)))
+            seen = seen.map(lambda rows: rows[None])
+        else:
+            seen = runner.rollout(np.tile(setpoint, (ticks, 1)))
     assert seen.ok.all()
     last = seen.qpos[-1, 0].astype(float)
-    if with_pose:
+    if control == "osc":
         pose = seen.tool_pose[-1, 0].astype(float)
         np.testing.assert_allclose(pose[:3], setpoint[:3], rtol=0, atol=2e-3)
         assert abs(pose[3:] @ setpoint[3:]) > 1 - 1e-6  # cosine of half the angle
     else:
-        np.testing.assert_allclose(off(robot, last, goal), 0.0, atol=0.02)
+        np.testing.assert_allclose(off(robot, last, goal), 0.0, atol=error)
     followers = robot.coupling.followers
     rates = robot.coupling.rates(seen.qvel[-20:])[..., followers]
     np.testing.assert_allclose(seen.qvel[-20:, :, followers], rates, atol=0.02)
@@ -147,23 +157,6 @@ def test_every_feature_is_followed_along_a_trajectory(feature, engine):
         seen = runner.rollout(move.position, setpoint_rates=move.velocity)
     most = 1e-3 if robot.fixed_base else 0.03  # a free base moves away
     assert np.abs(off(robot, seen.qpos[:, 0], move.position)).max() < most
-
-
-@pytest.mark.parametrize(("feature", "engine"), [*in_both_engines(*FEATURES)])
-def test_every_feature_reaches_its_goal_by_efforts(feature, engine):
-    """The law outside of the runner, whose setpoints are its efforts."""
-    robot = robot_with(feature)
-    start, goal = poses(robot)
-    pid = bp.BatchPID(robot.designed("effort").replace(measurement_rate="difference"), 1, 1 / 2000)
-    with Runner(
-        robot, 1, workers=0, engine=engine, ground=False, control="effort", substeps=1
-    ) as runner:
-        seen = runner.reset(start)
-        pid.reset(seen.qpos.astype(float))
-        for _ in range(3000):
-            seen = runner.step(pid(goal[None], seen.qpos.astype(float)))
-    assert seen.ok.all()
-    np.testing.assert_allclose(off(robot, seen.qpos[0], goal), 0.0, atol=0.03)
 
 
 @pytest.mark.parametrize("kind", ["urdf", "xml"])
