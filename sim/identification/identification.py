@@ -30,7 +30,7 @@ from batchpid.sim.identification.regression import (
     smooth,
 )
 from batchpid.sim.identification.result import Identification
-from batchpid.sim.identification.simulator import Apart, Exact, Plant
+from batchpid.sim.identification.simulator import Apart, Exact, LogPlant
 from batchpid.sim.identification.trials import fit, with_effects
 from batchpid.sim.identification.unknowns import (
     BASIC,
@@ -241,7 +241,7 @@ def _prepared(
         band = np.array([FRICTION_BAND[robot.units[joint]] for joint in joints])
         turns = robot.continuous[joints] / TURN
         modelled = {"modelled": friction, "band": band, "turns": turns}
-    plants = dict[Robot, Plant]()
+    plants = dict[Robot, LogPlant]()
     data = list[LogData]()
     for log in logs:
         law = _law(robot, log, params)
@@ -257,7 +257,7 @@ def _prepared(
         )
         key = log.robot or robot
         if key not in plants:
-            plants[key] = Plant(_resting(key, start), tuple(joints.tolist()), free)
+            plants[key] = LogPlant(_resting(key, start), tuple(joints.tolist()), free)
         part = log.part(joints=moves)
         data.append(LogData(part, smooth(part, dt), plants[key], drive))
     return _resting(robot, start), data

@@ -288,7 +288,7 @@ def closed_loop(
         scene.joints,
         friction,
         slice(0, num_envs),
-        controller and _Traced(controller),
+        controller and _TracedController(controller),
         scene.dissipation == "urdf",
     )
     tree = robot.kinematic_tree(armature=np.zeros(robot.dof)).held
@@ -297,7 +297,7 @@ def closed_loop(
     return ClosedLoop(plant, control, tree, robot.start)
 
 
-class _Traced:
+class _TracedController:
     """The caller's own controller in a program of JAX."""
 
     def __init__(self, controller: OwnController) -> None:

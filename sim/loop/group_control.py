@@ -31,7 +31,7 @@ from batchpid.sim.robot.tables import Joint
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.stages import Control, Stage, stages_of
 from batchpid.stages.friction import REFRESH_STEPS
-from batchpid.stages.stage import StageProgram, States, started
+from batchpid.stages.stage import States, bind_stages, started
 from batchpid.stages.values import Command, Measured, Model, Outputs, Step, Values
 
 
@@ -189,7 +189,7 @@ def untraceable(options: RunnerOptions) -> str:
             if any(leaf.shape != row.shape for leaf in leaves(state)):
                 return f"the state of stage {stage.name!r} is not (envs, joints)"
             try:
-                StageProgram([stage], (state,), values, row.shape)
+                bind_stages([stage], (state,), values, row.shape)
             except (AttributeError, AssertionError, TypeError, ValueError) as error:
                 return f"stage {stage.name!r}: {error}"
     return ""

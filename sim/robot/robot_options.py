@@ -45,12 +45,12 @@ def known_joints(robot: Robot) -> dict[str, Float64]:
     ``armature``: reflected inertia of the motors [kg m^2 or kg]; each (dof,).
     """
     motors = robot.actuators or bp.Actuators()
-    known = {}
+    leaves = {}
     for name in ("coulomb", "viscous", "armature"):
         leaf = getattr(motors, name)
-        known[name] = np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
-    known["coulomb"] *= FRICTION_SHARE
-    return known
+        leaves[name] = np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
+    leaves["coulomb"] *= FRICTION_SHARE
+    return leaves
 
 
 def load_robot_actuators(source: bp.Actuators | str | Path, robot: Robot) -> bp.Actuators:

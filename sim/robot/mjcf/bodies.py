@@ -23,7 +23,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.sim.geometry.shapes import Shape, ShapeKind, possible_inertia
 from batchpid.sim.robot.mjcf.model import RobotInFile, can_collide, label
-from batchpid.sim.robot.mjcf.motors import Couplings, Motors
+from batchpid.sim.robot.mjcf.motors import Couplings, JointMotors
 from batchpid.sim.robot.tables import (
     NO_TURN,
     ORIGIN,
@@ -55,7 +55,7 @@ class TableReader:
     ``solid`` is the row of each body that has shapes, by the body's number.
     """
 
-    def __init__(self, robot: RobotInFile, motors: Motors) -> None:
+    def __init__(self, robot: RobotInFile, motors: JointMotors) -> None:
         self._model = robot.model
         self._robot = robot
         self._motors = motors
