@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import MjModel
-from batchpid.sim.findings import Finding, Notes
+from batchpid.sim.findings import Finding
 from batchpid.sim.robot.mjcf.model import RobotInFile, label
 
 Couplings = dict[str, tuple[str, float, float]]
@@ -95,10 +95,11 @@ class JointMotors:
     lag: dict[str, float] = field(default_factory=dict)
 
 
-def read_couplings(model: MjModel, robot: RobotInFile, notes: Notes) -> Couplings:
+def read_couplings(robot: RobotInFile) -> Couplings:
     """Return the joints that linear equalities couple: y - y0 = c0 + c1 (x - x0), with y0, x0 the
     reference pose.
     """
+    model = robot.model
     couplings: Couplings = {}
     others: list[str] = []
     for equality in np.flatnonzero(model.eq_active0).tolist():
@@ -112,26 +113,22 @@ def read_couplings(model: MjModel, robot: RobotInFile, notes: Notes) -> Coupling
         is_linear = leader in robot.joints and multiplier and not any(higher)
         if not is_linear or name in couplings:
             text = "without the joint's equality, which is not linear in one other joint"
-            notes.lose(text, name)
+            robot.lose(text, name)
             continue
         rest, rest_of_leader = model.qpos0[model.jnt_qposadr[[follower, leader]]].tolist()
         offset += rest - multiplier * rest_of_leader
         couplings[name] = robot.joints[leader], multiplier, offset
     if others:
         text = "closed loops are open, without the equality constraints other than between the"
-        notes.lose(f"{text} robot's joints: {', '.join(others)}")
+        robot.lose(f"{text} robot's joints: {', '.join(others)}")
     return couplings
 
 
-def read_motors(
-    model: MjModel,
-    robot: RobotInFile,
-    couplings: Couplings,
-    notes: Notes,
-) -> JointMotors:
+def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
     """Return the motors of the joints, with findings for effects that are not simulated."""
+    model = robot.model
     motors = JointMotors()
-    findings = notes.repairs
+    findings = robot.repairs
     # A follower has no motor: its leader moves its armature, too.
     for joint, name in robot.joints.items():
         for leader, arm in _on_leaders({name: 1.0}, couplings).items():
@@ -175,7 +172,7 @@ def read_motors(
     ]
     if tendons:
         text = "joints move freely, without springs, damping, friction, armature and limits of tendons: "
-        notes.lose(text + ", ".join(tendons))
+        robot.lose(text + ", ".join(tendons))
     return motors
 
 
