@@ -36,6 +36,9 @@ _EXPRESSIONS = {
     "ceil": "ceil{f}({0})",
     "floor": "floor{f}({0})",
     "sqrt": "sqrt{f}({0})",
+    "exp": "exp{f}({0})",
+    "tanh": "tanh{f}({0})",
+    "sin": "sin{f}({0})",
     "sign": "{0} > {zero} ? {one} : {0} < {zero} ? -{one} : {0}",
     "isfinite": "{0} - {0} == {zero} ? {one} : {zero}",
     "where": "{0} != {zero} ? {1} : {2}",
@@ -147,7 +150,12 @@ def statements(
     inputs, for joint ``j``. The results are written to ``places``.
     """
     operations, ends = _unrolled(traced, constants, len(names) - constants)
-    symbols = {"p": c.prefix, "f": c.suffix, "one": c.number(1.0), "zero": c.number(0.0)}
+    symbols = {
+        "p": c.prefix,
+        "f": c.suffix,
+        "one": c.number(1.0),
+        "zero": c.number(0.0),
+    }
     arrays = ", ".join(f"t{out}[{c.size}]" for _, out, _ in operations)
     lines = [f"  {c.type} {arrays};\n"] if arrays else []
 

@@ -95,8 +95,8 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments, Fused const *t
   bool fits = program->inputs >= 0 && given <= program->registers;
   for (Operation const &each : program->operations) {
     bool const writes_input = each.code == PUSH && each.out == each.operands[0] && each.out >= count;
-    fits = fits && known(each.out) && (each.out >= given || writes_input) && each.code >= ADD && each.code <= TAKE_ROW &&
-           std::all_of(each.operands, each.operands + 3, known);
+    fits = fits && known(each.out) && (each.out >= given || writes_input) && each.code >= ADD &&
+           each.code < NUMBER_OF_CODES && std::all_of(each.operands, each.operands + 3, known);
   }
   fits = fits && std::all_of(program->results.begin(), program->results.end(), known);
   for (Segment const &each : program->segments) {

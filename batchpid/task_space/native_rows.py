@@ -19,7 +19,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Float64
-from batchpid.native.availability import SWITCH, obstacle
+from batchpid.native.array_program import SWITCH, obstacle
 from batchpid.native.extensions import KINEMATICS, TASK_SPACE, load
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -80,7 +80,17 @@ def kinematics(
     # The extension writes into arrays that it is given, by rows.
     outputs = empty(wanted, leading, dof)
     inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
-    call(native.kinematics, *_arguments(native, tree, outputs, inputs, index, point))
+    call(
+        native.kinematics,
+        *_arguments(
+            native,
+            tree,
+            outputs,
+            inputs,
+            index,
+            point,
+        ),
+    )
     return outputs
 
 

@@ -20,8 +20,13 @@ from batchpid.checks.validate import array
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Robot, Rollout, write_recording
 from batchpid.sim.cli.flags import BOUNDS, Gains, NumEnvs, Randomize, flag
-from batchpid.sim.diagnosis.causes import settled_envs
-from batchpid.sim.diagnosis.text import cause_lines, median_and_worst, overshoot_of_settled, table
+from batchpid.sim.diagnosis.causes import (
+    cause_lines,
+    median_and_worst,
+    overshoot_of_settled,
+    settled_envs,
+    table,
+)
 from batchpid.sim.tuning.evaluation import (
     following_error,
     load_randomization,
@@ -39,7 +44,14 @@ SHORTEST = 1.0
 """Shortest run in which envs should settle [s]."""
 LISTED = 8
 """Envs that a line lists."""
-AXIS_UNITS = {"x": "m", "y": "m", "z": "m", "rx": "rad", "ry": "rad", "rz": "rad"}
+AXIS_UNITS = {
+    "x": "m",
+    "y": "m",
+    "z": "m",
+    "rx": "rad",
+    "ry": "rad",
+    "rz": "rad",
+}
 """Axes of the error of a pose, with their units."""
 COLUMNS = {
     "first_error": ("first error", "{:.2g}"),
@@ -142,7 +154,7 @@ def rollout(
     if control == "osc":
         _refuse("gains", gains, "are for the control of joints")
         _refuse("trajectory", trajectory, "has joint setpoints, and excludes --control osc")
-        operational = OperationalSpace(robot, robot.rigid_tree.tool, posture=robot.target)
+        operational = OperationalSpace(robot, robot.kinematic_tree().tool, posture=robot.target)
         options["control"] = operational
         columns = operational.command.names
         goal = operational.tool_pose(robot.target)
@@ -197,7 +209,15 @@ def rollout(
         result = runner.rollout(setpoints, progress=progress, **further)
         wall = time.perf_counter() - began
         backend = runner.backend
-    return RunReport(robot, result, timestep, wall, backend, notes, is_held=trajectory is None)
+    return RunReport(
+        robot,
+        result,
+        timestep,
+        wall,
+        backend,
+        notes,
+        is_held=trajectory is None,
+    )
 
 
 def start_poses(
@@ -216,7 +236,8 @@ def start_poses(
     reach = np.minimum(spread, (robot.upper - robot.lower) / 4)
     poses = center + reach * random.uniform(-1.0, 1.0, (num_envs, robot.dof))
     poses[0] = center
-    return robot.coupled(np.clip(poses, robot.lower, robot.upper))
+    coupled: Float64 = robot.coupling.positions(np.clip(poses, robot.lower, robot.upper))
+    return coupled
 
 
 def _refuse(name: str, value: Any, problem: str) -> None:

@@ -164,7 +164,7 @@ class StabilityCheck:
     def check(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
         """Warn if ``params`` pass the bound."""
         # SAPIEN's own friction is not in the formula.
-        if self._robot.dissipation == "sapien":
+        if self._robot.source.dissipation == "sapien":
             return
         motors = None
         if actuators is not None and not actuators.is_ideal:

@@ -19,7 +19,7 @@ from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import DEADBEAT_SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import BASES, STATUS, WIDTH, Group, ModelStruct, Refresh
+from batchpid.sim.engine.native.interface import WIDTH, number, structure
 from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class HasTree(Protocol):
 
 
 class NativeModel:
-    """Model of the robots of ``pack``, on a base of this kind of :data:`BASES`, with ``inertias``
+    """Model of the robots of ``pack``, on a base of this kind of Base in model.h, with ``inertias``
     (robots, dof + 1, 13) where they differ: :meth:`RigidTree.inertias`.
     """
 
@@ -102,7 +102,7 @@ class NativeModel:
         self._inertias = inertias
 
     @cached_property
-    def _structure(self) -> tuple[ModelStruct, Any]:
+    def _structure(self) -> tuple[Any, Any]:
         tree, rows = self._pack.rigid_tree.tables
         if self._inertias is None:
             inertias = self._pack.rigid_tree.inertias()[None]
@@ -113,11 +113,10 @@ class NativeModel:
         numbers = {
             "dof": len(tree),
             "varies": self._inertias is not None,
-            "base": BASES.index(self._base),
+            "base": number("Base", self._base.upper()),
         }
-        return ModelStruct(
-            gravity=tuple(self._pack.rigid_tree.bodies.gravity), **numbers, **addresses
-        ), arrays
+        gravity = tuple(self._pack.rigid_tree.bodies.gravity)
+        return structure("Model")(gravity=gravity, **numbers, **addresses), arrays
 
     @property
     def address(self) -> int:
@@ -168,7 +167,14 @@ class NativeModel:
             for rows in (qpos, qvel, base)
         ]
         out = np.empty(qpos.shape)
-        self._native.forces(self.address, gravity, coriolis, *state, out, len(out))
+        self._native.forces(
+            self.address,
+            gravity,
+            coriolis,
+            *state,
+            out,
+            len(out),
+        )
         return out
 
 
@@ -219,8 +225,12 @@ class NativeRefresh:
         }
         arrays |= coupling.native()
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
-        self._structure = Refresh(
-            model=model.address, timestep=timestep, share=DEADBEAT_SHARE, steps=steps, **addresses
+        self._structure = structure("Refresh")(
+            model=model.address,
+            timestep=timestep,
+            share=DEADBEAT_SHARE,
+            steps=steps,
+            **addresses,
         )
         self._kept = model, arrays
 
@@ -242,7 +252,7 @@ class NativeStep:
     """Sim step of ``robots`` with ``dof`` joints as one native call, from Python or from an XLA
     program.
 
-    ``arrays`` and ``fields`` fill a :class:`.interface.Group`; a joint speed beyond ``speed_limit``
+    ``arrays`` and ``fields`` fill a Group of sim_step.h; a joint speed beyond ``speed_limit``
     (dof,) shows in the status.
     """
 
@@ -259,7 +269,12 @@ class NativeStep:
             self._arrays["speed_limit"] = np.broadcast_to(speed_limit, dof).astype(np.float64)
         addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
         self._native = native.extension("_gateway")
-        self._group = Group(robots=robots, dof=dof, **addresses, **fields)
+        self._group = structure("Group")(
+            robots=robots,
+            dof=dof,
+            **addresses,
+            **fields,
+        )
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension that does a sim
@@ -278,7 +293,7 @@ class NativeStep:
         """Return whether an env may have failed in a sim step with this status; RuntimeError if the
         engine has.
         """
-        if status & 1 << STATUS.index("failed"):
+        if status & number("Status", "FAILED"):
             raise RuntimeError(self._group.message.decode(errors="replace"))
         return bool(status)
 

@@ -96,7 +96,15 @@ def excite(
         # The motion shrinks about a center until nothing is in its way.
         share = movable.astype(np.float64)
         while most < _ENOUGH and share[movable].min() >= _LEAST:
-            motion = _chirp(robot, center, share, time, lowest, highest, phase)
+            motion = _chirp(
+                robot,
+                center,
+                share,
+                time,
+                lowest,
+                highest,
+                phase,
+            )
             problem, joints = _obstacle(robot, motion)
             obstacle = obstacle or problem
             # Followers move with their leaders.
@@ -122,7 +130,8 @@ def _centers(robot: Robot, easy: Float64, rng: np.random.Generator) -> Float64:
     low = np.maximum(robot.lower, robot.start - np.pi)
     high = np.minimum(robot.upper, robot.start + np.pi)
     edge = np.minimum(0.4 * (high - low), [REACH[unit] for unit in robot.units])
-    return robot.coupled(np.clip(poses, low + edge, high - edge))
+    coupled: Float64 = robot.coupling.positions(np.clip(poses, low + edge, high - edge))
+    return coupled
 
 
 def _obstacle(robot: Robot, motion: Trajectory) -> tuple[str, list[int]]:
@@ -190,6 +199,6 @@ def _chirp(
         1.0,
     )[:, None]
     window = edge**3 * (10 - 15 * edge + 6 * edge**2)
-    position = robot.coupled(center + window * amplitude * np.sin(angle))
+    position = robot.coupling.positions(center + window * amplitude * np.sin(angle))
     velocity = np.gradient(position, dt, axis=0)
     return Trajectory(time, position, velocity, np.gradient(velocity, dt, axis=0))

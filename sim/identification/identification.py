@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
-from importlib.util import find_spec
 from itertools import product
 from multiprocessing import get_context
 from typing import Any
@@ -18,7 +17,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import choice, flag, instance, integer, number
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.log import CommandKind, Log, checked
 from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.problem import Problem, windows_of
@@ -31,7 +30,7 @@ from batchpid.sim.identification.regression import (
     smooth,
 )
 from batchpid.sim.identification.result import Identification
-from batchpid.sim.identification.simulator import Apart, Exact, Plant
+from batchpid.sim.identification.simulator import Apart, Exact, LogPlant
 from batchpid.sim.identification.trials import fit, with_effects
 from batchpid.sim.identification.unknowns import (
     BASIC,
@@ -42,8 +41,8 @@ from batchpid.sim.identification.unknowns import (
     kinds_of,
 )
 from batchpid.sim.options.groups import Compensation
-from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
 from batchpid.stages import Control
 from batchpid.task_space.tree_quantities import mass_matrix
@@ -124,11 +123,7 @@ def identify(
     ------
     InvalidArgumentError
         An option is out of range or contradicts a recording, or a file holds no log of this robot.
-    MissingDependencyError
-        SciPy is missing.
     """
-    if find_spec("scipy") is None:
-        raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
     kinds = [choice("extras", name, EXTRAS) for name in dict.fromkeys(extras)]
     evaluations = integer("evaluations", evaluations, 2, 1000)
@@ -138,7 +133,14 @@ def identify(
         places = _payload_links(robot, payload_link)
     read = _read(robot, logs, params, reading)
     moves, still = _moving(robot, read)
-    robot, data = _prepared(robot, read, moves, params, compensate, timestep)
+    robot, data = _prepared(
+        robot,
+        read,
+        moves,
+        params,
+        compensate,
+        timestep,
+    )
     law_unknown = bool({"kd", "gain"}.intersection(kinds))
     data, guesses = _regress(robot, data, law_unknown, progress)
     windows = windows_of(data)
@@ -147,7 +149,14 @@ def identify(
         starts = dict[Any, list[Problem]]()
         for place, share in product(places, SATURATIONS if "saturation" in kinds else (0.7,)):
             for guess in guesses:
-                unknowns = _unknowns(robot, data, guess, kinds, place, share)
+                unknowns = _unknowns(
+                    robot,
+                    data,
+                    guess,
+                    kinds,
+                    place,
+                    share,
+                )
                 starts.setdefault((place, share), []).append(Problem(data, windows, unknowns, run))
         solution = with_effects(fit(starts, evaluations, progress), evaluations, progress)
     # Worker processes end with the fit.
@@ -158,7 +167,7 @@ def _payload_links(robot: Robot, name: str | None) -> list[str | None]:
     """Return the links where a payload may be: the one with a ``name``, or the last link with a
     mass that is fixed behind the tool, and the tool.
     """
-    tree = robot.rigid_tree
+    tree = link_tree(robot)
     if name is not None:
         return [choice("payload_link", name, tree.links)]
     body = tree.link_bodies[tree.index(tree.tool)]
@@ -241,12 +250,12 @@ def _prepared(
     free = (qpos.min(0) < robot.lower[joints]) | (qpos.max(0) > robot.upper[joints])
     # A Runner compensates the friction of the description and of the robot's motors, too.
     modelled = {}
-    friction = (robot.friction + known_joints(robot).coulomb)[joints]
+    friction = (robot.friction + known_joints(robot)["coulomb"])[joints]
     if "friction" in compensated and friction.any():
         band = np.array([FRICTION_BAND[robot.units[joint]] for joint in joints])
         turns = robot.continuous[joints] / TURN
         modelled = {"modelled": friction, "band": band, "turns": turns}
-    plants = dict[Robot, Plant]()
+    plants = dict[Robot, LogPlant]()
     data = list[LogData]()
     for log in logs:
         law = _law(robot, log, params)
@@ -262,7 +271,7 @@ def _prepared(
         )
         key = log.robot or robot
         if key not in plants:
-            plants[key] = Plant(_resting(key, start), tuple(joints.tolist()), free)
+            plants[key] = LogPlant(_resting(key, start), tuple(joints.tolist()), free)
         part = log.part(joints=moves)
         data.append(LogData(part, smooth(part, dt), plants[key], drive))
     return _resting(robot, start), data
@@ -281,8 +290,7 @@ def _own_timestep(log: Log) -> float:
 
 def _resting(robot: Robot, start: Float64) -> Robot:
     """Return ``robot`` with the start pose ``start`` (dof,)."""
-    reading = robot.reading._replace(defaults=FileDefaults(start))
-    return replace(robot, settings=None, reading=reading)
+    return replace(robot, settings=None, source=robot.source._replace(start=start))
 
 
 def _option(

@@ -24,6 +24,7 @@ from batchpid.sim.loop.closed_loop import ClosedLoop
 from batchpid.sim.loop.loop_run import LoopRun
 from batchpid.sim.loop.tree_plant import TreePlant
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.stages import Control, Stage, Told, Values
 from batchpid.task_space.frames import SpatialInertia, spatial_matrix
 from batchpid.task_space.tree_quantities import mass_matrix
@@ -113,7 +114,7 @@ class Exact(Stage):
         return state, values.told(qf=values.outputs.qf + values.seen.passive)
 
 
-class Plant:
+class LogPlant:
     """Logged ``joints`` of ``robot``; those that are ``free`` (joints,) have no limits.
 
     A control and candidates have the logged joints; arrays of the tree have the followers, too.
@@ -129,7 +130,7 @@ class Plant:
             leader = number[coupling.leader[joint]]
             ratio = coupling.multiplier[joint]
             followers.append(Follower(number[joint], leader, ratio, coupling.offset[joint]))
-        tree = robot.rigid_tree.fixed_at(coupling.positions(robot.start), moves)
+        tree = link_tree(robot).fixed_at(coupling.positions(robot.start), moves)
         self.tree = replace(tree, coupling=Coupling.of(tree.dof, followers))
         """Rigid tree of the logged joints and their followers."""
         self.joints = len(logged)
@@ -205,8 +206,10 @@ class Plant:
         for name, factor in candidates.mass.items():
             body = tree.link_bodies[tree.index(name)]
             for link in np.flatnonzero(np.array(tree.link_bodies) == body).tolist():
-                own = SpatialInertia(float(tree.mass[link]), tree.center[link], tree.inertia[link])
-                added[tree.links[link]] = (factor - 1)[:, None, None] * spatial_matrix(own)
+                spatial = SpatialInertia(
+                    float(tree.mass[link]), tree.center[link], tree.inertia[link]
+                )
+                added[tree.links[link]] = (factor - 1)[:, None, None] * spatial_matrix(spatial)
         for name, mass in candidates.payload.items():
             point = SpatialInertia(1.0, tree.center[tree.index(name)], np.zeros((3, 3)))
             change = mass[:, None, None] * spatial_matrix(point)
@@ -229,7 +232,7 @@ def changed_params(params: bp.PIDParams, law: Mapping[str, Float64]) -> bp.PIDPa
 
 
 def simulate(
-    plant: Plant,
+    plant: LogPlant,
     drive: Control,
     candidates: Candidates,
     states: Float64,

@@ -183,7 +183,14 @@ def setpoint_csv(robot: Robot, motion: Trajectory) -> str:
     text = io.StringIO()
     # A name may hold separators and quotation marks.
     header = [name if re.fullmatch(r"[\w.:/-]+", name) else _quoted(name) for name in names]
-    np.savetxt(text, rows, "%.9g", ",", header=",".join(["time", *header]), comments="")
+    np.savetxt(
+        text,
+        rows,
+        "%.9g",
+        ",",
+        header=",".join(["time", *header]),
+        comments="",
+    )
     return text.getvalue()
 
 
@@ -206,7 +213,7 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
     source = str(path)
     columns, lines = read_csv(path)
     tables = _tables(robot, source, columns, lines)
-    tables["setpoint"] = robot.coupled(tables["setpoint"])
+    tables["setpoint"] = robot.coupling.positions(tables["setpoint"])
     substeps, at_zero = _substeps(source, columns["time"], lines, timestep)
     start = None
     if at_zero:
@@ -216,13 +223,29 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
     acceleration = tables.get("setpoint_acceleration")
     if "setpoint_rate" in tables:
         rate = tables["setpoint_rate"]
-        return Setpoints(start, position, rate, acceleration, substeps, True, 0)
+        return Setpoints(
+            start,
+            position,
+            rate,
+            acceleration,
+            substeps,
+            True,
+            0,
+        )
     if start is None:
         first = robot.start
     else:
         first = start
     rate, steps = _rates(robot, np.vstack([first, position]), substeps * timestep)
-    return Setpoints(start, position, rate, acceleration, substeps, False, steps)
+    return Setpoints(
+        start,
+        position,
+        rate,
+        acceleration,
+        substeps,
+        False,
+        steps,
+    )
 
 
 def _rates(robot: Robot, position: Float64, dt: float) -> tuple[Float64, int]:
@@ -306,6 +329,9 @@ def _substeps(
         remedy = f"begin at 0 or {dt:g} s, with rows whole sim steps of {timestep:g} s apart"
         # Rows of 30 Hz are no whole number of the default steps.
         if abs(period - dt) > 1e-6 * timestep:
+            if len(time) > 1 and period > 0:
+                # Times are rounded: over all rows the period is closer than between two.
+                period = (time[-1] - time[0]) / np.round(np.diff(time) / period).sum()
             remedy += f", or use --timestep {period / substeps:.9g} (timestep=)"
         raise error(source, problem, remedy)
     if first + len(time) == 1:

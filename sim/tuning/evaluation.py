@@ -26,8 +26,13 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.motors import DRIVEN
-from batchpid.sim.diagnosis.causes import absolute_band
-from batchpid.sim.diagnosis.text import cause_lines, median_and_worst, overshoot_of_settled, table
+from batchpid.sim.diagnosis.causes import (
+    absolute_band,
+    cause_lines,
+    median_and_worst,
+    overshoot_of_settled,
+    table,
+)
 from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.options.groups import DEFAULT_ENGINE, EngineName
 from batchpid.sim.randomization.checks import check_robot

@@ -99,7 +99,7 @@ def generated_options(
                 rng.random(shape) < 0.3, off, on * rng.uniform(0.1, 1.0, shape)
             )
     strategies = ["none", "conditional"]
-    if "effort_max" in options:
+    if np.isfinite(options.get("effort_max", np.inf)).any():
         strategies.append("clamp")
     if units == "effort":
         options["non_finite"] = rng.choice(["propagate", "zero", "hold"]).item()
@@ -154,7 +154,7 @@ def made_up_inputs(envs: int = ENVS, joints: int = JOINTS, count: int = 30) -> I
     measurement = 3 * np.sin(0.15 * steps + phase) + 0.3 * steps
     measurement[..., 0] = (measurement[..., 0] + np.pi) % (2 * np.pi) - np.pi
     setpoint = np.where(steps < 12, 1.0, -2.0) * np.cos(phase) + 0.01 * steps
-    noise = [rng.normal(size=measurement.shape) for _ in range(4)]
+    noise = [scale * rng.normal(size=measurement.shape) for scale in (1, 1, 5, 1)]
     root = rng.normal(size=(count, envs, joints, joints))
     matrix = 0.1 * (root @ root.mT + np.eye(joints))
     arrays = setpoint, measurement, *noise, matrix

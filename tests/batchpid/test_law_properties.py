@@ -147,6 +147,26 @@ def test_a_change_of_ki_is_bumpless(run, ki):
     assert before.tobytes() == after.tobytes()
 
 
+@settings(max_examples=25)
+@given(b=st.floats(0.0, 1.0), seed=st.integers(0, 999), implicit=st.booleans(), turns=st.booleans())
+def test_to_begin_and_to_end_with_rates_makes_no_bump(b, seed, implicit, turns):
+    """P and I go on from step to step; a rate of 0 is no rate."""
+    options = {"gain_units": "mass_matrix", "discretization": "implicit"} if implicit else {}
+    params = bp.make_params(3, 170.0, 500.0, 26.0, setpoint_weight=b, continuous=turns, **options)
+    k, rng = bp.discretise(params, DT)._replace(gain_units=None), np.random.default_rng(seed)
+    y, r, rate = rng.normal(size=(3, 2, 3))
+    state, _ = bp.advance(k, bp.init(params, y), r, y, setpoint_rate=rate)
+    (with_rate, given), (without, none) = (
+        bp.advance(k, state, r, y, setpoint_rate=x) for x in (0 * rate, None)
+    )
+    for one, other in zip((*with_rate, *given), (*without, *none), strict=True):
+        np.testing.assert_array_equal(one, other)
+    _, rated = bp.advance(k, state, r, y, setpoint_rate=rate)
+    moved = (1 - b) * np.asarray(k.kp) * DT * np.abs(rate) if implicit else 0.0
+    assert (np.abs(rated.p - none.p) <= 1.001 * moved + 1e-12 * np.abs(none.p)).all()
+    np.testing.assert_array_equal(rated.i, none.i)
+
+
 @given(cases, runs, npst.arrays(bool, ENVS), st.booleans())
 @settings(max_examples=25)
 def test_reset_restarts_the_masked_envs_alone(case, run, mask, keep):

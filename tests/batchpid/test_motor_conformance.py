@@ -18,8 +18,7 @@ from scalar_motors import ScalarFriction, ScalarGuard, ScalarMotor, friction_gai
 import batchpid as bp
 from batchpid import motors
 from batchpid.motors import friction, guard
-from batchpid.native.array_program import ArrayProgram
-from batchpid.native.availability import obstacle
+from batchpid.native.array_program import ArrayProgram, obstacle
 from batchpid.native.tracing import trace
 
 DT, STEPS, ENVS, JOINTS = 1 / 500, 40, 5, 3

@@ -118,16 +118,6 @@ def test_single_rows_are_followed_within_the_limits_without_a_stop(frequency):
     assert abs(setpoint[-1, 0] - 0.02 * frequency) < 0.02
 
 
-def test_thirty_knots_end_where_they_are_to_within_the_limits():
-    knots = np.random.default_rng(1).normal(0, 0.15, (30, 3)).cumsum(0)
-    plan = made("newest", horizon=30, period=4 / 30, rate=2.0, acceleration=15.0)
-    (setpoint, rate, _), state = run(plan, 4 * DT * np.arange(2500), {0: [(knots, 4 / 30)]})
-    assert np.abs(rate).max() <= 2.0 + 1e-9
-    assert np.abs(np.diff(setpoint, 2, axis=0)).max() <= 15.0 * (4 * DT) ** 2 * (1 + 1e-6)
-    np.testing.assert_allclose(setpoint[-1], knots[-1], atol=1e-3)
-    assert state.starved.min() > 0
-
-
 def test_without_a_chunk_it_stops_within_the_limits_and_resumes_without_a_step():
     plan = made("newest", joints=1, horizon=16, rate=1.0, acceleration=9.0)
     ramp = 0.8 * PERIOD * np.arange(16)[:, None]

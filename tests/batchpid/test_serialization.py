@@ -161,16 +161,6 @@ def test_files_that_cannot_be_opened_are_named(tmp_path):
             bp.load_params(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("format: batchpid-params-2\njoints: {a: {kp: 1.0}}", r"batchpid-params-2; this one reads"),
-        (
-            "format: batchpid-params-1\nintegration: output_first\njoints: {a: {kp: 1.0}}",
-            r"What changed: integration: the effort is computed before",
-        ),
-    ],
-)
-def test_a_file_of_another_version_is_refused_with_what_changed(text, problem):
-    with pytest.raises(bp.InvalidArgumentError, match=problem):
-        bp.loads_params(text)
+def test_a_file_of_another_version_is_refused():
+    with pytest.raises(bp.InvalidArgumentError, match=r"batchpid-params-2; this one reads"):
+        bp.loads_params("format: batchpid-params-2\njoints: {a: {kp: 1.0}}")

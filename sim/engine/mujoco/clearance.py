@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
-from batchpid.sim.engine.native.interface import WIDTH, Clearance
+from batchpid.sim.engine.native.interface import WIDTH, structure
 from batchpid.sim.engine.native_model import aligned
 
 Arrays = dict[str, NDArray[Any]]
@@ -233,7 +233,7 @@ class GroupClearance:
         # Native code has their addresses.
         self._kept = [*models], data
         fields = zip(("flags", "counts", "types_at", "affinities_at"), places() or (), strict=True)
-        self._fields = Clearance(
+        self._fields = structure("Clearance")(
             kinematics=kinematics,
             number=pairs,
             ways=ways,

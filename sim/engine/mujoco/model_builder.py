@@ -33,7 +33,7 @@ from batchpid.sim.engine.mujoco.mujoco_sensors import add_link_sensors
 from batchpid.sim.engine.physics import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.geometry.shapes import add_geom
-from batchpid.sim.robot.parts import CONTACT_FRICTION, Joint, MjcfFile
+from batchpid.sim.robot.tables import CONTACT_FRICTION, Joint, MjcfFile
 from batchpid.task_space.frames import SpatialInertia
 
 FLOATING = 6
@@ -158,7 +158,16 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         joint = model.joint(model.body(parts.root).jntadr[0])
         base = int(joint.qposadr[0]), int(joint.dofadr[0])
     bodies = {link: model.body(name).id for link, name in parts.names.items()}
-    return RobotMj(model, spec.joints, qpos, qvel, bodies, parts.terms, parts.frames, base)
+    return RobotMj(
+        model,
+        spec.joints,
+        qpos,
+        qvel,
+        bodies,
+        parts.terms,
+        parts.frames,
+        base,
+    )
 
 
 def robot_spec(spec: SceneSpec) -> tuple[MjSpec, dict[str, str]]:

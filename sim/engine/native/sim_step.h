@@ -11,11 +11,11 @@ namespace batchpid {
 // Largest position of a robot that has not failed [rad or m].
 constexpr double FARTHEST = 1e6;
 
-// Reasons for which a loop over sim steps has to stop, as bits: STATUS in interface.py.
+// Reasons for which a loop over sim steps has to stop, as bits.
 enum Status : std::int32_t { NOT_FINITE = 1, TOO_FAST = 2, FAILED = 4, NO_NOISE = 8, SENSE = 16 };
 
-// Group of robots; Python fills in the fields (Group in interface.py) and owns what they point to.
-struct Group {
+// Group of robots; Python fills in the fields and owns what they point to.
+struct FOR_PYTHON Group {
   Functions const *functions;        // of SAPIEN
   Articulation *const *articulations;  // (robots,): in SAPIEN
   System *const *systems;            // (robots,): of each robot

@@ -21,11 +21,9 @@ from batchpid.arrays.elementwise import (
 )
 from batchpid.motors import delay
 from batchpid.native import array_program
-from batchpid.native.array_program import ArrayProgram
-from batchpid.native.availability import obstacle
+from batchpid.native.array_program import ArrayProgram, obstacle
 from batchpid.native.extensions import OPERATIONS
-from batchpid.native.symbols import Namespace, Symbol
-from batchpid.native.tracing import trace
+from batchpid.native.tracing import Namespace, Symbol, trace
 
 pytestmark = pytest.mark.skipif(bool(obstacle()), reason="there are no native programs")
 DTYPES = st.sampled_from([np.float64, np.float32])
@@ -104,8 +102,28 @@ def test_histories_rows_and_columns():
     assert_identical(found, columns_of(columns, a, b))
 
 
+def functions_of_the_c_library(a):
+    xp = a.__array_namespace__()
+    return [xp.exp(a), xp.tanh(a), xp.sin(a)]
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_functions_of_the_c_library_are_within_four_units_of_numpy_wherever_a_number_stands(dtype):
+    rng = np.random.default_rng(1)
+    rows = numbers(rng, (5000, 7), 0.1, dtype)
+    program = ArrayProgram(trace(functions_of_the_c_library, 0, 1, dtype), (), 1, rows.shape, dtype)
+    found = program(rows)
+    with np.errstate(all="ignore"):
+        expected = functions_of_the_c_library(rows)
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_max_ulp(ours, theirs, 4)
+    alone = ArrayProgram(trace(functions_of_the_c_library, 0, 1, dtype), (), 1, (1, 7), dtype)
+    assert_identical(alone(rows[4321:4322].copy()), [table[4321:4322] for table in found])
+
+
 def test_no_operation_is_left_out():
     namespace = Namespace()
+    functions_of_the_c_library(Symbol(namespace))
     every_operation(*(Symbol(namespace) for _ in range(4)))
     history_operations(*(Symbol(namespace) for _ in range(3)))
     columns_of(*(Symbol(namespace) for _ in range(3)))

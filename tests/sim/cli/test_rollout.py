@@ -313,6 +313,16 @@ def test_a_wrong_trajectory_is_refused(batchpid, tmp_path, panda, motion, change
     assert error.count("\n") == 1
 
 
+def test_the_time_step_that_an_error_names_is_accepted(batchpid, tmp_path, panda, motion):
+    path = tmp_path / "motion.csv"
+    at_30_hz = in_column(0, lambda cell: f"{float(cell) * 20 / 3:.4f}")
+    path.write_text(at_30_hz(csv(panda, motion, "setpoint_rate")))
+    _, _, error = batchpid("rollout", "--trajectory", path, *ONE)
+    timestep = re.search(r"--timestep (\S+)", error)[1]
+    status, _, error = batchpid("rollout", "--trajectory", path, "--timestep", timestep, *ONE)
+    assert (status, error) == (0, "")
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [

@@ -13,7 +13,7 @@ from robots import load_bundled
 
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError, RobotError
-from batchpid.native.availability import SWITCH
+from batchpid.native.array_program import SWITCH
 from batchpid.sim import OperationalSpace, Robot, Runner, StabilityWarning
 from batchpid.task_space.frames import about, compose
 
