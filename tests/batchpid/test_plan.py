@@ -116,7 +116,7 @@ def test_single_rows_are_followed_within_the_limits_without_a_stop(frequency):
     assert np.abs(np.diff(setpoint[:, 0], 2)).max() <= 15.0 * DT**2 * (1 + 1e-6)
     assert (rate[20:, 0] > 0).all()
     assert abs(setpoint[-1, 0] - 0.02 * frequency) < 0.02
-    np.testing.assert_allclose(np.diff(setpoint[:, 0]) / DT, rate[1:, 0], atol=15.0 * DT)
+    np.testing.assert_allclose(np.diff(setpoint[:, 0]) / DT, rate[1:, 0], atol=0.05)
 
 
 def test_without_a_chunk_it_stops_within_the_limits_and_resumes_without_a_step():
