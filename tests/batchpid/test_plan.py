@@ -179,20 +179,6 @@ def test_jax_agrees_with_times_of_each_env(name, alone, x64):
     np.testing.assert_allclose(shown.reshape(found.shape), found, atol=1e-8)
 
 
-def test_samples_in_a_scan(x64):
-    plan = made("align")
-    state = bp.plan.add(plan, bp.plan.init(plan, np.zeros((1, 3))), np.ones((1, 8, 3)), 0.0)
-    times = DT * np.arange(20)
-    _, rows = jax.lax.scan(
-        lambda state, t: (lambda new, *row: (new, row))(*bp.plan.sample(plan, state, t)),
-        jax.tree.map(jnp.asarray, state),
-        times,
-    )
-    for at, t in enumerate(times):
-        state, *row = bp.plan.sample(plan, state, t)
-        np.testing.assert_allclose([each[at] for each in rows], row, atol=1e-8)
-
-
 PROGRAM = """#include <stdio.h>
 {header}
 int main(void) {{
