@@ -4,7 +4,9 @@ motion to record for it.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 
 EVALUATIONS = 45
 """Length of the bar: a fit usually ends before."""
+THREADS = "scipy_openblas_set_num_threads64_"
+"""Function of the OpenBLAS in NumPy's wheels."""
 
 
 class Excitation(NamedTuple):
@@ -181,6 +185,7 @@ def identify_logs(
     from batchpid.sim.identification.identification import identify
     from batchpid.sim.identification.logs import Reading
 
+    _use_one_thread()
     # A fit ends when it has converged: the bar shows an upper bound.
     evaluations = iter(range(EVALUATIONS) if progress is None else progress(range(EVALUATIONS)))
     result = identify(
@@ -202,6 +207,13 @@ def identify_logs(
     problem = "are explained to less than half of the error of the robot as described"
     remedy = "--force writes the file nevertheless"
     raise InvalidArgumentError("logs", f"{problem}, and no file is written", remedy=remedy)
+
+
+def _use_one_thread() -> None:
+    """Let NumPy's OpenBLAS use one thread: the others spin for a third of a fit's time."""
+    library = ctypes.CDLL(find_spec("numpy._core._multiarray_umath").origin)  # type: ignore[union-attr]
+    if hasattr(library, THREADS):
+        getattr(library, THREADS)(1)
 
 
 def _gains(robot: Robot, name: str) -> bp.PIDParams:

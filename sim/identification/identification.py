@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
-from importlib.util import find_spec
 from itertools import product
 from multiprocessing import get_context
 from typing import Any
@@ -18,7 +17,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import choice, flag, instance, integer, number
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.log import CommandKind, Log, checked
 from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.problem import Problem, windows_of
@@ -31,7 +30,7 @@ from batchpid.sim.identification.regression import (
     smooth,
 )
 from batchpid.sim.identification.result import Identification
-from batchpid.sim.identification.simulator import Apart, Exact, Plant
+from batchpid.sim.identification.simulator import Apart, Exact, LogPlant
 from batchpid.sim.identification.trials import fit, with_effects
 from batchpid.sim.identification.unknowns import (
     BASIC,
@@ -124,11 +123,7 @@ def identify(
     ------
     InvalidArgumentError
         An option is out of range or contradicts a recording, or a file holds no log of this robot.
-    MissingDependencyError
-        SciPy is missing.
     """
-    if find_spec("scipy") is None:
-        raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
     kinds = [choice("extras", name, EXTRAS) for name in dict.fromkeys(extras)]
     evaluations = integer("evaluations", evaluations, 2, 1000)
@@ -138,7 +133,14 @@ def identify(
         places = _payload_links(robot, payload_link)
     read = _read(robot, logs, params, reading)
     moves, still = _moving(robot, read)
-    robot, data = _prepared(robot, read, moves, params, compensate, timestep)
+    robot, data = _prepared(
+        robot,
+        read,
+        moves,
+        params,
+        compensate,
+        timestep,
+    )
     law_unknown = bool({"kd", "gain"}.intersection(kinds))
     data, guesses = _regress(robot, data, law_unknown, progress)
     windows = windows_of(data)
@@ -147,7 +149,14 @@ def identify(
         starts = dict[Any, list[Problem]]()
         for place, share in product(places, SATURATIONS if "saturation" in kinds else (0.7,)):
             for guess in guesses:
-                unknowns = _unknowns(robot, data, guess, kinds, place, share)
+                unknowns = _unknowns(
+                    robot,
+                    data,
+                    guess,
+                    kinds,
+                    place,
+                    share,
+                )
                 starts.setdefault((place, share), []).append(Problem(data, windows, unknowns, run))
         solution = with_effects(fit(starts, evaluations, progress), evaluations, progress)
     # Worker processes end with the fit.
@@ -246,7 +255,7 @@ def _prepared(
         band = np.array([FRICTION_BAND[robot.units[joint]] for joint in joints])
         turns = robot.continuous[joints] / TURN
         modelled = {"modelled": friction, "band": band, "turns": turns}
-    plants = dict[Robot, Plant]()
+    plants = dict[Robot, LogPlant]()
     data = list[LogData]()
     for log in logs:
         law = _law(robot, log, params)
@@ -262,7 +271,7 @@ def _prepared(
         )
         key = log.robot or robot
         if key not in plants:
-            plants[key] = Plant(_resting(key, start), tuple(joints.tolist()), free)
+            plants[key] = LogPlant(_resting(key, start), tuple(joints.tolist()), free)
         part = log.part(joints=moves)
         data.append(LogData(part, smooth(part, dt), plants[key], drive))
     return _resting(robot, start), data

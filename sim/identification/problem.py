@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +35,10 @@ HELD_OUT = 0.25
 """Share of each log, at its end, that is held out."""
 MOST_WINDOWS = 500
 """Largest number of windows; if there are more, evenly spaced ones are used."""
+FEWER, LEAST_WINDOWS = 4, 12
+"""Share of the windows, and their least number, for the first steps of a fit."""
+BEGINNING = 4.0
+"""Length of a log of setpoints for the first steps of a fit [s]."""
 MOST_ROWS = 40_000
 """Largest number of rows of all logs; if there are more, evenly spaced ones are used."""
 ENVS = 1024
@@ -59,6 +63,17 @@ class Window(NamedTuple):
     fitted: Any
     """Fitted rows; the others are held out (rows,) bool."""
 
+    def until(self, step: int) -> Window:
+        """Return the rows that end before a sim step."""
+        stretch = self.stretch
+        rows = stretch.step < step
+        command = stretch.command[: stretch.past + step]
+        part = stretch._replace(
+            command=command, step=stretch.step[rows], before=stretch.before[rows]
+        )
+        columns = self.measured[rows], self.time[rows], self.fitted[rows]
+        return Window(self.log, part, *columns)
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -69,6 +84,21 @@ class Problem:
     unknowns: Unknowns
     run: Callable[..., Any] = map
     """Map over groups of windows: ``map``, or that of worker processes."""
+
+    def coarse(self, judged: bool = False) -> Problem:
+        """Return the problem with every FEWER-th window, or with the beginnings of logs of
+        setpoints, for the first steps of a fit; itself where logs are short.
+
+        A ``judged`` problem has held-out rows.
+        """
+        windows = self.windows[::FEWER]
+        if self.data[0].drive.mode == "pid":
+            most = round(BEGINNING / self.data[0].drive.timestep)
+            longest = max(len(window.stretch.command) for window in self.windows)
+            if judged or longest < 2 * most:
+                return self
+            return replace(self, windows=[window.until(most) for window in self.windows])
+        return replace(self, windows=windows) if len(windows) >= LEAST_WINDOWS else self
 
     def evaluate(
         self,
@@ -207,7 +237,16 @@ def windows_of(data: Sequence[LogData]) -> list[Window]:
             starts = [*range(edge, split - length + 1, length)]
             starts += range(first, total - length + 1, length)
         for start in starts:
-            windows.append(_window(number, part, start, start + length, split, every))
+            windows.append(
+                _window(
+                    number,
+                    part,
+                    start,
+                    start + length,
+                    split,
+                    every,
+                )
+            )
     return windows[:: 1 + len(windows) // MOST_WINDOWS]
 
 

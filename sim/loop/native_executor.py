@@ -22,7 +22,7 @@ from batchpid.sim.engine.native.interface import number, structure
 from batchpid.sim.loop.array_executors import COUPLING_STEPS, EngineSteps
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.loop.group_control import GroupControl, native_obstacle
-from batchpid.stages.stage import StageProgram, States, recalled, running
+from batchpid.stages.stage import States, bind_stages, recalled, running
 from batchpid.stages.values import Command, Measured, Outputs, Step, Values
 
 
@@ -194,10 +194,10 @@ class TickProgram:
         if not pairs:
             return values
         stages, states = zip(*pairs, strict=True)
-        made = StageProgram(stages, states, values, self.buffers.before.shape, passes)
+        # Native code sets the addresses of the noise, which is another in each sim step.
+        drawn = [id(block) for block in leaves(values.noise)]
+        made, values = bind_stages(stages, states, values, self.buffers.before.shape, passes)
         if made.outputs:
-            # Native code sets the addresses of the noise, which is another in each sim step.
-            drawn = [id(block) for block in leaves(values.noise)]
             noise = [at for at, array in enumerate(made.inputs) if id(array) in drawn]
             self._add_stage(
                 "PROGRAM",
@@ -208,7 +208,7 @@ class TickProgram:
             arguments = made.program.arguments
             self._programs.append(self._native.bind(arguments, rows, tuple(made.outputs)))
             self._references.append(made)
-        return made.values
+        return values
 
     def _add_stage(self, kind: str, every: int = 1, **fields: Any) -> None:
         self._stages.append(
