@@ -28,6 +28,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.trees import mapped
 from batchpid.motors import Actuators
 from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.shapes import LEAST_MASS, Shape
@@ -189,6 +190,7 @@ class Tables:
         vars(self).update(
             bodies=tuple(Body._make(map(read_only, body)) for body in self.bodies),
             shapes=tuple(Shape._make(map(read_only, shape)) for shape in self.shapes),
+            visuals={link: mapped(read_only, rows) for link, rows in self.visuals.items()},
         )
 
     def __eq__(self, other: object) -> bool:
