@@ -200,7 +200,7 @@ FEATURES: dict[str, Feature] = {
     "own controller": Feature({"control": Damped()}, exact=True),
     "a command of its own": Feature({"control": Polar()}, exact=True),
     "guard": Feature({"guard": GUARD}),
-    "plan": Feature({"plan": PLAN}),
+    "plan": Feature({"plan": PLAN, "randomization": Randomization(latency=Uniform(0, 0.03))}),
     "plan of a drive": Feature({"control": "drive", "plan": PLAN, "guard": GUARD}, exact=True),
     "guarded drive": Feature({"control": "drive", "guard": GUARD}, exact=True),
     "a thermal limit": Feature({"stages": [Thermal(2.0, 0.02)]}),
