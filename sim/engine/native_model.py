@@ -277,7 +277,7 @@ class NativeStep:
         """Return whether an env may have failed in a sim step with this status; RuntimeError if the
         engine has.
         """
-        if status & number("Status", "FAILED"):
+        if status and status & number("Status", "FAILED"):
             raise RuntimeError(self._group.message.decode(errors="replace"))
         return bool(status)
 
