@@ -95,7 +95,14 @@ class NumPyExecutor:
             step = Step(index, end, control.left(index, end))
             self.before = self.measured.qpos  # where a robot that fails now is suspended
             measured = self.measured
-            values = Values(command, measured, measured, control.timestep, step, setup.model)
+            values = Values(
+                command,
+                measured,
+                measured,
+                control.timestep,
+                step,
+                setup.model,
+            )
             with controller_errors(control.controller, index + 1):
                 self.outputs = outputs = self._stepped(values).outputs
             # Writing the targets of drives costs a call for each joint.

@@ -46,8 +46,10 @@ RESET = np.arange(N) % 2 == 0
 ENGINES = ("sapien", "mujoco")
 pytestmark = [
     pytest.mark.usefixtures("small_groups"),
-    # Of faults, lost workers and past bounds.
-    pytest.mark.filterwarnings("ignore::UserWarning"),
+    # An env fails and a worker is lost, of which a warning tells; no feature warns of anything else.
+    pytest.mark.filterwarnings("error::UserWarning"),
+    pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning"),
+    pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning"),
 ]
 
 
