@@ -45,7 +45,7 @@ def passive_force(
     bodies = None
     if base is not None:
         turning = base[:, 3:]
-        bodies = tree.bodies._replace(gravity=base[:, None, :3])
+        bodies = tree.bodies._replace(gravity=base[:, :3])
     force = zero
     if coriolis or gravity:
         force = ts.bias(
