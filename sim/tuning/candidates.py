@@ -158,11 +158,14 @@ class GainCandidates:
         leaves = np.stack([designed.ki, designed.kp, designed.kd])
         medians = np.median(leaves[..., self.robot.independent], axis=(1, 2))
         p, w = np.array(DESIGNS).T
-        gains = np.stack([p * w**2, w**2 + 2 * p * w, p + 2 * w], axis=1)
-        ki, kp, kd = (gains / medians).T
+        # Over the designed gains, by their equations.
+        ki = p * w**2 / medians[0]
+        kp = (w**2 + 2 * p * w) / medians[1]
+        kd = (p + 2 * w) / medians[2]
         bandwidth = np.cbrt(ki)
-        points = np.zeros((len(gains), len(FACTORS)))
-        points[:, :3] = np.log(np.stack([bandwidth, kp / bandwidth**2, kd / bandwidth], axis=1))
+        factors = bandwidth, kp / bandwidth**2, kd / bandwidth
+        points = np.zeros((len(p), len(FACTORS)))
+        points[:, :3] = np.log(np.stack(factors, axis=1))
         return points
 
     def params(self, points: Float64) -> bp.PIDParams:
