@@ -48,7 +48,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.gains.stability import stability_bound
-from batchpid.metrics import StepMetrics
+from batchpid.metrics import SETTLING_SHARE, StepMetrics
 from batchpid.sim.diagnosis.causes import absolute_band
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
@@ -124,7 +124,7 @@ class GainCandidates:
         # Figures of the moves as steps.
         self._steps = len(moves.names)
         self._band = absolute_band(robot)
-        self._size = np.maximum(np.abs(moves.target - moves.start), self._band / 0.02)
+        self._size = np.maximum(np.abs(moves.target - moves.start), self._band / SETTLING_SHARE)
         self._variation = smooth_variation(robot, moves, 1.0)
         self._limit = settling_limits(robot, moves)
         # The moves of a candidate's envs; a move has the same drawn robot both times.
