@@ -24,7 +24,7 @@ SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation22getRootAngularVelocityEv",
 )
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
-WIDTH = 4
+WIDTH = 8
 """Number of robots in a vector, as in lanes.h."""
 CONTACT = ("none", "some", "unknown")
 """What is known about the contacts of a robot, as Contact in free_motion.h."""
@@ -140,6 +140,10 @@ class FreeMotion(ctypes.Structure):
             "high",
             "contact",
             "time",
+            "ctrl",
+            "position_gain",
+            "drive_rate_gain",
+            "drive_limit",
         ),
         ("robots", ctypes.c_int64),
         *_all(ctypes.c_double, "stiffness", "rate_gain", "least", "most", "width", "timestep"),
