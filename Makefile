@@ -25,7 +25,7 @@ ARGS :=
 
 # Sources of the native extensions. BUILD builds those that are older than their sources.
 NATIVE := setup.py batchpid/native/extensions.py batchpid/sim/engine/native/interface.py \
-	$(filter-out %/passes.h,$(foreach folder,batchpid/native batchpid/sim/engine/native,$(wildcard $(folder)/*.cpp $(folder)/*.h))) \
+	$(filter-out %/codes.h %/passes.h %/structures.h,$(foreach folder,batchpid/native batchpid/sim/engine/native,$(wildcard $(folder)/*.cpp $(folder)/*.h))) \
 	$(wildcard batchpid/native/*.py batchpid/law/*.py)
 BUILD := $(STEP) "compiling native extensions" env -u BATCHPID_NATIVE $(RUN) -u -W ignore setup.py build_ext --inplace
 

@@ -6,6 +6,7 @@ With BATCHPID_NATIVE=0 none is built.
 
 import importlib.util
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -80,21 +81,62 @@ class Build(build_ext):
             sys.exit(f"batchpid: the extension {ext.name} cannot be built: {error}; {remedy}")
 
 
-def write_passes():
-    """Write passes.h, one pass for each of the commonest laws, from their traces."""
+def passes():
+    """Return passes.h: one pass for each of the commonest laws, from their traces."""
     sys.path.insert(0, str(ROOT))
     from batchpid.native.passes import header
 
-    file = ROOT / "batchpid" / "native" / "passes.h"
-    text = header()
-    # An equal file keeps its time, or all would be compiled again.
+    return header()
+
+
+def structures(headers, constants):
+    """Return structures.h: names of the fields of each structure that is marked FOR_PYTHON, and the
+    numbers of enumerations; the compiler adds types and places. ``constants`` are those of Python.
+    """
+    text = re.sub(r"//.*", "", "".join(header.read_text() for header in headers))
+    found = dict(re.findall(r"struct FOR_PYTHON (\w+) \{(.*?)\n\};", text, re.DOTALL))
+    lines = [
+        f"  FIELD({name}, {field})" for name, body in found.items() for field in fields(body, found)
+    ]
+    for name, body in re.findall(r"enum (?:class )?(\w+) : [\w:]+ \{(.*?)\};", text, re.DOTALL):
+        lines += [f"  NUMBER({name}, {entry})" for entry in re.findall(r"[A-Z_]+", body)]
+    checks = [f"static_assert(batchpid::{name} == {value});" for name, value in constants.items()]
+    macro = "#define FOR_ALL \\\n" + " \\\n".join(lines)
+    return "\n".join(["// Written by setup.py.", *checks, macro, ""])
+
+
+def fields(body, found):
+    """Return the names of the fields of a structure; those of a structure in it behind its own."""
+    names = []
+    for statement in body.partition("{")[0].split(";")[:-1]:
+        first, _, rest = statement.strip().partition(" ")
+        if "(*" in rest or "(*" in first:
+            names += re.findall(r"\(\*(\w+)\)", statement)
+        elif first in found and "*" not in rest:
+            names += [f"{rest}.{name}" for name in fields(found[first], {})]
+        else:
+            names += [re.search(r"\w+(?=\[|$)", part.strip())[0] for part in rest.split(",")]
+    return names
+
+
+def write(path, text):
+    """Write a header; an equal file keeps its time, or all would be compiled again."""
+    file = ROOT / path
     if not file.is_file() or file.read_text() != text:
         file.write_text(text)
 
 
 modules = [load(name) for name in MODULES] if os.environ.get("BATCHPID_NATIVE") != "0" else []
 if modules:
-    write_passes()
+    write("batchpid/native/codes.h", modules[0].codes())
+    write("batchpid/native/passes.h", passes())
+    folder = ROOT / "batchpid/sim/engine/native"
+    sources = [path for path in sorted(folder.glob("*.h")) if path.name != "structures.h"]
+    sources.append(ROOT / "batchpid/native/rigid_body.h")
+    write(
+        "batchpid/sim/engine/native/structures.h",
+        structures(sources, {"WIDTH": modules[1].WIDTH, "FARTHEST": modules[1].FARTHEST}),
+    )
 extensions = [extension for module in modules for extension in module.EXTENSIONS.values()]
 setup(
     cmdclass={"build_ext": Build},

@@ -16,8 +16,7 @@ Params say how to control, a state is carried from step to step, and every array
 - Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.gains.presets` for the
   tutorial's; :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`,
   :func:`load_about`.
-- Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`,
-  :func:`spectral_radius`.
+- Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`.
 - A simulator's drive with integral action: :func:`drive_target`.
 - Limits of setpoints: :func:`make_guard` and :mod:`batchpid.motors.guard`.
 - Chunks of a slow policy: :func:`make_plan` and :mod:`batchpid.plan`.
@@ -35,7 +34,7 @@ from batchpid.controller import BatchPID
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.gains import presets
 from batchpid.gains.design import design_gains
-from batchpid.gains.stability import spectral_radius, stability_bound
+from batchpid.gains.stability import stability_bound
 from batchpid.io.documents import (
     dumps_params,
     load_about,
@@ -43,7 +42,7 @@ from batchpid.io.documents import (
     loads_params,
     save_params,
 )
-from batchpid.io.packages import attributes_of
+from batchpid.io.files import attributes_of
 from batchpid.law.bumpless import track
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams, make_params
@@ -90,14 +89,13 @@ __all__ = [
     "save_actuators",
     "save_params",
     "save_plan",
-    "spectral_radius",
     "stability_bound",
     "step",
     "step_terms",
     "track",
 ]
 
-_MODULES = ("export", "metrics", "sim", "task_space", "trajectories")
+_MODULES = ("export", "metrics", "sim", "stages", "task_space", "trajectories")
 """Public modules, which are imported when they are used."""
 __getattr__ = attributes_of(__name__, _MODULES)
 

@@ -13,7 +13,7 @@ from batchpid.law import pid
 from batchpid.law.coefficients import discretise
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
-from batchpid.native.availability import obstacle
+from batchpid.native.array_program import obstacle
 from batchpid.native.compiled import CompiledLaw
 
 

@@ -22,9 +22,8 @@ from batchpid.checks.validate import (
 )
 from batchpid.errors import InvalidArgumentError
 from batchpid.law import bumpless, pid
-from batchpid.law.input_checks import check_alone
 from batchpid.law.params import PIDParams
-from batchpid.law.state import PIDState, Terms
+from batchpid.law.state import PIDState, Terms, check_alone
 
 BACKENDS: dict[str, type[NumPyBackend | JAXBackend]] = {"numpy": NumPyBackend, "jax": JAXBackend}
 MOST_ENVS = 2**31

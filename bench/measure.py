@@ -32,7 +32,7 @@ from workload import Case, Workload, run_round
 
 from batchpid.io.files import package_versions, write_atomically
 from batchpid.sim import Robot
-from batchpid.sim.cli.report import table
+from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.engine import native
 from batchpid.sim.engine.protocol import EnginePack, load_engine
 from batchpid.sim.loop import env_group

@@ -102,7 +102,9 @@ def poses(robot: Robot, num_envs: int) -> tuple[np.ndarray, np.ndarray]:
     target = robot.target if robot.settings is not None else start + 0.3 * (robot.upper > 1.0)
     noise = np.random.default_rng(0).uniform(-0.05, 0.05, (num_envs, robot.dof))
     starts = np.clip(start + noise, robot.lower, robot.upper)
-    return robot.coupled(starts), robot.coupled(np.clip(target, robot.lower, robot.upper))
+    return robot.coupling.positions(starts), robot.coupling.positions(
+        np.clip(target, robot.lower, robot.upper)
+    )
 
 
 def peer(robot: Robot, num_envs: int) -> Callable[[int], float]:

@@ -44,7 +44,7 @@ def bare_engine(robot: Robot, num_envs: int, ticks: int) -> float:
     """
     options: dict[str, Any] = {"ground": robot.has_ground}
     spec = SceneSpec(
-        robot.tables, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
+        robot.tables, robot.self_contact.ignored, robot.joints, 1 / 2000, MujocoSolver(), **options
     )
     built = robot_model(spec)
     batch = mujoco_batch.Batch(built.model, num_envs, nthread=1, persistent=True)

@@ -132,7 +132,7 @@ def bare_engine(
     """
     spec = SceneSpec(
         robot.tables,
-        robot.ignored_pairs,
+        robot.self_contact.ignored,
         robot.joints,
         1 / 2000,
         MujocoSolver(),

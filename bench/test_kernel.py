@@ -18,7 +18,7 @@ import simple_pid
 from tutorial import SimplePID
 
 import batchpid as bp
-from batchpid.native.availability import SWITCH
+from batchpid.native.array_program import SWITCH
 
 numba = pytest.importorskip("numba")
 pytestmark = pytest.mark.usefixtures("quick_smoke")

@@ -21,7 +21,7 @@ import pytest
 from workload import Workload
 
 import batchpid.task_space as ts
-from batchpid.native.availability import SWITCH
+from batchpid.native.array_program import SWITCH
 from batchpid.sim import OperationalSpace, Robot, Runner
 from batchpid.task_space import native_rows
 

@@ -80,13 +80,13 @@ class Workload:
         """
         robot = self.simulated_robot()
         options: dict[str, Any] = {
-            "dissipation": robot.dissipation,
+            "dissipation": robot.source.dissipation,
             "collisions": collisions,
             "ground": collisions,
         }
         spec = SceneSpec(
             robot.tables,
-            robot.ignored_pairs,
+            robot.self_contact.ignored,
             robot.joints,
             TIMESTEP,
             PHYSICS[self.physics],

@@ -151,7 +151,7 @@ def _model(robot: Robot, truth: Truth, names: tuple[str, ...], timestep: float) 
         geom.contype = geom.conaffinity = 0
     model = spec.compile()
     if truth.payload:
-        model.body(robot.rigid_tree.tool).mass[:] += truth.payload
+        model.body(robot.kinematic_tree().tool).mass[:] += truth.payload
     return model
 
 

@@ -68,7 +68,7 @@ class Planner:
 
 def robot_with_ball(robot, path):
     """Write a robot to ``path`` that has the ball as a visual shape of its base; return it."""
-    place, base = " ".join(map(str, BALL)), robot.links[0].name
+    place, base = " ".join(map(str, BALL)), robot.tables.bodies[0].name
     shape = f'<origin xyz="{place}"/><geometry><sphere radius="{RADIUS}"/></geometry>'
     shape += '<material name="red"><color rgba="0.8 0.2 0.1 1"/></material>'
     joint = f'<joint name="b" type="fixed"><parent link="{base}"/><child link="ball"/></joint>'

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from batchpid.io.packages import attributes_of
+from batchpid.io.files import attributes_of
 
 if TYPE_CHECKING:
     from batchpid.sim.diagnosis.loop_stability import StabilityWarning

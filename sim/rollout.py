@@ -62,8 +62,6 @@ _OF_ROBOT = (
     "lower",
     "upper",
     "effort_limit",
-    "digest",
-    "dissipation",
     "fixed_base",
 )
 """Fields of :class:`RunInfo` that are attributes of a robot."""
@@ -161,7 +159,10 @@ class RunInfo:
         """Return the info of a run of a :class:`batchpid.sim.Robot`; ``options`` are further
         fields.
         """
+        from batchpid.sim.robot.reading import content
+
         values = {name: getattr(robot, name) for name in _OF_ROBOT}
+        values |= {"digest": content(robot), "dissipation": robot.source.dissipation}
         return cls(robot=robot.name, description=robot, **values, **options)
 
     @property

@@ -18,7 +18,6 @@ from batchpid.checks.validate import array, choice, flag, instance, names
 from batchpid.errors import InvalidArgumentError, warn
 from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
-from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
 from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec
@@ -106,7 +105,9 @@ class OperationalSpace:
         if point is not None:
             self.point = array("point", point, (1, 3), "xyz", kind="entry")[0]
         posture = robot.start if posture is None else posture
-        self._posture = robot.coupled(array("posture", posture, (1, tree.dof), tree.joint_names))
+        self._posture = robot.coupling.positions(
+            array("posture", posture, (1, tree.dof), tree.joint_names)
+        )
         if options.keys().isdisjoint(("effort_limit", "effort_min", "effort_max")):
             options["effort_limit"] = robot.effort_limit
         params = ts.make_osc_params(tree, **options)
@@ -121,11 +122,11 @@ class OperationalSpace:
         # Coulomb friction, and the band of errors in which it is reduced.
         self._friction: tuple[Array, Array] | None = None
         # Damping and friction that the robot is known to have: the law acts against them.
-        modelled = DISSIPATION[robot.dissipation].modelled
+        modelled = robot.source.dissipation == "urdf"
         motors = known_joints(robot)
-        damping = motors.viscous + np.array([joint.damping * modelled for joint in robot.joints])
+        damping = motors["viscous"] + robot.damping * modelled
         self._damping = damping[None] if damping.any() else None
-        coulomb = motors.coulomb + robot.friction * modelled
+        coulomb = motors["coulomb"] + robot.friction
         band = np.array([FRICTION_BAND[unit] for unit in robot.units])
         self._known_friction = (coulomb[None], band[None]) if coulomb.any() else None
         # A setpoint has the pose (7), then the optional twist, acceleration and wrench (6 each),

@@ -10,6 +10,8 @@ import numpy as np
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 STRICT = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
+RESET = 20
+"""Step before which a law is reset with its integral, in programs of C and the runs that they are compared with."""
 TABLE = """#include <stdio.h>
 #include "arm.h"
 int main(void) {{
@@ -38,7 +40,7 @@ def compiled(
 def law_program(
     header: str, inputs: list[tuple[str, int]], prefix: str, kind: str, joints: int
 ) -> str:
-    """Return a program that reads steps from stdin and writes their efforts to stdout; step 60 is
+    """Return a program that reads steps from stdin and writes their efforts to stdout; step RESET is
     after a reset.
     """
     arrays = "".join(f"  {kind} {name}[{size}];\n" for name, size in inputs)
@@ -56,7 +58,7 @@ int main(void) {{
 {arrays}  memset(&state, 0, sizeof state);
   for (int at = 0;; ++at) {{
 {reads}    if (at == 0) {prefix}_init(&state, measurement);
-    if (at == 60) {prefix}_reset(&state, measurement);
+    if (at == {RESET}) {prefix}_reset(&state, measurement);
     {prefix}_step(&state, {arguments}, effort);
     fwrite(effort, sizeof({kind}), {joints}, stdout);
   }}

@@ -19,7 +19,6 @@ import warnings
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 from pages import (
     BLOCK,
@@ -103,18 +102,6 @@ def test_every_link_has_a_target(page):
         assert not anchor or anchor in [
             re.sub(r"[^\w-]", "", title.lower().replace(" ", "-")) for title in titles
         ]
-
-
-def test_the_legends_of_pictures_are_in_the_words_of_their_page():
-    robot = Robot.load("panda")
-    with Runner(robot, 2, engine="mujoco", workers=0) as runner:
-        figure = runner.rollout(np.tile(robot.target, (3, 1))).plot()
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    (legend,) = re.findall(r"^Legend: (.*?)\. ", (ROOT / "docs/tutorial.md").read_text(), re.M)
-    assert re.findall("`(.*?)`", legend) == labels
-    for page in PAGES:
-        for picture in re.findall(r"\]\((images/[^)]+)\)", page.read_text()):
-            assert (page.parent / picture).is_file(), page
 
 
 def test_the_pictures_of_the_readme_are_light():

@@ -115,22 +115,10 @@ def take_columns(rows: Array, columns: Array) -> Array:
 
 
 @_recorded("push")
-def push_history(history: Array, *values: Array) -> Array:
-    """Return ``history`` (envs, samples, numbers) with ``values`` (envs, joints), side by side, as
-    latest sample.
-    """
-    xp = namespace(history, *values)
-    if len(values) == 1:
-        sample = values[0]
-    else:
-        sample = xp.concatenate(values, axis=1)
-    return xp.concatenate((sample[:, None], history[:, :-1]), axis=1)
-
-
-@_recorded("take")
-def read_history(history: Array, places: Array) -> Array:
-    """Return the numbers of ``history`` at flat indices ``places`` (envs, joints)."""
-    return history.take(places)
+def push_history(history: Array, value: Array) -> Array:
+    """Return ``history`` (..., samples, joints) with ``value`` (..., joints) as latest sample."""
+    xp = namespace(history, value)
+    return xp.concatenate((value[..., None, :], history[..., :-1, :]), axis=-2)
 
 
 @_recorded("take_row")

@@ -256,18 +256,17 @@ def array(
     ``finite`` is False. ``names`` holds the name of each column. ``kind`` is the type of a column:
     a joint, or an entry of a command.
     """
-    remedy = (
-        f"the last axis counts the {'joints' if kind == 'joint' else 'entries'} {', '.join(names)}"
-    )
     is_read = type(value) is np.ndarray and value.dtype == np.float64  # nearly always
     result: NDArray[Any] = value if is_read else read_array(argument, value)  # type: ignore[assignment]
-    # One number for all joints is a scalar, not an array of one.
-    if result.ndim and result.shape[-1] != shape[-1]:
-        raise InvalidArgumentError(
-            argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy
-        )
     flat = result.reshape(-1)
     if not is_read or result.shape != shape:
+        columns = "joints" if kind == "joint" else "entries"
+        remedy = f"the last axis counts the {columns} {', '.join(names)}"
+        # One number for all joints is a scalar, not an array of one.
+        if result.ndim and result.shape[-1] != shape[-1]:
+            raise InvalidArgumentError(
+                argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy
+            )
         result = broadcast(argument, result, shape, remedy)
     # The sum of squares costs a third, and is finite for most; BLAS uses threads for a longer one.
     is_sound = flat.size < 10_000 and math.isfinite(flat.dot(flat))
@@ -350,14 +349,6 @@ def within(
         remedy="check the unit",
     )
     return rows
-
-
-def joint_speeds(
-    argument: str, value: ArrayLike, joint_names: Sequence[str]
-) -> NDArray[np.float64]:
-    """Return ``value`` as one positive number per joint (dof,)."""
-    rows = array(argument, value, (1, len(joint_names)), joint_names)
-    return at_least(argument, rows[0].copy(), 0.0, joint_names, above=True)
 
 
 def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_]:

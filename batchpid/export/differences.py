@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike
 from batchpid.arrays.array_types import Bool, Document, Float64
 from batchpid.checks.validate import array, at_least, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
-from batchpid.law.anti_windup import named
+from batchpid.law.coefficients import as_explicit
 from batchpid.law.computed_torque import check_gain_units
-from batchpid.law.implicit import as_explicit
-from batchpid.law.params import LAW_FIELDS, PIDParams
+from batchpid.law.params import LAW_FIELDS, PIDParams, strategy_names
 from batchpid.motors.actuators import ACTUATOR_FIELDS, Actuators
 from batchpid.motors.guard import GUARD_FIELDS, Guard
 
@@ -111,7 +110,7 @@ class Law(NamedTuple):
     def strategies(self) -> list[str]:
         """Strategy of anti-windup of each joint, by the names of make_params."""
         params = self.params
-        rows = named(params.num_joints, params.tracking_time, params.conditional)
+        rows = strategy_names(params.num_joints, params.tracking_time, params.conditional)
         return [str(strategy) for strategy in rows[0]]
 
     @property

@@ -1,6 +1,6 @@
 """Gains: their design, the stability of the loop under them, presets."""
 
 from batchpid.gains.design import design_gains, pid_from_inertia
-from batchpid.gains.stability import spectral_radius, stability_bound
+from batchpid.gains.stability import stability_bound
 
-__all__ = ["design_gains", "pid_from_inertia", "spectral_radius", "stability_bound"]
+__all__ = ["design_gains", "pid_from_inertia", "stability_bound"]

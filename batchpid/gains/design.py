@@ -143,7 +143,7 @@ def design_gains(
     gain_units
         Unit of the gains: "effort", or per "mass_matrix" (:mod:`batchpid.law.computed_torque`).
     discretization
-        "explicit", or "implicit" for gains per "mass_matrix" (:mod:`batchpid.law.implicit`): stable
+        "explicit", or "implicit" for gains per "mass_matrix" (:mod:`batchpid.law.coefficients`): stable
         at any ``dt``, so that the bandwidth is kept and the derivative is not filtered.
     margin
         Share of the stability range that may be used, in [0.001, 0.999].

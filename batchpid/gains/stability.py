@@ -1,4 +1,4 @@
-r"""Stability of a sampled PID loop on a chain of rigid bodies: in closed form, and exactly.
+r"""Stability of a sampled PID loop on a chain of rigid bodies.
 
 The simulator holds the effort u over a step dt and integrates semi-implicitly. Around a pose, with
 the mass matrix M, implicit joint damping B, gains Kp, Kd and the derivative's filter time tau (all
@@ -31,8 +31,8 @@ multivariable root loci", Int. J. Control 25, 1977). The phase has to fall throu
 there; if it begins below, no gains are stable and the ratio is infinite. A delay between two steps
 is interpolated, as :mod:`batchpid.motors.delay` does.
 
-The integral, which is slow, is not in the ratio; :func:`spectral_radius` includes it. E. I. Jury,
-Theory and Application of the z-Transform Method (Wiley, 1964).
+The integral, which is slow, is not in the ratio. E. I. Jury, Theory and Application of the
+z-Transform Method (Wiley, 1964).
 """
 
 from __future__ import annotations
@@ -211,58 +211,6 @@ def _crossing(z: Rows, values: Rows) -> tuple[float, int]:
         0.0,
     )
     return float(crossed.max()), int(crossed.max(1).argmax())
-
-
-def spectral_radius(
-    mass_matrix: ArrayLike,
-    kp: ArrayLike,
-    ki: ArrayLike,
-    kd: ArrayLike,
-    dt: float,
-    *,
-    filter_time: ArrayLike = 0.0,
-    damping: ArrayLike = 0.0,
-) -> Float64:
-    """Return the largest modulus (...) of the eigenvalues of the sampled PID loop: below 1 it is
-    stable.
-
-    They are the eigenvalues of the exact one-step matrix of the law, output first, and the plant,
-    on the state (q, q - q', I, d). Arguments are as in :func:`stability_bound`, and ``ki`` [N
-    m/(rad s) or N/(m s)], shaped as kp. Where ki is 0 its pole at 1 is left out.
-    """
-    values = np.linalg.eigvals(_one_step(mass_matrix, dt, kp, ki, kd, filter_time, damping))
-    radius: Float64 = np.abs(values).max(-1)
-    return radius
-
-
-def _one_step(mass_matrix: ArrayLike, dt: float, *gains: ArrayLike) -> Float64:
-    """Return the matrix (..., 4 joints, 4 joints) of one step on the state (q, q - q', I, d)."""
-    columns = dict(zip(("kp", "ki", "kd", "filter_time", "damping"), gains, strict=True))
-    m, p, i, c, tau, b = _columns(mass_matrix, dt, **columns)
-    shape = m.shape[:-1]
-    one = np.broadcast_to(np.eye(shape[-1]), m.shape)
-    zero = np.zeros(m.shape)
-
-    def diagonal(values: Float64) -> Float64:
-        return values[..., None] * one
-
-    # One step of the law, output first, and of the plant, semi-implicit, as block rows.
-    keep = tau / (tau + dt)
-    take = dt / (tau + dt)
-    # d = keep d' - take w / dt on the negated measurement, so u = -p q + I + c d; w = q - q'.
-    rate = [zero, diagonal(-take / dt), zero, diagonal(keep)]
-    effort = [
-        diagonal(-p),
-        c[..., None] * rate[1],
-        diagonal(np.where(i > 0, 1.0, 0.0)),
-        c[..., None] * rate[3],
-    ]
-    implicit = np.linalg.inv(m + diagonal(dt * b))
-    step = [dt**2 * (implicit @ column) for column in effort]
-    step[1] = step[1] + implicit @ m
-    integral = [diagonal(-i * dt), zero, diagonal(np.where(i > 0, 1.0, 0.0)), zero]
-    position = [s + e for s, e in zip(step, [one, zero, zero, zero], strict=True)]
-    return np.block([position, step, integral, rate])
 
 
 def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[Float64, ...]:

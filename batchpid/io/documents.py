@@ -17,7 +17,7 @@ import os
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -58,8 +58,6 @@ class RecordFile(Generic[R]):
     """Options that every joint must have."""
     partial: bool = False
     """Whether a file may leave joints out, whose options are then off."""
-    gone: Mapping[str, str] = field(default_factory=dict)
-    """Options that files of earlier versions have, and what holds now."""
 
     def dumps(
         self,
@@ -184,14 +182,13 @@ class RecordFile(Generic[R]):
     def _joints(self, source: str, document: Any) -> dict[str, Document]:
         """Return the joints of a document of this form, with checked keys and types of values."""
         version = document.get("format") if isinstance(document, dict) else None
-        if (
-            isinstance(version, str)
-            and version.rpartition("-")[0] == self.format.rpartition("-")[0]
-        ):
-            self._check_version(source, version, document)
-        elif version != self.format:
+        if version != self.format:
+            problem = f"holds no {self.record.NAME}"
             remedy = f"it must contain 'format: {self.format}'"
-            raise InvalidArgumentError(source, f"holds no {self.record.NAME}", remedy=remedy)
+            if str(version).rpartition("-")[0] == self.format.rpartition("-")[0]:
+                problem = f"is a file of another version ({version}; this one reads {self.format})"
+                remedy = "write the file anew"
+            raise InvalidArgumentError(source, problem, remedy=remedy)
         for key in document:
             choice(f"{source}: key", key, ("format", "about", *self.head, "joints"))
         if not isinstance(document.get("about", {}), dict):
@@ -212,22 +209,6 @@ class RecordFile(Generic[R]):
             for name, value in options.items():
                 self.check_option(source, joint, name, value)
         return joints
-
-    def _check_version(self, source: str, version: str, document: Document) -> None:
-        """Raise InvalidArgumentError for a file of another version, or with options that are gone;
-        the error says what changed.
-        """
-        joints = document.get("joints")
-        entries = [document, *joints.values()] if isinstance(joints, dict) else [document]
-        old = {key for entry in entries if isinstance(entry, dict) for key in entry} & set(
-            self.gone
-        )
-        changes = "; ".join(f"{key}: {self.gone[key]}" for key in sorted(old))
-        if changes or version != self.format:
-            problem = f"is a file of another version ({version}; this one reads {self.format})"
-            if changes:
-                problem = f"{problem}. What changed: {changes}"
-            raise InvalidArgumentError(source, problem, remedy="write the file anew")
 
     def check_option(
         self,
@@ -390,11 +371,6 @@ class _ParamsFile(RecordFile[PIDParams]):
         return options
 
 
-_GONE = {
-    "integration": "the effort is computed before the integral advances ('output_first')",
-    "first_derivative": "the first derivative is zero ('zero')",
-    "weight_origin": "setpoint weights act about zero ('zero')",
-}
 PARAMS = _ParamsFile(
     "batchpid-params-1",
     PIDParams,
@@ -402,7 +378,6 @@ PARAMS = _ParamsFile(
     ("dtype", *CHOICES),
     LAW_FIELDS,
     required=("kp",),
-    gone=_GONE,
 )
 dumps_params = PARAMS.dumps
 loads_params = PARAMS.loads

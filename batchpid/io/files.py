@@ -1,4 +1,6 @@
-"""Files: atomic writes, descriptors, and the versions of packages that are written into them."""
+"""Files: atomic writes and descriptors. Packages: imports at their first use, and the versions that
+are written into files.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +8,16 @@ import errno
 import os
 import platform
 import secrets
+import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
-from typing import BinaryIO
+from signal import SIGINT
+from types import MappingProxyType
+from typing import Any, BinaryIO
 
 PACKAGES = ("batchpid", "numpy", "sapien", "jax", "h5py", "cmaes", "mujoco", "gymnasium")
 """Packages on which a result may depend."""
@@ -97,3 +104,60 @@ def package_versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
             versions[package] = version(package)
     # This package may run from a checkout whose metadata are older, or are missing.
     return versions | {"batchpid": sys.modules["batchpid"].__version__}
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold SIGINT back while packages are imported; its handler is called at the end of the block.
+
+    Some packages take every exception in an import of theirs for the lack of an optional package,
+    KeyboardInterrupt included: Ctrl-C would be lost, and the package would stay half of itself.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    # Without a handler of Python there is no KeyboardInterrupt.
+    if not is_main or signal.getsignal(SIGINT) is None:
+        yield
+        return
+    held = list[int]()
+    handler = signal.signal(SIGINT, lambda number, _: held.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(SIGINT, handler)
+        if held:
+            signal.raise_signal(SIGINT)
+
+
+def imported(name: str) -> Any:
+    """Return a module, imported at its first use with SIGINT held back.
+
+    Raises
+    ------
+    ImportError
+        It is missing.
+    """
+    if name in sys.modules:
+        return import_module(name)
+    with uninterrupted():
+        return import_module(name)
+
+
+def attributes_of(
+    package: str, modules: Sequence[str], places: Mapping[str, str] = MappingProxyType({})
+) -> Callable[[str], Any]:
+    """Return the function ``__getattr__`` of a package that imports its public ``modules``, and the
+    modules that define the names in ``places``, when they are used.
+    """
+
+    def get(name: str) -> Any:
+        if name in places:
+            return getattr(imported(places[name]), name)
+        problem = f"module {package!r} has no attribute {name!r}"
+        if name not in modules:
+            raise AttributeError(problem)
+        try:
+            return imported(f"{package}.{name}")
+        except ImportError as error:  # help() goes on without it
+            raise AttributeError(f"{problem}: {error}") from error
+
+    return get

@@ -8,10 +8,9 @@ from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import discretise
-from batchpid.law.input_checks import check_alone, checked_inputs, checked_state, needs
 from batchpid.law.params import PIDParams
 from batchpid.law.pid import origins, proportional, weighted_rate, wrapped_error
-from batchpid.law.state import PIDState
+from batchpid.law.state import PIDState, check_alone, checked_inputs, checked_state, needs
 
 
 def track(
@@ -73,7 +72,7 @@ def track(
     if measurement_rate is None:
         rate = zero
     else:
-        rate = -measurement_rate
+        rate = zero - measurement_rate
     if setpoint_rate is not None:
         rate = rate + weighted_rate(k, setpoint_rate)
     # The law solved for its integral: I = u - P - D - feedforward, with the derivative filter

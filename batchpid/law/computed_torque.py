@@ -27,7 +27,7 @@ effort.
 A setpoint's acceleration r'' is added to the law's: u = M (a + r'') + passive force.
 
 The time step limits the gains per mass matrix, unless the law is implicit
-(:mod:`batchpid.law.implicit`).
+(:mod:`batchpid.law.coefficients`).
 """
 
 from __future__ import annotations

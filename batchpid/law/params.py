@@ -14,14 +14,16 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Document, DType
+from batchpid.arrays.array_types import Array, Bool, Document, DType, Rows
 from batchpid.arrays.choices import CHOICES, Everywhere, NamedChoice, PerMassMatrix
+from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.field_tables import Field, declared
-from batchpid.arrays.records import LeafBuilder, Record, with_fields
-from batchpid.checks.validate import choice, is_traced
+from batchpid.arrays.records import Ends, LeafBuilder, Record, is_everywhere, with_fields
+from batchpid.checks.validate import choice, entries, is_traced
 from batchpid.errors import InvalidArgumentError
-from batchpid.law import anti_windup as strategies
 
+ANTI_WINDUP = ("none", "clamp", "conditional", "back_calculation")
+"""Strategies of anti-windup."""
 DEFAULTS = {name: next(iter(chosen)) for name, chosen in CHOICES.items()}
 """Default of each choice."""
 GAINS = ("kp", "ki", "kd")
@@ -105,7 +107,7 @@ class PIDParams(Record, _ParamsFields):
         if self.continuous is not None:
             options["continuous"] = options["continuous"] > 0
         if not is_traced(self.tracking_time) and not is_traced(self.conditional):
-            options["anti_windup"] = strategies.named(
+            options["anti_windup"] = strategy_names(
                 self.num_joints, self.tracking_time, self.conditional
             )
         return {**options, "dtype": np.dtype(self.dtype)}
@@ -218,8 +220,8 @@ def make_params(
     discretization
         "explicit": P, I and D act on position and velocity at the beginning of the step, which is
         unstable at large gains or time steps; "implicit": on those at its end
-        (:mod:`batchpid.law.implicit`), stable at any time step. It needs gain_units "mass_matrix"
-        and no derivative_filter_time; without kd, kd is 0.
+        (:mod:`batchpid.law.coefficients`), stable at any time step. It needs gain_units
+        "mass_matrix" and no derivative_filter_time; without kd, kd is 0.
     joint_names
         Used in error messages.
     dtype
@@ -251,11 +253,11 @@ def make_params(
     integral = build.limits("integral_limit", "integral_min", "integral_max", options)
     # The joints may have different strategies: each becomes an array of the joints that use it, or
     # None for none.
-    clamp, conditional, back = strategies.masks(build, anti_windup)
+    clamp, conditional, back = _masks(build, anti_windup)
     if clamp is not None and all(end is None for end in integral):
-        integral = strategies.clamped(clamp, effort)
+        integral = _clamped(clamp, effort)
     leaves |= dict(zip(ENDS, (*effort, *integral), strict=True))
-    time = strategies.tracking_time(
+    time = _tracking_leaf(
         build, options.get("tracking_time"), back, *[leaves[name] for name in GAINS]
     )
     is_everywhere = conditional is not None and conditional.all()
@@ -284,3 +286,96 @@ def _check_implicit(gain_units: NamedChoice | None, filter_time: Array) -> None:
         )
         remedy = "leave it out or 0: the implicit law is stable without; or use 'explicit'"
         raise InvalidArgumentError("derivative_filter_time", problem, remedy=remedy)
+
+
+def _masks(build: LeafBuilder, names: str | Sequence[object]) -> list[Bool | None]:
+    """Return the masks of clamp, conditional and back-calculation, each None where no joint has
+    it.
+
+    Raises InvalidArgumentError for names that are not among ANTI_WINDUP, or of a wrong shape.
+    """
+    remedy = f"use one of {', '.join(map(repr, ANTI_WINDUP))}"
+    try:
+        array = np.asarray(names, dtype=object)
+    except (TypeError, ValueError, RuntimeError) as error:
+        problem = f"cannot be read as an array: {error}"
+        raise InvalidArgumentError("anti_windup", problem, remedy=remedy) from None
+    array = build.rows("anti_windup", array)
+    good = np.array([isinstance(name, str) and name in ANTI_WINDUP for name in array.flat], bool)
+    good = good.reshape(array.shape)
+    entries("anti_windup", array, good, "unknown option", build.names, remedy=remedy)
+    # "none" needs no mask: it is where the others are not.
+    joints = [array == strategy for strategy in ANTI_WINDUP[1:]]
+    return [mask if mask.any() else None for mask in joints]
+
+
+def strategy_names(
+    joints: int, tracking_time: Array, conditional: Array | NamedChoice | None
+) -> Rows:
+    """Return the strategies (1 | envs, joints) by name, from the leaves of params."""
+    # A joint has one strategy, so later marks cannot meet earlier ones.
+    names: Rows = np.full((1, joints), "none", dtype=object)
+    if tracking_time is not None:
+        names = np.where(np.isfinite(tracking_time), "back_calculation", names)
+    if conditional is not None:
+        chosen = isinstance(conditional, Everywhere) or np.asarray(conditional) > 0
+        names = np.where(chosen, "conditional", names)
+    return names
+
+
+def _clamped(clamp: Bool, effort: Ends) -> Ends:
+    """Return the limits of an integral without limits of its own: the effort limits on the joints
+    of the mask ``clamp``.
+    """
+    if all(end is None for end in effort):
+        problem = "'clamp' has no limit to clamp the integral to"
+        remedy = "give integral_limit or effort_limit"
+        raise InvalidArgumentError("anti_windup", problem, remedy=remedy)
+    low, high = effort
+    if low is not None:
+        low = namespace(low).where(clamp, low, -math.inf)
+    if high is not None:
+        high = namespace(high).where(clamp, high, math.inf)
+    return low, high
+
+
+def _tracking_leaf(
+    build: LeafBuilder,
+    value: Array,
+    back: Bool | None,
+    kp: Array,
+    ki: Array,
+    kd: Array,
+) -> Array:
+    """Return the leaf of back-calculation's time constant, inf where a joint is not ``back``."""
+    if back is None:
+        if value is not None:
+            problem = "is given, but no joint has anti_windup 'back_calculation'"
+            remedy = "choose that strategy or leave tracking_time out"
+            raise InvalidArgumentError("tracking_time", problem, remedy=remedy)
+        return None
+    time = build.array("tracking_time", value, Field("s", math.inf))
+    time = _rule_of_thumb(kp, ki, kd) if time is None else time
+    time = namespace(time).where(back, time, math.inf)
+    if is_everywhere(time, math.inf):
+        return None
+    return build.freeze(time)
+
+
+def _rule_of_thumb(kp: Array, ki: Array, kd: Array) -> Array:
+    """Return Tt = sqrt(Ti Td) = sqrt(kd/ki), or Ti = kp/ki without kd; inf, no correction, where ki
+    is 0.
+    """
+    xp = namespace(kp, ki, kd)
+    if ki is None:
+        return xp.full_like(kp, math.inf)
+    kp, ki, kd = xp.broadcast_arrays(kp, ki, xp.zeros_like(kp) if kd is None else kd)
+    # Where ki is 0 the quotient is not used, but must be finite.
+    safe = xp.where(ki > 0, ki, 1.0)
+    # The inner where keeps the gradient of the square root finite where kd is 0.
+    times = xp.where(
+        kd > 0,
+        xp.sqrt(xp.where(kd > 0, kd, 1.0) / safe),
+        kp / safe,
+    )
+    return xp.where(ki > 0, times, math.inf)

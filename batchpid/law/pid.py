@@ -19,7 +19,7 @@ effort is computed before I includes the present error. Saturation is on the tot
 motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and
 13; conditional integration and the order of the two stages as in ros-controls/control_toolbox,
 src/pid.cpp. With discretization "implicit" the law is this one with other coefficients:
-:mod:`batchpid.law.implicit`.
+:mod:`batchpid.law.coefficients`.
 
 The moving origin is our own addition. With r = o + s, P = kp (o + b s - y): o, the motion that a
 rate describes, is followed with full weight, and the rest s, a step, is approached with weight b.
@@ -41,7 +41,10 @@ from batchpid.arrays.elementwise import (
     wrap,
 )
 from batchpid.law.coefficients import Coefficients, discretise
-from batchpid.law.input_checks import (
+from batchpid.law.params import PIDParams
+from batchpid.law.state import (
+    PIDState,
+    Terms,
     check_alone,
     check_drive,
     checked_inputs,
@@ -49,8 +52,6 @@ from batchpid.law.input_checks import (
     checked_state,
     needs,
 )
-from batchpid.law.params import PIDParams
-from batchpid.law.state import PIDState, Terms
 
 
 def init(params: PIDParams, measurement: Array) -> PIDState:

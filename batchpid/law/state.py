@@ -1,12 +1,20 @@
-"""State of the law between steps, and the terms of one step."""
+"""State of the law between steps, the terms of one step, and the checks of arguments: types, shapes
+and dtypes, which JAX knows while it traces. Of the values, only a time step is read.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.choices import HoldEffort
+from batchpid.arrays.elementwise import in_dtype_of, namespace
 from batchpid.arrays.records import Record, array_summary
+from batchpid.checks.validate import instance, read_array, time_step
+from batchpid.errors import InvalidArgumentError
+from batchpid.law.params import PIDParams
 
 
 class _PIDStateFields(NamedTuple):
@@ -72,3 +80,168 @@ class Terms(NamedTuple):
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")
+
+
+DRIVE_LACKS = {
+    "effort_rate_limit": None,
+    "derivative_filter_time": None,
+    "setpoint_weight": None,
+    "setpoint_weight_derivative": None,
+    "deadband": None,
+    "non_finite": "propagate",
+}
+"""Options that change P, D or the effort in a way that no target of a drive can, and their values
+for off.
+"""
+
+
+def checked_inputs(
+    params: PIDParams,
+    state: PIDState,
+    measurement: Array,
+    **inputs: Array,
+) -> list[Array]:
+    """Return ``measurement`` and ``inputs`` as arrays in the params' dtype that broadcast with
+    params and state.
+
+    None stays None.
+    """
+    instance("params", params, PIDParams, "build them with make_params")
+    instance("state", state, PIDState, "begin with init(params, measurement)")
+    arrays = {"measurement": _as_array("measurement", measurement)}
+    arrays |= {
+        name: None if value is None else _as_array(name, value) for name, value in inputs.items()
+    }
+    # Shapes are compared as sets: one look suffices where all are (envs, joints).
+    of_params = {leaf.shape for leaf in params if leaf is not None and not isinstance(leaf, tuple)}
+    shapes = {"state": [leaf.shape for leaf in state if leaf is not None]}
+    shapes |= {name: [array.shape] for name, array in arrays.items() if array is not None}
+    (whole,) = shapes["measurement"]
+    joints = params.num_joints
+    # One look saves most of the time.
+    usual = {whole, (1, joints)}
+    if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*shapes.values())):
+        _check_shapes(np.broadcast_shapes(*of_params), joints, shapes)
+    return in_dtype_of(params, *arrays.values())
+
+
+def check_alone(law: Any, measurement_rate: Array) -> None:
+    """Raise InvalidArgumentError if params or coefficients need a mass matrix, or a measured rate
+    that is not given.
+    """
+    if law.gain_units is not None:
+        raise InvalidArgumentError(
+            "params.gain_units",
+            "are accelerations: without the robot's mass matrix the law cannot turn them into"
+            " efforts",
+            value="mass_matrix",
+            remedy=(
+                "use gains in efforts, such as robot.designed('effort'), or a batchpid.sim.Runner"
+            ),
+        )
+    if law.measurement_rate is not None and law.kd is not None and measurement_rate is None:
+        raise InvalidArgumentError(
+            "measurement_rate",
+            "is missing: the params have measurement_rate='measured'",
+            remedy=(
+                "pass the measured velocity, or use params.replace(measurement_rate='difference')"
+            ),
+        )
+
+
+def check_drive(params: PIDParams) -> None:
+    """Raise InvalidArgumentError for options of the law that a drive of stiffness kp and damping kd
+    does not have.
+    """
+    lacking = {name: off for name, off in DRIVE_LACKS.items() if getattr(params, name) is not None}
+    if lacking:
+        others = ", ".join(f"{name}={off!r}" for name, off in lacking.items())
+        raise InvalidArgumentError(
+            f"params.{next(iter(lacking))}",
+            "is not available in a drive, whose effort is kp (target - y) - kd dy/dt within the"
+            " effort limits",
+            remedy=f"use params.replace({others}), or the PID law, as in control 'pid'",
+        )
+
+
+def _check_shapes(
+    shape: tuple[int, ...], joints: int, known: dict[str, list[tuple[int, ...]]]
+) -> None:
+    """Raise InvalidArgumentError for the first of ``known`` that does not broadcast with those
+    before and ``shape``.
+    """
+    for name, shapes in known.items():
+        try:
+            shape = np.broadcast_shapes(shape, *shapes)
+            fits = shape[-1] == joints and (name != "measurement" or shapes[0][-1:] == (joints,))
+        except ValueError:
+            fits = False
+        if not fits:
+            problem = (
+                f"has shape {shapes[0]}, which does not fit {shape} of the params and the other"
+                " inputs"
+            )
+            raise InvalidArgumentError(name, problem, remedy=f"give (envs, {joints})")
+
+
+def needs(params: PIDParams) -> PIDState:
+    """Return which leaves of a state the params need, as bools."""
+    differentiates = params.kd is not None
+    weights = params.setpoint_weight is not None
+    weights_rate = differentiates and params.setpoint_weight_derivative is not None
+    return PIDState(
+        integral=params.ki is not None,
+        measurement=differentiates or (weights and params.continuous is not None),
+        derivative=differentiates and params.derivative_filter_time is not None,
+        setpoint=weights_rate,
+        setpoint_seen=weights_rate,
+        effort=params.effort_rate_limit is not None or isinstance(params.non_finite, HoldEffort),
+        origin=weights,
+    )
+
+
+def checked_state(state: PIDState, needed: PIDState) -> PIDState:
+    """Return ``state`` if it has every leaf that is ``needed``."""
+    for name, leaf, need in zip(PIDState._fields, state, needed, strict=True):
+        if need and leaf is None:
+            remedy = (
+                "begin with init(params, measurement), or use state.matched_to(init(params,"
+                " measurement))"
+            )
+            raise InvalidArgumentError(
+                "state", f"has no {name}, which these params need", remedy=remedy
+            )
+    return state
+
+
+def checked_mask(mask: Array, state: PIDState) -> Array:
+    """Return ``mask`` as bools, one for each env of ``state``; () for one robot."""
+    array = _as_array("mask", mask, "b")
+    shape = np.broadcast_shapes(*(leaf.shape for leaf in state if leaf is not None))
+    envs = shape[:-1]
+    if array.dtype.kind != "b" or array.ndim > 1 or (shape and array.shape != envs):
+        problem = f"is {array.dtype} {array.shape}, not bool {envs}"
+        raise InvalidArgumentError("mask", problem, remedy="give one bool per env")
+    return array
+
+
+def checked_dt(dt: Array) -> Array:
+    """Return ``dt`` as a float if it is positive and finite; an array of JAX is returned unread.
+
+    A number of NumPy would give its own dtype to the efforts.
+    """
+    if isinstance(dt, np.ndarray | np.generic):
+        dt = dt.tolist()
+    if hasattr(dt, "__array_namespace__"):
+        return dt
+    return time_step("dt", dt)
+
+
+def _as_array(name: str, value: Array, kinds: str = "iuf") -> Array:
+    """Return ``value`` as an array of NumPy; arrays of JAX are returned unchanged."""
+    is_own = type(value) is np.ndarray
+    if (is_own and value.dtype.kind in kinds) or (
+        not is_own and hasattr(value, "__array_namespace__")
+    ):
+        return value
+    return read_array(name, value, kinds)

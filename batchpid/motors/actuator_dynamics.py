@@ -1,7 +1,8 @@
 r"""From the commanded effort to the delivered effort, and from the joint's state to its
 measurement.
 
-Pure functions on (envs, joints), for NumPy and JAX. At each step, with the joint's position q and
+Pure functions on (envs, joints), or (joints,) for one robot, such as under ``jax.vmap``, for NumPy
+and JAX. At each step, with the joint's position q and
 velocity v, and the effort u that the controller asks for::
 
     x      = q + min(max(x' - q, -B/2), B/2)               backlash: the sensor is dragged along
@@ -39,12 +40,14 @@ in ``fit_actuators`` (batchpid/sim/robot/robot_options.py) and ``OF_JOINTS``
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, ArrayModule, Document
+from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import TURN, clip, in_dtype_of, namespace, push_history, wrap
+from batchpid.arrays.trees import mapped
 from batchpid.checks.validate import check_time_step
 from batchpid.motors import delay
 from batchpid.motors import sensor_noise as noise
@@ -60,9 +63,7 @@ class MotorCoefficients(NamedTuple):
     """
 
     command: delay.Delay | None = None
-    position_delay: delay.Delay | None = None
-    """Delay of the sensor's positions, in its history of positions and velocities."""
-    velocity_delay: delay.Delay | None = None
+    sensor: delay.Delay | None = None
     envelope: Envelope = Envelope()
     commands: Envelope = Envelope()
     """Envelope of the commands that the motor delivers unclipped."""
@@ -99,13 +100,13 @@ def init(
     Parameters
     ----------
     qpos, qvel, effort
-        Position [rad or m], velocity and effort [N m or N] (envs, joints) so far; velocity and
-        effort are 0 by default.
+        Position [rad or m], velocity and effort [N m or N] (envs, joints) or (joints,) so far;
+        velocity and effort are 0 by default.
     dt
         Time step [s].
     envs, episode
         Number of each env, default 0, 1, ..., and of its episode (envs,): the noise depends on
-        both.
+        both. One robot (joints,) is number 0, so pass its number under ``jax.vmap``.
     samples
         Length of the histories, at least 2; None: as long as ``max_delay`` needs. Needed where that
         is traced by JAX.
@@ -118,13 +119,14 @@ def init(
     """
     check_time_step(dt)
     qpos, qvel, effort = in_dtype_of(actuators, qpos, qvel, effort)
+    actuators = actuators.for_rank(qpos.ndim)
     xp = namespace(*actuators, qpos)
     zeros = xp.zeros_like(qpos)
     position = zeros + qpos
     velocity = zeros if qvel is None else zeros + qvel
     requested = zeros if effort is None else zeros + effort
     # What no effect needs is None, and costs nothing.
-    command = sensor = encoder = key = step = None
+    command = positions = velocities = encoder = key = step = None
     # Histories are as long as the longest delay may become, so that delays can grow in flight.
     if actuators.max_delay is not None:
         if samples is None:
@@ -132,15 +134,16 @@ def init(
         if actuators.command_delay is not None:
             command = delay.start(requested, samples)
         if actuators.sensor_delay is not None:
-            sensor = delay.start(xp.concatenate((position, velocity), axis=1), samples)
+            positions, velocities = (delay.start(rows, samples) for rows in (position, velocity))
     if actuators.backlash is not None:
         encoder = position
     if actuators.seed is not None:
-        numbers = xp.arange(len(zeros)) if envs is None else envs
-        episodes = xp.broadcast_to(xp.asarray(episode), (len(zeros),))
+        leading = zeros.shape[:-1]
+        numbers = xp.arange(math.prod(leading)).reshape(leading) if envs is None else envs
+        episodes = xp.broadcast_to(xp.asarray(episode), leading)
         key = noise.keys(actuators.seed, numbers, episodes, xp)
-        step = xp.zeros(len(zeros), xp.uint32)
-    state = ActuatorState(command, None, sensor, encoder, key, step)
+        step = xp.zeros(leading, xp.uint32)
+    state = ActuatorState(command, None, positions, velocities, encoder, key, step)
     if actuators.lag is None:
         return state
     k = discretise(actuators, state, dt)
@@ -164,21 +167,16 @@ def discretise(
     check_time_step(dt)
     a = actuators
     xp = namespace(*actuators)
-    position = velocity = None
-    if a.sensor_delay is not None:
-        # One history for both: positions side by side with velocities.
-        begins = 0, a.sensor_delay.shape[1]
-        position, velocity = (
-            delay.discretise(a.sensor_delay, dt, state.sensor, begin) for begin in begins
+    command, sensor = [
+        None if seconds is None else delay.discretise(seconds, dt, history.shape[-2])
+        for seconds, history in (
+            (a.command_delay, state.command),
+            (a.sensor_delay, state.position),
         )
+    ]
     k = MotorCoefficients(
-        command=(
-            None
-            if a.command_delay is None
-            else delay.discretise(a.command_delay, dt, state.command)
-        ),
-        position_delay=position,
-        velocity_delay=velocity,
+        command=command,
+        sensor=sensor,
         envelope=envelope(a),
         commands=command_envelope(a),
         intake=None if a.lag is None else -xp.expm1(-dt / xp.maximum(a.lag, 1e-3 * dt)),
@@ -196,16 +194,10 @@ def discretise(
         return k
 
     def spread(leaf: Array) -> Array:
-        if leaf is None or (leaf.ndim == 3 and leaf.shape[1] == num_envs):
-            return leaf
-        return xp.broadcast_to(leaf, (*leaf.shape[:-2], num_envs, leaf.shape[-1])).copy()
+        return xp.broadcast_to(leaf, (num_envs, leaf.shape[-1])).copy()
 
-    # An envelope is a tuple within the tuple.
-    flat: Document = {
-        name: spread(leaf) for name, leaf in k._asdict().items() if not isinstance(leaf, tuple)
-    }
-    ends, commands = (Envelope(*map(spread, item)) for item in (k.envelope, k.commands))
-    return k._replace(**flat, envelope=ends, commands=commands)
+    wide: MotorCoefficients = mapped(spread, k)
+    return wide
 
 
 def deliver(
@@ -220,9 +212,10 @@ def deliver(
     or N].
 
     ``effort`` is that asked for [N m or N], ``qpos`` and ``qvel`` are the joints' true positions
-    [rad or m] and velocities, all (envs, joints); none is written to.
+    [rad or m] and velocities, all (envs, joints) or (joints,); none is written to.
     """
     inputs = in_dtype_of(actuators, effort, qpos, qvel)
+    actuators = actuators.for_rank(inputs[0].ndim)
     return advance_effort(discretise(actuators, state, dt), state, *inputs)
 
 
@@ -233,12 +226,13 @@ def measure(
     qvel: Array,
     dt: Array,
 ) -> tuple[ActuatorState, Array, Array]:
-    """Advance the sensors by ``dt`` seconds; return ``(state, qpos, qvel)`` as measured (envs,
-    joints).
+    """Advance the sensors by ``dt`` seconds; return ``(state, qpos, qvel)`` as measured.
 
-    ``qpos`` and ``qvel`` are the true positions [rad or m] and velocities; none is written to.
+    ``qpos`` and ``qvel`` are the true positions [rad or m] and velocities (envs, joints) or
+    (joints,); none is written to.
     """
     qpos, qvel = in_dtype_of(actuators, qpos, qvel)
+    actuators = actuators.for_rank(qpos.ndim)
     return advance_measurement(discretise(actuators, state, dt), state, qpos, qvel)
 
 
@@ -354,21 +348,21 @@ def advance_measurement(
     ``drawn`` is the :func:`measurement_noise` at ``state.step``, if it is known already.
     """
     xp = namespace(qpos, qvel)
-    command, effort, sensor, encoder, key, step = state
+    command, effort, positions, velocities, encoder, key, step = state
     # Play, delay, encoder: in the order in which a signal passes them.
     if k.play is not None:
         encoder, qvel = _play(k, encoder, qpos, qvel)
         qpos = encoder
-    if k.position_delay is not None and k.velocity_delay is not None:
-        sensor = push_history(sensor, qpos, qvel)
-        qpos = delay.read(sensor, k.position_delay, k.turns, xp)
-        qvel = delay.read(sensor, k.velocity_delay, None, xp)
+    if k.sensor is not None:
+        positions, velocities = push_history(positions, qpos), push_history(velocities, qvel)
+        qpos = delay.read(positions, k.sensor, k.turns, xp)
+        qvel = delay.read(velocities, k.sensor, None, xp)
     if key is not None:
         if drawn is None:
             drawn = measurement_noise(k, key, step, qpos, xp)
         step = step + _ONE
     qpos, qvel = _encode(k, qpos, qvel, *(drawn or (None, None)))
-    return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel
+    return ActuatorState(command, effort, positions, velocities, encoder, key, step), qpos, qvel
 
 
 def measurement_noise(
@@ -383,7 +377,7 @@ def measurement_noise(
 
     ``key`` is the key of the state, and ``like`` an array (envs, joints) of the same dtype.
     """
-    both = noise.normals(key, step, like.shape[1], like.dtype, xp)
+    both = noise.normals(key, step, like.shape[-1], like.dtype, xp)
     deviations = k.position_noise, k.velocity_noise
     position, velocity = (
         None if sigma is None else sigma * z for sigma, z in zip(deviations, both, strict=True)

@@ -292,8 +292,10 @@ class _ActuatorStateFields(NamedTuple):
     """Commanded efforts, latest first (envs, samples, joints) [N m or N]."""
     effort: Array = None
     """Effort behind the lag (envs, joints) [N m or N]."""
-    sensor: Array = None
-    """Positions and velocities at the sensor, latest first (envs, samples, 2 joints)."""
+    position: Array = None
+    """Positions at the sensor, latest first (envs, samples, joints) [rad or m]."""
+    velocity: Array = None
+    """Velocities there, latest first (envs, samples, joints) [rad/s or m/s]."""
     encoder: Array = None
     """Position of the sensor's side of the play (envs, joints) [rad or m]."""
     key: Array = None
@@ -331,13 +333,8 @@ def _resized(old: Array, new: Array) -> Array:
     """Return a history of the length of another; other arrays as they are."""
     if old.ndim < 3 or old.shape == new.shape:
         return old
-    xp = old.__array_namespace__()
-    samples = new.shape[1]
-    if samples < old.shape[1]:
-        return old[:, :samples].copy()
     # Before its oldest sample a signal is taken as constant.
-    oldest = xp.broadcast_to(old[:, -1:], (old.shape[0], samples - old.shape[1], old.shape[2]))
-    return xp.concatenate((old, oldest), axis=1)
+    return old[:, np.minimum(np.arange(new.shape[1]), old.shape[1] - 1)]
 
 
 ACTUATORS = RecordFile(

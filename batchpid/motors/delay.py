@@ -16,7 +16,7 @@ import math
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array, ArrayModule
-from batchpid.arrays.elementwise import namespace, read_history, wrap
+from batchpid.arrays.elementwise import namespace, take_rows, wrap
 from batchpid.checks.validate import is_traced
 from batchpid.errors import InvalidArgumentError
 
@@ -25,12 +25,12 @@ _NEAR = 1e-5  # steps: a delay that is a whole number of steps but for rounding 
 
 
 class Delay(NamedTuple):
-    """A delay at one time step, for histories (envs, samples, numbers)."""
+    """A delay at one time step, for histories (..., samples, joints)."""
 
-    index: Array  # type: ignore[assignment]  # a field hides tuple.index
-    """Flat indices of x_{k-n} in a history, and of x_{k-n-1} (1 or 2, envs, joints)."""
+    whole: Array
+    """n (1 | envs, joints)."""
     fraction: Array
-    """f (envs, joints); None: 0 everywhere."""
+    """f (1 | envs, joints); None: 0 everywhere."""
 
 
 def samples_of(longest: Array, dt: float) -> int:
@@ -43,47 +43,38 @@ def samples_of(longest: Array, dt: float) -> int:
         raise InvalidArgumentError(
             "max_delay", "is traced: its value is unknown", remedy="pass samples= to init"
         )
-    count = math.floor(float(longest[0, 0]) / dt + _NEAR) + 2
+    seconds = float(longest.item())
+    count = math.floor(seconds / dt + _NEAR) + 2
     if count > MOST_SAMPLES:
         remedy = f"use a longer time step, or delays of at most {(MOST_SAMPLES - 2) * dt:g} s"
         raise InvalidArgumentError(
-            "max_delay", f"needs {count} samples", value=float(longest[0, 0]), remedy=remedy
+            "max_delay", f"needs {count} samples", value=seconds, remedy=remedy
         )
     return count
 
 
-def discretise(
-    delay: Array,
-    dt: Array,
-    history: Array,
-    begin: int = 0,
-) -> Delay:
-    """Return ``delay`` (1 | envs, joints) [s] in samples of ``dt`` [s], at most the length of
-    ``history`` (envs, samples, numbers).
-
-    The joints' values are those from number ``begin`` of a sample on.
+def discretise(delay: Array, dt: Array, samples: int) -> Delay:
+    """Return ``delay`` (1 | envs, joints) [s] in steps of ``dt`` [s], for histories of
+    ``samples``; a longer one reads the oldest sample.
     """
-    xp = namespace(delay, history)
-    envs, samples, numbers = history.shape
+    xp = namespace(delay)
     steps = delay / dt
     whole = xp.rint(steps)
     steps = xp.where(xp.abs(steps - whole) < _NEAR, whole, steps)
-    steps = xp.minimum(steps, samples - 1) + xp.zeros((envs, 1), steps.dtype)
+    steps = xp.minimum(steps, samples - 1)
     # One sample is left for the older neighbour of the interpolation.
-    floor = xp.minimum(xp.floor(steps), samples - 2)
-    fraction = steps - floor
-    first = xp.arange(envs)[:, None] * (samples * numbers) + begin + xp.arange(delay.shape[1])[None]
-    later = first + floor.astype(int) * numbers
+    whole = xp.minimum(xp.floor(steps), samples - 2)
+    fraction = steps - whole
     # Delays of whole steps need no interpolation.
     if not is_traced(fraction) and not fraction.any():
-        return Delay(later[None], None)
-    return Delay(xp.stack((later, later + numbers)), fraction)
+        return Delay(whole, None)
+    return Delay(whole, fraction)
 
 
 def start(value: Array, samples: int) -> Array:
-    """Return a history (envs, samples, joints) that has been ``value`` (envs, joints) so far."""
-    xp = namespace(value)
-    return xp.broadcast_to(value[:, None], (value.shape[0], samples, value.shape[1])).copy()
+    """Return a history (..., samples, joints) that has been ``value`` (..., joints) so far."""
+    shape = *value.shape[:-1], samples, value.shape[-1]
+    return namespace(value).broadcast_to(value[..., None, :], shape).copy()
 
 
 def read(
@@ -92,10 +83,10 @@ def read(
     turns: Array,
     xp: ArrayModule,
 ) -> Array:
-    """Return the delayed value (envs, joints); ``turns`` is 1 / (2 pi) where it is an angle, 0
+    """Return the delayed value (..., joints); ``turns`` is 1 / (2 pi) where it is an angle, 0
     elsewhere, or None.
     """
-    later = read_history(history, k.index[0])
+    later = take_rows(history, k.whole)
     if k.fraction is None:
         return later
-    return later + k.fraction * wrap(read_history(history, k.index[1]) - later, turns, xp)
+    return later + k.fraction * wrap(take_rows(history, k.whole + 1) - later, turns, xp)

@@ -1,5 +1,5 @@
-r"""Coulomb friction with stiction, and viscous damping: pure functions on (envs, joints), for NumPy
-and JAX.
+r"""Coulomb friction with stiction, and viscous damping: pure functions on (envs, joints), or any
+other leading axes, for NumPy and JAX.
 
 With the motor's effort tau, the load h (gravity and more), the mass matrix M, viscous damping B and
 Coulomb friction F, a joint moves by M dv/dt = tau - h - B v - f, with f = F sgn(v) while it moves
@@ -159,18 +159,19 @@ def refresh(
     check_time_step(dt)
     if friction.coulomb is None:
         return state
-    xp = namespace(mass_matrix, *friction)
+    xp = namespace(mass_matrix, *friction, *state)
     rubs = xp.zeros_like(state.effort) + friction.most > 0
     implicit = (0.0 if friction.viscous is None else friction.viscous) + damping + dt * stiffness
     implicit = xp.zeros_like(state.effort) + implicit
-    diagonal = implicit[:, :, None] * xp.eye(implicit.shape[-1], dtype=implicit.dtype)[None]
+    eye = xp.broadcast_to(xp.eye(implicit.shape[-1], dtype=implicit.dtype), mass_matrix.shape)
+    diagonal = implicit[..., None] * eye
     inverse = xp.linalg.inv(mass_matrix + dt * diagonal)
     # The diagonal is what each joint shows while the others are free.
-    mobility = xp.einsum("ejj->ej", inverse)
+    mobility = xp.diagonal(inverse, axis1=-2, axis2=-1)
     scale = xp.sqrt(mobility)
     # Coupled joints share the gain, by Gershgorin: see above.
-    correlation = xp.abs(inverse) / (scale[:, :, None] * scale[:, None, :])
-    shared = (correlation * rubs.astype(correlation.dtype)[:, None, :]).sum(-1)
+    correlation = xp.abs(inverse) / (scale[..., :, None] * scale[..., None, :])
+    shared = (correlation * rubs.astype(correlation.dtype)[..., None, :]).sum(-1)
     k = xp.where(
         rubs,
         DEADBEAT_SHARE / (dt * mobility * xp.where(rubs, shared, 1.0)),

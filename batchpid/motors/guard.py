@@ -119,8 +119,11 @@ def make_guard(
 
 
 def init(guard: Guard, qpos: Array) -> GuardState:
-    """Return the state of a guard that starts at rest at ``qpos`` (envs, joints) [rad or m]."""
+    """Return the state of a guard that starts at rest at ``qpos`` (envs, joints) or (joints,) [rad
+    or m].
+    """
     (qpos,) = in_dtype_of(guard, qpos)
+    guard = guard.for_rank(qpos.ndim)
     zeros = namespace(*guard, qpos).zeros_like(qpos)
     return GuardState(zeros + qpos, zeros, zeros + qpos)
 
@@ -134,12 +137,13 @@ def advance(
     """Advance the guard by ``dt`` [s]; return the state, with the guarded ``setpoint``, and a mask
     of the changes.
 
-    ``setpoint`` (envs, joints) [rad or m] is the requested setpoint; it is not modified. The mask
-    has the same shape. Raises InvalidArgumentError if dt is a number that is not positive, or above
-    1 s.
+    ``setpoint`` (envs, joints) or (joints,) [rad or m] is the requested setpoint; it is not
+    modified. The mask has the same shape. Raises InvalidArgumentError if dt is a number that is not
+    positive, or above 1 s.
     """
     check_time_step(dt)
     (setpoint,) = in_dtype_of(guard, setpoint)
+    guard = guard.for_rank(state.setpoint.ndim)
     xp = namespace(*guard, setpoint, *state)
     # A copy: the state keeps it, and the caller may change the setpoint.
     requested = clip(setpoint.copy(), guard.lower, guard.upper, xp)

@@ -60,11 +60,11 @@ def keys(
     episode: Array,
     xp: ArrayModule,
 ) -> Array:
-    """Return the key of each env's noise (envs, 2) uint32, from a ``seed`` (1, 2) uint32 and
-    numbers (envs,).
+    """Return the key of each env's noise (..., 2) uint32, from a ``seed`` (2,) or (1, 2) uint32
+    and numbers (...).
     """
     words = (xp.asarray(number).astype(xp.uint32) for number in (envs, episode))
-    return xp.stack(pcg4d(seed[:, 0], seed[:, 1], *words)[:2], axis=1)
+    return xp.stack(pcg4d(seed[..., 0], seed[..., 1], *words)[:2], axis=-1)
 
 
 def normals(
@@ -78,11 +78,12 @@ def normals(
 
     ``key`` is (envs, 2), ``step`` (..., envs) uint32; the results are (..., envs, joints).
     """
-    joint = xp.arange(joints, dtype=xp.uint32)[None]
+    # With the axes of the key, whose ranks JAX does not promote in its strict mode.
+    joint = xp.arange(joints, dtype=xp.uint32).reshape(*[1] * (key.ndim - 1), joints)
     table = xp.asarray(quantiles(np.dtype(dtype)))
     first, second, *_ = pcg4d(
-        key[:, :1],
-        key[:, 1:],
+        key[..., :1],
+        key[..., 1:],
         step[..., None],
         joint,
     )

@@ -1,8 +1,8 @@
 """Native extensions: their files and tables, and loading of those that were built from the present
 files.
 
-C++ code repeats tables of the Python code, so an extension works only with the files that it was
-built from. ``setup.py`` compiles a digest of each file into the extension, and :func:`load`
+``setup.py`` writes tables of this module into a header (:func:`codes`), so an extension works only
+with the files that it was built from. ``setup.py`` compiles a digest of each file into the extension, and :func:`load`
 compares them. ``setup.py`` imports this module without its package, before NumPy is installed: it
 may import the standard library only. Modules that define extensions may import this one.
 """
@@ -96,6 +96,9 @@ OPERATIONS = (
     "ceil",
     "floor",
     "sqrt",
+    "exp",
+    "tanh",
+    "sin",
     "sign",
     "isfinite",
     "where",
@@ -106,22 +109,21 @@ OPERATIONS = (
     "subtract_multiply",
     "clip",
     "push",
-    "take",
     "gather",
     "take_row",
 )
-"""Operations of programs, as Code in program.h."""
-ROW_WISE = ("row_minimum", "matrix_vector", "push", "take", "gather", "take_row")
+"""Operations of programs. program.h describes those that no array library has."""
+ROW_WISE = ("row_minimum", "matrix_vector", "push", "gather", "take_row")
 """Operations whose result at a number depends on other numbers of its row, or on a table."""
 MOST_OPERANDS = 48
-"""Largest number of operands, and of results, of a fused segment; as in program.h."""
+"""Largest number of operands, and of results, of a fused segment."""
 MASKS = frozenset(OPERATIONS[6:15]) | {"isfinite"}
 """Operations whose results are masks."""
 MOST_SUMMED = 128
 """Largest number of terms for which a sum has NumPy's order."""
 
 
-_FILES = ("make_program.h", "extension.h", "program.h", "extensions.py")
+_FILES = ("make_program.h", "extension.h", "program.h", "codes.h", "extensions.py")
 PROGRAMS = tuple(f"batchpid/native/{name}" for name in _FILES)
 """Headers and tables of programs, for extensions that include them."""
 PROGRAM = Extension(
@@ -202,6 +204,7 @@ _TASK_SPACE_FILES = (
     "pose_search.h",
     "tables.h",
     "tool.h",
+    "codes.h",
 )
 
 TASK_SPACE = Extension(
@@ -209,6 +212,24 @@ TASK_SPACE = Extension(
     (*(f"batchpid/native/{name}" for name in _TASK_SPACE_FILES), *RIGID_BODIES),
     (*ROUNDED, *LANES_ONLY),
 )
+
+
+def codes() -> str:
+    """Return codes.h: the numbers of operations and arrays for C++."""
+    enumerations = {
+        "Code : std::int32_t": (*OPERATIONS, "number_of_codes"),
+        "Kinematics": (*(f"kinematics_{name}" for name in KINEMATICS), "kinematics"),
+        "Law": (*(f"law_{name}" for name in LAW), "law"),
+    }
+    lines = ["// Written by setup.py: extensions.py.", "#pragma once", "#include <cstddef>"]
+    lines += ["#include <cstdint>", "namespace batchpid {"]
+    for kind, names in enumerations.items():
+        entries = ", ".join(names).upper()
+        lines.append(f"enum {kind} {{{entries}}};")
+    lines += [f"constexpr std::size_t MOST_OPERANDS = {MOST_OPERANDS};", "}", ""]
+    return "\n".join(lines)
+
+
 EXTENSIONS = {"_program": PROGRAM, "_task_space": TASK_SPACE}
 
 

@@ -48,9 +48,6 @@ struct alignas(WIDTH * sizeof(double)) Lanes {  // GCC aligns its vectors otherw
   friend Lanes operator/(Lanes a, Lanes b) { return a.of / b.of; }
   friend Lanes at_least(Lanes a, Lanes low) { return a.of < low.of ? low.of : a.of; }
   friend Lanes at_most(Lanes a, Lanes high) { return a.of > high.of ? high.of : a.of; }
-  friend Lanes zero_outside(Lanes a, Lanes low, Lanes q, Lanes high) {
-    return (q.of < low.of) | (q.of > high.of) ? Packed{} : a.of;
-  }
   friend Lanes where_positive(Lanes mask, Lanes a, Lanes b) { return mask.of > 0.0 ? a.of : b.of; }
   friend double largest(Lanes a) {
     double most = a.of[0];

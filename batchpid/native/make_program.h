@@ -95,8 +95,8 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments, Fused const *t
   bool fits = program->inputs >= 0 && given <= program->registers;
   for (Operation const &each : program->operations) {
     bool const writes_input = each.code == PUSH && each.out == each.operands[0] && each.out >= count;
-    fits = fits && known(each.out) && (each.out >= given || writes_input) && each.code >= ADD && each.code <= TAKE_ROW &&
-           std::all_of(each.operands, each.operands + 3, known);
+    fits = fits && known(each.out) && (each.out >= given || writes_input) && each.code >= ADD &&
+           each.code < NUMBER_OF_CODES && std::all_of(each.operands, each.operands + 3, known);
   }
   fits = fits && std::all_of(program->results.begin(), program->results.end(), known);
   for (Segment const &each : program->segments) {
@@ -139,7 +139,7 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments, Fused const *t
 }
 
 // Return whether operations find tables where they take them, of a size that fits, and nowhere else.
-inline bool tables_fit(Program const &program, Index rows, std::vector<Input> const &inputs) {
+inline bool tables_fit(Program const &program, std::vector<Input> const &inputs) {
   auto const constants = static_cast<Index>(program.constants.size());
   auto const size_of = [&](Index number) {  // 0: no table
     Index const i = number - constants;
@@ -149,17 +149,15 @@ inline bool tables_fit(Program const &program, Index rows, std::vector<Input> co
   for (auto const &[code, out, operands] : program.operations) {
     Index const size = size_of(operands[0]), columns = program.columns;
     bool const is_alone = operands[2] == operands[0];  // operands that are not there are copies of the first
-    bool const reads_table = code == MATRIX_VECTOR || code == PUSH || code == TAKE || code == TAKE_ROW;
+    bool const reads_table = code == MATRIX_VECTOR || code == PUSH || code == TAKE_ROW;
     if ((size > 0) != reads_table) return false;
     if (size_of(operands[1]) || (!is_alone && size_of(operands[2]))) return false;
     if (code == MATRIX_VECTOR && size != columns * columns) return false;
-    if (code == TAKE_ROW && size % columns != 0) return false;
-    if (code == PUSH && size % ((is_alone ? 1 : 2) * columns) != 0) return false;
-    if (code != TAKE && code != GATHER) continue;
+    if ((code == TAKE_ROW || code == PUSH) && size % columns != 0) return false;
+    if (code != GATHER) continue;
     if (program.single || operands[1] >= constants) return false;
-    Index const end = code == TAKE ? rows * size : columns;
     for (double const place : program.constants[static_cast<std::size_t>(operands[1])]) {
-      if (!(place >= 0 && place < static_cast<double>(end))) return false;
+      if (!(place >= 0 && place < static_cast<double>(columns))) return false;
     }
   }
   return std::none_of(program.results.begin(), program.results.end(), size_of);

@@ -3,38 +3,25 @@
 
 #pragma once
 
+#include "batchpid/native/codes.h"
 #include "batchpid/native/mobility.h"
 #include "batchpid/native/tables.h"
 
 namespace batchpid {
-
-// Arrays of `law`: LAW in extensions.py.
-enum Law {
-  TASK_POSE, TASK_JACOBIAN, TASK_RATE, TASK_MASS, TASK_BIAS, CHAIN,
-  SETPOINT, LAW_QPOS, LAW_QVEL, TWIST, ACCELERATION, WRENCH, FEEDFORWARD,
-  DAMPING, ADDED_INERTIA, LEFT, POSTURE, INTEGRAL,
-  KP, KD, C, ACCELERATION_SHARE, KI_DT, KI_DT2, POSTURE_KP, POSTURE_KD,  // coefficients: fields of OSCCoefficients
-  LIMIT_KP, LIMIT_KD, LIMIT_MARGIN, LIMIT_LOW, LIMIT_HIGH, INTEGRAL_LIMIT,
-  POSITION_LIMIT, ROTATION_LIMIT, SMALLEST, SELECTED, FORCE_AXES,
-  EFFORT_MIN, EFFORT_MAX, TURNS,
-  EFFORT, NEXT_INTEGRAL, LIMITED, TASK_ERROR, FORCE, TASK_EFFORT, POSTURE_EFFORT, UNSATURATED,  // results
-  TASK_SHARE, POSTURE_SHARE, NEAR_SINGULAR,
-  LAW
-};
 
 // Inputs of a law for WIDTH rows. Coefficients in one row are loaded once.
 class Given {
  public:
   explicit Given(Tables const &table) : table_(table) {
     std::size_t size = 0;
-    for (int i = 0; i < EFFORT; ++i) size += table[i] ? static_cast<std::size_t>(table[i].columns) : 0;
+    for (int i = 0; i < LAW_EFFORT; ++i) size += table[i] ? static_cast<std::size_t>(table[i].columns) : 0;
     of_.resize(size);
     Lanes *next = of_.data();
-    for (int i = 0; i < EFFORT; ++i) {
+    for (int i = 0; i < LAW_EFFORT; ++i) {
       if (!table[i]) continue;
       at_[i] = next;
       next += table[i].columns;
-      if (i >= KP && table[i].rows == 1) {
+      if (i >= LAW_KP && table[i].rows == 1) {
         table[i].load(0, at_[i]);
       } else {
         each_.push_back(i);
@@ -50,7 +37,7 @@ class Given {
 
  private:
   Tables const &table_;
-  Lanes *at_[EFFORT] = {};
+  Lanes *at_[LAW_EFFORT] = {};
   std::vector<int> each_;
   std::vector<Lanes> of_;
 };
@@ -60,11 +47,11 @@ class Given {
 inline void write_friction(std::int64_t dof, Given const &at, Lanes const *viscous, Lanes const *coulomb,
                            Lanes const *band, Lanes *out) {
   constexpr double LOOKAHEAD = 0.1;  // of batchpid/motors/friction.py
-  Lanes const *jacobian = at[TASK_JACOBIAN], *chain = at[CHAIN];
+  Lanes const *jacobian = at[LAW_JACOBIAN], *chain = at[LAW_CHAIN];
   Lanes ahead[AXES], mobility[AXES * AXES];
-  write_error(at[SETPOINT], at[TASK_POSE], ahead);
+  write_error(at[LAW_SETPOINT], at[LAW_POSE], ahead);
   for (int a = 0; a < AXES; ++a) {
-    if (at[TWIST] != nullptr) ahead[a] += LOOKAHEAD * at[TWIST][a];
+    if (at[LAW_TWIST] != nullptr) ahead[a] += LOOKAHEAD * at[LAW_TWIST][a];
     for (int b = 0; b <= a; ++b) {
       mobility[a * AXES + b] = mobility[b * AXES + a] = along(jacobian + a * dof, jacobian + b * dof, dof);
     }
@@ -74,7 +61,7 @@ inline void write_friction(std::int64_t dof, Given const &at, Lanes const *visco
   solve_both<1>(AXES, mobility, ahead);
   for (std::int64_t j = 0; j < dof; ++j) {
     Lanes const moved = along(jacobian + j, ahead, AXES, dof);
-    Lanes const way = chain[j] * moved + (1.0 - chain[j]) * (at[POSTURE][j] - at[LAW_QPOS][j]);
+    Lanes const way = chain[j] * moved + (1.0 - chain[j]) * (at[LAW_POSTURE][j] - at[LAW_QPOS][j]);
     out[j] = at_most(at_least(way * (coulomb[j] / band[j]), -coulomb[j]), coulomb[j]);
     if (viscous != nullptr) out[j] = viscous[j] * at[LAW_QVEL][j] + out[j];
   }
@@ -102,7 +89,7 @@ class OSCLaw {
  public:
   OSCLaw(std::int64_t dof, bool in_tool_axes, Tables const &table, ToolDynamics *dynamics = nullptr)
       : dof_(dof), in_tool_axes_(in_tool_axes), table_(table), given_(table) {
-    for (std::int64_t i = 0; i < dof; ++i) (table[CHAIN].data[i] > 0 ? chain_ : others_).push_back(i);
+    for (std::int64_t i = 0; i < dof; ++i) (table[LAW_CHAIN].data[i] > 0 ? chain_ : others_).push_back(i);
     auto const n = static_cast<std::size_t>(dof), links = chain_.size();
     factor_.resize(links * links);
     white_.resize(links * AXES);
@@ -111,21 +98,21 @@ class OSCLaw {
       leaf->resize(n);
     }
     if (dynamics == nullptr) return;
-    given_.set(TASK_POSE, dynamics->pose);
-    given_.set(TASK_JACOBIAN, dynamics->jacobian.data());
-    given_.set(TASK_RATE, dynamics->rate);
-    given_.set(TASK_MASS, dynamics->mass.data());
-    if (!table[TASK_BIAS]) given_.set(TASK_BIAS, dynamics->bias.data());
+    given_.set(LAW_POSE, dynamics->pose);
+    given_.set(LAW_JACOBIAN, dynamics->jacobian.data());
+    given_.set(LAW_JACOBIAN_RATE, dynamics->rate);
+    given_.set(LAW_MASS_MATRIX, dynamics->mass.data());
+    if (!table[LAW_BIAS]) given_.set(LAW_BIAS, dynamics->bias.data());
   }
 
   // Load WIDTH rows, with setpoints at the present moment of the tick: `_carried` in sim/tool_space.py.
   void load(std::int64_t first) {
     given_.load(first);
-    if (given_[LEFT] == nullptr) return;
-    Lanes *twist = given_[TWIST], *pose = given_[SETPOINT], *q = pose + 3, step[AXES], cosine, sine;
+    if (given_[LAW_LEFT] == nullptr) return;
+    Lanes *twist = given_[LAW_TWIST], *pose = given_[LAW_SETPOINT], *q = pose + 3, step[AXES], cosine, sine;
     for (int axis = 0; axis < AXES; ++axis) {
-      Lanes const change = given_[ACCELERATION] ? *given_[LEFT] * given_[ACCELERATION][axis] : Lanes{};
-      step[axis] = -*given_[LEFT] * (twist[axis] - 0.5 * change);
+      Lanes const change = given_[LAW_ACCELERATION] ? *given_[LAW_LEFT] * given_[LAW_ACCELERATION][axis] : Lanes{};
+      step[axis] = -*given_[LAW_LEFT] * (twist[axis] - 0.5 * change);
       twist[axis] -= change;
     }
     Lanes const angle = length_of(step + 3);
@@ -148,8 +135,8 @@ class OSCLaw {
 
   // Write the results of the rows loaded.
   void advance(std::int64_t first) {
-    for (std::int64_t i = 0; i < dof_ && given_[ADDED_INERTIA] != nullptr; ++i) {
-      given_[TASK_MASS][i * dof_ + i] += given_[ADDED_INERTIA][i];
+    for (std::int64_t i = 0; i < dof_ && given_[LAW_ADDED_INERTIA] != nullptr; ++i) {
+      given_[LAW_MASS_MATRIX][i * dof_ + i] += given_[LAW_ADDED_INERTIA][i];
     }
     set_accelerations();
     set_inertias();
@@ -165,26 +152,26 @@ class OSCLaw {
   // Add J v of the chain.
   void add_moved(Lanes const *v, Lanes *out) const {
     for (std::int64_t const j : chain_) {
-      for (int axis = 0; axis < AXES; ++axis) out[axis] += given_[TASK_JACOBIAN][axis * dof_ + j] * v[j];
+      for (int axis = 0; axis < AXES; ++axis) out[axis] += given_[LAW_JACOBIAN][axis * dof_ + j] * v[j];
     }
   }
 
   // Set error, a, a_n and a_s.
   void set_accelerations() {
-    Lanes *jacobian = given_[TASK_JACOBIAN], *rate = given_[TASK_RATE];
+    Lanes *jacobian = given_[LAW_JACOBIAN], *rate = given_[LAW_JACOBIAN_RATE];
     Lanes const *qpos = given_[LAW_QPOS], *qvel = given_[LAW_QVEL];
-    Lanes const *target = given_[TWIST], *target_rate = given_[ACCELERATION];
+    Lanes const *target = given_[LAW_TWIST], *target_rate = given_[LAW_ACCELERATION];
     Lanes twist[AXES];
-    write_error(given_[SETPOINT], given_[TASK_POSE], error_);
+    write_error(given_[LAW_SETPOINT], given_[LAW_POSE], error_);
     for (int half = 0; half < AXES; half += 3) {
       Lanes const *e = error_ + half, length = length_of(e);
-      Lanes const limit = *given_[half == 0 ? POSITION_LIMIT : ROTATION_LIMIT];
+      Lanes const limit = *given_[half == 0 ? LAW_POSITION_ERROR_LIMIT : LAW_ROTATION_ERROR_LIMIT];
       Lanes const scale = where_positive(length - limit, limit / length, 1.0);
       for (int k = 0; k < 3; ++k) near_error_[half + k] = scale * e[k];
     }
     add_moved(qvel, twist);
     if (in_tool_axes_) {
-      Turn const turn(given_[TASK_POSE] + 3);
+      Turn const turn(given_[LAW_POSE] + 3);
       if (target != nullptr) target = std::copy(target, target + AXES, turned_[0]) - AXES;
       if (target_rate != nullptr) target_rate = std::copy(target_rate, target_rate + AXES, turned_[1]) - AXES;
       for (Lanes *vector : {error_, near_error_, twist, rate, turned_[0], turned_[1]}) turn.reverse(vector, 1);
@@ -192,32 +179,32 @@ class OSCLaw {
     }
     target_ = target;
     for (int axis = 0; axis < AXES; ++axis) {
-      a_[axis] = given_[KP][axis] * near_error_[axis] - given_[KD][axis] * twist[axis];
-      if (target != nullptr) a_[axis] += given_[C][axis] * target[axis];
-      if (target_rate != nullptr) a_[axis] += given_[ACCELERATION_SHARE][axis] * target_rate[axis];
-      if (given_[INTEGRAL] != nullptr) a_[axis] += given_[INTEGRAL][axis];
+      a_[axis] = given_[LAW_KP][axis] * near_error_[axis] - given_[LAW_KD][axis] * twist[axis];
+      if (target != nullptr) a_[axis] += given_[LAW_C][axis] * target[axis];
+      if (target_rate != nullptr) a_[axis] += given_[LAW_ACCELERATION_SHARE][axis] * target_rate[axis];
+      if (given_[LAW_INTEGRAL] != nullptr) a_[axis] += given_[LAW_INTEGRAL][axis];
     }
     for (std::int64_t j = 0; j < dof_; ++j) {
-      Lanes away = given_[POSTURE][j] - qpos[j];
-      for (int k = 0; k < WIDTH && given_[TURNS] != nullptr; ++k) {
-        away.of[k] -= TURN * std::nearbyint(away.of[k] * given_[TURNS][j].of[k]);
+      Lanes away = given_[LAW_POSTURE][j] - qpos[j];
+      for (int k = 0; k < WIDTH && given_[LAW_TURNS] != nullptr; ++k) {
+        away.of[k] -= TURN * std::nearbyint(away.of[k] * given_[LAW_TURNS][j].of[k]);
       }
-      a_s_[j] = given_[POSTURE_KP][j] * away;
-      a_n_[j] = a_s_[j] - given_[POSTURE_KD][j] * qvel[j];
-      if (given_[LIMIT_KP] == nullptr) continue;
-      Lanes const low = given_[LIMIT_LOW][j] - qpos[j], high = qpos[j] - given_[LIMIT_HIGH][j];
+      a_s_[j] = given_[LAW_POSTURE_KP][j] * away;
+      a_n_[j] = a_s_[j] - given_[LAW_POSTURE_KD][j] * qvel[j];
+      if (given_[LAW_LIMIT_KP] == nullptr) continue;
+      Lanes const low = given_[LAW_LIMIT_LOW][j] - qpos[j], high = qpos[j] - given_[LAW_LIMIT_HIGH][j];
       Lanes const depth = at_least(low, 0.0) - at_least(high, 0.0), within = absolute(depth);
       if (!any_positive(within)) continue;
-      Lanes const damped = given_[LIMIT_KD][j] * qvel[j] * within / given_[LIMIT_MARGIN][j];
-      Lanes const pushed = given_[LIMIT_KP][j] * depth;
-      a_s_[j] = where_positive(within, a_s_[j] + given_[CHAIN][j] * pushed, a_s_[j]);
-      a_n_[j] = where_positive(within, a_n_[j] + given_[CHAIN][j] * (pushed - damped), a_n_[j]);
+      Lanes const damped = given_[LAW_LIMIT_KD][j] * qvel[j] * within / given_[LAW_LIMIT_MARGIN][j];
+      Lanes const pushed = given_[LAW_LIMIT_KP][j] * depth;
+      a_s_[j] = where_positive(within, a_s_[j] + given_[LAW_CHAIN][j] * pushed, a_s_[j]);
+      a_n_[j] = where_positive(within, a_n_[j] + given_[LAW_CHAIN][j] * (pushed - damped), a_n_[j]);
     }
   }
 
   // Set the factor of M_cc, L, L_n and L_s.
   void set_inertias() {
-    Lanes const *jacobian = given_[TASK_JACOBIAN], *mass = given_[TASK_MASS], *axes = given_[SELECTED];
+    Lanes const *jacobian = given_[LAW_JACOBIAN], *mass = given_[LAW_MASS_MATRIX], *axes = given_[LAW_AXES];
     std::int64_t const size = links();
     for (std::int64_t i = 0; i < size; ++i) {
       for (std::int64_t j = 0; j <= i; ++j) factor_[i * size + j] = mass[chain_[i] * dof_ + chain_[j]];
@@ -236,11 +223,11 @@ class OSCLaw {
     for (int a = 0; a < AXES; ++a) {
       for (int b = 0; b < a; ++b) mobility[b * AXES + a] = mobility[a * AXES + b];
     }
-    bool const force_too = axes != nullptr && given_[FORCE_AXES] != nullptr;
+    bool const force_too = axes != nullptr && given_[LAW_FORCE_AXES] != nullptr;
     for (int axis = 0; axis < AXES && axes != nullptr; ++axis) {
-      allowed[axis] = force_too ? at_least(axes[axis], given_[FORCE_AXES][axis]) : axes[axis];
+      allowed[axis] = force_too ? at_least(axes[axis], given_[LAW_FORCE_AXES][axis]) : axes[axis];
     }
-    Lanes const s0 = *given_[SMALLEST];
+    Lanes const s0 = *given_[LAW_SMALLEST_EIGENVALUE];
     near_ = {};
     selected_inverse(mobility, axes == nullptr ? nullptr : allowed, s0, null_inertia_, near_, more_of_springs_);
     null_near_ = near_;
@@ -253,16 +240,16 @@ class OSCLaw {
 
   // Set the efforts of base, task and posture.
   void set_efforts() {
-    Lanes const *jacobian = given_[TASK_JACOBIAN], *mass = given_[TASK_MASS];
+    Lanes const *jacobian = given_[LAW_JACOBIAN], *mass = given_[LAW_MASS_MATRIX];
     Lanes moved[AXES], pulled[AXES];
     for (int axis = 0; axis < AXES; ++axis) {
-      moved[axis] = a_[axis] - given_[TASK_RATE][axis];
+      moved[axis] = a_[axis] - given_[LAW_JACOBIAN_RATE][axis];
     }
     add_moved(a_n_.data(), pulled);
     Lanes drop[AXES];
     for (int axis = 0; axis < AXES; ++axis) {
       force_[axis] = along(inertia_ + axis * AXES, moved, AXES);
-      if (given_[WRENCH] != nullptr) force_[axis] += given_[WRENCH][axis];
+      if (given_[LAW_WRENCH] != nullptr) force_[axis] += given_[LAW_WRENCH][axis];
       drop[axis] = along(null_inertia_ + axis * AXES, pulled, AXES);
     }
     if (any_positive(null_near_)) {  // (L_s - L_n) J a_s
@@ -282,10 +269,10 @@ class OSCLaw {
       posture_[i] = both_[2 * c + 1] = y;
     }
     for (std::int64_t i = 0; i < dof_; ++i) {
-      Lanes sum = given_[TASK_BIAS][i];
+      Lanes sum = given_[LAW_BIAS][i];
       for (std::int64_t const j : others_) sum += mass[i * dof_ + j] * a_n_[j];
-      if (given_[FEEDFORWARD] != nullptr) sum += given_[FEEDFORWARD][i];
-      if (given_[DAMPING] != nullptr) sum += given_[DAMPING][i] * given_[LAW_QVEL][i];
+      if (given_[LAW_FEEDFORWARD] != nullptr) sum += given_[LAW_FEEDFORWARD][i];
+      if (given_[LAW_DAMPING] != nullptr) sum += given_[LAW_DAMPING][i] * given_[LAW_QVEL][i];
       base_[i] = sum;
     }
     if (others_.empty()) return;
@@ -303,7 +290,7 @@ class OSCLaw {
 
   // Write the results: efforts within their limits, and the integral.
   void saturate(std::int64_t first) {
-    Lanes const *low = given_[EFFORT_MIN], *high = given_[EFFORT_MAX], *integral = given_[INTEGRAL];
+    Lanes const *low = given_[LAW_EFFORT_MIN], *high = given_[LAW_EFFORT_MAX], *integral = given_[LAW_INTEGRAL];
     Lanes const s1 = share_within(dof_, task_.data(), base_.data(), base_.data(), low, high);
     for (std::int64_t i = 0; i < dof_; ++i) effort_[i] = base_[i] + s1 * task_[i];
     Lanes const s2 = share_within(dof_, posture_.data(), effort_.data(), base_.data(), low, high);
@@ -318,27 +305,27 @@ class OSCLaw {
       limited_[i] = differs_mask(sum, whole_[i]);
       held = where_positive(limited_[i], 1.0, held);
     }
-    table_[EFFORT].store(first, effort_.data());
+    table_[LAW_EFFORT].store(first, effort_.data());
     if (integral != nullptr) {
       Lanes next[AXES];
       for (int axis = 0; axis < AXES; ++axis) {
-        next[axis] = integral[axis] + given_[KI_DT][axis] * near_error_[axis];
-        if (given_[KI_DT2] != nullptr && target_ != nullptr) next[axis] -= given_[KI_DT2][axis] * target_[axis];
-        Lanes const limit = given_[INTEGRAL_LIMIT][axis];
+        next[axis] = integral[axis] + given_[LAW_KI_DT][axis] * near_error_[axis];
+        if (given_[LAW_KI_DT2] != nullptr && target_ != nullptr) next[axis] -= given_[LAW_KI_DT2][axis] * target_[axis];
+        Lanes const limit = given_[LAW_INTEGRAL_LIMIT][axis];
         Lanes const grows = held * where_positive(a_[axis] * near_error_[axis], 1.0, 0.0);
         next[axis] = where_positive(grows, integral[axis], at_most(at_least(next[axis], -limit), limit));
       }
-      table_[NEXT_INTEGRAL].store(first, next);
+      table_[LAW_NEXT_INTEGRAL].store(first, next);
     }
-    table_[LIMITED].store(first, limited_.data());
-    table_[TASK_ERROR].store(first, error_);
-    table_[FORCE].store(first, force_);
-    table_[TASK_EFFORT].store(first, task_.data());
-    table_[POSTURE_EFFORT].store(first, posture_.data());
-    table_[UNSATURATED].store(first, whole_.data());
-    table_[TASK_SHARE].store(first, &s1);
-    table_[POSTURE_SHARE].store(first, &s2);
-    table_[NEAR_SINGULAR].store(first, &near_);
+    table_[LAW_LIMITED].store(first, limited_.data());
+    table_[LAW_ERROR].store(first, error_);
+    table_[LAW_FORCE].store(first, force_);
+    table_[LAW_TASK].store(first, task_.data());
+    table_[LAW_POSTURE_EFFORT].store(first, posture_.data());
+    table_[LAW_UNSATURATED].store(first, whole_.data());
+    table_[LAW_TASK_SHARE].store(first, &s1);
+    table_[LAW_POSTURE_SHARE].store(first, &s2);
+    table_[LAW_NEAR_SINGULAR].store(first, &near_);
   }
 
   std::int64_t dof_;

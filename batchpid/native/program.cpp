@@ -117,7 +117,7 @@ bool overlaps(Program const &program, Index rows, Output const &output, Input co
 bool fits(Program const &program, Index rows, std::vector<Input> const &inputs, std::vector<Output> const &outputs) {
   bool good = static_cast<Index>(inputs.size()) == program.inputs && outputs.size() == program.results.size() &&
               (rows == program.rows || std::count(program.shapes.begin(), program.shapes.end(), Shape::FULL) == 0);
-  if (!good || !tables_fit(program, rows, inputs)) return false;
+  if (!good || !tables_fit(program, inputs)) return false;
   for (Operation const &each : program.operations) {
     if (each.code != PUSH) continue;
     Input const &history = inputs[static_cast<std::size_t>(each.out) - program.constants.size()];

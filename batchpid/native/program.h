@@ -1,6 +1,6 @@
 // Programs of operations on arrays (rows, columns), such as the control law of many envs: traced in Python
 // (tracing.py), run here on plain pointers. No Python calls, no exceptions, and no allocation after a thread's first
-// run. Every operation is rounded as in NumPy, in float or double.
+// run. Every operation is rounded as in NumPy, in float or double; EXP, TANH and SIN are those of the C library.
 //
 // Rows are processed in blocks that stay in the cache. In a block, an input is read before an output at its address is
 // written. An output may therefore be the same array as an input of its shape (state in place). A history is an input
@@ -9,6 +9,8 @@
 // Flags: -O3 -ffp-contract=off -fno-math-errno -fno-trapping-math, and no other part of -ffast-math.
 
 #pragma once
+
+#include "codes.h"
 
 #include <algorithm>
 #include <cmath>
@@ -28,26 +30,21 @@ namespace batchpid {
 
 using Index = std::ptrdiff_t;
 
-// OPERATIONS in extensions.py. Masks are 1 and 0.
-enum Code : std::int32_t {
-  ADD, SUBTRACT, MULTIPLY, DIVIDE, MAXIMUM, MINIMUM, GREATER, GREATER_EQUAL, LESS, LESS_EQUAL, EQUAL, NOT_EQUAL, AND, OR,
-  NOT, NEGATIVE, ABSOLUTE, RINT, CEIL, FLOOR, SQRT, SIGN, FINITE, WHERE, ROW_MINIMUM, MATRIX_VECTOR,
-  MULTIPLY_ADD,       // a b + c, rounded twice
-  ADD_SUBTRACT,       // (a + b) - c
-  SUBTRACT_MULTIPLY,  // (a - b) c
-  CLIP,               // min(max(a, b), c)
-  PUSH,               // history, in place: b, or b and c, as its latest sample; the oldest one is lost
-  TAKE,               // numbers of a table, at the places b in the whole of it
-  GATHER,             // columns b of each row of a
-  TAKE_ROW,           // numbers of a table, in row b of the rows of each env and column
-};
+// Codes of operations beside those of array libraries; masks are 1 and 0.
+// MULTIPLY_ADD       a b + c, rounded twice
+// ADD_SUBTRACT       (a + b) - c
+// SUBTRACT_MULTIPLY  (a - b) c
+// CLIP               min(max(a, b), c)
+// PUSH               history, in place: b as its latest sample; the oldest one is lost
+// GATHER             columns b of each row of a
+// TAKE_ROW           numbers of a table, in row b of the rows of each env and column
 
 struct Operation {
   std::int32_t code, out, operands[3];  // numbers of registers
 };
 
 // Shapes of constants and inputs: (), (1, columns), (rows, 1), (rows, columns), (rows, numbers of a table).
-// A table is a matrix (columns, columns), or a history (samples, columns or 2 columns) with the latest sample first.
+// A table is a matrix (columns, columns), or a history (samples, columns) with the latest sample first.
 enum class Shape : std::int32_t { NUMBER, ROW, COLUMN, FULL, TABLE };
 
 struct Input {
@@ -81,8 +78,6 @@ struct Fused {
   Pass<float> single;
   Pass<double> pass;
 };
-
-constexpr std::size_t MOST_OPERANDS = 48;  // of a segment, and of its results
 
 // Consecutive elementwise operations that are one pass. Segment in tracing.py.
 struct Segment {
@@ -154,8 +149,11 @@ BATCHPID_INLINE T result_of(T a, T b, T c) {
     case CEIL: return std::ceil(a);
     case FLOOR: return std::floor(a);
     case SQRT: return std::sqrt(a);
+    case EXP: return std::exp(a);
+    case TANH: return std::tanh(a);
+    case SIN: return std::sin(a);
     case SIGN: return a > 0 ? 1 : a < 0 ? -1 : a == 0 ? 0 : a;
-    case FINITE: return a - a == 0 ? 1 : 0;
+    case ISFINITE: return a - a == 0 ? 1 : 0;
     case WHERE: return a != 0 ? b : c;
     case MULTIPLY_ADD: return a * b + c;
     case ADD_SUBTRACT: return a + b - c;
@@ -183,8 +181,8 @@ BATCHPID_INLINE void apply(Program const &program, Code code, Index first, Index
   switch (code) {
     EACH(ADD) EACH(SUBTRACT) EACH(MULTIPLY) EACH(DIVIDE) EACH(MAXIMUM) EACH(MINIMUM) EACH(GREATER) EACH(GREATER_EQUAL)
     EACH(LESS) EACH(LESS_EQUAL) EACH(EQUAL) EACH(NOT_EQUAL) EACH(AND) EACH(OR) EACH(NOT) EACH(NEGATIVE) EACH(ABSOLUTE)
-    EACH(RINT) EACH(CEIL) EACH(FLOOR) EACH(SQRT) EACH(SIGN) EACH(FINITE) EACH(WHERE) EACH(MULTIPLY_ADD)
-    EACH(ADD_SUBTRACT) EACH(SUBTRACT_MULTIPLY) EACH(CLIP)
+    EACH(RINT) EACH(CEIL) EACH(FLOOR) EACH(SQRT) EACH(EXP) EACH(TANH) EACH(SIN) EACH(SIGN) EACH(ISFINITE) EACH(WHERE)
+    EACH(MULTIPLY_ADD) EACH(ADD_SUBTRACT) EACH(SUBTRACT_MULTIPLY) EACH(CLIP)
     case ROW_MINIMUM:
       for (Index row = 0; row < n; row += columns) {
         T const *a = x.data + (x.step ? row : row % program.chunk);
@@ -202,14 +200,9 @@ BATCHPID_INLINE void apply(Program const &program, Code code, Index first, Index
     case PUSH:
       for (Index row = 0; row < n; row += columns) {
         T *latest = const_cast<T *>(x.data) + (first + row) / columns * x.step, *end = latest + x.step;
-        bool const is_pair = z.data != x.data;
-        std::copy_backward(latest, end - (is_pair ? 2 : 1) * columns, end);
+        std::copy_backward(latest, end - columns, end);
         std::copy_n(y.data + (y.step ? row : row % program.chunk), columns, latest);
-        if (is_pair) std::copy_n(z.data + (z.step ? row : row % program.chunk), columns, latest + columns);
       }
-      break;
-    case TAKE:
-      for (Index i = 0; i < n; ++i) out[i] = x.data[static_cast<Index>(y.data[y.step ? i : i % program.chunk])];
       break;
     case TAKE_ROW:
       for (Index row = 0; row < n; row += columns) {  // a place beyond the table, or NaN, is one in it

@@ -9,6 +9,9 @@
 #include <cstddef>
 #include <cstdint>
 
+// Structure whose fields Python fills in: setup.py lists them for interface.py.
+#define FOR_PYTHON
+
 namespace batchpid {
 
 template <class N>
@@ -216,7 +219,7 @@ void move_bodies(std::int64_t dof, std::int32_t const *tree, BodyState<N> const 
 }
 
 // Leaders and multipliers of the joints, null for none: batchpid/motors/coupling.py.
-struct Coupling {
+struct FOR_PYTHON Coupling {
   std::int32_t const *leader;  // (dof,)
   double const *multiplier;    // (dof,)
 

@@ -32,9 +32,6 @@ PyObject *make_tree(PyObject *, PyObject *arguments) {
   return capsule_of(std::move(made));
 }
 
-// Arrays of `kinematics`: KINEMATICS in extensions.py.
-enum Kinematics { QPOS, QVEL, TOOL, TOOL_POSE, JACOBIAN, JACOBIAN_RATE, MASS_MATRIX, BIAS, KINEMATICS };
-
 // Write results that are asked for; `body` is the body of the tool, or -1 for the base.
 FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, std::int64_t rows, Tables const &table) {
   auto const size = static_cast<std::size_t>(tree.dof);
@@ -42,22 +39,22 @@ FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, st
   Lanes frame[FRAME];
   ToolDynamics at(tree, body);
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    table[QPOS].load(first, qpos.data());
-    if (table[QVEL]) table[QVEL].load(first, qvel.data());
-    at.place(qpos.data(), table[QVEL] ? qvel.data() : nullptr);
-    if (table[TOOL]) {
-      table[TOOL].load(first, frame);
-      bool const moves{table[JACOBIAN_RATE]};
-      at.set_tool(frame, bool{table[TOOL_POSE]}, bool{table[JACOBIAN]}, moves);
-      table[TOOL_POSE].store(first, at.pose);
-      table[JACOBIAN].store(first, at.jacobian.data());
-      table[JACOBIAN_RATE].store(first, at.rate);
+    table[KINEMATICS_QPOS].load(first, qpos.data());
+    if (table[KINEMATICS_QVEL]) table[KINEMATICS_QVEL].load(first, qvel.data());
+    at.place(qpos.data(), table[KINEMATICS_QVEL] ? qvel.data() : nullptr);
+    if (table[KINEMATICS_TOOL]) {
+      table[KINEMATICS_TOOL].load(first, frame);
+      bool const moves{table[KINEMATICS_JACOBIAN_RATE]};
+      at.set_tool(frame, bool{table[KINEMATICS_POSE]}, bool{table[KINEMATICS_JACOBIAN]}, moves);
+      table[KINEMATICS_POSE].store(first, at.pose);
+      table[KINEMATICS_JACOBIAN].store(first, at.jacobian.data());
+      table[KINEMATICS_JACOBIAN_RATE].store(first, at.rate);
     }
-    if (table[BIAS] || table[MASS_MATRIX]) at.weigh();
-    if (table[BIAS]) at.set_bias();
-    table[BIAS].store(first, at.bias.data());
-    if (table[MASS_MATRIX]) at.set_mass();
-    table[MASS_MATRIX].store(first, at.mass.data());
+    if (table[KINEMATICS_BIAS] || table[KINEMATICS_MASS_MATRIX]) at.weigh();
+    if (table[KINEMATICS_BIAS]) at.set_bias();
+    table[KINEMATICS_BIAS].store(first, at.bias.data());
+    if (table[KINEMATICS_MASS_MATRIX]) at.set_mass();
+    table[KINEMATICS_MASS_MATRIX].store(first, at.mass.data());
   }
 }
 
@@ -68,19 +65,21 @@ PyObject *kinematics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]), dof = tree->dof;
   Tables table;
   std::int64_t const columns[KINEMATICS] = {dof, dof, FRAME, POSE, AXES * dof, AXES, dof * dof, dof};
-  if (!table.open_all(arguments + 3, columns, rows, TOOL_POSE)) return nullptr;
+  if (!table.open_all(arguments + 3, columns, rows, KINEMATICS_POSE)) return nullptr;
   write_kinematics(*tree, body, rows, table);
   Py_RETURN_NONE;
 }
 
 // Columns of an array of `law`.
 std::int64_t law_columns(int array, std::int64_t dof) {
-  constexpr int ONE[] = {LEFT, POSITION_LIMIT, ROTATION_LIMIT, SMALLEST, TASK_SHARE, POSTURE_SHARE, NEAR_SINGULAR};
-  constexpr int SIX[] = {TASK_RATE, TWIST, ACCELERATION, WRENCH, INTEGRAL, KP, KD, C, ACCELERATION_SHARE, KI_DT, KI_DT2,
-                         INTEGRAL_LIMIT, SELECTED, FORCE_AXES, NEXT_INTEGRAL, TASK_ERROR, FORCE};
-  if (array == TASK_POSE || array == SETPOINT) return POSE;
-  if (array == TASK_JACOBIAN) return AXES * dof;
-  if (array == TASK_MASS) return dof * dof;
+  constexpr int ONE[] = {LAW_LEFT, LAW_POSITION_ERROR_LIMIT, LAW_ROTATION_ERROR_LIMIT, LAW_SMALLEST_EIGENVALUE,
+                         LAW_TASK_SHARE, LAW_POSTURE_SHARE, LAW_NEAR_SINGULAR};
+  constexpr int SIX[] = {LAW_JACOBIAN_RATE, LAW_TWIST, LAW_ACCELERATION, LAW_WRENCH, LAW_INTEGRAL, LAW_KP, LAW_KD, LAW_C,
+                         LAW_ACCELERATION_SHARE, LAW_KI_DT, LAW_KI_DT2,
+                         LAW_INTEGRAL_LIMIT, LAW_AXES, LAW_FORCE_AXES, LAW_NEXT_INTEGRAL, LAW_ERROR, LAW_FORCE};
+  if (array == LAW_POSE || array == LAW_SETPOINT) return POSE;
+  if (array == LAW_JACOBIAN) return AXES * dof;
+  if (array == LAW_MASS_MATRIX) return dof * dof;
   if (std::count(std::begin(ONE), std::end(ONE), array)) return 1;
   return std::count(std::begin(SIX), std::end(SIX), array) ? AXES : dof;
 }
@@ -126,7 +125,7 @@ struct Step : Call {
     }
     if (PyErr_Occurred() || !tool.open(arguments[5], FRAME, rows, false)) return false;
     for (int i = 0; i < LAW; ++i) {
-      if (!law.open(arguments[6 + i], law_columns(i, dof), i == CHAIN ? 1 : rows, i >= EFFORT)) return false;
+      if (!law.open(arguments[6 + i], law_columns(i, dof), i == LAW_CHAIN ? 1 : rows, i >= LAW_EFFORT)) return false;
     }
     return true;
   }
@@ -138,7 +137,7 @@ struct StepRoom {
       : dynamics(step.tree, step.body),
         law(step.dof, step.in_tool_axes, step.law, step.tool[0] ? &dynamics : nullptr),
         friction(step.friction, step.dof) {
-    if (step.friction[1]) law.given().set(FEEDFORWARD, friction.out.data());
+    if (step.friction[1]) law.given().set(LAW_FEEDFORWARD, friction.out.data());
   }
   ToolDynamics dynamics;
   OSCLaw law;
@@ -155,7 +154,7 @@ FOR_EACH_PROCESSOR void write_step(Step const &step, StepRoom &room) {
       dynamics.place(law.qpos(), law.qvel());
       dynamics.set_tool(tool, true, true, true);
       dynamics.weigh();
-      if (!step.law[TASK_BIAS]) dynamics.set_bias();
+      if (!step.law[LAW_BIAS]) dynamics.set_bias();
       dynamics.set_mass();
     }
     if (step.friction[1]) friction.write(first, law.given());
@@ -209,50 +208,12 @@ PyObject *search(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
-// Arrays of `move`; the first two are changed.
-enum Move { AT, RATE, INERTIA, PUSH, ADDED, LOWER_END, UPPER_END, MOVE };
-
-// Step joints: sim/identification/simulator.py.
-FOR_EACH_PROCESSOR void write_move(std::int64_t rows, std::int64_t joints, double dt, Tables const &table) {
-  auto const n = static_cast<std::size_t>(joints);
-  std::vector<Lanes> columns[MOVE], room(n * n);
-  for (int i = 0; i < MOVE; ++i) columns[i].resize(i == INERTIA ? n * n : n);
-  std::vector<Lanes> &inverse = columns[INERTIA];
-  auto &[q, v, matrix, push, added, low, high] = columns;
-  for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    for (int i = 0; i < MOVE; ++i) table[i].load(first, columns[i].data());
-    for (std::int64_t j = 0; j < joints; ++j) matrix[j * joints + j] += added[j];
-    invert(joints, inverse.data(), room.data());
-    for (std::int64_t j = 0; j < joints; ++j) {
-      v[j] += dt * along(&inverse[j * joints], push.data(), joints);
-      Lanes const end = q[j] + dt * v[j];
-      v[j] = zero_outside(v[j], low[j], end, high[j]);
-      q[j] = at_most(at_least(end, low[j]), high[j]);
-    }
-    for (int i : {AT, RATE}) table[i].store(first, columns[i].data());
-  }
-}
-
-// move(rows, joints, dt, *arrays)
-PyObject *move(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  std::int64_t const rows = PyLong_AsLong(arguments[0]), joints = PyLong_AsLong(arguments[1]);
-  double const dt = PyFloat_AsDouble(arguments[2]);
-  if (PyErr_Occurred()) return nullptr;
-  Tables table;
-  std::int64_t const others[] = {joints * joints, joints, joints, joints, joints};
-  if (!table.open_all(arguments + 3, {joints, joints}, rows, 0)) return nullptr;
-  if (!table.open_all(arguments + 3 + INERTIA, others, rows, MOVE)) return nullptr;
-  write_move(rows, joints, dt, table);
-  Py_RETURN_NONE;
-}
-
 PyMethodDef METHODS[] = {
     {"tree", make_tree, METH_VARARGS, nullptr},
     {"kinematics", method(kinematics), METH_FASTCALL, nullptr},
     {"law", method(law), METH_FASTCALL, nullptr},
     {"bind", method(bind), METH_FASTCALL, nullptr},
     {"search", method(search), METH_FASTCALL, nullptr},
-    {"move", method(move), METH_FASTCALL, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 

@@ -34,19 +34,15 @@ from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.trees import mapped
 from batchpid.errors import InvalidArgumentError
 from batchpid.stages.control import Control
-from batchpid.stages.drive import Drive
-from batchpid.stages.effort import Effort, Own
 from batchpid.stages.feedforward import Feedforward, Passive
 from batchpid.stages.friction import Friction, Inertia
 from batchpid.stages.guard import Guard
-from batchpid.stages.last import Last
-from batchpid.stages.matrix import Matrix
+from batchpid.stages.law import PID, Drive, Effort, Matrix, Own
 from batchpid.stages.motors import Limits, Motors
-from batchpid.stages.pid import PID
 from batchpid.stages.plan import Plan
 from batchpid.stages.sensors import Sensors
 from batchpid.stages.setpoint import Setpoint
-from batchpid.stages.stage import Stage
+from batchpid.stages.stage import Last, Stage
 from batchpid.stages.values import Told, Values
 
 __all__ = ["STAGES", "Control", "Stage", "Told", "Values", "fit_stages", "stages_of"]

@@ -21,7 +21,7 @@ class Passive(Stage):
     """
 
     name = "passive force"
-    native = "passive force"
+    native = "FORCE"
     calls_model = True
 
     @classmethod

@@ -45,7 +45,7 @@ class Inertia(Stage):
 
     name = "inertia"
     starting = ("armature",)
-    native = "inertia"
+    native = "INERTIA"
     calls_model = True
 
     @classmethod

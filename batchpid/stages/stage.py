@@ -10,13 +10,17 @@ restart of some envs is :func:`started` under a mask, and a native program is a 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
 
 from batchpid.arrays.array_types import Array, Pytree
-from batchpid.arrays.elementwise import replace_envs
+from batchpid.arrays.elementwise import namespace, replace_envs
+from batchpid.arrays.trees import mapped
+from batchpid.native.array_program import Bound, TreeProgram
 from batchpid.stages.control import Control
-from batchpid.stages.values import Told, Values
+from batchpid.stages.values import Outputs, Told, Values
 
 States = tuple[Pytree, ...]
 """State of each stage, a tree of arrays (M, ...)."""
@@ -34,7 +38,7 @@ class Stage:
     after: ClassVar[str]
     """Name of the stage before it, for a stage of the caller's."""
     native: ClassVar[str] = ""
-    """Kind of stage in tick.h that replaces ``step`` in native code; "": a trace of ``step`` runs."""
+    """Entry of StageKind in tick.h that replaces ``step`` in native code; "": a trace of ``step`` runs."""
     calls_model: ClassVar[bool] = False
     """Whether ``step`` calls functions of the robots' model, which no program has."""
     is_brief: ClassVar[bool] = False
@@ -136,3 +140,68 @@ def by_name(stages: Iterable[Any], states: States) -> dict[str, Pytree]:
     """Return the states by the names of their stages, as a snapshot holds them."""
     pairs = zip(stages, states, strict=True)
     return {stage.name: state for stage, state in pairs if not stage.is_brief}
+
+
+@dataclass(frozen=True)
+class Last(Stage):
+    """Keeps ``qf`` and ``motor`` for the stages of the caller, which find them in
+    :attr:`.Values.last`.
+    """
+
+    name = "last"
+
+    @classmethod
+    def of(cls, control: Control) -> Self | None:
+        return cls() if control.further else None
+
+    def init(self, values: Values) -> Told:
+        qpos = values.measured.qpos
+        zero = namespace(qpos).zeros_like(qpos)
+        return Outputs(qf=zero, motor=zero), values
+
+    def step(self, state: Outputs, values: Values) -> Told:
+        outputs = values.outputs
+        return Outputs(qf=outputs.qf, motor=outputs.motor), values
+
+
+def bind_stages(
+    stages: Sequence[Any],
+    states: States,
+    values: Values,
+    shape: tuple[int, int],
+    passes: bool = False,
+) -> tuple[Bound, Values]:
+    """Return a program of stages, their states, and the values before them, whose arrays it reads;
+    and the values after them.
+
+    It changes the arrays of ``states`` in place. It makes new arrays for the ``values`` that it
+    changes: for the outputs alone, or with ``passes`` for all, which stages after it read. Errors
+    as for :class:`.TreeProgram`.
+    """
+    constants = mapped(_split, running(stages))
+    # Programs have no keys of noise, counts, or state of a controller.
+    states = mapped(_number, tuple(states))
+    function = _values_after if passes else _outputs_after
+    bound = TreeProgram(function, constants, states, values, shape).bind(states, values)
+    _, outputs, others = bound.after
+    after = others._replace(noise=None) if passes else values
+    return bound, after._replace(outputs=outputs)
+
+
+def _values_after(stages: Any, states: States, values: Values) -> tuple[States, Outputs, Values]:
+    states, values = stepped(stages, states, values)
+    return states, values.outputs, values._replace(outputs=Outputs())
+
+
+def _outputs_after(stages: Any, states: States, values: Values) -> tuple[States, Outputs, Any]:
+    return *_values_after(stages, states, values)[:2], ()
+
+
+def _number(array: Array) -> Any:
+    """Return an array of numbers in double precision; None for another."""
+    return array if array.dtype == np.float64 else None
+
+
+def _split(array: Array) -> Any:
+    """Return an array (n, envs, dof) as a tuple of n arrays, and other arrays unchanged."""
+    return tuple(array) if array.ndim == 3 else array

@@ -110,7 +110,7 @@ class BoundOSC:
     limited
         1 for joints whose effort the limits have changed in the last call, else 0 (envs, dof).
     address
-        Address of the call: ``control`` of :class:`batchpid.sim.engine.native.interface.Tick`.
+        Address of the call: ``control`` of Tick in tick.h.
     """
 
     def __init__(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from types import ModuleType
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -19,7 +19,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Float64
-from batchpid.native.availability import SWITCH, obstacle
+from batchpid.native.array_program import SWITCH, obstacle
 from batchpid.native.extensions import KINEMATICS, TASK_SPACE, load
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -82,26 +82,6 @@ def kinematics(
     inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
     call(native.kinematics, *_arguments(native, tree, outputs, inputs, index, point))
     return outputs
-
-
-def bound(
-    tree: RigidTree,
-    wanted: tuple[str, ...],
-    qpos: Float64,
-    qvel: Float64,
-    index: int,
-) -> tuple[Callable[[], None], tuple[Float64, ...]] | None:
-    """Return a function that computes the results of :func:`kinematics`, on a fixed base, and their
-    arrays.
-
-    A call reads the contiguous arrays ``qpos`` and ``qvel`` (rows, dof).
-    """
-    if (native := in_use()) is None:
-        return None
-    outputs = empty(wanted, qpos.shape[:1], tree.dof)
-    return partial(
-        native.kinematics, *_arguments(native, tree, outputs, [qpos, qvel], index, None)
-    ), tuple(outputs.values())
 
 
 def _arguments(

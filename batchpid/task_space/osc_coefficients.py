@@ -9,7 +9,7 @@ twist of the tool, V and V' the twist and acceleration of the setpoint, and I th
 - "explicit": kp* = kp, kd* = c* = kd, g* = 1, ki* = ki and ki2* = 0. Decoupled axes are stable for
   w dt < 0.828 with kp = w^2, kd = 2 w.
 - "implicit": the error, the twist and the integral are those at the end of the step, where V and V'
-  are given. As for joints (:mod:`batchpid.law.implicit`), with D = 1 + dt kd + dt^2 kp + dt^3 ki::
+  are given. As for joints (:mod:`batchpid.law.coefficients`), with D = 1 + dt kd + dt^2 kp + dt^3 ki::
 
       kp* = (kp + dt ki) / D      kd* = (kd + dt kp + dt^2 ki) / D      c* = kd / D      g* = 1 / D      ki* = ki / D
 

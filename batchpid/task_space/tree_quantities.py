@@ -55,27 +55,41 @@ def evaluated(
         if native is not None:
             return native
     # The definition, for JAX, for varied bodies, and where no extension was built.
-    varied = bodies or nominal
-    quantities: dict[str, Array] = {}
+    leading = q.shape[:-1]
+
+    def by_rows(rows: Array) -> Array:
+        return rows if rows is None or rows.ndim == 1 else rows.reshape(-1, rows.shape[-1])
+
+    # Rows of robots are the last axis, along which NumPy and XLA make vectors.
+    columns = q.reshape(-1, tree.dof).T
+    parts = [
+        xp.moveaxis(leaf, 0, -1) if leaf.ndim > one.ndim else leaf[..., None]
+        for leaf, one in zip(bodies or nominal, nominal, strict=True)
+    ]
+    of_robots = Bodies(*parts)._replace(moves=nominal.moves)
+    of_robots = of_robots._replace(slides=nominal.slides, mass=of_robots.mass[:, 0])
+    place, turning = by_rows(point), by_rows(turning)
+    results: dict[str, Array] = {}
     with quiet():
-        motions = motions_of(tree, nominal, q, xp)
+        motions = motions_of(tree, of_robots, columns, xp)
         if v is None:
             velocities = None
         else:
-            velocities = velocities_of(tree, motions, v, xp, turning)
+            speeds = v.reshape(-1, tree.dof).T
+            velocities = velocities_of(tree, of_robots, motions, speeds, xp, turning)
         if link is not None:
-            tool = tool_frame(tree, nominal, motions.frames, index, point)
+            tool = tool_frame(tree, of_robots, motions, index, place)
+            results["pose"] = pose_of(tool)
             place = tool[..., 3]
-            quantities["pose"] = pose_of(tool)
             if "jacobian" in names:
-                quantities["jacobian"] = jacobian_at(tree, nominal, motions, index, place)
+                results["jacobian"] = jacobian_at(tree, of_robots, motions, index, place)
             if "jacobian_rate" in names and velocities is not None:
-                quantities["jacobian_rate"] = rate_at(tree, velocities, index, place)
+                results["jacobian_rate"] = rate_at(tree, velocities, index, place)
         if "mass_matrix" in names:
-            quantities["mass_matrix"] = mass_matrix_of(tree, varied, motions, xp)
+            results["mass_matrix"] = mass_matrix_of(tree, of_robots, motions, xp)
         if "bias" in names and velocities is not None:
-            quantities["bias"] = effort_of(tree, varied, motions, velocities, xp, turning)
-    return quantities
+            results["bias"] = effort_of(tree, of_robots, motions, velocities, xp, turning)
+    return {name: rows.reshape(*leading, *rows.shape[1:]) for name, rows in results.items()}
 
 
 def link_poses(

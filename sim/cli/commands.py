@@ -10,7 +10,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,14 +22,10 @@ from batchpid.io.files import write_atomically
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.drawing import plot, view
-from batchpid.sim.cli.excite import excite_joints
-from batchpid.sim.cli.export import ENDINGS, export
-from batchpid.sim.cli.gains import compare, tune
-from batchpid.sim.cli.identify import identify_logs
+from batchpid.sim.cli.gains import ENDINGS, compare, export, tune
+from batchpid.sim.cli.identify import excite_joints, identify_logs
 from batchpid.sim.cli.inspect import inspect_robot
 from batchpid.sim.cli.rollout import demo, rollout
-from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.tuning.gain_sets import default_gains
 
 PICTURES = (".png", ".svg")
 DOCUMENTS = (".yaml", ".yml", ".json")
@@ -38,6 +34,8 @@ FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
 FIRST_SECONDS, LINE_SECONDS = 1.0, 10.0
 """Time before the first line about the progress of a command, and between lines [s]."""
+SHOWN_FLAGS = ("base", "engine", "control", "gains")
+"""Flags in the first line that a command prints."""
 FIXED: dict[str | None, bool] = {"fixed": True, "free": False}
 """Values of the flag ``--base``."""
 
@@ -202,33 +200,22 @@ def _arguments(command: CommandFunction, values: Document) -> Document:
         )
         arguments["robot"] = robot
         if not is_recorded:
-            print(f"{robot.name}: {', '.join(_settings(robot, values))}", flush=True)
+            print(_settings(robot, values), flush=True)
     if "progress" in accepted:
         arguments["progress"] = bar(command.function.__name__)
     return arguments
 
 
-def _settings(robot: Robot, values: Document) -> Iterator[str]:
-    """Yield the words of the first line: base, joints, engine, gains, rate and number of robots."""
-    if not robot.fixed_base:
-        yield "free base"
-    yield f"{robot.dof} dof"
-    engines = values.get("engine") or ()
-    # A comparison may have two engines.
-    for name in (engines,) if isinstance(engines, str) else engines:
-        yield load_engine(name).title
-    # Drives and tools have other gains.
-    if values.get("control", "pid") != "pid":
-        yield f"control {values['control']}"
-    elif values.get("gains"):
-        gains = values["gains"]
-        yield f"gains {gains if isinstance(gains, str) else ', '.join(gains)}"
-    elif "num_envs" in values:
-        yield f"gains {default_gains(robot)}"
-    if values.get("timestep") is not None:
-        yield f"{1 / values['timestep']:g} Hz"
+def _settings(robot: Robot, values: Document) -> str:
+    """Return the first line: the robot, and the flags that say how it is run."""
+    words = [f"{robot.name}: {robot.dof} dof"]
+    for name in SHOWN_FLAGS:
+        value = values.get(name)
+        if value:
+            words.append(f"{name} {value if isinstance(value, str) else ' '.join(value)}")
     if "num_envs" in values:
-        yield f"{values['num_envs']} robots"
+        words.append(f"{values['num_envs']} robots")
+    return ", ".join(words)
 
 
 def _write(name: str, result: Any, path: Path) -> None:
@@ -282,18 +269,17 @@ def bar(label: str, unit: str = "it") -> Progress[Any]:
     return partial(tqdm, desc=label, unit=unit, delay=1.0, leave=False, dynamic_ncols=True)
 
 
-def _lines(label: str, unit: str, items: Iterable[T]) -> Iterator[T]:
+def _lines(label: str, unit: str, items: Collection[T]) -> Iterator[T]:
     """Yield ``items``, with lines about how many are done."""
     began = time.monotonic()
     due = began + FIRST_SECONDS
-    total = f" of {len(items)}" if isinstance(items, Sized) else ""
+    total = len(items)
     for count, item in enumerate(items):
         now = time.monotonic()
         if now >= due and count:
             due = now + LINE_SECONDS
-            left = ""
-            if isinstance(items, Sized):
-                left = f", about {(now - began) * (len(items) / count - 1):.0f} s left"
-            text = f"{label}: {count}{total} {unit}, {now - began:.0f} s{left}"
-            print(f"batchpid: {text}", file=sys.stderr, flush=True)
+            spent = now - began
+            left = spent * (total / count - 1)
+            text = f"{count} of {total} {unit}, {spent:.0f} s, about {left:.0f} s left"
+            print(f"batchpid: {label}: {text}", file=sys.stderr, flush=True)
         yield item

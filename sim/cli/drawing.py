@@ -17,7 +17,7 @@ from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, read_recording
 from batchpid.sim.cli.flags import Gains, flag
-from batchpid.sim.tuning.gain_sets import gain_set
+from batchpid.sim.cli.gains import law_gains
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -140,11 +140,7 @@ def _live(
 
     # Without gains the Runner has its own default, which knows the loops of an MJCF file.
     if gains is not None:
-        chosen = gain_set(robot, gains)
-        if chosen.control != "pid":
-            remedy = "name others"
-            raise InvalidArgumentError("gains", "must be PID gains", value=gains, remedy=remedy)
-        options["params"] = chosen.params
+        options["params"] = law_gains(robot, gains)
     return LiveSimulation(robot, num_envs, **options)
 
 

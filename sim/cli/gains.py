@@ -1,14 +1,47 @@
-"""``batchpid tune`` and ``batchpid compare``: gains by simulation."""
+"""``batchpid tune`` and ``batchpid compare``: gains by simulation. ``batchpid export``: gains, or the
+robot itself, as a file for another program.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
 
 from batchpid.arrays.field_tables import Field
+from batchpid.checks.validate import file_path
+from batchpid.errors import InvalidArgumentError
+from batchpid.io.files import write_atomically
 from batchpid.sim import Robot, tuning
-from batchpid.sim.cli.flags import GAINS_FLAG, Randomize, flag
+from batchpid.sim.cli.flags import GAINS_FLAG, Gains, Randomize, flag
 from batchpid.sim.options.groups import EngineName
 from batchpid.sim.tuning.evaluation import load_randomization
+from batchpid.sim.tuning.gain_sets import gain_set
+
+if TYPE_CHECKING:
+    import batchpid as bp
+    from batchpid.export import Exported
+
+ENDINGS = {
+    "c": "pid.h",
+    "ros2_control": "controllers.yaml",
+    "mjcf": "pid.xml",
+    "urdf": "repaired.urdf",
+}
+"""End of the default file name of each target."""
+USED = {
+    "c": ("gains", "limits", "dynamics", "plan"),
+    "ros2_control": ("gains", "limits"),
+    "mjcf": ("gains", "limits"),
+    "urdf": (),
+}
+"""Flags that have an effect for each target, of those that only some have."""
+COMMENTS = {"c": "/* {} */", "mjcf": "<!-- {} -->", "urdf": "<!-- {} -->"}
+"""Comment of a target's language; of the others "# {}"."""
 
 
 def tune(
@@ -68,3 +101,178 @@ def compare(
         randomization=load_randomization(randomize, robot),
         progress=progress,
     )
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """File for a target, with its differences from batchpid's law or the robot's file."""
+
+    target: str
+    make: Callable[[Path], Exported]
+    """Function of the file's folder."""
+
+    def report(self) -> str:
+        """Return a line for each difference."""
+        # The folder decides only how meshes are named.
+        differences = self.make(Path.cwd()).differences
+        if not differences:
+            return "The file has no differences."
+        return "\n".join(f"differs: {text}" for text in differences)
+
+    def save(self, path: Path) -> None:
+        """Write the file, with a comment at its end for each difference that it does not name."""
+        file_path("out", path, (Path(ENDINGS[self.target]).suffix,))
+        text, differences = self.make(path.absolute().parent)
+        comment = COMMENTS.get(self.target, "# {}")
+        for difference in differences:
+            # Two hyphens would end a comment of XML, and */ one of C.
+            sentence = " ".join(difference.split()).replace("--", "- -").replace("*/", "* /")
+            if sentence not in text:
+                text += comment.format(f"differs: {sentence}") + "\n"
+        write_atomically(path, text)
+
+
+def export(
+    robot: Robot,
+    to: Annotated[Literal["c", "ros2_control", "mjcf", "urdf"], flag("Target.")] = "c",
+    gains: Gains = None,
+    timestep: Annotated[
+        float,
+        Field("seconds, not a rate: 1/1000", low=1e-6, high=1.0),
+        flag("Time step of the control on the robot, or of the physics [s]."),
+    ] = 1 / 1000,
+    limits: Annotated[
+        bool,
+        flag("Limit setpoints to the robot's joint limits and speeds before they reach the law."),
+    ] = False,
+    prefix: Annotated[
+        str,
+        flag("Beginning of every name in the file; in ros2_control the name of the controller."),
+    ] = "batchpid",
+    dynamics: Annotated[
+        bool, flag("In C, add the robot's mass matrix, gravity and bias as functions.")
+    ] = False,
+    plan: Annotated[
+        Path | None,
+        flag("In C, add a plan for chunks of a policy, from a file of `batchpid.save_plan`."),
+    ] = None,
+) -> ExportedFile:
+    """Write a robot's gains, or the robot itself, as a file for another program.
+
+    Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to
+    batchpid's. "ros2_control" is the YAML of a controller. "mjcf" is the robot with the law in
+    MuJoCo's own actuators, "urdf" the robot with its repairs. Differences between the file and
+    batchpid's law or the robot's file are printed, one line each.
+    """
+    # A flag without effect is refused by name.
+    chosen = {"gains": gains, "limits": limits, "dynamics": dynamics, "plan": plan}
+    unused = [name for name, value in chosen.items() if value and name not in USED[to]]
+    if unused:
+        raise InvalidArgumentError(
+            unused[0], f"has no effect with --to {to}", remedy="leave it out"
+        )
+    # The robot alone, or the law.
+    if to == "urdf":
+        from batchpid.sim.robot.urdf_export import to_urdf
+
+        return ExportedFile(to, partial(to_urdf, robot))
+    params = law_gains(robot, gains)
+    if to == "mjcf":
+        exported = _mjcf(robot, params, timestep, limits)
+    elif to == "c":
+        exported = _c_header(robot, params, timestep, limits, prefix, dynamics, plan)
+    else:
+        exported = _controllers(robot, params, timestep, limits, prefix)
+    return ExportedFile(to, lambda folder: exported)
+
+
+def law_gains(robot: Robot, gains: str | None) -> bp.PIDParams:
+    """Return the gains of the law by name; InvalidArgumentError for those of a drive."""
+    chosen = gain_set(robot, gains)
+    if chosen.control != "pid":
+        remedy = "choose gains of the law: tuned, designed, sapien-tutorial, or a file"
+        problem = "belong to a drive, and not to the law"
+        raise InvalidArgumentError("gains", problem, value=chosen.name, remedy=remedy)
+    return chosen.params
+
+
+def _c_header(
+    robot: Robot,
+    params: bp.PIDParams,
+    dt: float,
+    limits: bool,
+    prefix: str,
+    dynamics: bool,
+    plan: Path | None,
+) -> Exported:
+    """Return the C header."""
+    from batchpid.export import to_c
+    from batchpid.plan import load_plan
+
+    exported = to_c(
+        params,
+        dt,
+        joint_names=robot.joint_names,
+        guard=robot.guard() if limits else None,
+        prefix=prefix,
+        tree=robot.kinematic_tree() if dynamics else None,
+        plan=None if plan is None else load_plan(plan, robot.joint_names)[0],
+    )
+    return _with_followers(robot, exported, "separate joints in the file; ignore their efforts")
+
+
+def _controllers(
+    robot: Robot,
+    params: bp.PIDParams,
+    dt: float,
+    limits: bool,
+    name: str,
+) -> Exported:
+    """Return the file of controllers for ros2_control."""
+    from batchpid.export import to_ros2_control
+
+    leaders = robot.independent
+    exported = to_ros2_control(
+        params.for_joints(leaders),
+        [robot.joint_names[joint] for joint in np.flatnonzero(leaders)],
+        dt,
+        name=name or "joint_trajectory_controller",
+        inertia=_inertia(robot)[leaders],
+    )
+    if limits:
+        text = "guard: setpoints are not limited in the target"
+        exported = exported._replace(differences=(*exported.differences, text))
+    return _with_followers(robot, exported, "not in the file")
+
+
+def _with_followers(robot: Robot, exported: Exported, place: str) -> Exported:
+    """Return the file with a difference about followers, if there are any."""
+    names = [robot.joint_names[joint] for joint in np.flatnonzero(~robot.independent)]
+    if not names:
+        return exported
+    text = f"{', '.join(names)}: followers are {place}"
+    return exported._replace(differences=(*exported.differences, text))
+
+
+def _mjcf(
+    robot: Robot,
+    params: bp.PIDParams,
+    dt: float,
+    limits: bool,
+) -> Exported:
+    """Return the MJCF of the robot with its motors."""
+    from batchpid.sim.engine.protocol import load_engine
+
+    load_engine("mujoco")  # raises without MuJoCo
+    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+
+    options: dict[str, Any] = {"actuators": robot.actuators, "inertia": _inertia(robot)}
+    if limits:
+        options["guard"] = robot.guard()
+    return to_mjcf(robot, params, dt, **options)
+
+
+def _inertia(robot: Robot) -> np.ndarray:
+    """Return the inertia of the joints (dof,), 1 for followers, at the start pose."""
+    matrix = robot.mass_matrix(robot.start)[0]
+    return np.diagonal(robot.coupling.mass_matrix(matrix))

@@ -1,25 +1,91 @@
-"""``batchpid identify``: a robot's motors, friction and payload, found from logs."""
+"""``batchpid identify``: a robot's motors, friction and payload, found from logs. ``batchpid excite``: a
+motion to record for it.
+"""
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
+import numpy as np
 import tyro
 
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
+from batchpid.io.files import write_atomically
 from batchpid.sim import Robot
 from batchpid.sim.cli.flags import flag
+from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.options.groups import Compensation
+from batchpid.trajectories import Trajectory
 
 if TYPE_CHECKING:
     import batchpid as bp
 
 EVALUATIONS = 45
 """Length of the bar: a fit usually ends before."""
+THREADS = "scipy_openblas_set_num_threads64_"
+"""Function of the OpenBLAS in NumPy's wheels."""
+
+
+class Excitation(NamedTuple):
+    """Motion that excites the joints of a robot."""
+
+    robot: Robot
+    motion: Trajectory
+
+    def report(self) -> str:
+        """Return the range and the largest speed of each joint."""
+        names = self.robot.joint_names
+        units = self.robot.units
+        low = self.motion.position.min(0)
+        high = self.motion.position.max(0)
+        speed = np.abs(self.motion.velocity).max(0)
+        rows = []
+        still = []
+        for joint, (name, unit) in enumerate(zip(names, units, strict=True)):
+            span = f"{low[joint]:.3f} to {high[joint]:.3f} {unit}"
+            rows.append([name, span, f"{speed[joint]:.3g} {unit}/s"])
+            if low[joint] == high[joint]:
+                still.append(name)
+        lines = [table(rows, ["joint", "moves from ... to", "fastest"], "lrr")]
+        if still:
+            lines.append(
+                f"\nToo weak for their friction and gravity, so they stay still: {', '.join(still)}."
+            )
+        lines.append(
+            f"\n{self.motion.ticks} rows of {self.motion.time[0]:g} s; the robot starts at rest at"
+            " the first row"
+        )
+        return "\n".join(lines)
+
+    def save(self, path: Path) -> None:
+        """Write the setpoints and their rates as CSV."""
+        from batchpid.sim.recording.setpoint_files import setpoint_csv
+
+        write_atomically(path, setpoint_csv(self.robot, self.motion))
+
+
+def excite_joints(
+    robot: Robot,
+    seconds: Annotated[
+        float, Field("s", low=1.0, high=3600.0), flag("Duration of the motion [s].")
+    ] = 10.0,
+) -> Excitation:
+    """Make the motion to record for identification: a chirp of every joint.
+
+    It keeps the limits of position, velocity and effort, and is free of contact. Writes setpoints
+    and their rates as CSV with the header "time, setpoint:JOINT, ..., setpoint_rate:JOINT, ...",
+    which `batchpid rollout --trajectory` follows. Move the robot to the first row before it starts,
+    and add the measured positions to the log as qpos:JOINT.
+    """
+    from batchpid.sim.identification.excitation import excite
+
+    return Excitation(robot, excite(robot, seconds))
 
 
 def identify_logs(
@@ -119,6 +185,7 @@ def identify_logs(
     from batchpid.sim.identification.identification import identify
     from batchpid.sim.identification.logs import Reading
 
+    _use_one_thread()
     # A fit ends when it has converged: the bar shows an upper bound.
     evaluations = iter(range(EVALUATIONS) if progress is None else progress(range(EVALUATIONS)))
     result = identify(
@@ -140,6 +207,13 @@ def identify_logs(
     problem = "are explained to less than half of the error of the robot as described"
     remedy = "--force writes the file nevertheless"
     raise InvalidArgumentError("logs", f"{problem}, and no file is written", remedy=remedy)
+
+
+def _use_one_thread() -> None:
+    """Let NumPy's OpenBLAS use one thread: the others spin for a third of a fit's time."""
+    library = ctypes.CDLL(find_spec("numpy._core._multiarray_umath").origin)  # type: ignore[union-attr]
+    if hasattr(library, THREADS):
+        getattr(library, THREADS)(1)
 
 
 def _gains(robot: Robot, name: str) -> bp.PIDParams:

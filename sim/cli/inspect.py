@@ -4,6 +4,7 @@ links.
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections import Counter
 from collections.abc import Iterable
@@ -12,23 +13,26 @@ from typing import Annotated
 
 from batchpid.sim import Finding, Robot
 from batchpid.sim.cli.flags import Gains, flag
-from batchpid.sim.diagnosis.text import table
+from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.findings import summary
-from batchpid.sim.geometry.inertia import DENSITY
-from batchpid.sim.robot.parts import JOINT_HEADERS, joint_rows
+from batchpid.sim.geometry.shapes import DENSITY
+from batchpid.sim.robot.merging import link_inertias
+from batchpid.sim.robot.reading import tuned_file
+from batchpid.sim.robot.tables import Body, Joint
 from batchpid.sim.tuning.gain_sets import GainSet, gain_set, gain_table
 
-SOURCES = {
-    "inertial": "<inertial>",
-    "repaired": "<inertial>, repaired",
-    "shapes": f"collision shapes at {DENSITY:g} kg/m^3",
-    "none": "-",
-}
-"""Words for the sources of masses."""
+JOINT_COLUMNS = (
+    "",
+    "joint",
+    "type",
+    "limits",
+    "effort",
+    "velocity",
+    "damping",
+    "friction",
+    "parent > child link",
+)
 NO_GROUND = "No ground: links other than the fixed base reach it at the start pose."
-LEGS = "A robot with legs? Its base is fixed: --base free, or fixed_base=False, puts it on a floor."
-LIMB = 3
-"""Joints of the shortest limb."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +50,10 @@ class Inspection:
     def report(self) -> str:
         """Return the findings, and tables of joints and links."""
         robot = self.robot
-        masses = robot.link_masses
-        total = sum(link.mass for link in masses.values())
-        size = f"{robot.dof} degrees of freedom, {len(robot.links)} links, {total:.4g} kg"
+        links = robot.tables.bodies
+        inertias = link_inertias(robot.tables)
+        total = sum(inertia.mass for inertia in inertias.values())
+        size = f"{robot.dof} degrees of freedom, {len(links)} links, {total:.4g} kg"
         lines = [
             f"{robot.path}: {size}\n",
             *(sentences(self.findings) or ["Nothing odd about it."]),
@@ -64,14 +69,25 @@ class Inspection:
         joints = list(robot.joints)
         if self.all:
             joints += [joint for joint in robot.tables.joints if not joint.moves]
-        lines.append("\n" + table(list(joint_rows(joints)), JOINT_HEADERS, "lllrrrrrl"))
+        rows = [joint_row(number, joint) for number, joint in enumerate(joints)]
+        lines.append("\n" + table(rows, JOINT_COLUMNS, "lllrrrrrl"))
         rows = []
-        for name, link in masses.items():
-            mass = f"{link.mass:.4g} kg" if link.mass else "none"
-            rows.append([name, mass, SOURCES[link.source]])
+        for link in links:
+            inertia = inertias.get(link.name)
+            mass = "none" if inertia is None else f"{inertia.mass:.4g} kg"
+            rows.append([link.name, mass, self._origin_of_mass(link)])
         lines.append("\n" + table(rows, ("link", "mass", "from"), "lrl"))
         lines += ["", *self._contact_lines()]
         return "\n".join(lines)
+
+    def _origin_of_mass(self, link: Body) -> str:
+        """Return where the mass of a link is from."""
+        repaired = {repair.link for repair in self.robot.repairs if repair.code == "inertia"}
+        if link.mass:
+            return "<inertial>, repaired" if link.name in repaired else "<inertial>"
+        if self.robot.tables.shapes_of(link.name):
+            return f"collision shapes at {DENSITY:g} kg/m^3"
+        return "-"
 
     def _contact_lines(self) -> list[str]:
         """Return lines about the ground, and about the pairs of links that do not collide."""
@@ -81,9 +97,6 @@ class Inspection:
             ground = "Ground at height 0."
         else:
             ground = NO_GROUND
-        # A robot that hangs in the air by its trunk settles, and nothing else would say so.
-        if robot.fixed_base and limbs(robot) > 1:
-            ground = f"{ground} {LEGS}"
         if not pairs:
             return [_fill(f"{ground} All links collide.")]
         reasons = Counter(pair.reason for pair in pairs)
@@ -108,7 +121,7 @@ def inspect_robot(
     links.
     """
     findings = robot.check(setpoint=robot.target, control="drive")  # without gains
-    if gains is None and not robot.has_tuned:
+    if gains is None and tuned_file(robot) is None:
         # Designed gains keep the stability bound.
         return Inspection(robot, findings, None, [], all)
     chosen = gain_set(robot, gains)
@@ -117,19 +130,29 @@ def inspect_robot(
     return Inspection(robot, findings, chosen, of_gains, all)
 
 
-def limbs(robot: Robot) -> int:
-    """Return how many chains of :data:`LIMB` or more joints leave the root link."""
-    above = {joint.child_link: joint for joint in robot.tables.joints}
-    sizes = Counter[str]()
-    # Of each joint, the first moving joint on the way from the root.
-    for joint in robot.joints:
-        first = joint.name
-        link = joint.parent_link
-        while link in above:
-            first = above[link].name if above[link].moves else first
-            link = above[link].parent_link
-        sizes[first] += 1
-    return sum(size >= LIMB for size in sizes.values())
+def joint_row(number: int, joint: Joint) -> list[str]:
+    """Return the cells of a joint under :data:`JOINT_COLUMNS`; ``number`` is that of its qpos."""
+    links = f"{joint.parent_link} > {joint.child_link}"
+    if not joint.moves:
+        return ["-", joint.name, joint.type, *"-----", links]
+    limits = "none"
+    if math.isfinite(joint.lower) or math.isfinite(joint.upper):
+        limits = f"{_bound(joint.lower)} to {_bound(joint.upper, f' {joint.unit}')}"
+    return [
+        str(number),
+        joint.name,
+        joint.type,
+        limits,
+        _bound(joint.effort_limit, f" {joint.effort_unit}"),
+        _bound(joint.velocity_limit, f" {joint.unit}/s"),
+        f"{joint.damping:g}",
+        f"{joint.friction:g}",
+        links,
+    ]
+
+
+def _bound(value: float, unit: str = "") -> str:
+    return f"{value:.5g}{unit}" if math.isfinite(value) else "none"
 
 
 def sentences(findings: Iterable[Finding]) -> list[str]:

@@ -2,20 +2,22 @@
 
 A joint has settled if it ends within its band: 2 % of its move, and 1e-3 rad or 1e-4 m at least.
 :data:`RULES` is the table of causes; an env has the first that fits one of its joints outside their
-bands.
+bands. The functions at the end write reports of runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tabulate import tabulate
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Bool, Float64
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.preflight import touching_links
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 SETTLING_SHARE = 0.02  # half width of the settling band, as a share of the move
 EXAMINED = 100  # envs at most
 TAIL = 0.2  # last share of the run, by which joints are judged
+MOST_CAUSES = 3  # of a report
 TOUCH = 3e-3  # distance below which links touch, within the accuracy of meshes [m]
 
 
@@ -138,7 +141,8 @@ class _Run:
         command = self.info.own_command
         end: Float64 = self.qpos[-1]
         if command is None and self.info.control != "effort":
-            return self.robot.coupled(self.rollout.setpoint[-1])
+            goal: Float64 = self.robot.coupling.positions(self.rollout.setpoint[-1])
+            return goal
         if (
             command is None
             or command.size != 7
@@ -148,7 +152,7 @@ class _Run:
             return end
         pose = self.rollout.setpoint[-1, :, :7].copy()
         pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-        tree = self.robot.rigid_tree
+        tree = self.robot.kinematic_tree()
         start = np.nan_to_num(end)
         solution = ts.inverse_kinematics(tree, self.info.tool, pose, start, on_failure="return")
         self.out_of_reach = ~np.asarray(solution.success)[:, None]
@@ -232,7 +236,9 @@ class _Run:
             moves = [steps[env], *np.diag(steps[env])] if before else []
             pressed = set[str]()
             for move in moves:
-                after = touching_links(self.robot, self.robot.coupled(end + move), ground, TOUCH)
+                after = touching_links(
+                    self.robot, self.robot.coupling.positions(end + move), ground, TOUCH
+                )
                 pressed |= {pair for pair in before if after.get(pair, TOUCH) < before[pair] - 1e-4}
             links[env] = min(pressed, key=before.__getitem__, default="")
         return links
@@ -296,3 +302,37 @@ RULES: tuple[Rule, ...] = (
     Rule("slow", lambda run: run.unsettled),
 )
 """Every cause, in the order in which they are tested and listed."""
+
+
+def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:
+    """Return ``rows`` under ``headers`` as text; ``align`` has one letter per column, "l" or
+    "r".
+    """
+    sides = tuple("left" if side == "l" else "right" for side in align)
+    return tabulate(rows, headers, disable_numparse=True, colalign=sides)
+
+
+def cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
+    """Yield a line for each of the first causes, the most likely first."""
+    for cause in findings[:MOST_CAUSES]:
+        yield f"WHY: {cause.where}: {cause.text} ({cause.figures}); {cause.remedy}."
+    if len(findings) > MOST_CAUSES:
+        yield f"and {len(findings) - MOST_CAUSES} more, which rollout.findings() lists."
+
+
+def overshoot_of_settled(overshoot: Rows, settling: Rows) -> Rows:
+    """Return the overshoots of joints that settled; NaN for the others, of which it says
+    nothing.
+    """
+    return np.where(np.isinf(settling) & np.isfinite(overshoot), np.nan, overshoot)
+
+
+def median_and_worst(figures: Rows, style: str) -> str:
+    """Return the median and the worst of ``figures``, "never" for infinity, and "-" where none is
+    defined.
+    """
+    if np.isnan(figures).all():
+        return "-"
+    # Infinite figures allow no interpolation between two of them.
+    quantiles = np.nanquantile(figures, [0.5, 1.0], method="higher")
+    return " / ".join("never" if math.isinf(value) else style.format(value) for value in quantiles)

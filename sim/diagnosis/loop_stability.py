@@ -18,7 +18,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.errors import InvalidArgumentError, warn
-from batchpid.law.implicit import as_explicit
+from batchpid.law.coefficients import as_explicit
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
@@ -164,7 +164,7 @@ class StabilityCheck:
     def check(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
         """Warn if ``params`` pass the bound."""
         # SAPIEN's own friction is not in the formula.
-        if self._robot.dissipation == "sapien":
+        if self._robot.source.dissipation == "sapien":
             return
         motors = None
         if actuators is not None and not actuators.is_ideal:

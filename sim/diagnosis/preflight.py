@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,8 +23,13 @@ from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
 from batchpid.sim.findings import FINDING_KINDS, LIMIT_TOLERANCE, SEVERITIES, Finding, Findings
-from batchpid.sim.geometry.inertia import LEAST_MASS, triangle_excess
-from batchpid.sim.geometry.shapes import hull_share
+from batchpid.sim.geometry.shapes import (
+    LEAST_MASS,
+    extent,
+    hull_share,
+    inertia_of,
+    triangle_excess,
+)
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
@@ -79,35 +84,24 @@ def check(
         # Gains of a drive are not sampled, and its errors do not wrap.
         params = params if control == "pid" else None
     plan = _Plan(robot, start, goal, params, timestep)
-    findings = [*robot.repairs, *robot.reading.srdf.findings]
-    for oddity in ODDITIES:
-        kind = FINDING_KINDS[oddity.code]
-        for place in oddity.places(plan):
-            text = place.text or kind.when
-            remedy = place.remedy or kind.done
-            where = place.joint, place.link, place.detail
-            findings.append(Finding(kind.code, text, remedy, *where))
+    findings = list(robot.repairs)
+    for oddities in ODDITIES:
+        findings += oddities(plan)
     findings += of_engine
     return Findings(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
-class Place(NamedTuple):
-    """Joint or link of a finding, and its figures; text and remedy where they are not those of the
-    kind.
-    """
-
-    joint: str | None = None
-    link: str | None = None
-    detail: str = ""
-    text: str = ""
-    remedy: str = ""
-
-
-class Oddity(NamedTuple):
-    """Kind of finding, and the places that have it."""
-
-    code: str
-    places: Callable[[_Plan], Iterator[Place]]
+def _found(
+    code: str,
+    joint: str | None = None,
+    link: str | None = None,
+    detail: str = "",
+    text: str = "",
+    remedy: str = "",
+) -> Finding:
+    """Return a finding; text and remedy are those of the kind where they are not given."""
+    kind = FINDING_KINDS[code]
+    return Finding(code, text or kind.when, remedy or kind.done, joint, link, detail)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +119,9 @@ class _Plan:
         """Length [m] of the longest chain of joints, slides extended."""
         robot = self.robot
         length: dict[str, float] = defaultdict(float)
-        for joint, link in zip(robot.tables.joints, robot.links[1:], strict=True):  # parents first
+        for joint, link in zip(
+            robot.tables.joints, robot.tables.bodies[1:], strict=True
+        ):  # parents first
             ends = (joint.lower, joint.upper) if joint.type == "prismatic" else ()
             travel = max((abs(end) for end in ends if np.isfinite(end)), default=0.0)
             offset = float(np.linalg.norm(link.position)) + travel
@@ -148,21 +144,21 @@ def touching_links(
     return {f"{link} on {other or 'the ground'}": gap for link, other, gap in pairs}
 
 
-def _odd_sizes(plan: _Plan) -> Iterator[Place]:
+def _odd_sizes(plan: _Plan) -> Iterator[Finding]:
     """Yield links whose shapes are larger than the robot, or the robot if all are tiny."""
-    masses = plan.robot.link_masses
-    sizes = {name: mass.size for name, mass in masses.items() if mass.size > 0}
+    tables = plan.robot.tables
+    sizes = {name: size for name in tables.links if (size := extent(tables.shapes_of(name)))}
     of_chain = f"the robot's chain of joints is {plan.chain:.3g} m long"
     for name, size in sizes.items():
         if size > LARGEST_SHAPES * max(plan.chain, SHORTEST_CHAIN):
-            yield Place(link=name, detail=f"shapes of {size:.3g} m; {of_chain}")
+            yield _found("units", link=name, detail=f"shapes of {size:.3g} m; {of_chain}")
     # A single small link is common, such as a sensor.
     largest = max(sizes.values(), default=math.inf)
     if largest < SMALLEST_SHAPES * plan.chain:
-        yield Place(detail=f"shapes of at most {largest:.2g} m; {of_chain}")
+        yield _found("units", detail=f"shapes of at most {largest:.2g} m; {of_chain}")
 
 
-def _odd_angles(plan: _Plan) -> Iterator[Place]:
+def _odd_angles(plan: _Plan) -> Iterator[Finding]:
     """Yield hinges with limits or mimic offsets of many turns."""
     for joint in plan.robot.tables.joints:
         offset = 0.0 if joint.mimic is None else joint.mimic.offset
@@ -173,62 +169,76 @@ def _odd_angles(plan: _Plan) -> Iterator[Place]:
             if MOST_RADIANS < abs(angle) <= PLACEHOLDER
         ]
         if large and joint.unit == "rad":
-            yield Place(joint.name, detail=", ".join(large))
+            yield _found("units", joint.name, detail=", ".join(large))
 
 
-def _odd_inertia(plan: _Plan) -> Iterator[Place]:
+def _odd_inertia(plan: _Plan) -> Iterator[Finding]:
     """Yield links with a principal moment above the sum of the others."""
-    for link in plan.robot.links:
+    for link in plan.robot.tables.bodies:
         excess = triangle_excess(link.inertia) if link.mass else 0.0
         if excess > LEAST_EXCESS:
             text = "no body has such an inertia tensor, a moment above the sum of the others"
             detail = f"by {100 * excess:.0f} %"
-            yield Place(None, link.name, detail, f"{text}: simulated as given", "correct <inertia>")
+            yield _found(
+                "inertia",
+                None,
+                link.name,
+                detail,
+                f"{text}: simulated as given",
+                "correct <inertia>",
+            )
 
 
-def _massless(plan: _Plan) -> Iterator[Place]:
+def _massless(plan: _Plan) -> Iterator[Finding]:
     """Yield links whose mass is that of their shapes, and bodies that carry no mass at all."""
     robot = plan.robot
     bodies = {name: place.link for name, place in robot.bodies.items()}
     root = bodies[robot.tables.joints[0].parent_link]
-    masses = robot.link_masses
-    loaded = {bodies[name] for name, mass in masses.items() if mass.mass > LEAST_MASS}
+    masses = {link.name: link.mass for link in robot.tables.bodies}
+    shaped = dict[str, float]()
+    for name, mass in masses.items():
+        if not mass and (shapes := robot.tables.shapes_of(name)):
+            shaped[name] = inertia_of(shapes).mass
+    masses |= shaped
+    loaded = {bodies[name] for name, mass in masses.items() if mass > LEAST_MASS}
     # Bodies with mass in them, or in the links that they carry.
     for joint in reversed(robot.tables.joints):
         if bodies[joint.child_link] in loaded:
             loaded.add(bodies[joint.parent_link])
-    for name, mass in masses.items():
+    for name in masses:
         if robot.fixed_base and bodies[name] == root:
             continue
-        if mass.source == "shapes":
-            yield Place(link=name, detail=f"{mass.mass:.3g} kg")
+        if name in shaped:
+            yield _found("no-inertia", link=name, detail=f"{shaped[name]:.3g} kg")
         elif name == bodies[name] and name not in loaded:
-            yield Place(link=name, detail="1e-6 kg")
+            yield _found("no-inertia", link=name, detail="1e-6 kg")
 
 
-def _changed_meshes(plan: _Plan) -> Iterator[Place]:
+def _changed_meshes(plan: _Plan) -> Iterator[Finding]:
     """Yield links with a mesh that is much smaller than the hull that collides in its place."""
     for shape in plan.robot.tables.shapes:
         if (share := hull_share(shape)) > LARGEST_HULL:
             text = "a collision mesh is not convex, and collides as its convex hull"
             detail = f"{share:.3g} times its volume"
-            yield Place(None, shape.owner, detail, text, "divide the mesh into convex parts")
+            yield _found(
+                "collision", None, shape.owner, detail, text, "divide the mesh into convex parts"
+            )
 
 
-def _touching(plan: _Plan) -> Iterator[Place]:
+def _touching(plan: _Plan) -> Iterator[Finding]:
     """Yield the robot if links touch at the start pose or at the setpoint."""
     robot = plan.robot
     # A floating base starts on its ground, which is no fault.
     ground = robot.fixed_base and robot.has_ground
-    goal = robot.target if plan.goal is None else robot.coupled(plan.goal)
+    goal = robot.target if plan.goal is None else robot.coupling.positions(plan.goal)
     for name, qpos in (("start pose", plan.start), ("setpoint", goal)):
         pairs = touching_links(robot, qpos, ground, 0.0)
         if pairs:
             *_, nearest = pairs
-            yield Place(detail=f"{name}: {nearest}")
+            yield _found("touching", detail=f"{name}: {nearest}")
 
 
-def _outside(plan: _Plan) -> Iterator[Place]:
+def _outside(plan: _Plan) -> Iterator[Finding]:
     """Yield joints whose start position or setpoint is outside the limits."""
     for name, qpos in (("start pose", plan.start), ("setpoint", plan.goal)):
         if qpos is not None:
@@ -236,10 +246,12 @@ def _outside(plan: _Plan) -> Iterator[Place]:
                 if joint.lower - LIMIT_TOLERANCE <= value <= joint.upper + LIMIT_TOLERANCE:
                     continue
                 limits = f"limits [{joint.lower:g}, {joint.upper:g}]"
-                yield Place(joint.name, detail=f"{name} {value:g} {joint.unit}, {limits}")
+                yield _found(
+                    "out-of-limits", joint.name, detail=f"{name} {value:g} {joint.unit}, {limits}"
+                )
 
 
-def _without_range(plan: _Plan) -> Iterator[Place]:
+def _without_range(plan: _Plan) -> Iterator[Finding]:
     """Yield joints that cannot move, apart from those of which a repair says so."""
     reported = {repair.joint for repair in plan.robot.repairs if repair.code == "limits"}
     for joint in plan.robot.joints:
@@ -247,10 +259,10 @@ def _without_range(plan: _Plan) -> Iterator[Place]:
             text = "lower and upper limit are equal: no motion"
             limits = f"[{joint.lower:g}, {joint.upper:g}]"
             remedy = "give <limit lower= upper=>, or make it fixed"
-            yield Place(joint.name, None, limits, text, remedy)
+            yield _found("limits", joint.name, None, limits, text, remedy)
 
 
-def _weak(plan: _Plan) -> Iterator[Place]:
+def _weak(plan: _Plan) -> Iterator[Finding]:
     """Yield joints that cannot be held, or not be moved, in some poses."""
     robot = plan.robot
     limits = robot.effort_limit
@@ -258,7 +270,8 @@ def _weak(plan: _Plan) -> Iterator[Place]:
     share = (load + robot.friction >= limits).mean(0)
     for index in np.flatnonzero((share > 0) & (limits > 0)):
         joint = robot.joints[index]
-        yield Place(
+        yield _found(
+            "effort-limit",
             joint.name,
             detail=f"{joint.effort_limit:g} {joint.effort_unit}, gravity up to"
             f" {load[:, index].max():.3g}, friction {joint.friction:g},"
@@ -266,15 +279,15 @@ def _weak(plan: _Plan) -> Iterator[Place]:
         )
 
 
-def _without_effort_limit(plan: _Plan) -> Iterator[Place]:
+def _without_effort_limit(plan: _Plan) -> Iterator[Finding]:
     """Yield joints without an effort limit, with the one of their designed gains."""
     robot = plan.robot
     for joint, limit in zip(robot.joints, robot.design_effort_limit, strict=True):
         if math.isinf(joint.effort_limit) and joint.mimic is None:
-            yield Place(joint.name, detail=f"{limit:.3g} {joint.effort_unit}")
+            yield _found("no-effort-limit", joint.name, detail=f"{limit:.3g} {joint.effort_unit}")
 
 
-def _wrong_turns(plan: _Plan) -> Iterator[Place]:
+def _wrong_turns(plan: _Plan) -> Iterator[Finding]:
     """Yield joints whose errors wrap in the params, but not in the file, and the reverse."""
     if plan.params is None:
         return
@@ -283,12 +296,16 @@ def _wrong_turns(plan: _Plan) -> Iterator[Place]:
         wraps |= np.asarray(plan.params.continuous).any(axis=0)
     for joint, is_wrapped in zip(plan.robot.joints, wraps, strict=True):
         if joint.continuous and not is_wrapped:
-            yield Place(joint.name, detail="in the file: the error jumps where qpos wraps")
+            yield _found(
+                "continuous", joint.name, detail="in the file: the error jumps where qpos wraps"
+            )
         if is_wrapped and not joint.continuous:
-            yield Place(joint.name, detail="in params: the short way round may exceed limits")
+            yield _found(
+                "continuous", joint.name, detail="in params: the short way round may exceed limits"
+            )
 
 
-def _unstable(plan: _Plan) -> Iterator[Place]:
+def _unstable(plan: _Plan) -> Iterator[Finding]:
     """Yield the joint that is the first to become unstable."""
     if plan.params is None:
         return
@@ -304,21 +321,21 @@ def _unstable(plan: _Plan) -> Iterator[Place]:
         effect = report.effect
     joint = robot.joint_names[int(np.argmax(report.participation))]
     detail = f"{ratio:.3g} times the bound at the start pose: {effect}"
-    yield Place(joint, detail=detail, remedy=report.remedy)
+    yield _found("unstable", joint, detail=detail, remedy=report.remedy)
 
 
-ODDITIES = (
-    Oddity("units", _odd_sizes),
-    Oddity("units", _odd_angles),
-    Oddity("inertia", _odd_inertia),
-    Oddity("no-inertia", _massless),
-    Oddity("collision", _changed_meshes),
-    Oddity("touching", _touching),
-    Oddity("out-of-limits", _outside),
-    Oddity("limits", _without_range),
-    Oddity("effort-limit", _weak),
-    Oddity("no-effort-limit", _without_effort_limit),
-    Oddity("continuous", _wrong_turns),
-    Oddity("unstable", _unstable),
+ODDITIES: tuple[Callable[[_Plan], Iterator[Finding]], ...] = (
+    _odd_sizes,
+    _odd_angles,
+    _odd_inertia,
+    _massless,
+    _changed_meshes,
+    _touching,
+    _outside,
+    _without_range,
+    _weak,
+    _without_effort_limit,
+    _wrong_turns,
+    _unstable,
 )
 """Every oddity, in the order in which they are listed."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import DEADBEAT_SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import BASES, STATUS, Group, ModelStruct, Refresh
+from batchpid.sim.engine.native.interface import WIDTH, number, structure
 from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:
@@ -56,20 +56,53 @@ def passive_force(
     return np.asarray(force, np.float64)
 
 
+ALIGNMENT = 64
+"""Alignment of vectors in memory [bytes]."""
+
+
+def aligned(*shape: int) -> Float64:
+    """Return an array of zeros whose memory begins where a vector may."""
+    size = 8 * int(np.prod(shape))
+    memory = np.zeros(size + ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % ALIGNMENT
+    rows: Float64 = memory[start : start + size].view(np.float64).reshape(shape)
+    return rows
+
+
+def table(rows: Rows, size: int) -> Float64:
+    """Return ``rows`` (size | 1, columns) in blocks (blocks, columns, WIDTH), as lanes of native
+    code read them.
+    """
+    blocks = -(-size // WIDTH)
+    out = aligned(blocks, rows.shape[1], WIDTH)
+    numbers = np.minimum(np.arange(blocks * WIDTH), size - 1)
+    padded = np.broadcast_to(rows, (size, rows.shape[1]))[numbers]
+    out[...] = padded.reshape(blocks, WIDTH, -1).swapaxes(1, 2)
+    return out
+
+
+class HasTree(Protocol):
+    """Robots of one kind."""
+
+    @property
+    def rigid_tree(self) -> RigidTree:
+        """Their tree."""
+
+
 class NativeModel:
-    """Model of the robots of ``pack``, without their variation, on a base of this kind of
-    :data:`BASES`.
+    """Model of the robots of ``pack``, on a base of this kind of Base in model.h, with ``inertias``
+    (robots, dof + 1, 13) where they differ: :meth:`RigidTree.inertias`.
     """
 
-    def __init__(self, pack: EnginePack, base: str = "fixed") -> None:
+    def __init__(self, pack: HasTree, base: str = "fixed", inertias: Float64 | None = None) -> None:
         # The pack's tree is read at the first use: SAPIEN has to build a robot for it.
         self._pack = pack
         self._base = base
         self._native = native.extension("_gateway")
-        self._inertias: Float64 | None = None
+        self._inertias = inertias
 
     @cached_property
-    def _structure(self) -> tuple[ModelStruct, Any]:
+    def _structure(self) -> tuple[Any, Any]:
         tree, rows = self._pack.rigid_tree.tables
         if self._inertias is None:
             inertias = self._pack.rigid_tree.inertias()[None]
@@ -80,9 +113,10 @@ class NativeModel:
         numbers = {
             "dof": len(tree),
             "varies": self._inertias is not None,
-            "base": BASES.index(self._base),
+            "base": number("Base", self._base.upper()),
         }
-        return ModelStruct(gravity=self._pack.spec.gravity, **numbers, **addresses), arrays
+        gravity = tuple(self._pack.rigid_tree.bodies.gravity)
+        return structure("Model")(gravity=gravity, **numbers, **addresses), arrays
 
     @property
     def address(self) -> int:
@@ -184,7 +218,7 @@ class NativeRefresh:
         }
         arrays |= coupling.native()
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
-        self._structure = Refresh(
+        self._structure = structure("Refresh")(
             model=model.address, timestep=timestep, share=DEADBEAT_SHARE, steps=steps, **addresses
         )
         self._kept = model, arrays
@@ -207,7 +241,7 @@ class NativeStep:
     """Sim step of ``robots`` with ``dof`` joints as one native call, from Python or from an XLA
     program.
 
-    ``arrays`` and ``fields`` fill a :class:`.interface.Group`; a joint speed beyond ``speed_limit``
+    ``arrays`` and ``fields`` fill a Group of sim_step.h; a joint speed beyond ``speed_limit``
     (dof,) shows in the status.
     """
 
@@ -224,7 +258,7 @@ class NativeStep:
             self._arrays["speed_limit"] = np.broadcast_to(speed_limit, dof).astype(np.float64)
         addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
         self._native = native.extension("_gateway")
-        self._group = Group(robots=robots, dof=dof, **addresses, **fields)
+        self._group = structure("Group")(robots=robots, dof=dof, **addresses, **fields)
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension that does a sim
@@ -243,7 +277,7 @@ class NativeStep:
         """Return whether an env may have failed in a sim step with this status; RuntimeError if the
         engine has.
         """
-        if status & 1 << STATUS.index("failed"):
+        if status & number("Status", "FAILED"):
             raise RuntimeError(self._group.message.decode(errors="replace"))
         return bool(status)
 

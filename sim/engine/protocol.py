@@ -24,7 +24,7 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, SingleOwner
-from batchpid.io.packages import imported
+from batchpid.io.files import imported
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.native_model import NativeModel, NativeStep, passive_force_of

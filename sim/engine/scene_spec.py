@@ -18,12 +18,17 @@ from batchpid.arrays.array_types import Float64
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.geometry.distances import Contacts
-from batchpid.sim.robot.merging import merge_links, place_links
-from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
+from batchpid.sim.robot.merging import (
+    Part,
+    body_tree,
+    coupling_of,
+    merge_links,
+    payload_place,
+    place_links,
+    varied_bodies,
+)
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.simulated_links import BodyParts, body_tree, varied_bodies
-from batchpid.sim.robot.tables import Tables
+from batchpid.sim.robot.tables import Joint, MjcfFile, Tables
 from batchpid.task_space.frames import SpatialInertia, spatial_matrix, total
 from batchpid.task_space.rigid_tree import GRAVITY, RigidTree
 
@@ -76,11 +81,11 @@ class SceneSpec:
         """Return the description of scenes of ``robot``; ``options`` are further fields."""
         return cls(
             robot.tables,
-            robot.ignored_pairs,
+            robot.self_contact.ignored,
             robot.joints,
             timestep,
             physics,
-            dissipation=robot.dissipation,
+            dissipation=robot.source.dissipation,
             fixed_base=robot.fixed_base,
             **options,
         )
@@ -160,14 +165,14 @@ class VariedMasses:
 
     def __init__(self, spec: SceneSpec, size: int, variation: Variation) -> None:
         self._variation = variation
-        self._bodies: dict[str, BodyParts] = {}
+        self._bodies: dict[str, list[Part]] = {}
         varies_links = variation.link_mass is not None or variation.center_of_mass is not None
         if varies_links or variation.payload is not None:
             links = spec.varied_links if varies_links else ()
             self._bodies = varied_bodies(spec.tables, spec.separate, spec.carrier, links)
+            self._payload = payload_place(spec.tables, spec.separate, spec.carrier)
         self._nominal = {
-            name: total([part.inertia for part in body.parts])
-            for name, body in self._bodies.items()
+            name: total([part.inertia for part in parts]) for name, parts in self._bodies.items()
         }
         self.added = {name: np.zeros((size, 6, 6)) for name in self._bodies}
 
@@ -175,16 +180,16 @@ class VariedMasses:
         """Return the present inertias of robot ``row`` by link, in the frames of the links;
         :attr:`added` gets them.
         """
-        inertias = {name: self._inertia(body, row) for name, body in self._bodies.items()}
+        inertias = {name: self._inertia(name, row) for name in self._bodies}
         for name, inertia in inertias.items():
             self.added[name][row] = spatial_matrix(inertia) - spatial_matrix(self._nominal[name])
         return inertias
 
-    def _inertia(self, body: BodyParts, row: int) -> SpatialInertia:
+    def _inertia(self, body: str, row: int) -> SpatialInertia:
         """Return the inertia of a body with its links as in ``row``, and with the payload."""
         parts = []
         variation = self._variation
-        for part in body.parts:
+        for part in self._bodies[body]:
             (mass, center, tensor) = part.inertia
             column = part.column
             share = 1.0
@@ -195,10 +200,9 @@ class VariedMasses:
                 displacement = variation.center_of_mass[row, 3 * column : 3 * column + 3]
                 center = center + part.axes @ np.nan_to_num(displacement)
             parts.append(SpatialInertia(share * mass, center, share * tensor))
-        if body.payload is not None and variation.payload is not None:
-            parts.append(
-                SpatialInertia(float(variation.payload[row]), body.payload, np.zeros((3, 3)))
-            )
+        if variation.payload is not None and body == self._payload.link:
+            mass = float(variation.payload[row])
+            parts.append(SpatialInertia(mass, self._payload.position, np.zeros((3, 3))))
         return total(parts)
 
 
@@ -207,7 +211,7 @@ def own_friction(spec: SceneSpec, variation: Variation | None = None) -> Frictio
     ``variation``.
     """
     model = Friction()
-    if DISSIPATION[spec.dissipation].modelled:
+    if spec.dissipation == "urdf":
         rows = (
             np.array([[getattr(joint, name) for joint in spec.joints]])
             for name in ("friction", "damping")

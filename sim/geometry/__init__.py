@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 
 from batchpid.errors import BatchPIDError
-from batchpid.io.packages import imported
+from batchpid.io.files import imported
 
 try:
     imported("mujoco")

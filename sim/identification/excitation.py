@@ -122,7 +122,8 @@ def _centers(robot: Robot, easy: Float64, rng: np.random.Generator) -> Float64:
     low = np.maximum(robot.lower, robot.start - np.pi)
     high = np.minimum(robot.upper, robot.start + np.pi)
     edge = np.minimum(0.4 * (high - low), [REACH[unit] for unit in robot.units])
-    return robot.coupled(np.clip(poses, low + edge, high - edge))
+    coupled: Float64 = robot.coupling.positions(np.clip(poses, low + edge, high - edge))
+    return coupled
 
 
 def _obstacle(robot: Robot, motion: Trajectory) -> tuple[str, list[int]]:
@@ -190,6 +191,6 @@ def _chirp(
         1.0,
     )[:, None]
     window = edge**3 * (10 - 15 * edge + 6 * edge**2)
-    position = robot.coupled(center + window * amplitude * np.sin(angle))
+    position = robot.coupling.positions(center + window * amplitude * np.sin(angle))
     velocity = np.gradient(position, dt, axis=0)
     return Trajectory(time, position, velocity, np.gradient(velocity, dt, axis=0))

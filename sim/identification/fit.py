@@ -22,6 +22,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.problem import Problem
+from batchpid.sim.identification.regression import bounded_solution
 
 OUTLIER = 2.0
 """Ratio C of a residual to its size above which its weight in the loss decreases."""
@@ -33,10 +34,14 @@ ROUNDS = 4
 """Largest number of weights; each is the size of the residuals that the last one left."""
 SETTLED = 0.5
 """Ratio of that size to the one before from which the weight stays."""
-TOLERANCE = 1e-4
-"""Expected decrease over the cost at which a fit ends."""
+TOLERANCE, ROUGH_TOLERANCE = 1e-4, 2e-3
+"""Expected decreases over the cost at which a fit ends, and its first steps on few windows."""
 DAMPING = 1e-2
 """Damping at the start."""
+GROWTH = 10.0
+"""Growth of the damping after a step that does not lower the cost, ten times as large after each
+further one.
+"""
 MOST_DAMPING = 1e6
 """Damping at which no step lowers the cost."""
 
@@ -65,6 +70,7 @@ def solve(
     size: Float64 | None = None,
     evaluations: int = 60,
     progress: Callable[[], object] | None = None,
+    tolerance: float = TOLERANCE,
 ) -> Solution:
     """Return the fit from a ``point``; it begins with a ``size`` (joints,) of the residuals, or the
     one at the point.
@@ -77,6 +83,7 @@ def solve(
     place = iterate(problem, point, FIRST_CHANGE * np.eye(len(point)))
     weight = problem.size(place.evaluation) if size is None else size
     damping = DAMPING
+    growth = GROWTH
     rounds = 1
     settled = False
     for _ in range(evaluations - 1):
@@ -86,16 +93,19 @@ def solve(
         triangle = triangle_of(problem, place, weight)
         step, expected = bounded_step(triangle, damping, low - place.point, high - place.point)
         further = place.point + step
-        square = max(float(triangle[:, 0] @ triangle[:, 0]) / rows_of(problem), 1e-6)
-        axes, _ = axes_of(triangle[:, 1:].T @ triangle[:, 1:] / square, np.maximum(abs(further), 1))
-        trial = iterate(problem, further, _inward(further, axes, low, high))
+        trial = Iterate(further, place.changes[:0], problem.evaluate(further))
         gain = before - cost(problem, trial, weight)
         if gain > 0:
-            place = trial
+            square = max(float(triangle[:, 0] @ triangle[:, 0]) / rows_of(problem), 1e-6)
+            hessian = triangle[:, 1:].T @ triangle[:, 1:] / square
+            axes, _ = axes_of(hessian, np.maximum(abs(further), 1))
+            place = iterate(problem, further, _inward(further, axes, low, high))
             damping = max(damping * (0.1 if gain > 0.5 * expected else 0.5), 1e-9)
+            growth = GROWTH
         else:
-            damping *= 10
-        settled = expected < TOLERANCE * before or damping > MOST_DAMPING
+            damping *= growth
+            growth *= GROWTH
+        settled = expected < tolerance * before or damping > MOST_DAMPING
         size = problem.size(place.evaluation)
         shrunk = rounds < ROUNDS and bool(np.median(size / weight) < SETTLED)
         if shrunk and (settled or gain > 0):
@@ -158,16 +168,13 @@ def bounded_step(
     high: Float64,
 ) -> tuple[Float64, float]:
     """Return the damped step within bounds, and the decrease of the cost that it promises."""
-    from scipy.optimize import lsq_linear
-
     residual, slopes = triangle[:, 0], triangle[:, 1:]
     ridge = np.diag(np.sqrt(damping) * np.linalg.norm(slopes, axis=0))
     rows = np.vstack([slopes, ridge])
     target = -np.append(residual, np.zeros(len(ridge)))
-    # Bounds that meet would have no interior.
-    step = lsq_linear(rows, target, (low, high + 1e-9), "bvls").x
+    step = bounded_solution(rows, target, low, high)
     decrease = target @ target - ((rows @ step - target) ** 2).sum()
-    return np.clip(step, low, high), 0.5 * float(decrease)
+    return step, 0.5 * float(decrease)
 
 
 def _inward(

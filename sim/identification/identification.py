@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
-from importlib.util import find_spec
 from itertools import product
 from multiprocessing import get_context
 from typing import Any
@@ -18,7 +17,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import choice, flag, instance, integer, number
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.log import CommandKind, Log, checked
 from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.problem import Problem, windows_of
@@ -31,7 +30,7 @@ from batchpid.sim.identification.regression import (
     smooth,
 )
 from batchpid.sim.identification.result import Identification
-from batchpid.sim.identification.simulator import Dynamics, LogControl, Plant
+from batchpid.sim.identification.simulator import Apart, Exact, LogPlant
 from batchpid.sim.identification.trials import fit, with_effects
 from batchpid.sim.identification.unknowns import (
     BASIC,
@@ -42,9 +41,11 @@ from batchpid.sim.identification.unknowns import (
     kinds_of,
 )
 from batchpid.sim.options.groups import Compensation
-from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
+from batchpid.stages import Control
+from batchpid.task_space.tree_quantities import mass_matrix
 
 STILL = {"rad": 1e-3, "m": 1e-4}
 """Standard deviation of the positions up to which a joint did not move."""
@@ -62,6 +63,10 @@ DETOUR = 0.1
 """Decrease of the regression's cost from which the compensation counts as exact, not through the
 motors.
 """
+
+
+EXACT = (Apart(), Exact())
+"""Stages of a compensation that does not pass through the motors."""
 
 
 def identify(
@@ -118,11 +123,7 @@ def identify(
     ------
     InvalidArgumentError
         An option is out of range or contradicts a recording, or a file holds no log of this robot.
-    MissingDependencyError
-        SciPy is missing.
     """
-    if find_spec("scipy") is None:
-        raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
     kinds = [choice("extras", name, EXTRAS) for name in dict.fromkeys(extras)]
     evaluations = integer("evaluations", evaluations, 2, 1000)
@@ -152,7 +153,7 @@ def _payload_links(robot: Robot, name: str | None) -> list[str | None]:
     """Return the links where a payload may be: the one with a ``name``, or the last link with a
     mass that is fixed behind the tool, and the tool.
     """
-    tree = robot.rigid_tree
+    tree = link_tree(robot)
     if name is not None:
         return [choice("payload_link", name, tree.links)]
     body = tree.link_bodies[tree.index(tree.tool)]
@@ -221,7 +222,7 @@ def _prepared(
     choice(
         "compensate", forces, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none")
     )
-    forces, is_friction, _ = forces.partition("+friction")
+    compensated = forces.split("+")
     dt = _option("timestep", timestep, [log.timestep for log in logs], _own_timestep(logs[0]))
     dt = number("timestep", dt, 1e-5, 0.01, "seconds")
     # Joints that did not move are held at their mean position, with the unlogged ones.
@@ -234,20 +235,29 @@ def _prepared(
     qpos = qpos[:, moves]
     free = (qpos.min(0) < robot.lower[joints]) | (qpos.max(0) > robot.upper[joints])
     # A Runner compensates the friction of the description and of the robot's motors, too.
-    modelled = None
-    friction = (robot.friction + known_joints(robot).coulomb)[joints]
-    if is_friction and friction.any():
+    modelled = {}
+    friction = (robot.friction + known_joints(robot)["coulomb"])[joints]
+    if "friction" in compensated and friction.any():
         band = np.array([FRICTION_BAND[robot.units[joint]] for joint in joints])
         turns = robot.continuous[joints] / TURN
         modelled = {"modelled": friction, "band": band, "turns": turns}
-    plants = dict[Robot, Plant]()
+    plants = dict[Robot, LogPlant]()
     data = list[LogData]()
     for log in logs:
         law = _law(robot, log, params)
-        drive = LogControl(dt, law and law.for_joints(moves), forces, modelled=modelled)
+        drive = Control(
+            timestep=dt,
+            envs=1,
+            coupling=robot.coupling,
+            params=bp.PIDParams(kp=None) if law is None else law.for_joints(moves),
+            mode="effort" if law is None else "pid",
+            gravity="gravity" in compensated,
+            coriolis="coriolis" in compensated,
+            **modelled,
+        )
         key = log.robot or robot
         if key not in plants:
-            plants[key] = Plant(_resting(key, start), tuple(joints.tolist()), free)
+            plants[key] = LogPlant(_resting(key, start), tuple(joints.tolist()), free)
         part = log.part(joints=moves)
         data.append(LogData(part, smooth(part, dt), plants[key], drive))
     return _resting(robot, start), data
@@ -266,8 +276,7 @@ def _own_timestep(log: Log) -> float:
 
 def _resting(robot: Robot, start: Float64) -> Robot:
     """Return ``robot`` with the start pose ``start`` (dof,)."""
-    reading = robot.reading._replace(defaults=FileDefaults(start))
-    return replace(robot, settings=None, reading=reading)
+    return replace(robot, settings=None, source=robot.source._replace(start=start))
 
 
 def _option(
@@ -329,9 +338,9 @@ def _regress(
     far more sense in another reading.
     """
     guesses = regress(_fitted(data))
-    if data[0].drive.compensate != "none":
+    if data[0].drive.gravity:
         # A robot that adds the compensation by itself may do so exactly, whatever its motors.
-        exact = [part._replace(drive=part.drive._replace(through=False)) for part in data]
+        exact = [part._replace(drive=part.drive._replace(further=EXACT)) for part in data]
         others = regress(_fitted(exact))
         if others[0].cost < guesses[0].cost - DETOUR:
             data = exact
@@ -364,12 +373,12 @@ def _unknowns(
     log, _, plant, drive = data[0]
     starts = dict(guess.values)
     kinds = list(BASIC)
-    if drive.params is not None:
+    if drive.mode == "pid":
         kinds += SENDER
         starts["setpoint_lag"] = np.zeros(1)
     for name in extras:
         kinds += kinds_of(name)
-        if UNKNOWN_KINDS[kinds[-1]].target == "law" and drive.params is None:
+        if UNKNOWN_KINDS[kinds[-1]].target == "law" and drive.mode == "effort":
             problem = "is of a law, and the logs hold efforts"
             remedy = "leave it out, or give the params of the law"
             raise InvalidArgumentError("extras", problem, value=name, remedy=remedy)
@@ -384,8 +393,8 @@ def _unknowns(
     motion = Motion(*map(np.concatenate, zip(*(part.motion for part in data), strict=True)))
     # The mean inertia of the links, on 200 poses of the motion.
     poses = np.ascontiguousarray(motion.qpos[:: 1 + len(motion.qpos) // 200])
-    dynamics = Dynamics(plant, {}, poses, np.zeros_like(poses))
-    links = np.diagonal(dynamics.matrix, axis1=1, axis2=2).mean(0)
+    matrices = mass_matrix(plant.tree, plant.spread(poses))
+    links = np.diagonal(matrices, axis1=1, axis2=2).mean(0)[plant.columns]
     speed = np.maximum(np.sqrt((motion.qvel**2).mean(0)), 1e-3)
     acceleration = np.maximum(np.sqrt((motion.qacc**2).mean(0)), 0.1)
     friction = starts["friction"]

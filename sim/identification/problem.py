@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,9 +35,13 @@ HELD_OUT = 0.25
 """Share of each log, at its end, that is held out."""
 MOST_WINDOWS = 500
 """Largest number of windows; if there are more, evenly spaced ones are used."""
+FEWER, LEAST_WINDOWS = 4, 12
+"""Share of the windows, and their least number, for the first steps of a fit."""
+BEGINNING = 4.0
+"""Length of a log of setpoints for the first steps of a fit [s]."""
 MOST_ROWS = 40_000
 """Largest number of rows of all logs; if there are more, evenly spaced ones are used."""
-ENVS = 2048
+ENVS = 1024
 """Most simulations at once."""
 STATE_STEPS = 1e-3, 1e-2
 """Changes of initial positions and velocities."""
@@ -59,6 +63,17 @@ class Window(NamedTuple):
     fitted: Any
     """Fitted rows; the others are held out (rows,) bool."""
 
+    def until(self, step: int) -> Window:
+        """Return the rows that end before a sim step."""
+        stretch = self.stretch
+        rows = stretch.step < step
+        command = stretch.command[: stretch.past + step]
+        part = stretch._replace(
+            command=command, step=stretch.step[rows], before=stretch.before[rows]
+        )
+        columns = self.measured[rows], self.time[rows], self.fitted[rows]
+        return Window(self.log, part, *columns)
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -69,6 +84,21 @@ class Problem:
     unknowns: Unknowns
     run: Callable[..., Any] = map
     """Map over groups of windows: ``map``, or that of worker processes."""
+
+    def coarse(self, judged: bool = False) -> Problem:
+        """Return the problem with every FEWER-th window, or with the beginnings of logs of
+        setpoints, for the first steps of a fit; itself where logs are short.
+
+        A ``judged`` problem has held-out rows.
+        """
+        windows = self.windows[::FEWER]
+        if self.data[0].drive.mode == "pid":
+            most = round(BEGINNING / self.data[0].drive.timestep)
+            longest = max(len(window.stretch.command) for window in self.windows)
+            if judged or longest < 2 * most:
+                return self
+            return replace(self, windows=[window.until(most) for window in self.windows])
+        return replace(self, windows=windows) if len(windows) >= LEAST_WINDOWS else self
 
     def evaluate(
         self,
@@ -84,7 +114,7 @@ class Problem:
         fitted rows are evaluated if ``held_out``, and are empty otherwise.
         """
         joints = self.windows[0].measured.shape[1]
-        free = free_states and self.data[0].drive.params is None
+        free = free_states and self.data[0].drive.mode == "effort"
         shifts = np.diag(np.repeat(STATE_STEPS, joints * free))
         # Rows: the point, each change of it, a change of each initial state.
         moved = point[None] if changes is None else np.vstack([point, point + changes])
@@ -118,7 +148,7 @@ class Problem:
         parts = [self.data[self.windows[number].log] for number in group]
         stretches = [self.windows[number].stretch for number in group]
         drive = parts[0].drive
-        if drive.params is not None:
+        if drive.mode == "pid":
             # A column of rows: other options are equal in all logs of a group.
             rows: Any = zip(*[part.drive.params for part in parts * len(points)], strict=True)
             leaves: Any = [
@@ -199,7 +229,7 @@ def windows_of(data: Sequence[LogData]) -> list[Window]:
         split = round(share * total)
         length = total
         starts = [0]
-        if part.drive.params is None:
+        if part.drive.mode == "effort":
             # Windows of the fitted part, then of the held-out part; the filter begins at the edge.
             edge = round(0.05 / dt)
             first = max(split + 1, edge)
@@ -225,7 +255,7 @@ def _window(
     log, motion, _, drive = data
     dt = drive.timestep
     settle = 0.0
-    if drive.params is not None:
+    if drive.mode == "pid":
         settle = min(SETTLE, 0.2 * log.seconds) / dt
     place = (log.time - log.time[0]) / dt
     rows = np.flatnonzero((place > first + settle + 1e-6) & (place <= last + 1e-6))[::every]

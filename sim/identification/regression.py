@@ -24,15 +24,13 @@ import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.motors.actuators import Actuators
+from batchpid.motors.friction import Friction
 from batchpid.sim.identification.log import Log, interpolated
-from batchpid.sim.identification.simulator import (
-    Dynamics,
-    LogControl,
-    Plant,
-    PlantCandidates,
-    SimulatedControl,
-)
+from batchpid.sim.identification.simulator import Candidates, LogPlant
+from batchpid.sim.loop.loop_run import LoopRun, MotionPlant
 from batchpid.sim.robot.robot import Robot
+from batchpid.stages import Control
+from batchpid.task_space.tree_quantities import inverse_dynamics
 
 VALUES = "armature", "damping", "friction", "strength", "bias", "cost"
 """Results for a joint."""
@@ -46,7 +44,7 @@ delay of setpoints is negative where they were logged late. Loops have short del
 """
 EDGE_SECONDS = 0.15
 """Time left out at both ends of a log, where the filter begins [s]."""
-LONGEST_PART = 60.0
+LONGEST_PART = 30.0
 """Length of a log that is used [s]."""
 MOST_REGRESSION_ROWS = 4000
 """Most rows of a regression."""
@@ -90,8 +88,8 @@ class LogData(NamedTuple):
 
     log: Log
     motion: Motion
-    plant: Plant
-    drive: LogControl
+    plant: LogPlant
+    drive: Control
 
 
 class Guess(NamedTuple):
@@ -133,13 +131,19 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
     1 / (1 + (f / cutoff)^8).
     """
     # Less the line between its ends, and with its odd reflection, a column is smoothly periodic.
-    line = np.linspace(table[0], table[-1], len(table))
-    rest = table - line
+    # The transform of a length with large prime factors takes ten times as long: rows are added by
+    # odd reflection at the end.
+    count = len(table) - 1
+    length = min(factor << max(-(-count // factor) - 1, 0).bit_length() for factor in (4, 5, 6, 7))
+    added = 2 * table[-1] - table[max(2 * count - length, 0) : -1][::-1]
+    longer = np.concatenate([table, added])
+    line = np.linspace(longer[0], longer[-1], len(longer))
+    rest = longer - line
     period = np.concatenate([rest, -rest[-2:0:-1]])
     frequency = np.fft.rfftfreq(len(period), timestep)[:, None]
     spectrum = np.fft.rfft(period, axis=0) / (1 + (frequency / cutoff) ** 8)
     filtered = np.fft.irfft(spectrum, len(period), axis=0)
-    return np.ascontiguousarray(line + filtered[: len(table)])
+    return np.ascontiguousarray((line + filtered[: len(line)])[: len(table)])
 
 
 def regress(data: Sequence[LogData]) -> list[Guess]:
@@ -149,7 +153,7 @@ def regress(data: Sequence[LogData]) -> list[Guess]:
     every = 1 + sum(len(part.motion.qpos) for part in data) // MOST_REGRESSION_ROWS
     cutoff = min(_cutoff(part.log) for part in data)
     shifts, delays = SETPOINT_DELAYS, LOOP_DELAYS
-    if data[0].drive.params is None:
+    if data[0].drive.mode == "effort":
         shifts, delays = np.zeros(1), EFFORT_DELAYS
     tables = [_table(part, delays, every, cutoff) for part in data]
     *columns, efforts = (np.concatenate(parts, axis=-2) for parts in zip(*tables, strict=True))
@@ -193,14 +197,14 @@ def _table(
     rows = np.arange(edge, len(motion.qpos) - edge, every)
     links = _force(part, motion.qpos[rows], motion.qvel[rows], motion.qacc[rows])
     efforts = _commanded(part)
-    if part.drive.compensate != "none":
-        speed = 0.0 if part.drive.compensate == "gravity" else 1.0
+    if part.drive.gravity:
+        speed = float(part.drive.coriolis)
         compensation = _force(part, motion.qpos, speed * motion.qvel, 0 * motion.qacc)
-        if part.drive.through:
-            efforts = efforts + compensation
-        else:
+        if part.drive.further:
             links -= compensation[rows]
-    if part.drive.params is None:
+        else:
+            efforts = efforts + compensation
+    if part.drive.mode == "effort":
         efforts = lowpass(efforts[0], cutoff, dt)[None]
     time = dt * np.arange(len(motion.qpos))
     late = [[interpolated(time[rows] - delay, time, u) for delay in delays] for u in efforts]
@@ -216,35 +220,31 @@ def _force(
     qacc: Float64,
 ) -> Float64:
     """Return the efforts (rows, joints) that the links need to move so, without motors."""
-    dynamics = Dynamics(
-        part.plant,
-        {},
-        np.array(qpos),
-        np.array(qvel),
-    )
-    return dynamics.force + (dynamics.matrix @ qacc[..., None])[..., 0]
+    plant = part.plant
+    state = map(plant.spread, (qpos, qvel, qacc))
+    return np.asarray(inverse_dynamics(plant.tree, *state)[:, plant.columns], float)
 
 
 def _commanded(part: LogData) -> Float64:
     """Return logged efforts (1, steps, joints), or the law's along a motion (setpoint delays,
     steps, joints).
     """
-    motion, drive = part.motion, part.drive
-    if drive.params is None:
+    motion, drive, plant = part.motion, part.drive, part.plant
+    if drive.mode == "effort":
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
     none = np.zeros(count)
-    ideal = PlantCandidates(Actuators(), {}, none, none, {})
-    q, v = (np.repeat(table[:, None], count, axis=1) for table in motion[:2])
-    dynamics = Dynamics(part.plant, {}, q[0], v[0])
-    qpos, qvel = q[0].copy(), v[0].copy()
-    control = SimulatedControl(drive, ideal, dynamics, qpos, qvel)
+    alone = drive._replace(gravity=False, coriolis=False, further=())
+    loop = plant.loop(alone, Candidates(Actuators(), {}, none, none, {}, {}))
+    loop = replace(loop, control=loop.control._replace(friction=Friction()))
+    tables = [np.repeat(plant.spread(table)[:, None], count, axis=1) for table in motion[:2]]
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)
-    efforts = np.empty(q.shape)
-    for step in range(steps):
-        control.command[...] = motion.command[np.clip(step - late, 0, steps - 1)]
-        qpos[...], qvel[...] = q[step], v[step]
-        efforts[step] = control.advance()
+    setpoints = motion.command[np.clip(np.arange(steps)[:, None] - late, 0, steps - 1)]
+    moving = loop.changed(plant=MotionPlant(*tables))
+    run = LoopRun(moving, tables[0][0], tables[1][0], plant.spread(setpoints[0]), steps)
+    run.setpoints[...] = plant.spread(setpoints)
+    run.run(steps)
+    efforts: Float64 = run.effort[..., plant.columns]
     return efforts.swapaxes(0, 1)
 
 
@@ -254,8 +254,6 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     ``table`` has (rows,) the effort that the links need, acceleration, speed, its sign, and the
     effort of the motor.
     """
-    from scipy.optimize import nnls
-
     target, *motion, effort = table
     columns: Any = np.stack([*(-column for column in motion), effort, target], axis=1)
     # The bias is the mean of what is left, so that the others are found without it.
@@ -267,11 +265,51 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     prior = np.sqrt(len(target)) * weight * size[3] + 1e-12
     rows = np.vstack([columns, [0.0, 0.0, 0.0, prior, prior]])
     triangle: Any = np.linalg.qr(rows / np.append(size[:4], 1.0), mode="r")
-    values = nnls(triangle[:, :4], triangle[:, 4])[0] / size[:4]
+    least = np.zeros(4)
+    values = bounded_solution(triangle[:, :4], triangle[:, 4], least, least + np.inf) / size[:4]
     residual = columns[:, 4] - columns[:, :4] @ values
     bias = center[4] - center[:4] @ values
     motor = (values[3] * size[3]) ** 2 + 1e-3 * size[4] ** 2
     return [*values, bias, float(np.log((residual**2).mean() / motor + 1e-12))]
+
+
+def bounded_solution(
+    rows: Float64,
+    target: Float64,
+    low: Float64,
+    high: Float64,
+) -> Float64:
+    """Return the x (n,) between ``low`` <= 0 and ``high`` >= 0 that minimises |rows x - target|.
+
+    From 0 on, x goes to the minimum over its free entries, or to the first bound in between, whose
+    entry is then held; at a minimum the entry is freed that the gradient drives off its bound the
+    most (P. B. Stark and R. L. Parker, "Bounded-variable least squares", 1995).
+    """
+    x = np.zeros(len(low))
+    free = low < high
+    movable = free.copy()
+    for _ in range(10 * len(x)):
+        aim = x.copy()
+        rest = target - rows[:, ~free] @ x[~free]
+        aim[free] = np.linalg.lstsq(rows[:, free], rest, rcond=None)[0]
+        ends = np.where(aim < low, low, high)
+        beyond = free & ((aim < low) | (aim > high))
+        if beyond.any():
+            steps = np.full(len(x), np.inf)
+            steps[beyond] = ((ends - x)[beyond] / (aim - x)[beyond]).clip(0.0)
+            first = steps == steps.min()
+            x += steps.min() * (aim - x)
+            x[first] = ends[first]
+            free &= ~first
+            continue
+        x = aim
+        push = rows.T @ (target - rows @ x)
+        inward = movable & ~free & np.where(x <= low, push > 0, push < 0)
+        size = np.linalg.norm(rows, axis=0) * np.linalg.norm(target)
+        if not (np.abs(push)[inward] > 1e-12 * size[inward]).any():
+            break
+        free[np.argmax(np.abs(push) * inward)] = True
+    return x
 
 
 def better_reading(

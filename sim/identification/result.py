@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,12 +20,13 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.sim.identification.intervals import INTERVAL
 from batchpid.sim.identification.problem import Problem
-from batchpid.sim.identification.simulator import LogControl, changed_params
+from batchpid.sim.identification.simulator import changed_params
 from batchpid.sim.identification.trials import Fit
 from batchpid.sim.identification.unknowns import UNKNOWN_KINDS, Unknown, Unknowns, least_value
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import load_robot_actuators
 from batchpid.sim.robot.urdf_export import to_urdf
+from batchpid.stages import Control
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -87,7 +89,7 @@ class Identification:
         return self.unknowns.joints
 
     @property
-    def drive(self) -> LogControl:
+    def drive(self) -> Control:
         """Control of the first log."""
         return self.fit.problem.data[0].drive
 
@@ -237,7 +239,7 @@ class Identification:
             "remarks": self.remarks,
             "held_out_error": list(self.held_out_error),
             "converged": self.converged,
-            "compensation_through_motors": self.drive.through,
+            "compensation_through_motors": not self.drive.further,
             "identified_from": [part.log.source for part in self.fit.problem.data],
         }
 
@@ -262,7 +264,7 @@ class Identification:
         the law.
         """
         law = self.unknowns.tables(self.values[None], "law")
-        if self.drive.params is None or law.keys() <= {"slew"}:
+        if self.drive.mode == "effort" or law.keys() <= {"slew"}:
             return None
         return changed_params(self.drive.params, law)
 
@@ -291,10 +293,12 @@ class Identification:
         for place, table in document["intervals"].items():
             cells = ", ".join(f"{kind} {_cell(kind, *row)}" for kind, row in table.items())
             lines.append(f"{place}: {cells}")
-        if self.drive.compensate != "none":
-            path = "through its motors" if self.drive.through else "apart from its motors"
-            friction = "" if self.drive.modelled is None else "+friction"
-            lines.append(f"the robot compensates {self.drive.compensate}{friction} {path}")
+        drive = self.drive
+        if drive.gravity:
+            parts = {"coriolis": drive.coriolis, "friction": drive.modelled is not None}
+            forces = "+".join(["gravity", *compress(parts, parts.values())])
+            path = "apart from its motors" if drive.further else "through its motors"
+            lines.append(f"the robot compensates {forces} {path}")
         before, after = self.held_out_error
         lines.append(
             "position error on the held-out part, simulated from the logged state:"

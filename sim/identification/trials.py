@@ -22,6 +22,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.fit import (
     DAMPING,
     FIRST_CHANGE,
+    ROUGH_TOLERANCE,
     Solution,
     axes_of,
     bounded_step,
@@ -66,6 +67,9 @@ def fit(
 ) -> Fit:
     """Fit from the best of ``starts``: alternatives by label, each with guesses of the motors."""
     problem, point = _best_start(starts, progress)
+    coarse = problem.coarse()
+    if coarse is not problem:
+        point = solve(coarse, point, None, evaluations, progress, ROUGH_TOLERANCE).point
     solution = solve(problem, point, None, evaluations, progress)
     result = Fit(problem, solution, certainty(problem, solution))
     return _without_sender(result, evaluations, progress)
@@ -97,12 +101,13 @@ def _best_start(
     for guesses in starts.values():
         problem = guesses[0]
         if len(guesses) > 1:
-            problem = min(guesses, key=lambda guess: error(guess, guess.unknowns.start))
+            problem = min(guesses, key=lambda one: error(one.coarse(), one.unknowns.start))
         point = problem.unknowns.start
         if len(starts) == 1:
             return problem, point
-        point = solve(problem, point, None, TRIAL, progress).point
-        tried.append((error(problem, point), len(tried), problem, point))
+        coarse = problem.coarse()
+        point = solve(coarse, point, None, TRIAL, progress, ROUGH_TOLERANCE).point
+        tried.append((error(coarse, point), len(tried), problem, point))
     return min(tried)[2:]
 
 
@@ -168,7 +173,7 @@ def _with_effect(
     zero = np.zeros(len(unknowns.joints))
     kinds = [kind for effect in effects for kind in kinds_of(effect)]
     wider = unknowns.adding(kinds, {"load_friction": zero, "static": zero})
-    wide = replace(problem, unknowns=wider)
+    wide = replace(problem.coarse(judged=True), unknowns=wider)
     count = len(present)
     point = np.append(solution.point, wider.start[count:])
     changes = FIRST_CHANGE * np.eye(len(point))
@@ -189,13 +194,16 @@ def _with_effect(
     if after[best] > 0.5 * (1 + EFFECTS[effects[best]]) * before:
         return result
     is_used = np.isin(names, [*present, *kinds_of(effects[best])])
-    problem = replace(problem, unknowns=wider.only(is_used))
-    further = solve(problem, (point + steps[best])[is_used], None, evaluations, progress)
-    share = _left(problem, further._replace(size=solution.size)) / before
+    trial = replace(wide, unknowns=wider.only(is_used))
+    start = (point + steps[best])[is_used]
+    further = solve(trial, start, None, evaluations, progress, ROUGH_TOLERANCE)
+    share = _left(trial, further._replace(size=solution.size)) / before
     if share > EFFECTS[effects[best]]:
         return result
+    trial = replace(trial, windows=problem.windows)
+    further = solve(trial, further.point, None, evaluations, progress)
     added = {**result.effects, effects[best]: share}
-    return Fit(problem, further, certainty(problem, further), result.dropped, added)
+    return Fit(trial, further, certainty(trial, further), result.dropped, added)
 
 
 def _axes(result: Fit) -> Float64:

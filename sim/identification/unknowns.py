@@ -17,7 +17,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.motors.actuators import Actuators
-from batchpid.sim.identification.simulator import MassChange, PlantCandidates
+from batchpid.sim.identification.simulator import Candidates
 from batchpid.sim.robot.robot import Robot
 
 
@@ -224,7 +224,7 @@ class Unknowns:
             tables["static"] += tables.get("coulomb", 0.0)
         return tables
 
-    def candidates(self, values: Float64) -> PlantCandidates:
+    def candidates(self, values: Float64) -> Candidates:
         """Return the candidates with ``values`` (n, unknowns)."""
         fields = self.tables(values, "motor", "sensor")
         if "command_delay" in fields:
@@ -232,12 +232,12 @@ class Unknowns:
         none = np.zeros((len(values), 1))
         sender = self.tables(values, "setpoint")
         late, lag = (sender.get(name, none)[:, 0] for name in SENDER)
-        masses = {}
+        masses: dict[str, dict[str, Float64]] = {"payload": {}, "mass": {}}
         for column, entry in enumerate(self.entries):
             if entry.link is not None:
-                masses[MassChange(entry.link, entry.kind == "payload")] = values[:, column]
+                masses[entry.kind][entry.link] = values[:, column]
         law = self.tables(values, "law")
-        return PlantCandidates(Actuators(**fields), law, late, lag, masses)
+        return Candidates(Actuators(**fields), law, late, lag, **masses)
 
     def only(self, mask: Bool) -> Unknowns:
         """Return the unknowns of a mask (unknowns,); the others have their neutral value."""

@@ -17,15 +17,14 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import added_friction, own_friction
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.group_control import control_of
-from batchpid.sim.loop.tree_plant import TreePlant
+from batchpid.sim.loop.tree_plant import DYNAMICS, TreePlant
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control, stages_of
 from batchpid.stages.stage import States, placed, started, stepped
 from batchpid.stages.values import Command, Measured, Model, Outputs, Step, Values
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.tree_quantities import bias, mass_matrix
+from batchpid.task_space.tree_quantities import bias, evaluated, mass_matrix
 
 
 class Plant(Protocol):
@@ -99,7 +98,7 @@ class ClosedLoop:
         plant = self._placed(qpos, qvel)
         xp = namespace(*self.plant.read(plant))
         episode = xp.zeros(self.control.envs, int)
-        values = self._values(plant, Command(None), Step(0, 1), episode)
+        values = self.values(plant, Command(None), Step(0, 1), episode)
         return LoopState(plant, started(stages_of(self.control), values), episode)
 
     def reset(
@@ -113,7 +112,7 @@ class ClosedLoop:
         mask = xp.ones(self.control.envs, bool) if mask is None else xp.asarray(mask)
         episode = state.episode + mask
         plant = replace_envs(state.plant, fresh, mask)
-        values = self._values(plant, Command(None), Step(0, 1), episode)
+        values = self.values(plant, Command(None), Step(0, 1), episode)
         return LoopState(
             plant, placed(stages_of(self.control), state.stages, values, mask), episode
         )
@@ -154,9 +153,15 @@ class ClosedLoop:
         def sim_step(carry: Any, index: Array) -> tuple[Any, Outputs]:
             plant, states = carry
             step = Step(index, substeps, self.control.left(index, substeps))
-            values = self._values(plant, command, step, episode)
+            # The law and the robots have the same dynamics, computed once.
+            shared = evaluated(self.tree, DYNAMICS, *self.plant.read(plant))
+            values = self.values(plant, command, step, episode, shared["bias"])
             states, values = stepped(stages, states, values)
-            return (self.plant.step(plant, values.outputs.qf), states), values.outputs
+            if isinstance(self.plant, TreePlant):
+                plant = self.plant.step(plant, values.outputs.qf, shared)
+            else:
+                plant = self.plant.step(plant, values.outputs.qf)
+            return (plant, states), values.outputs
 
         carry = state.plant, state.stages
         if xp is np:
@@ -184,14 +189,17 @@ class ClosedLoop:
         place, rate = (xp.broadcast_to(xp.asarray(rows, float), shape) for rows in (start, rest))
         return self.plant.init(place, rate)
 
-    def _values(
+    def values(
         self,
         plant: Pytree,
         command: Command,
         step: Step,
         episode: Array,
+        load: Array = None,
     ) -> Values:
-        """Return the values of a sim step before its stages."""
+        """Return the values of a sim step before its stages; ``load`` is the bias at the state, if it
+        is known.
+        """
         control, tree = self.control, self.tree
         qpos, qvel = self.plant.read(plant)
         xp = namespace(qpos)
@@ -201,8 +209,11 @@ class ClosedLoop:
                 return 0.0 * qpos
             return bias(tree, qpos, qvel if control.coriolis else 0.0 * qvel)
 
+        # The joints show the masses of the plant.
+        bodies = getattr(self.plant, "bodies", None)
+
         def joint_matrix(qpos: Array) -> Array:
-            matrix = mass_matrix(tree, qpos)
+            matrix = mass_matrix(tree, qpos, bodies)
             motors = control.actuators
             if motors is None or motors.armature is None:
                 return matrix
@@ -219,7 +230,9 @@ class ClosedLoop:
         )
         if xp is not np:
             model = model._replace(when=_when)
-        measured = Measured(qpos, qvel, passive(qpos, qvel))
+        if load is None or not (control.gravity and control.coriolis):
+            load = passive(qpos, qvel)
+        measured = Measured(qpos, qvel, load)
         return Values(command, measured, measured, control.timestep, step, model)
 
 
@@ -275,8 +288,8 @@ def closed_loop(
         scene.joints,
         friction,
         slice(0, num_envs),
-        controller and _Traced(controller),
-        DISSIPATION[scene.dissipation].modelled,
+        controller and _TracedController(controller),
+        scene.dissipation == "urdf",
     )
     tree = robot.kinematic_tree(armature=np.zeros(robot.dof)).held
     if plant is None:
@@ -284,7 +297,7 @@ def closed_loop(
     return ClosedLoop(plant, control, tree, robot.start)
 
 
-class _Traced:
+class _TracedController:
     """The caller's own controller in a program of JAX."""
 
     def __init__(self, controller: OwnController) -> None:

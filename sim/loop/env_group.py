@@ -18,15 +18,13 @@ from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.arrays.elementwise import clip
 from batchpid.arrays.trees import flatten, leaves, structure, unflatten
 from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.loop.array_executors import JAXExecutor, NumPyExecutor
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_parts import ActingDraws, LinkSensors, Pushes, variation
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
 from batchpid.sim.loop.group_control import GroupControl
-from batchpid.sim.loop.jax_executor import JAXExecutor
-from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
-from batchpid.sim.loop.native_program import Table
-from batchpid.sim.loop.numpy_executor import NumPyExecutor
+from batchpid.sim.loop.native_executor import NativeExecutor, Table, run_ticks, runs_natively
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
 from batchpid.stages.stage import States, adopted, by_name, placed, started

@@ -19,17 +19,19 @@ from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.trees import leaves, mapped
 from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
 from batchpid.motors.friction import Friction
+from batchpid.native.extensions import MOST_SUMMED
+from batchpid.sim.engine import native
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.parts import DISSIPATION, Joint
+from batchpid.sim.robot.merging import coupling_of
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
+from batchpid.sim.robot.tables import Joint
+from batchpid.sim.tool_space import OperationalSpace
 from batchpid.stages import Control, Stage, stages_of
 from batchpid.stages.friction import REFRESH_STEPS
-from batchpid.stages.program import StageProgram
-from batchpid.stages.stage import States, started
+from batchpid.stages.stage import States, bind_stages, started
 from batchpid.stages.values import Command, Measured, Model, Outputs, Step, Values
 
 
@@ -65,7 +67,7 @@ class GroupControl(NamedTuple):
             pack.friction,
             slice(first, first + pack.size),
             controller,
-            DISSIPATION[scene.dissipation].modelled,
+            scene.dissipation == "urdf",
         )
         return cls(options, pack, control, stages_of(control), model_functions(pack, control))
 
@@ -100,15 +102,15 @@ def control_of(
     compensated = options.compensate.split("+")
     described = known_joints(options.robot)
     turns = np.array([joint.continuous / TURN for joint in joints])
-    modelled = np.array([joint.friction * share for joint in joints]) + described.coulomb
+    modelled = np.array([joint.friction * share for joint in joints]) + described["coulomb"]
     free = np.array([joint.name in (options.free_joints or ()) for joint in joints])
     modelled[free] = 0.0
     has_modelled = "friction" in compensated and options.sets_positions and modelled.any()
     armature = None
     damping = np.array([joint.damping for joint in joints])
     if options.robot.actuators is not None:
-        armature = described.armature
-        damping = damping + described.viscous
+        armature = described["armature"]
+        damping = damping + described["viscous"]
     return Control(
         timestep=options.timestep,
         envs=envs.stop - envs.start,
@@ -187,10 +189,45 @@ def untraceable(options: RunnerOptions) -> str:
             if any(leaf.shape != row.shape for leaf in leaves(state)):
                 return f"the state of stage {stage.name!r} is not (envs, joints)"
             try:
-                StageProgram([stage], (state,), values, row.shape)
+                bind_stages([stage], (state,), values, row.shape)
             except (AttributeError, AssertionError, TypeError, ValueError) as error:
                 return f"stage {stage.name!r}: {error}"
     return ""
+
+
+def native_obstacle(options: RunnerOptions) -> str:
+    """Return why the sim steps of a tick cannot be one native call; "" if they can."""
+    if options.backend == "jax":
+        return "the control is compiled by JAX"
+    control = options.control
+    if isinstance(control, OperationalSpace):
+        if type(control) is not OperationalSpace:
+            return "a subclass of OperationalSpace runs in Python"
+    elif not isinstance(control, str):
+        return "the controller runs in Python"
+    if options.robot.dof > MOST_SUMMED:
+        return f"more than {MOST_SUMMED} joints"
+    return untraceable(options) if options.stages else ""
+
+
+def describe(options: RunnerOptions) -> str:
+    """Describe the library of the law, and the calls into the engine, with reasons."""
+    engine = options.load_engine()
+    lack = engine.native_obstacle()
+    reason = "" if lack else native_obstacle(options)
+    if options.backend == "jax":
+        law = "in JAX"
+    elif lack or reason:
+        law = "in NumPy"
+    else:
+        law = "as a native program"
+    if options.control == "drive":
+        law = f"in {engine.title} (control 'drive')"
+    if reason:
+        steps = f", one call per sim step ({reason})"
+    else:
+        steps = ""
+    return f"law {law}{steps}, {native.describe_calls(engine.title, lack)}"
 
 
 # -- functions of the model

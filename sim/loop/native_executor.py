@@ -1,33 +1,254 @@
 """Ticks in native code: one call of the extension runs those of several groups, until an event
 needs Python.
+
+Stages that are pure functions of arrays are traced, and neighbours become one program; the others
+have a native function: see tick.h.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import ctypes
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64, Pytree, Rows
+from batchpid.arrays.array_types import DType, Float64, Pytree, Rows
 from batchpid.arrays.trees import flatten, leaves, mapped, rebuilt_as
 from batchpid.motors import ActuatorState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native import interface
-from batchpid.sim.loop.backend import native_obstacle
-from batchpid.sim.loop.group_control import GroupControl
-from batchpid.sim.loop.native_program import Buffers, Table, TickProgram
-from batchpid.sim.loop.numpy_executor import EngineSteps
-from batchpid.stages.stage import States, running
-from batchpid.stages.values import Command, Measured, Outputs
+from batchpid.sim.engine.native.interface import number, structure
+from batchpid.sim.loop.array_executors import COUPLING_STEPS, EngineSteps
+from batchpid.sim.loop.arrays import Arrays, FaultArrays
+from batchpid.sim.loop.group_control import GroupControl, native_obstacle
+from batchpid.stages.stage import States, bind_stages, recalled, running
+from batchpid.stages.values import Command, Measured, Outputs, Step, Values
 
-_NO_NOISE = 1 << interface.STATUS.index("no_noise")
+
+class Buffers(NamedTuple):
+    """Arrays that native code reads and writes in each sim step."""
+
+    states: States
+    command: Command
+    measured: Measured
+    before: Rows
+    """Positions before the last sim step (M, dof)."""
+
+
+class TickProgram:
+    """Stages and arrays of the ticks of a group.
+
+    ``copies`` returns the copies before and after each tick, between tables (ticks, M, ...) and
+    arrays of a sim step: commands are tables of float64. ``reads_force`` says whether the engine's
+    sim step reads the passive force, ``moves`` whether joint setpoints move within a tick, and
+    ``noise`` is that of positions and velocities in a sim step.
+
+    Attributes
+    ----------
+    tick
+        Structure of native code: place in the ticks, noise, status.
+    bound
+        Capsule of the programs and ``tick``, for the extension.
+    outputs
+        Results of the last sim step.
+    control
+        Native controller, or None.
+    buffers
+        Arrays of a sim step.
+    """
+
+    def __init__(
+        self,
+        setup: GroupControl,
+        buffers: Buffers,
+        copies: Callable[[TickProgram], list[tuple[Rows, Rows]]],
+        noise: Pytree,
+        reads_force: bool,
+        moves: bool,
+    ) -> None:
+        _, pack, control, _, model = setup
+        self._setup, self.buffers = setup, buffers
+        self.pack, self.model = pack, model
+        self._native = native.extension("_gateway")
+        self._programs, self._stages = list[Any](), list[Any]()
+        self._references = list[Any]()  # keeps arrays alive that native code has addresses of
+        self.control: Any = None
+        # The structure has the addresses of all arrays.
+        self.tick = structure("Tick")(
+            timestep=control.timestep,
+            dof=pack.dof,
+            late=control.late,
+            matrix_steps=getattr(setup.stage("matrix"), "steps", 1),
+            gravity=control.gravity,
+            coriolis=control.coriolis,
+        )
+        self._left = np.zeros(())
+        self.place(**buffers.measured._asdict(), before=buffers.before, left=self._left)
+        # SAPIEN knows neither measured states nor the model of varied robots.
+        if control.gravity and (control.measures or not reads_force):
+            if control.measures:
+                field = "measured_force"
+            else:
+                field = "read_force"
+            setattr(self.tick, field, pack.force_model.address)
+        values = Values(
+            command=buffers.command if moves else buffers.command.resting(),
+            measured=buffers.measured,
+            seen=buffers.measured,
+            timestep=control.timestep,
+            step=Step(0, 1, self._left if moves else None),
+            noise=noise,
+        )
+        self.outputs = self._add_stages(recalled(setup.stages, buffers.states, values), moves)
+        self.place(qf=self.outputs.qf)
+        stages = (structure("Stage") * len(self._stages))(*self._stages)
+        self.tick.stages, self.tick.stage_count = ctypes.addressof(stages), len(stages)
+        pairs = [self._transfer(*pair) for pair in copies(self)]
+        transfers = (structure("Transfer") * len(pairs))(*pairs)
+        self.tick.transfers = ctypes.addressof(transfers)
+        self.tick.transfer_count = len(transfers)
+        self._references += stages, transfers
+        self.bound = self._native.bind_ticks(tuple(self._programs), ctypes.addressof(self.tick))
+
+    # -- for stages in C++
+
+    def place(self, **arrays: Rows | None) -> None:
+        """Let fields of the structure of native code point to these arrays."""
+        for name, array in arrays.items():
+            if array is not None:
+                setattr(self.tick, name, self._address(array, _TYPES.get(name, np.float64)))
+
+    def use(self, **owners: Any) -> None:
+        """Let fields of the structure of native code point to the structures of these objects."""
+        for name, owner in owners.items():
+            setattr(self.tick, name, owner.address)
+            self._references.append(owner)
+
+    def control_by(self, state: Pytree, *seen: Rows) -> tuple[Rows, Rows]:
+        """Let the native controller follow ``seen``: qpos, qvel and feedforward; return its
+        effort, and the joints whose effort it limits.
+        """
+        controller: Any = self._setup.options.control
+        self.control = controller.bound(*seen, self._left)
+        self.control.set_state(state)
+        self.use(control=self.control)
+        return self.control.effort, self.control.limited
+
+    def _address(self, array: Rows, dtype: DType) -> int:
+        """Return the address of an array for native code, which has this dtype."""
+        if array.dtype != dtype or not array.flags.c_contiguous:
+            raise ValueError(f"not a contiguous array of {np.dtype(dtype)}")
+        self._references.append(array)
+        return array.ctypes.data
+
+    def _transfer(self, table: Rows, row: Rows) -> Any:
+        """Return a copy between a row (M, ...) and the first of the ticks of ``table``."""
+        # Of arrays of numbers only commands have tables in double precision.
+        kind, size = "WRITE_BYTES", row.nbytes
+        if row.dtype == np.float64:
+            kind, size = "WRITE_FLOATS", table[0].size
+            if table.dtype == np.float64:
+                kind = "READ"
+        return structure("Transfer")(
+            table=self._address(table[0], table.dtype),
+            row=self._address(row, row.dtype),
+            stride=0 if len(table) == 1 else table.strides[0],
+            size=size,
+            # A number of each env has the same value for all joints of the row.
+            step=row.size // table[0].size,
+            kind=number("TransferKind", kind),
+        )
+
+    # -- stages
+
+    def _add_stages(self, values: Values, moves: bool) -> Outputs:
+        """Add the stages; return the results after them."""
+        setup = self._setup
+        waiting = list[tuple[Any, Pytree]]()
+        for stage, state in zip(setup.stages, self.buffers.states, strict=True):
+            if not stage.native:
+                waiting.append((stage, state))
+                continue
+            values = self._add_program(waiting, values, passes=True)
+            waiting = []
+            values = stage.bind(self, state, values)
+            self._add_stage(stage.native, stage.every)
+        outputs = self._add_program(waiting, values).outputs
+        if outputs.target is not None:
+            self.place(target=outputs.target, target_rate=outputs.target_rate)
+            # Writing the targets of drives costs a call for each joint.
+            self._add_stage("TARGETS", int(moves or setup.moves_drives))
+        if not setup.control.coupling.is_identity:
+            self._add_stage("CONSTRAINT", COUPLING_STEPS)
+        if setup.pack.steps_natively:
+            self._add_stage("ENGINE")
+        return outputs
+
+    def _add_program(
+        self, pairs: list[tuple[Any, Pytree]], values: Values, passes: bool = False
+    ) -> Values:
+        """Add a program of stages and their states; return the values after it, which it
+        ``passes`` on to further stages.
+        """
+        if not pairs:
+            return values
+        stages, states = zip(*pairs, strict=True)
+        # Native code sets the addresses of the noise, which is another in each sim step.
+        drawn = [id(block) for block in leaves(values.noise)]
+        made, values = bind_stages(stages, states, values, self.buffers.before.shape, passes)
+        if made.outputs:
+            noise = [at for at, array in enumerate(made.inputs) if id(array) in drawn]
+            self._add_stage(
+                "PROGRAM",
+                program=len(self._programs),
+                noise=(*noise, -1, -1)[:2],
+            )
+            rows = tuple([(array, _row_size(array)) for array in made.inputs])
+            arguments = made.program.arguments
+            self._programs.append(self._native.bind(arguments, rows, tuple(made.outputs)))
+            self._references.append(made)
+        return values
+
+    def _add_stage(self, kind: str, every: int = 1, **fields: Any) -> None:
+        self._stages.append(
+            structure("Stage")(kind=number("StageKind", kind), every=every, **fields)
+        )
+
+
+_TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
+"""Dtypes of arrays that are not float64."""
+
+
+def _row_size(array: Rows) -> int:
+    """Return the numbers in each row of a table (rows, ...), as the extension counts them: 0 for
+    as many as joints, -1 for an input that is one number.
+    """
+    if array.ndim == 0:
+        return -1
+    if array.ndim == 2:
+        return 0
+    size: int = array[0].size
+    return size
+
+
+class Table(NamedTuple):
+    """Commands and observations of the ticks of a run, and arrays of its last observation."""
+
+    arrays: Arrays
+    """(ticks, envs, ...), the same in every run."""
+    effort: NDArray[np.float32]
+    """Effort of the last tick (envs, dof), as are the next two."""
+    saturated: NDArray[np.bool_]
+    guarded: NDArray[np.bool_]
+    fault: FaultArrays
+    """Last fault of each env (envs,)."""
 
 
 class NativeExecutor:
     """Executor of the sim steps of the robots of ``setup`` in native code.
 
-    It has the methods of :class:`batchpid.sim.loop.numpy_executor.NumPyExecutor`. With
+    It has the methods of :class:`batchpid.sim.loop.array_executors.NumPyExecutor`. With
     :func:`run_ticks` it also runs whole ticks, with their commands and observations in ``table``.
     """
 
@@ -108,7 +329,7 @@ class NativeExecutor:
         begin: int,
         end: int,
     ) -> int:
-        """Run sim steps of a tick: :meth:`batchpid.sim.loop.numpy_executor.NumPyExecutor.run`."""
+        """Run sim steps of a tick: :meth:`batchpid.sim.loop.array_executors.NumPyExecutor.run`."""
         # The tables of ticks are not used here, since the command may differ from theirs.
         # A program for each kind of tick is made once, at the first such tick.
         self.start(moves, begin)
@@ -129,7 +350,7 @@ class NativeExecutor:
             self._programs[moves] = program = TickProgram(
                 self.setup,
                 self._buffers,
-                self._table,
+                self._copies,
                 noise,
                 self._engine.native_force,
                 moves,
@@ -139,6 +360,38 @@ class NativeExecutor:
                 self._replace("law", program.control.state)
         self._program = program = self._programs[moves]
         program.tick.tick, program.tick.step = tick, step
+
+    def _copies(self, program: TickProgram) -> list[tuple[Rows, Rows]]:
+        """Return the copies between the tables of the ticks and the arrays of a sim step."""
+        table = self._table
+        command, seen, fault = table.arrays
+        outputs = program.outputs
+        measured = self._buffers.measured
+        none = np.zeros(measured.qpos.shape, bool)
+        copies: list[tuple[Rows, Rows]] = [
+            (seen.qpos, measured.qpos),
+            (seen.qvel, measured.qvel),
+            (seen.effort, outputs.motor),
+            (seen.ok, np.ones(len(none), bool)),
+            # One row, which each tick overwrites.
+            (table.effort[None], outputs.motor),
+            *zip(fault, table.fault, strict=True),
+        ]
+        for name in ("saturated", "guarded"):
+            mask = getattr(outputs, name)
+            if mask is None:
+                mask = none
+            copies.append((getattr(seen, name), mask))
+            copies.append((getattr(table, name)[None], mask))
+        if seen.base_pose is not None and seen.base_twist is not None:
+            pose = np.zeros((len(none), 7))
+            twist = np.zeros((len(none), 6))
+            program.place(base_pose=pose, base_twist=twist)
+            copies += (seen.base_pose, pose), (seen.base_twist, twist)
+        if seen.starved is not None:
+            copies.append((seen.starved, self._buffers.states[self._places["plan"]].starved))
+        pairs = zip(command, self._buffers.command, strict=True)
+        return copies + [(rows, row) for rows, row in pairs if row is not None]
 
     def complete(self) -> tuple[int, int]:
         """Complete ticks that ran: return the first tick that is not observed, and its sim steps
@@ -170,7 +423,7 @@ class NativeExecutor:
         sensors = self._sensors()
         if sensors is not None and sensors.step is not None:
             sensors.step[...] += tick.ran
-        return bool(tick.status & _NO_NOISE)
+        return bool(tick.status & number("Status", "NO_NOISE"))
 
     def _noise(self) -> Any:
         """Return the noise of positions and velocities in the next sim steps (steps, M, dof)."""

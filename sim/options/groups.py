@@ -1,9 +1,9 @@
-"""Options of a Runner in five groups, each declared once.
+"""Options of a Runner in three groups, each declared once.
 
-An option is a field of :class:`Scene`, :class:`Timing`, :class:`Control`, :class:`Faults` or
-:class:`Workers`. The field has its type, default, bounds and text, the places that keep it, and the
-help of its flag. The signature of :class:`batchpid.sim.Runner`, the checks of plain values, the
-table of options in docs/runner.md, the flags, and what snapshots and recordings hold come from it.
+An option is a field of :class:`SceneOptions`, :class:`ControlOptions` or :class:`WorkerOptions`. The
+field has its type, default, bounds and text, the places that keep it, and the help of its flag. The
+signature of :class:`batchpid.sim.Runner`, the checks of plain values, the table of options in
+docs/runner.md, the flags, and what snapshots and recordings hold come from it.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ from batchpid.arrays.array_types import Array, Document, Rows
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.field_tables import Field, plain
 from batchpid.arrays.jax_settings import require_jax
-from batchpid.checks.validate import choice, instance, joint_speeds, names
+from batchpid.checks.validate import array, at_least, choice, instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.physics import MujocoSolver, Physics
 from batchpid.sim.engine.protocol import Engine, load_engine, require
 from batchpid.sim.randomization.checks import check_robot
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.merging import place_links
-from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
+from batchpid.sim.robot.tables import MjcfFile
 from batchpid.sim.signals.quantities import own_command
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.stages import Stage, fit_stages
@@ -106,7 +107,7 @@ class OptionGroup:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Scene(OptionGroup):
+class SceneOptions(OptionGroup):
     """Engine, ground, contacts, and content of the scenes."""
 
     engine: Annotated[
@@ -209,7 +210,7 @@ class Scene(OptionGroup):
         engine = self.load_engine()
         if not engine.is_physics(self.physics):
             choice("physics", self.physics, engine.physics)
-        if robot.dissipation == "sapien":
+        if robot.source.dissipation == "sapien":
             require(engine, "sapien_dissipation", "robot")
         # MuJoCo compiles a scene as a whole: it has no content of the caller's own.
         if self.build is not None:
@@ -275,7 +276,7 @@ class Scene(OptionGroup):
         if not links:
             return None
         # SAPIEN reports its damping of links among the contacts.
-        if self.engine == "sapien" and robot.dissipation == "sapien":
+        if self.engine == "sapien" and robot.source.dissipation == "sapien":
             problem = "need a robot without SAPIEN's link damping, which acts like a contact"
             remedy = "load the robot with dissipation='urdf'"
             raise InvalidArgumentError(argument, problem, remedy=remedy)
@@ -283,30 +284,12 @@ class Scene(OptionGroup):
         bodies = place_links(robot.tables, links if argument == "wrenches" else ())
         root = next(place.link for place in bodies.values())
         for link in links:
-            choice(argument, link, [link.name for link in robot.links])
+            choice(argument, link, list(robot.bodies))
             if bodies[link].link == root and (argument == "wrenches" or robot.fixed_base):
                 problem = f"names {link!r}, which no joint moves"
                 remedy = "name a link beyond a joint"
                 raise InvalidArgumentError(argument, problem, remedy=remedy)
         return links
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Timing(OptionGroup):
-    """Time step and ticks."""
-
-    timestep: Annotated[
-        float,
-        Field("seconds, not a rate: 1/2000", low=1e-6, high=0.1),
-        option("snapshot", "recording", "scene"),
-    ] = 1 / 2000
-    """Time step of simulation and control [s]; default 1/2000."""
-    substeps: Annotated[int, Field(low=1, high=1_000_000), option("recording", "next commands")] = (
-        20
-    )
-    """Sim steps of one tick, all under the same setpoint; default 20. The control runs at every sim
-    step.
-    """
 
 
 class Controller(Protocol):
@@ -352,9 +335,21 @@ class Controller(Protocol):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Control(OptionGroup):
-    """Law, gains, motors and guard."""
+class ControlOptions(OptionGroup):
+    """Time step, law, gains, motors and guard; what makes an env fail, and what happens then."""
 
+    timestep: Annotated[
+        float,
+        Field("seconds, not a rate: 1/2000", low=1e-6, high=0.1),
+        option("snapshot", "recording", "scene"),
+    ] = 1 / 2000
+    """Time step of simulation and control [s]; default 1/2000."""
+    substeps: Annotated[int, Field(low=1, high=1_000_000), option("recording", "next commands")] = (
+        20
+    )
+    """Sim steps of one tick, all under the same setpoint; default 20. The control runs at every sim
+    step.
+    """
     params: Annotated[bp.PIDParams | None, option("restored")] = None
     """PID parameters of one row, or one row per env. Default: see
     :func:`batchpid.sim.options.options.default_params`.
@@ -414,6 +409,20 @@ class Control(OptionGroup):
     changed.
     """
 
+    on_fault: Annotated[FaultAction, option("snapshot")] = "hold"
+    """Action when an env fails: ``"hold"`` (default) keeps it at rest in its last valid state, with
+    ``ok`` False until it is reset; ``"reset"`` returns it to its last start, with ``ok`` False for
+    that tick. An env fails when its state, or the effort of a :class:`Controller`, is not finite,
+    when a position is beyond 1e6 rad or m, or by ``speed_limit``. The other envs are not
+    affected.
+    """
+    speed_limit: Annotated[ArrayLike | None, option("snapshot")] = None
+    """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
+    on_invalid_input: Annotated[InvalidInputAction, option("next commands")] = "raise"
+    """Response to NaN or infinity in a command or in a pose to reset to: ``"raise"`` (default)
+    raises an error, and ``"contain"`` lets only the env concerned fail.
+    """
+
     def fit(self, robot: Robot) -> Self:
         control = self.control
         tool = self.tool
@@ -423,7 +432,7 @@ class Control(OptionGroup):
                 remedy = "load the robot with fixed_base=True, or control its joints"
                 raise InvalidArgumentError("control", problem, remedy=remedy)
             if tool is None:
-                tool = robot.rigid_tree.tool
+                tool = link_tree(robot).tool
             # From here on it is a controller like the caller's own.
             control = OperationalSpace(robot, choice("tool", tool, robot.kinematic_tree().links))
         elif callable(control) and callable(getattr(control, "init", None)):
@@ -450,7 +459,13 @@ class Control(OptionGroup):
         for name in names("free_joints", free):
             choice("free_joints", name, robot.joint_names)
         values = {"free_joints": tuple(free), "stages": fit_stages(self.stages)}
-        return self.changed(control=control, tool=link, **values)
+        limit = self.speed_limit
+        joints = robot.joint_names
+        if limit is not None:
+            # A copy: the caller may change the array later.
+            speeds = array("speed_limit", limit, (1, robot.dof), joints)[0].copy()
+            limit = read_only(at_least("speed_limit", speeds, 0.0, joints, above=True))
+        return self.changed(control=control, tool=link, speed_limit=limit, **values)
 
     @property
     def control_name(self) -> str:
@@ -470,32 +485,6 @@ class Control(OptionGroup):
     def sets_positions(self) -> bool:
         """True if setpoints are joint positions."""
         return self.control in ("pid", "drive")
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Faults(OptionGroup):
-    """What makes an env fail, and what happens then."""
-
-    on_fault: Annotated[FaultAction, option("snapshot")] = "hold"
-    """Action when an env fails: ``"hold"`` (default) keeps it at rest in its last valid state, with
-    ``ok`` False until it is reset; ``"reset"`` returns it to its last start, with ``ok`` False for
-    that tick. An env fails when its state, or the effort of a :class:`Controller`, is not finite,
-    when a position is beyond 1e6 rad or m, or by ``speed_limit``. The other envs are not
-    affected.
-    """
-    speed_limit: Annotated[ArrayLike | None, option("snapshot")] = None
-    """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
-    on_invalid_input: Annotated[InvalidInputAction, option("next commands")] = "raise"
-    """Response to NaN or infinity in a command or in a pose to reset to: ``"raise"`` (default)
-    raises an error, and ``"contain"`` lets only the env concerned fail.
-    """
-
-    def fit(self, robot: Robot) -> Self:
-        if self.speed_limit is None:
-            return self
-        # A copy: the caller may change the array later.
-        limit = joint_speeds("speed_limit", self.speed_limit, robot.joint_names)
-        return self.changed(speed_limit=read_only(limit.copy()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -535,7 +524,7 @@ class Ray:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Workers(OptionGroup):
+class WorkerOptions(OptionGroup):
     """Processes and machines that run the envs."""
 
     first_env: Annotated[int, Field(high=1e9), option("snapshot")] = 0

@@ -24,27 +24,26 @@ from batchpid.arrays.records import frozen
 from batchpid.checks.validate import AxisKind, instance
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.law.computed_torque import check_gain_units
-from batchpid.law.input_checks import check_drive
+from batchpid.law.state import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction
 from batchpid.sim.options.groups import (
-    Control,
     Controller,
     ControlMode,
-    Faults,
+    ControlOptions,
     Option,
     Place,
     Ray,
-    Scene,
-    Timing,
-    Workers,
+    SceneOptions,
+    WorkerOptions,
     option,
 )
 from batchpid.sim.randomization.checks import check_params, prepared_actuators
-from batchpid.sim.robot.parts import MjcfFile
+from batchpid.sim.robot.reading import describe, tuned_file
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import fit_actuators, fit_guard, known_joints
+from batchpid.sim.robot.tables import MjcfFile
 from batchpid.sim.signals.quantities import (
     CommandSpec,
     Observation,
@@ -57,11 +56,11 @@ from batchpid.sim.tool_space import OperationalSpace
 
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
-OPTION_GROUPS = (Scene, Timing, Control, Faults, Workers)
+OPTION_GROUPS = (SceneOptions, ControlOptions, WorkerOptions)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RunnerKeywords(Scene, Timing, Control, Faults, Workers):
+class RunnerKeywords(SceneOptions, ControlOptions, WorkerOptions):
     """Arguments of a :class:`batchpid.sim.Runner`, as they are passed; all but the first two may be
     left out.
 
@@ -305,9 +304,9 @@ class RunnerOptions(RunnerKeywords):
         command = self.own_command
         options = {name: _plain(value) for name, value in self.values_for("snapshot").items()}
         return options | {
-            **robot.describe(),
+            **describe(robot),
             "joints": list(robot.joint_names),
-            "ignored_pairs": digest(robot.ignored_pairs),
+            "ignored_pairs": digest(robot.self_contact.ignored),
             "robot_actuators": digest(known_joints(robot)),
             "command": None if command is None else list(command.names),
         }
@@ -342,7 +341,7 @@ def default_params(
         return robot.params(
             kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None
         )
-    if robot.has_tuned:
+    if tuned_file(robot) is not None:
         return robot.tuned()
     return robot.designed("effort" if loops else None)
 

@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, Rows
@@ -198,6 +198,10 @@ def fit_errors(
         axes.set_ylabel(units[joint], fontsize=SMALL)
         axes.semilogy(time, before[:, joint], color=SECOND, lw=0.8, label="before")
         axes.semilogy(time, after[:, joint], color=ENV, lw=0.8, label="after")
+        # Minor ticks and exponents as formulas take most of a second to lay out.
+        axes.yaxis.set_major_locator(LogLocator(numticks=5))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.yaxis.set_major_formatter("{x:.0e}")
         if len(held_out):
             axes.axvspan(held_out[0], held_out[-1], color=SETPOINT, alpha=0.15, lw=0)
     _add_legend(figure)

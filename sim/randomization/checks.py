@@ -14,8 +14,8 @@ from batchpid.motors import DRIVEN
 from batchpid.motors.actuators import ACTUATOR_FIELDS, DELAYS, NOISES
 from batchpid.sim.randomization.distributions import Field, elements, nominal_values, parts
 from batchpid.sim.randomization.randomization import EVENTS, RANDOMIZED_FIELDS, Randomization
-from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.tables import MjcfFile
 
 _ZERO = ("payload", "center_of_mass", *EVENTS)
 """Fields whose nominal value is 0, which no draw can scale."""
@@ -39,12 +39,12 @@ def check_robot(randomization: Randomization, robot: Robot, mjcf: MjcfFile | Non
                 raise InvalidArgumentError(name, problem, remedy="use operation 'add'")
         for rows in _outermost(name, field, columns, nominal_values(name, robot, mjcf)[None]):
             RANDOMIZED_FIELDS[name].checked(name, rows[0], columns, kind="entry")
-    if randomization.damping is not None and robot.dissipation != "urdf":
+    if randomization.damping is not None and robot.source.dissipation != "urdf":
         problem = "cannot be drawn: the engine sets it with this dissipation"
         remedy = "load with dissipation='urdf'"
         raise InvalidArgumentError("damping", problem, remedy=remedy)
     if randomization.payload_link is not None:
-        choice("payload_link", randomization.payload_link, [link.name for link in robot.links])
+        choice("payload_link", randomization.payload_link, list(robot.bodies))
 
 
 def _check_events(randomization: Randomization, robot: Robot) -> None:

@@ -18,8 +18,9 @@ from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.checks.validate import choice, flag, number, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.sim.robot.parts import CONTACT_FRICTION, MjcfFile
+from batchpid.sim.robot.merging import link_inertias
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.tables import CONTACT_FRICTION, MjcfFile
 from batchpid.sim.signals.quantities import TWIST_UNITS
 
 Episodes = NDArray[np.int64]
@@ -293,7 +294,7 @@ def elements(name: str, robot: Robot) -> Sequence[str]:
     if name not in ("link_mass", "center_of_mass"):
         return robot.joint_names
     # A link without a stated mass has that of its shapes.
-    links = [link for link, mass in robot.link_masses.items() if mass.mass]
+    links = list(link_inertias(robot.tables))
     if name == "link_mass":
         return links
     return [f"{link}.{axis}" for link in links for axis in "xyz"]
@@ -322,7 +323,8 @@ def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None) -> Float64:
     ``mjcf`` is the file that the engine simulates, with its own friction.
     """
     if name == "link_mass":
-        return np.array([robot.link_masses[link].mass for link in elements(name, robot)])
+        inertias = link_inertias(robot.tables)
+        return np.array([inertias[link].mass for link in elements(name, robot)])
     if name == "friction":
         return robot.friction
     if name == "damping":

@@ -38,6 +38,7 @@ from batchpid.sim.randomization.distributions import (
     read_field,
 )
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 
 Drawn = TypeVar("Drawn", bp.PIDParams, bp.Actuators | None)
 LARGEST_SEED = 2**63 - 1
@@ -142,7 +143,7 @@ class Randomization:
 
     def carrier(self, robot: Robot) -> str:
         """Return the name of the link that carries the payload."""
-        return self.payload_link or robot.rigid_tree.tool
+        return self.payload_link or link_tree(robot).tool
 
     # -- draws
     # ----------------------------------------------------------------------------------------------

@@ -206,7 +206,7 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
     source = str(path)
     columns, lines = read_csv(path)
     tables = _tables(robot, source, columns, lines)
-    tables["setpoint"] = robot.coupled(tables["setpoint"])
+    tables["setpoint"] = robot.coupling.positions(tables["setpoint"])
     substeps, at_zero = _substeps(source, columns["time"], lines, timestep)
     start = None
     if at_zero:
@@ -306,6 +306,9 @@ def _substeps(
         remedy = f"begin at 0 or {dt:g} s, with rows whole sim steps of {timestep:g} s apart"
         # Rows of 30 Hz are no whole number of the default steps.
         if abs(period - dt) > 1e-6 * timestep:
+            if len(time) > 1 and period > 0:
+                # Times are rounded: over all rows the period is closer than between two.
+                period = (time[-1] - time[0]) / np.round(np.diff(time) / period).sum()
             remedy += f", or use --timestep {period / substeps:.9g} (timestep=)"
         raise error(source, problem, remedy)
     if first + len(time) == 1:

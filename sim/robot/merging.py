@@ -1,8 +1,10 @@
-"""Merging of links that are joined by fixed joints: a robot with one body for each rigid body.
+"""What is simulated of a robot's tables: merged bodies with their masses and their rigid tree, and
+coupled joints.
 
 A fixed joint of an articulation costs as much as one that moves, and a frame without mass becomes a
-link of 1e-6 kg. A merged body has the frame of the first of its links; shapes, inertias and joints
-of the others are placed in it.
+link of 1e-6 kg. So links that fixed joints connect are one body, with the frame of the first of its
+links; shapes, inertias and joints of the others are placed in it. A link without ``<inertial>`` has
+the inertia of its collision shapes.
 
 The engine numbers joints breadth first, fixed ones counted, so that a merge may change the order of
 the joints below it. Such fixed joints are kept.
@@ -14,16 +16,17 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import read_only
-from batchpid.sim.geometry.inertia import LEAST_MASS
-from batchpid.sim.geometry.shapes import inertia_of
-from batchpid.sim.robot.parts import Joint, Placement
-from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Tables
+from batchpid.motors.coupling import Coupling, Follower
+from batchpid.sim.geometry.shapes import LEAST_MASS, inertia_of
+from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Joint, Placement, Tables
 from batchpid.task_space.frames import SpatialInertia, compose, matrix_of, rotate, total
+from batchpid.task_space.rigid_tree import GRAVITY, RigidTree
 
 Separate = tuple[str, ...]
 """Links that are not merged into their parents."""
@@ -165,3 +168,145 @@ def _moving_order(joints: Sequence[Joint], merged: Collection[str]) -> list[str]
     for joint in ordered:
         ordered += below[joint.child_link]
     return [joint.name for joint in ordered if joint.moves]
+
+
+_EMPTY = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))
+
+
+@lru_cache(maxsize=64)
+def body_tree(
+    tables: Tables, fixed_base: bool = True, gravity: tuple[float, ...] = GRAVITY
+) -> RigidTree:
+    """Return the rigid tree of all bodies, all joints independent; the same object for tables of
+    equal content.
+
+    Links are in breadth-first order, as in SAPIEN. Raises RobotError if a mass comes from the
+    volume of a mesh that cannot be read.
+    """
+    bodies, joints = tables.bodies, tables.joints
+    names = [body.name for body in bodies]
+    inertias = link_inertias(tables)
+    of_bodies = [inertias.get(name, _EMPTY) for name in names]
+    kinds = ["revolute" if joint.continuous else joint.type for joint in joints]
+    return RigidTree(
+        links=tuple(names),
+        parent=np.array([-1, *(names.index(joint.parent_link) for joint in joints)]),
+        joint_types=("fixed", *kinds),
+        joint_names=tuple(joint.name for joint in joints if joint.moves),
+        position=np.array([body.position for body in bodies]),
+        wxyz=np.array([body.wxyz for body in bodies]),
+        axis=np.array([(1.0, 0.0, 0.0), *(joint.axis for joint in joints)]),
+        mass=np.array([inertia.mass for inertia in of_bodies]),
+        center=np.array([inertia.center for inertia in of_bodies]),
+        inertia=np.array([inertia.tensor for inertia in of_bodies]),
+        fixed_base=fixed_base,
+        gravity=gravity,
+    )
+
+
+class Part(NamedTuple):
+    """Link of the URDF, as a part of a simulated body."""
+
+    inertia: SpatialInertia
+    """Inertia of the link in the frame of the body."""
+    axes: Float64
+    """Axes of the link's frame in the body's frame, as columns (3, 3)."""
+    column: int | None
+    """Index among the links that vary; None for a link that does not vary."""
+
+
+def varied_bodies(
+    tables: Tables,
+    separate: Separate,
+    carrier: str,
+    links: Sequence[str],
+) -> dict[str, list[Part]]:
+    """Return the parts of the simulated bodies with varying mass, by name: they contain ``links``
+    or ``carrier``.
+    """
+    placements = place_links(tables, separate)
+    inertias = link_inertias(tables)
+    parts: dict[str, list[Part]] = defaultdict(list)
+    for name, at in placements.items():
+        if name in inertias:
+            inertia = inertias[name].moved(at.position, at.wxyz)
+            column = links.index(name) if name in links else None
+            parts[at.link].append(Part(inertia, matrix_of(at.wxyz), column))
+    varied = {}
+    for body in merge_links(tables, separate).bodies:
+        # A body without mass of its links varies as it is simulated.
+        members = parts[body.name] or [Part(body.spatial_inertia, np.eye(3), None)]
+        is_carrier = body.name == placements[carrier].link
+        if is_carrier or any(part.column is not None for part in members):
+            varied[body.name] = members
+    return varied
+
+
+def payload_place(tables: Tables, separate: Separate, carrier: str) -> Placement:
+    """Return body and place of a payload: the center of mass of its carrier, or the origin of one
+    without mass.
+    """
+    at = place_links(tables, separate)[carrier]
+    inertia = link_inertias(tables).get(carrier)
+    if inertia is None:
+        return at
+    return at._replace(position=inertia.moved(at.position, at.wxyz).center)
+
+
+@lru_cache(maxsize=32)
+def coupling_of(joints: tuple[Joint, ...]) -> Coupling:
+    """Return the coupling of the degrees of freedom ``joints``; the identity without mimic
+    joints.
+    """
+    indices = {joint.name: index for index, joint in enumerate(joints)}
+    followers = [
+        Follower(index, indices[joint.mimic.joint], joint.mimic.multiplier, joint.mimic.offset)
+        for index, joint in enumerate(joints)
+        if joint.mimic is not None
+    ]
+    return Coupling.of(len(joints), followers)
+
+
+def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
+    """Return ``joints`` with the leaders' limits, friction and damping adapted to their followers.
+
+    A follower's position limits narrow the leader's, unless that would leave no range; the follower
+    then gets the leader's limits, multiplied. Its friction and damping act on the leader as |m| F
+    and m^2 B, which is equivalent in the coupled motion.
+    """
+    joints = tuple(joints)
+    coupling = coupling_of(joints)
+    lower = np.array([joint.lower for joint in joints])
+    upper = np.array([joint.upper for joint in joints])
+    lower, upper = narrowed(coupling, lower, upper)
+    # Followers get the images of the limits of their leaders.
+    ends = np.stack([lower, upper])[:, coupling.leader] * coupling.multiplier + coupling.offset
+    lower = np.where(coupling.independent, lower, ends.min(0))
+    upper = np.where(coupling.independent, upper, ends.max(0))
+    share = np.abs(coupling.multiplier)
+    friction, damping = np.zeros((2, len(joints)))
+    np.add.at(friction, coupling.leader, share * [joint.friction for joint in joints])
+    np.add.at(damping, coupling.leader, share**2 * [joint.damping for joint in joints])
+    columns = {"lower": lower, "upper": upper, "friction": friction, "damping": damping}
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return tuple(
+        replace(joint, **dict(zip(columns, row, strict=True)))
+        for joint, row in zip(joints, rows, strict=True)
+    )
+
+
+def narrowed(coupling: Coupling, lower: Float64, upper: Float64) -> tuple[Float64, Float64]:
+    """Return position limits (..., joints) with the limits of leaders narrowed by those of their
+    followers, unless that would leave no range.
+    """
+    lower, upper = lower.copy(), upper.copy()
+    for follower in coupling.followers.tolist():
+        leader = coupling.leader[follower]
+        ends = np.stack([lower[..., follower], upper[..., follower]]) - coupling.offset[follower]
+        ends = ends / coupling.multiplier[follower]
+        low = np.maximum(lower[..., leader], ends.min(0))
+        high = np.minimum(upper[..., leader], ends.max(0))
+        fits = low < high
+        lower[..., leader] = np.where(fits, low, lower[..., leader])
+        upper[..., leader] = np.where(fits, high, upper[..., leader])
+    return lower, upper

@@ -1,16 +1,13 @@
 """Robot: a URDF or MJCF file, parsed once and checked: joints, limits and defaults, checks and
 gains. Nothing here depends on an engine.
-
-Longer than 350 lines because it is one class, which users meet first.
 """
 
 from __future__ import annotations
 
-import os
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,36 +15,35 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import batchpid as bp
-from batchpid import assets
 from batchpid.arrays.array_types import Bool, Document, Float64
 from batchpid.arrays.choices import CHOICES
-from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.checks.validate import check_keywords, choice, file_path, flag
-from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
+from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.findings import Finding, Findings, report
-from batchpid.sim.robot.merging import merge_links, place_links
-from batchpid.sim.robot.mimics import couple, coupling_of
-from batchpid.sim.robot.parts import (
-    DISSIPATION,
-    Joint,
-    LinkMass,
-    MjcfFile,
-    Placement,
-    Reading,
-    Settings,
-    Srdf,
+from batchpid.sim.robot.merging import couple, coupling_of, place_links
+from batchpid.sim.robot.reading import (
+    bundled_robots,
+    find_robot,
+    read_robot,
+    read_settings,
+    tuned_file,
+    with_srdf,
 )
-from batchpid.sim.robot.robot_model import RobotModel
+from batchpid.sim.robot.robot_model import (
+    RobotModel,
+    SelfContact,
+    free_target,
+    link_tree,
+    model_of,
+    self_contact,
+    suggested_effort_limit,
+)
 from batchpid.sim.robot.robot_options import load_robot_actuators, setpoint_guard
-from batchpid.sim.robot.self_collision import SELF_COLLISION, SelfContact, read_srdf, self_contact
-from batchpid.sim.robot.simulated_links import body_tree, link_masses
-from batchpid.sim.robot.tables import Body, Tables
-from batchpid.sim.robot.urdf import read_robot
+from batchpid.sim.robot.tables import Joint, MjcfFile, Placement, Settings, Source, Tables
 from batchpid.task_space.rigid_tree import RigidTree
 
-_ASSETS = Path(assets.__file__).parent
 DESIGN_HZ = 1.7
 """Bandwidth of :meth:`Robot.designed` with the mass matrix."""
 STANDING_HZ = 3.0
@@ -56,80 +52,61 @@ STANDING_HZ)^2.
 """
 
 
-GRAVITY_MARGIN = 2.0  # of the effort that holds the joint still
-SPEED = 3.0  # [rad/s or m/s], at which the joint's damping is overcome
-ACCELERATION = 30.0  # [rad/s^2 or m/s^2] of all joints at once
-POSES = 50
-TARGET_SHARES = (1.0, -1.0, 0.5, -0.5, 0.2, -0.2)
-"""Shares of the first move that are tried for one without contact."""
-
-
-def suggested_effort_limit(
-    gravity: Float64,
-    mass_matrix: Float64,
-    friction: ArrayLike,
-    damping: ArrayLike,
-) -> Float64:
-    """Return an effort limit for each joint (dof,) [N m or N], from gravity (n, dof) and M (n, dof,
-    dof) at n poses.
-
-    It is 2 (max |g_j| + friction) + damping * 3 rad/s + max sum_k |M_jk| * 30 rad/s^2: twice the
-    effort that holds the joint still, plus the effort that accelerates all joints at once, in the
-    worst directions.
-    """
-    still = np.abs(gravity).max(0) + np.asarray(friction)
-    inertia = np.abs(mass_matrix).sum(2).max(0)
-    efforts: Float64 = GRAVITY_MARGIN * still + SPEED * np.asarray(damping) + ACCELERATION * inertia
-    return efforts
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot:
     """Robot as its file describes it; every array is in the order of ``joint_names``. Load one with
     :meth:`load`.
 
-    ``tables`` are its bodies and shapes as in the file, after ``repairs``. ``joints`` are the
-    degrees of freedom, the joints of ``tables`` that move. ``settings`` come from a bundled robot,
-    ``mjcf`` from an MJCF file, else None. ``reading`` is what else the file says, and how it was
-    read. ``actuators`` are its motors and sensors, None for ideal ones.
+    ``source`` is what the reader found. ``joints`` are the degrees of freedom, the joints of
+    ``tables`` that move, with limits, friction and damping of followers moved to their leaders.
+    ``settings`` come from a bundled robot, else None. ``actuators`` are its motors and sensors, None
+    for ideal ones.
     """
 
-    name: str
-    path: Path
-    tables: Tables
-    repairs: tuple[Finding, ...]
+    source: Source
     joints: tuple[Joint, ...]
-    fixed_base: bool
-    dissipation: str
-    reading: Reading
     settings: Settings | None
-    mjcf: MjcfFile | None = None
     actuators: bp.Actuators | None = None
 
     def __repr__(self) -> str:
-        total = sum(body.mass for body in self.links)
-        owners = {shape.owner for shape in self.tables.shapes}
-        shaped = sum(not body.mass and body.name in owners for body in self.links)
-        mass = f"{total:.4g} kg"
-        if shaped:
-            by_shapes = f"{shaped} links with the mass of shapes"
-            mass = f"{mass} and {by_shapes}" if total else by_shapes
         joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
-        head = (
-            f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
-        )
+        mass = f"{sum(body.mass for body in self.tables.bodies):.4g} kg"
+        head = f"Robot({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
         return f"{head}\n  joints={joints})"
 
     @property
-    def links(self) -> tuple[Body, ...]:
-        """Links of the file, with mass and the joint above, breadth first."""
-        return self.tables.bodies
+    def name(self) -> str:
+        """Name in the file, else the file's."""
+        return self.source.name
+
+    @property
+    def path(self) -> Path:
+        """Path of the file."""
+        return self.source.path
+
+    @property
+    def tables(self) -> Tables:
+        """Bodies, shapes and visuals as in the file, after the repairs."""
+        return self.source.tables
+
+    @property
+    def repairs(self) -> tuple[Finding, ...]:
+        """Findings of reading the file."""
+        return self.source.repairs
+
+    @property
+    def fixed_base(self) -> bool:
+        """False if the base floats."""
+        return self.source.fixed_base
+
+    @property
+    def mjcf(self) -> MjcfFile | None:
+        """MJCF file that MuJoCo simulates, None for a URDF."""
+        return self.source.mjcf
 
     @cached_property
     def bodies(self) -> Mapping[str, Placement]:
-        """Placement of every link, by name, in its simulated body: links joined by fixed joints are
-        one.
-        """
+        """Placement of every link in its simulated body: links joined by fixed joints are one."""
         return place_links(self.tables)
 
     @property
@@ -164,27 +141,18 @@ class Robot:
 
     @cached_property
     def design_effort_limit(self) -> Float64:
-        """Effort limits (dof,) [N m or N] of designed and tuned gains.
-
-        They are the URDF's, or :func:`batchpid.sim.robot.robot.suggested_effort_limit` where
-        it gives none.
+        """Effort limits (dof,) [N m or N] of designed and tuned gains: those of the URDF, or
+        :func:`batchpid.sim.robot.robot_model.suggested_effort_limit` where it gives none.
         """
         limits = self.effort_limit
         # The dynamics of 50 poses take time that most robots need not spend.
         if np.isfinite(limits).all():
             return read_only(limits)
-        qpos = self.sample(POSES)
-        mass_matrix = self.coupling.mass_matrix(self.dynamics().mass_matrix(qpos))
-        suggested = suggested_effort_limit(
-            self.dynamics().holding_efforts(qpos), mass_matrix, self.friction, self.damping
-        )
-        return read_only(np.where(np.isfinite(limits), limits, suggested))
+        return read_only(np.where(np.isfinite(limits), limits, suggested_effort_limit(self)))
 
     @property
     def velocity_limit(self) -> Float64:
-        """Velocity limits (dof,) [rad/s or m/s], infinite where the URDF gives none. No engine
-        enforces them.
-        """
+        """Velocity limits (dof,) [rad/s or m/s], infinite where the URDF gives none."""
         return np.array([joint.velocity_limit for joint in self.joints])
 
     @property
@@ -199,13 +167,9 @@ class Robot:
 
     @property
     def friction(self) -> Float64:
-        """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien": PhysX
-        has its own.
-        """
-        return (
-            np.array([joint.friction for joint in self.joints])
-            * DISSIPATION[self.dissipation].modelled
-        )
+        """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien"."""
+        modelled = self.source.dissipation == "urdf"
+        return np.array([joint.friction for joint in self.joints]) * modelled
 
     @cached_property
     def coupling(self) -> Coupling:
@@ -217,22 +181,15 @@ class Robot:
         """Mask (dof,) of the joints that are not followers."""
         return self.coupling.independent
 
-    def coupled(self, qpos: ArrayLike) -> Float64:
-        """Return ``qpos`` (..., dof) with the followers moved to match their leaders."""
-        positions: Float64 = self.coupling.positions(np.asarray(qpos, np.float64))
-        return positions
-
     @property
     def start(self) -> Float64:
-        """Start pose (dof,) [rad or m]: the bundled settings' or the file's, else zero, clipped to
-        the joint limits.
-        """
+        """Start pose (dof,) [rad or m]: the bundled settings', the file's, or zero, in the limits."""
         if self.settings is not None:
             return self.settings.start.copy()
-        defaults = self.reading.defaults
-        return self.coupled(
-            np.clip(0.0 if defaults is None else defaults.start, self.lower, self.upper)
-        )
+        start = self.source.start
+        pose = np.clip(0.0 if start is None else start, self.lower, self.upper)
+        coupled: Float64 = self.coupling.positions(pose)
+        return coupled
 
     @property
     def target(self) -> Float64:
@@ -244,23 +201,7 @@ class Robot:
         """
         if self.settings is not None:
             return self.settings.target.copy()
-        return self._free_target.copy()
-
-    @cached_property
-    def _free_target(self) -> Float64:
-        # Toward the farther limit, so that the move is inside.
-        above = self.upper - self.start
-        below = self.lower - self.start
-        move = np.clip(0.25 * np.where(above >= -below, above, below), -0.5, 0.5)
-        model = self.dynamics(ground=self.fixed_base and self.has_ground)
-        for share in TARGET_SHARES:
-            ways = share * np.linspace(0.2, 1.0, 5)[:, None] * move
-            poses = self.coupled(np.clip(self.start + ways, self.lower, self.upper))
-            if not model.in_contact(poses).any():
-                free: Float64 = poses[-1]
-                return free
-        # Links touch at the start already, which is a finding.
-        return self.coupled(self.start + move)
+        return free_target(self).copy()
 
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's
@@ -268,12 +209,7 @@ class Robot:
 
         Effort limits and continuous joints come from the URDF and, for a bundled robot, kp, ki and
         kd from its settings; anti-windup is "conditional". ``options`` override these and add
-        others.
-
-        Raises
-        ------
-        InvalidArgumentError
-            The robot has no gains and ``options`` has no ``kp``.
+        others. Raises InvalidArgumentError if there is no ``kp``.
         """
         defaults: Document = {"joint_names": self.joint_names, "anti_windup": "conditional"}
         if self.continuous.any():
@@ -288,93 +224,34 @@ class Robot:
         return bp.make_params(joints=self.dof, **(defaults | options))
 
     def sample(self, count: int, seed: int = 0) -> Float64:
-        """Return seeded poses (count, dof), uniform within the limits and half a turn of the start;
-        followers match.
-        """
+        """Return seeded poses (count, dof), uniform within the limits and half a turn of the start."""
         # A joint without limits would have no range to draw from.
         low = np.maximum(self.lower, self.start - np.pi)
         high = np.minimum(self.upper, self.start + np.pi)
-        return self.coupled(np.random.default_rng(seed).uniform(low, high, (count, self.dof)))
-
-    @cached_property
-    def rigid_tree(self) -> RigidTree:
-        """Tree of every link of the URDF, merged ones included, with the coupling and limits of the
-        joints.
-
-        Raises RobotError if a link's mass comes from its shapes, and a mesh cannot be read.
-        """
-        low, high = np.where(
-            self.continuous,
-            [[-np.inf], [np.inf]],
-            [self.lower, self.upper],
-        )
-        tree = body_tree(self.tables, self.fixed_base)
-        return replace(tree, coupling=self.coupling, lower=low, upper=high)
+        poses = np.random.default_rng(seed).uniform(low, high, (count, self.dof))
+        coupled: Float64 = self.coupling.positions(poses)
+        return coupled
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
-        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof),
-        on a fixed base.
-        """
+        """Return the mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof), base fixed."""
         return self.dynamics().mass_matrix(np.atleast_2d(np.asarray(qpos, np.float64)))
 
     def dynamics(self, ground: bool | None = None) -> RobotModel:
         """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed
-        base.
-
-        ``ground``: whether there is a ground at height 0; default :attr:`has_ground`.
+        base. ``ground``: whether there is a ground at height 0; default :attr:`has_ground`.
         """
         has_ground = self.has_ground if ground is None else ground
-        return _model(self, has_ground)
+        return model_of(self, has_ground)
 
     @cached_property
     def self_contact(self) -> SelfContact:
-        """Pairs of links that do not collide, and contact with the ground, computed at the first
-        use.
-        """
+        """Pairs of links that do not collide, and contact with the ground."""
         return self_contact(self)
-
-    @cached_property
-    def link_masses(self) -> Mapping[str, LinkMass]:
-        """Simulated mass of every link of the URDF, by name, computed at the first use."""
-        return link_masses(self.tables, self.repairs)
-
-    @property
-    def ignored_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of links that do not collide."""
-        return tuple((pair.first, pair.second) for pair in self.self_contact.pairs)
 
     @property
     def has_ground(self) -> bool:
-        """True if scenes have a ground by default; False if a fixed base is so low that links start
-        in it.
-        """
+        """True if scenes have a ground by default; False if links of a fixed base start in it."""
         return not self.self_contact.reaches_ground
-
-    def describe(self) -> Document:
-        """Return a description of the simulated robot as plain values, equal for robots of equal
-        content.
-
-        The tables with the collision meshes, the .srdf, and the settings of a bundled robot
-        are given by digests. The actuators are left out.
-        """
-        srdf, defaults = self.reading.srdf, self.reading.defaults
-        return {
-            "robot": self.name,
-            "content": self.digest,
-            "srdf": digest(srdf.disabled, srdf.enabled),
-            "settings": digest(self.settings) if defaults is None else digest(defaults),
-            "mjcf": None if self.mjcf is None else digest(replace(self.mjcf, path="")),
-            "self_collision": self.reading.self_collision,
-            "dissipation": self.dissipation,
-            "fixed_base": self.fixed_base,
-            "base_start": self.reading.base_start,
-        }
-
-    @cached_property
-    def digest(self) -> str:
-        """Digest of bodies, joints and shapes, with the content of mesh files in place of paths."""
-        shapes = [shape._replace(file="") for shape in self.tables.shapes]
-        return digest(self.tables.bodies, shapes, self.joints)
 
     @classmethod
     def load(
@@ -389,7 +266,7 @@ class Robot:
         actuators: bp.Actuators | str | Path | None = None,
         strict: bool = False,
     ) -> Robot:
-        """Load a bundled robot by name (``Robot.bundled()``), or any URDF or MJCF file by path.
+        """Load a bundled robot by name (:meth:`bundled`), or any URDF or MJCF file by path.
 
         Parameters
         ----------
@@ -399,15 +276,13 @@ class Robot:
             ``"skip"`` to leave out collision shapes whose mesh is missing or cannot be read, or
             ``"error"``.
         dissipation
-            ``"urdf"``: joint friction and damping as the URDF says, in N m and N m s/rad, by the
-            model of :mod:`batchpid.motors.friction`; no link damping. ``"sapien"``: SAPIEN's
-            defaults, PhysX's joint friction 0.05 and link damping 0.05, for comparison with its
-            tutorial.
+            ``"urdf"``: joint friction and damping as the URDF says, by the model of
+            :mod:`batchpid.motors.friction`. ``"sapien"``: SAPIEN's defaults, PhysX's joint friction
+            0.05 and link damping 0.05, for comparison with its tutorial.
         fixed_base
-            True to fix the root link to the world. Default True, unless the file has a floating
-            base: the root of an MJCF file has a free joint, or the root of a URDF is a link without
-            mass and shapes and its only joint is floating: then the root is that joint's
-            child.
+            True to fix the root link to the world. Default True, unless the root of an MJCF file has
+            a free joint, or the root of a URDF is a link without mass and shapes whose only joint is
+            floating: then the root is that joint's child.
         self_collision
             ``"auto"``: links that are neighbours, or touch or overlap at the start pose or in
             nearly every sampled pose do not collide (:attr:`self_contact`). ``"urdf"``: all links
@@ -415,25 +290,25 @@ class Robot:
             pairs. ``"none"``: no link collides with another.
         actuators
             Motors and sensors that runners of this robot have by default:
-            :class:`batchpid.Actuators` of one row, or a file of :func:`batchpid.save_actuators`, in
-            which joints are matched by name. None: ideal ones, with the armature of an MJCF file.
+            :class:`batchpid.Actuators` of one row, or a file of :func:`batchpid.save_actuators`.
+            None: ideal ones, with the armature of an MJCF file.
         strict
-            True to refuse a file that needs repairs that change the motion, which are otherwise
-            made, with a warning, and listed by :meth:`check`.
+            True to refuse a file that needs repairs that change the motion; otherwise a warning
+            counts them, and :meth:`check` lists them.
 
         Raises
         ------
         RobotNotFoundError
             No bundled robot and no file of that name.
         RobotError
-            The file is neither a usable URDF nor a usable MJCF file; the message names the element
-            and the remedy. With ``strict``, it needs repairs, which the message lists.
+            The file is neither a usable URDF nor a usable MJCF file, or, with ``strict``, it needs
+            repairs.
         InvalidArgumentError
             An option has none of the values above.
         """
         choice("missing_meshes", missing_meshes, ("error", "skip"))
-        choice("dissipation", dissipation, DISSIPATION)
-        choice("self_collision", self_collision, SELF_COLLISION)
+        choice("dissipation", dissipation, ("urdf", "sapien"))
+        choice("self_collision", self_collision, ("auto", "urdf", "none"))
         fixed_base = None if fixed_base is None else flag("fixed_base", fixed_base)
         strict = flag("strict", strict)
         if not isinstance(package_dirs, list | tuple):
@@ -441,9 +316,8 @@ class Robot:
             raise InvalidArgumentError(
                 "package_dirs", problem, value=package_dirs, remedy="pass a list of paths"
             )
-        # Options are checked before a file is read, so that a wrong one is not hidden by a fault of
-        # the file.
-        path = _find(name_or_path)
+        # A wrong option is not hidden by a fault of the file.
+        path = find_robot(name_or_path)
         folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
         source = read_robot(path, fixed_base, folders, missing_meshes)
         report(path, source.repairs, strict)
@@ -452,24 +326,9 @@ class Robot:
             raise RobotError(
                 f"{path}: a robot without moving joints cannot be controlled; check the joint types"
             )
-        beside = path.with_suffix(".srdf")
-        srdf = Srdf()
-        if os.path.isfile(beside):
-            srdf = read_srdf(beside, source.tables.links)
-        srdf = srdf._replace(disabled=(*source.pairs, *srdf.disabled))
-        bundled = path.parent == _ASSETS
-        robot = cls(
-            source.name,
-            path,
-            source.tables,
-            source.repairs,
-            joints,
-            source.fixed_base,
-            dissipation,
-            Reading(self_collision, srdf, folders, source.defaults, source.base_start),
-            _read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
-            source.mjcf,
-        )
+        source = with_srdf(source)
+        source = source._replace(self_collision=self_collision, dissipation=dissipation)
+        robot = cls(source, joints, read_settings(path, joints))
         motors = source.actuators if actuators is None else actuators
         if motors is None:
             return robot
@@ -478,7 +337,7 @@ class Robot:
     @staticmethod
     def bundled() -> tuple[str, ...]:
         """Return the names of the robots that ship with batchpid."""
-        return tuple(sorted(path.stem for path in _ASSETS.glob("*.urdf")))
+        return bundled_robots()
 
     def check(
         self,
@@ -496,22 +355,14 @@ class Robot:
         Parameters
         ----------
         params
-            PID parameters to check, too; default :meth:`params` if the robot has gains.
+            PID parameters to check, too; default :meth:`params` of a bundled robot.
         qpos, setpoint
-            Start pose (default :attr:`start`) and setpoint (default: none) to check, (dof,) [rad or
-            m].
-        timestep
-            Time step of control and simulation [s].
-        control
-            ``"pid"``, ``"drive"`` or ``"effort"``, as in :class:`batchpid.sim.Runner`.
+            Start pose (default :attr:`start`) and setpoint (default: none), (dof,) [rad or m].
+        timestep, control
+            As in :class:`batchpid.sim.Runner`: ``"pid"``, ``"drive"`` or ``"effort"``.
         engine
             ``"mujoco"`` or ``"sapien"``: add what this engine cannot run, and what it runs
-            otherwise than the file says. None: findings that hold in every engine.
-
-        Raises
-        ------
-        InvalidArgumentError
-            An argument has a wrong shape, type or range.
+            otherwise than the file says.
         """
         from batchpid.sim.diagnosis.preflight import check
 
@@ -529,22 +380,11 @@ class Robot:
         self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None
     ) -> bp.Guard:
         """Return the limits of setpoints: positions, and soft limits of ``safety_controller``, as
-        in the URDF.
+        in the URDF. Followers have none: they move with their leaders.
 
-        Followers have none: they move with their leaders.
-
-        Parameters
-        ----------
-        rate
-            Largest rate, scalar or (dof,) [rad/s or m/s]; default the URDF's velocity limits.
-        acceleration
-            Largest acceleration, scalar or (dof,) [rad/s^2 or m/s^2]; default the URDF's limits of
-            acceleration and deceleration (URDF 1.2), the smaller of both.
-
-        Raises
-        ------
-        InvalidArgumentError
-            A limit is not positive.
+        ``rate`` [rad/s or m/s] and ``acceleration`` [rad/s^2 or m/s^2] are scalars or (dof,), by
+        default the URDF's limits of velocity, and of acceleration or deceleration (URDF 1.2), the
+        smaller of both.
         """
         return setpoint_guard(self.joints, rate, acceleration)
 
@@ -559,84 +399,51 @@ class Robot:
         poles of that speed need. In other units the joints disturb each other, which three equal
         poles tolerate better.
 
-        Parameters
-        ----------
-        gain_units
-            ``"mass_matrix"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
-            ``"mass_matrix"``; on a floating base ``"effort"``, for legs that carry the base at the
-            start pose: the mass matrix is that of legs in the air, a twentieth.
-
-        Raises
-        ------
-        InvalidArgumentError
-            Unknown gain_units, or a mass matrix that is not positive definite.
+        ``gain_units`` are "mass_matrix" or "effort" (:mod:`batchpid.law.computed_torque`). Default
+        "mass_matrix"; on a floating base "effort", for legs that carry the base at the start pose:
+        the mass matrix is that of legs in the air, a twentieth. Raises InvalidArgumentError for a
+        mass matrix that is not positive definite.
         """
-        chosen = (
-            ("mass_matrix" if self.fixed_base else "effort") if gain_units is None else gain_units
-        )
-        gain_units = choice("gain_units", chosen, CHOICES["gain_units"])
+        if gain_units is None:
+            gain_units = "mass_matrix" if self.fixed_base else "effort"
+        choice("gain_units", gain_units, CHOICES["gain_units"])
         options: Document = {"gain_units": gain_units, "measurement_rate": "measured"}
         if gain_units == "effort" and not self.fixed_base:
-            return bp.design_gains(
-                self, STANDING_HZ, load=self.dynamics().standing_inertia(self.start), **options
-            )
+            load = self.dynamics().standing_inertia(self.start)
+            return bp.design_gains(self, STANDING_HZ, load=load, **options)
         if gain_units != "mass_matrix":
             return bp.design_gains(self, 2.25, **options)
-        return bp.design_gains(
-            self, DESIGN_HZ, 0.82, integral_time=4.5 / (2 * np.pi * DESIGN_HZ), **options
-        )
+        time = 4.5 / (2 * np.pi * DESIGN_HZ)
+        return bp.design_gains(self, DESIGN_HZ, 0.82, integral_time=time, **options)
 
     def kinematic_tree(self, **options: ArrayLike) -> RigidTree:
         """Return the kinematic tree of this robot, for :mod:`batchpid.task_space`, in float64.
 
-        No engine is needed.
+        It has every link of the file by name, merged ones included. Followers move with their
+        leaders. It has no friction and damping.
 
-        It knows every link of the URDF by name, merged ones included. Followers move with their
-        leaders (:attr:`coupling`). It has no friction and damping.
-
-        Parameters
-        ----------
-        options
-            ``armature`` (dof,) [kg m^2 or kg], by default the one in :attr:`actuators`; ``gravity``
-            (3,) [m/s^2].
-
-        Raises
-        ------
-        RobotError
-            The base is not fixed, or a mesh cannot be read of a link whose mass comes from its
-            collision shapes.
-        InvalidArgumentError
-            An option is not one of those above, or has a wrong shape or sign.
+        ``options`` are ``armature`` (dof,) [kg m^2 or kg], by default the one in :attr:`actuators`,
+        and ``gravity`` (3,) [m/s^2]. Raises RobotError if the base is not fixed, or a mesh cannot be
+        read of a link whose mass comes from its collision shapes.
         """
         check_keywords("kinematic_tree", options, ("armature", "gravity"))
         own_options = {}
         if self.actuators is not None and self.actuators.armature is not None:
             own_options["armature"] = np.asarray(self.actuators.armature, float)[0]
         if not self.fixed_base:
-            problem = "operational space and inverse kinematics need a robot with a fixed base"
-            raise RobotError(
-                f"{self.path}: {problem}; load the robot with fixed_base=True, or control its"
-                " joints"
-            )
-        return replace(self.rigid_tree, **(own_options | options))
-
-    @property
-    def has_tuned(self) -> bool:
-        """True if tuned params ship with the robot, for :meth:`tuned`."""
-        return self.settings is not None and self.path.with_suffix(".tuned.yaml").is_file()
+            problem = f"{self.path}: a kinematic tree needs a robot with a fixed base"
+            raise RobotError(f"{problem}; load it with fixed_base=True, or control its joints")
+        return replace(link_tree(self), **(own_options | options))
 
     def tuned(self) -> bp.PIDParams:
-        """Return the tuned params of a bundled robot; see docs/choosing-gains.md.
-
-        Raises
-        ------
-        InvalidArgumentError
-            The robot is not bundled.
+        """Return the tuned params of a bundled robot; see docs/choosing-gains.md. Raises
+        InvalidArgumentError for another robot.
         """
-        if not self.has_tuned:
+        file = tuned_file(self)
+        if file is None:
             remedy = "use robot.designed(), or search for gains with: batchpid tune"
             raise InvalidArgumentError("robot", f"{self.name!r} has no tuned gains", remedy=remedy)
-        return bp.load_params(self.path.with_suffix(".tuned.yaml"), self.joint_names)[0]
+        return bp.load_params(file, self.joint_names)[0]
 
     def mjcf_gains(self) -> bp.PIDParams:
         """Return params with the gains of the servos of an MJCF file: kp, ki and kd, on the
@@ -644,60 +451,11 @@ class Robot:
 
         Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of
         the servo's control; a velocity servo has kd alone. :meth:`guard` has the limits of their
-        setpoints.
-
-        Raises
-        ------
-        InvalidArgumentError
-            The robot is not from an MJCF file, or that has no servos.
+        setpoints. Raises InvalidArgumentError for a file without servos.
         """
-        defaults = self.reading.defaults
-        if defaults is None or defaults.kp is None:
-            problem = (
-                f"{self.name!r} has no servos of an MJCF file (<position>, or <general> with an"
-                " affine bias)"
-            )
+        gains = self.source.gains
+        if gains is None:
+            problem = f"{self.name!r} has no servos of an MJCF file"
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
-        gains = {name: getattr(defaults, name) for name in ("kp", "ki", "kd", "integral_limit")}
         # MuJoCo's integral grows during saturation, up to its limit.
         return self.params(**gains, anti_windup="none", measurement_rate="measured")
-
-
-@lru_cache(maxsize=8)
-def _model(robot: Robot, ground: bool) -> RobotModel:
-    ignored = frozenset(map(frozenset, robot.ignored_pairs))
-    # Merged, since the engines simulate merged links, too.
-    simulated = merge_links(robot.tables)
-    return RobotModel(body_tree(simulated), robot.coupling, simulated, ignored, ground)
-
-
-def _find(name_or_path: str | Path) -> Path:
-    path = Path(os.path.expanduser(file_path("name_or_path", name_or_path)))
-    if str(name_or_path) in Robot.bundled():
-        return _ASSETS / f"{name_or_path}.urdf"
-    if os.path.isdir(
-        path
-    ):  # pathlib's methods raise other errors for names that are too long or start with ~
-        raise RobotNotFoundError(f"{path} is a folder; pass the path of a URDF or MJCF file in it")
-    if os.path.exists(path):  # also a pipe, such as /dev/stdin
-        return path.absolute()
-    raise RobotNotFoundError(
-        f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a"
-        " file; check the spelling, or pass the path of a URDF or MJCF file"
-    )
-
-
-def _read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings:
-    import yaml  # here, so that `batchpid --help` does not load it
-
-    data = yaml.safe_load(path.read_text())
-    rows = [data["joints"][joint.name] for joint in joints]
-    keys = ("start", "target", "kp", "ki", "kd")
-    columns = {key: read_only(np.array([row[key] for row in rows], float)) for key in keys}
-    return Settings(
-        **columns,
-        drive_stiffness=float(data["drive"]["stiffness"]),
-        drive_damping=float(data["drive"]["damping"]),
-        rate_hz=float(data["rate_hz"]),
-        notes=tuple(data.get("notes", ())),
-    )

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.records import frozen
 from batchpid.checks.validate import entries, instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN, JOINT_SIDE
-from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.merging import coupling_of, narrowed
+from batchpid.sim.robot.tables import Joint
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
@@ -36,30 +37,20 @@ simulated with it.
 _NO_LIMIT = {"lower": -np.inf, "upper": np.inf, "rate": np.inf, "acceleration": np.inf}
 
 
-class KnownJoints(NamedTuple):
-    """Joints as a controller knows them, in addition to the robot's description, (dof,)."""
+def known_joints(robot: Robot) -> dict[str, Float64]:
+    """Return the joints as a controller knows them, in addition to the robot's description, from
+    the robot's own actuators.
 
-    coulomb: NDArray[np.float64]
-    """Coulomb friction to compensate [N m or N]."""
-    viscous: NDArray[np.float64]
-    """Viscous damping [N m s/rad or N s/m]."""
-    armature: NDArray[np.float64]
-    """Reflected inertia of the motors [kg m^2 or kg]."""
-
-
-def known_joints(robot: Robot) -> KnownJoints:
-    """Return friction, damping and armature of the robot's own actuators, which its controller
-    knows.
+    ``coulomb``: friction to compensate [N m or N]; ``viscous``: damping [N m s/rad or N s/m];
+    ``armature``: reflected inertia of the motors [kg m^2 or kg]; each (dof,).
     """
-    if robot.actuators is None:
-        motors = bp.Actuators()
-    else:
-        motors = robot.actuators
-    coulomb, viscous, armature = (
-        np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
-        for leaf in (motors.coulomb, motors.viscous, motors.armature)
-    )
-    return KnownJoints(FRICTION_SHARE * coulomb, viscous, armature)
+    motors = robot.actuators or bp.Actuators()
+    leaves = {}
+    for name in ("coulomb", "viscous", "armature"):
+        leaf = getattr(motors, name)
+        leaves[name] = np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
+    leaves["coulomb"] *= FRICTION_SHARE
+    return leaves
 
 
 def load_robot_actuators(source: bp.Actuators | str | Path, robot: Robot) -> bp.Actuators:
@@ -177,25 +168,19 @@ def _of_leaders(guard: bp.Guard, joints: Sequence[Joint]) -> bp.Guard:
     for name, none in _NO_LIMIT.items():
         leaf = getattr(guard, name)
         limits[name] = np.broadcast_to(none if leaf is None else leaf, shape).astype(np.float64)
-    low, high = limits["lower"], limits["upper"]
-    for index in coupling.followers.tolist():
-        leader = int(coupling.leader[index])
-        multiplier = float(coupling.multiplier[index])
-        for name in ("rate", "acceleration"):
-            fastest = limits[name][:, index] / abs(multiplier)
-            limits[name][:, leader] = np.minimum(limits[name][:, leader], fastest)
-        ends = [(end[:, index] - coupling.offset[index]) / multiplier for end in (low, high)]
-        # A leader that turns without end takes its follower anywhere.
-        if joints[leader].continuous and np.isfinite(ends).any():
-            problem = f"cannot hold the position limits of its follower {joints[index].name!r}"
-            remedy = "make the leader revolute with limits, or leave out lower and upper"
-            raise InvalidArgumentError("guard", problem, joint=joints[leader].name, remedy=remedy)
-        lower = np.maximum(low[:, leader], np.min(ends, axis=0))
-        upper = np.minimum(high[:, leader], np.max(ends, axis=0))
-        # Limits that exclude each other would leave no setpoint.
-        narrower = lower < upper
-        low[narrower, leader] = lower[narrower]
-        high[narrower, leader] = upper[narrower]
+    ends = np.stack([limits["lower"], limits["upper"]])
+    # A leader that turns without end takes its follower anywhere.
+    turns = np.array([joints[leader].continuous for leader in coupling.leader])
+    held = turns & ~coupling.independent & np.isfinite(ends).any((0, 1))
+    for index in np.flatnonzero(held).tolist():
+        leader = joints[coupling.leader[index]].name
+        problem = f"cannot hold the position limits of its follower {joints[index].name!r}"
+        remedy = "make the leader revolute with limits, or leave out lower and upper"
+        raise InvalidArgumentError("guard", problem, joint=leader, remedy=remedy)
+    limits["lower"], limits["upper"] = narrowed(coupling, *ends)
+    for name in ("rate", "acceleration"):
+        fastest = limits[name] / np.abs(coupling.multiplier)
+        np.minimum.at(limits[name].T, coupling.leader, fastest.T)
     leaves = {}
     for name, none in _NO_LIMIT.items():
         limits[name][:, coupling.followers] = none

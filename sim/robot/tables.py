@@ -1,8 +1,8 @@
-"""Record of a robot: bodies with their joints, and collision shapes, as rows of arrays and names.
+"""Record of a robot: bodies with their joints, and shapes, as rows of arrays and names.
 
 A :class:`Tables` is made once, by the reader of a URDF (:mod:`batchpid.sim.robot.urdf`) or of an
 MJCF file (:mod:`batchpid.sim.robot.mjcf.reader`). Everything else reads it: engines, rigid
-trees, distances and exports.
+trees, distances, exports and pictures.
 
 :func:`batchpid.sim.robot.merging.merge_links` makes the tables that engines simulate, with one body
 for all links that fixed joints hold together. :attr:`batchpid.sim.engine.scene_spec.SceneSpec.tables`
@@ -15,10 +15,12 @@ their leaders. Reflected inertia of motors is in the robot's actuators.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -28,10 +30,99 @@ from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.motors import Actuators
 from batchpid.sim.findings import Finding
-from batchpid.sim.geometry.inertia import LEAST_MASS
-from batchpid.sim.geometry.shapes import Shape
-from batchpid.sim.robot.parts import DisabledPair, FileDefaults, Joint, MjcfFile, Placement
+from batchpid.sim.geometry.shapes import LEAST_MASS, Shape
 from batchpid.task_space.frames import SpatialInertia, matrix_of
+
+CONTACT_FRICTION = 0.3
+"""Coefficient of sliding friction of every shape and of the ground: SAPIEN's default material."""
+MOVING_TYPES = ("revolute", "continuous", "prismatic")
+"""URDF joint types that are degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """Coupling of a joint's position to another's: ``q = multiplier * q_of_joint + offset``."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Joint of a URDF. Units: rad, N m, rad/s (revolute) or m, N, m/s (prismatic).
+
+    Limits that the URDF leaves out are infinite. ``axis`` is a direction in the joint's frame, not
+    normalised.
+    """
+
+    name: str
+    type: str
+    parent_link: str
+    child_link: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    effort_limit: float = math.inf
+    velocity_limit: float = math.inf
+    acceleration_limit: float = math.inf
+    soft_lower: float = -math.inf
+    soft_upper: float = math.inf
+    damping: float = 0.0
+    friction: float = 0.0
+    mimic: Mimic | None = None
+    axis: tuple[float, ...] = (1.0, 0.0, 0.0)
+    has_motor: bool = True
+    """False where an MJCF file has actuators, and none for this joint."""
+
+    @property
+    def moves(self) -> bool:
+        """True if the joint is a degree of freedom."""
+        return self.type in MOVING_TYPES
+
+    @property
+    def continuous(self) -> bool:
+        """True if positions wrap at a full turn (URDF type ``continuous``)."""
+        return self.type == "continuous"
+
+    @property
+    def unit(self) -> str:
+        """Unit of position: ``"m"`` for a prismatic joint, else ``"rad"``."""
+        if self.type == "prismatic":
+            return "m"
+        return "rad"
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of effort: ``"N"`` for a prismatic joint, else ``"N m"``."""
+        return {"rad": "N m", "m": "N"}[self.unit]
+
+
+class DisabledPair(NamedTuple):
+    """Two links that do not collide.
+
+    ``reason`` is one of MoveIt's: "Adjacent" (neighbours), "Default" (in contact at the start
+    pose), "Always" (in nearly every sampled pose), "Never" or "User" (in an .srdf).
+    """
+
+    first: str
+    second: str
+    reason: str
+
+    @property
+    def links(self) -> frozenset[str]:
+        """Names of the links."""
+        return frozenset((self.first, self.second))
+
+
+class Placement(NamedTuple):
+    """Frame of a link in the simulated ``link`` that it is part of: ``position`` (3,) [m], ``wxyz``
+    (4,).
+    """
+
+    link: str
+    position: Float64
+    wxyz: Float64
+
 
 ORIGIN = read_only(np.zeros(3))
 NO_TURN = read_only(np.array([1.0, 0.0, 0.0, 0.0]))
@@ -67,6 +158,17 @@ class Body(NamedTuple):
         return SpatialInertia(self.mass, self.center, read_only(turn @ self.inertia @ turn.T))
 
 
+class Visual(NamedTuple):
+    """Shape that is drawn."""
+
+    shape: Shape | None
+    """Shape, with the name of its mesh as in the file; None where it cannot be read."""
+    rgba: tuple[float, ...] | None = None
+    """Colour, None where the file gives none."""
+    problem: str | None = None
+    """Reason for which it cannot be read."""
+
+
 @dataclass(frozen=True, eq=False)
 class Tables:
     """Tables of a robot. Equal content makes them equal, in any process; they can be pickled."""
@@ -79,6 +181,8 @@ class Tables:
     """
     links: Mapping[str, Placement]
     """Body and place in it of each link of the file, in the order of the file's rows."""
+    visuals: Mapping[str, tuple[Visual, ...]] = field(default_factory=dict)
+    """Drawn shapes by link; they are no part of the digest. Merged tables have none."""
 
     def __post_init__(self) -> None:
         # Frozen, so that caches and processes can share them.
@@ -108,13 +212,28 @@ class Tables:
         return tuple(body.joint for body in self.bodies if body.joint is not None)
 
 
+def unique(name: str, names: set[str]) -> str:
+    """Return ``name``, with a number if it is one of ``names``, and add it to them."""
+    new = name
+    number = 2
+    while new in names:
+        new = f"{name}_{number}"
+        number += 1
+    names.add(new)
+    return new
+
+
 def without_mass(body: Body) -> Body:
     """Return ``body`` with next to no mass, in place of that of its shapes."""
     tensor = 1e-3 * LEAST_MASS * np.eye(3)
     return body._replace(mass=LEAST_MASS, center=ORIGIN, inertia=tensor, inertia_wxyz=NO_TURN)
 
 
-def breadth_first(bodies: Iterable[Body], shapes: Iterable[Shape]) -> Tables:
+def breadth_first(
+    bodies: Iterable[Body],
+    shapes: Iterable[Shape],
+    visuals: Mapping[str, tuple[Visual, ...]] | None = None,
+) -> Tables:
     """Return the tables of the base, which has no joint, and all bodies below it, breadth first."""
     below: dict[str, list[Body]] = defaultdict(list)
     ordered = []
@@ -130,23 +249,80 @@ def breadth_first(bodies: Iterable[Body], shapes: Iterable[Shape]) -> Tables:
     links = {name: Placement(name, ORIGIN, NO_TURN) for name in row}
     of_rows = [shape for shape in shapes if shape.body in row]
     of_rows.sort(key=lambda shape: row[shape.body])
-    return Tables(tuple(ordered), tuple(of_rows), links)
+    return Tables(tuple(ordered), tuple(of_rows), links, visuals or {})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Tutorial's poses and gains of a bundled robot, in joint order.
+
+    ``start``, ``target``: (dof,) [rad or m]; ``kp``, ``ki``, ``kd``: (dof,) of the PID;
+        ``drive_stiffness`` and
+    ``drive_damping`` of PhysX's internal drive; ``rate_hz``: control and simulation rate;
+    ``notes``: differences from the tutorial, in words.
+    """
+
+    start: Float64
+    target: Float64
+    kp: Float64
+    ki: Float64
+    kd: Float64
+    drive_stiffness: float
+    drive_damping: float
+    rate_hz: float
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class MjcfFile:
+    """MJCF file that MuJoCo simulates itself, with everything in it besides the robot.
+
+    ``is_whole`` says whether all of it is compiled
+    (:func:`batchpid.sim.robot.mjcf.model.compile_scene`), and ``content`` is the digest of the
+    model. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
+    other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
+    links. ``losses`` are findings of what is lost in an engine that does not simulate the file.
+    ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of
+    the world can collide, unless the root is fixed to the origin in place of its free joint.
+    ``friction`` is the coefficient of its ground, the first of these planes.
+    """
+
+    path: str
+    is_whole: bool
+    content: str
+    bodies: tuple[str, ...]
+    falling: tuple[str, ...] = ()
+    loops: tuple[str, ...] = ()
+    losses: tuple[Finding, ...] = ()
+    is_alone: bool = True
+    has_floor: bool = False
+    friction: float = 1.0
 
 
 class Source(NamedTuple):
-    """Robot as its file gives it.
+    """Robot as its file gives it, and how the file was read."""
 
-    ``repairs`` are findings, one for each change that the simulation needs. ``base_start`` is the
-    pose (7,) at which the file places a floating base.
-    """
-
+    path: Path
     name: str
     tables: Tables
     repairs: tuple[Finding, ...]
+    """Findings, one for each change that the simulation needs."""
     fixed_base: bool
     base_start: tuple[float, ...] | None
+    """Pose (7,) at which the file places a floating base, None if it does not."""
+    start: Float64 | None = None
+    """Start pose (dof,) [rad or m] of the file, None if it has none."""
+    gains: Mapping[str, Float64] | None = None
+    """Gains ``kp``, ``ki``, ``kd`` of the servos of an MJCF file (dof,), and the ``integral_limit``
+    [N m or N]; None without servos.
+    """
     mjcf: MjcfFile | None = None
-    pairs: tuple[DisabledPair, ...] = ()
-    """Pairs of links that do not collide."""
-    defaults: FileDefaults | None = None
     actuators: Actuators | None = None
+    disabled: tuple[DisabledPair, ...] = ()
+    """Pairs of links that do not collide, by the file or its .srdf."""
+    enabled: frozenset[frozenset[str]] = frozenset()
+    """Pairs of links that an .srdf enables."""
+    package_dirs: tuple[Path, ...] = ()
+    """Folders in which meshes are looked up first."""
+    self_collision: str = "auto"
+    dissipation: str = "urdf"

@@ -15,13 +15,14 @@ from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.export.differences import Exported
 from batchpid.sim.findings import summary
-from batchpid.sim.geometry.inertia import MOMENTS
 from batchpid.sim.geometry.mesh_files import find_mesh
-from batchpid.sim.geometry.shapes import Shape, mesh_file
+from batchpid.sim.geometry.shapes import MOMENTS, Shape, mesh_file
 from batchpid.sim.robot.merging import link_inertias
+from batchpid.sim.robot.reading import is_mjcf, read_robot
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.sim.robot.tables import NO_TURN, Body
-from batchpid.sim.robot.urdf import UNUSED, is_mjcf, read_robot
+from batchpid.sim.robot.urdf import UNUSED
 from batchpid.sim.robot.xml import parse_xml
 from batchpid.task_space.frames import to_rpy
 
@@ -54,7 +55,7 @@ def to_urdf(
     RobotError
         The file cannot be read, or has changed since the robot was loaded.
     """
-    path, packages = robot.path, robot.reading.package_dirs
+    path, packages = robot.path, robot.source.package_dirs
     if read_robot(path, robot.fixed_base, packages, "skip").tables != robot.tables:
         raise RobotError(f"{path}: has changed since the robot was loaded; load it again")
     root = _write(robot, mass_factors or {})
@@ -76,10 +77,10 @@ def to_urdf(
 def _write(robot: Robot, mass_factors: Mapping[str, float]) -> etree._Element:
     """Return the ``<robot>`` of the tables."""
     root = etree.Element("robot", name=robot.name)
-    tree = robot.rigid_tree
+    tree = link_tree(robot)
     inertias = link_inertias(robot.tables)
     factors = {tree.link_bodies[tree.index(name)]: mass_factors[name] for name in mass_factors}
-    for body in robot.links:
+    for body in robot.tables.bodies:
         link = etree.SubElement(root, "link", name=body.name)
         factor = factors.get(tree.link_bodies[tree.index(body.name)])
         # A factor of the rigid body holds for each of its links.
@@ -97,7 +98,7 @@ def _write(robot: Robot, mass_factors: Mapping[str, float]) -> etree._Element:
             collision = _placed(link, "collision", shape.position, shape.wxyz)
             geometry = etree.SubElement(collision, "geometry")
             etree.SubElement(geometry, shape.kind, _shape_attributes(shape))
-    for body in robot.links[1:]:
+    for body in robot.tables.bodies[1:]:
         _write_joint(root, body)
     return root
 

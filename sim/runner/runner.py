@@ -28,8 +28,8 @@ from batchpid.io.files import package_versions
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.engine.physics import MujocoSolver, Physics
 from batchpid.sim.findings import report_shortfalls
-from batchpid.sim.loop.backend import describe, native_obstacle
 from batchpid.sim.loop.faults import Fault, FaultWarning
+from batchpid.sim.loop.group_control import describe, native_obstacle
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import (
     DEFAULT_ENGINE,

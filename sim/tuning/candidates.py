@@ -95,7 +95,7 @@ joint.
 """
 
 
-class Candidates:
+class GainCandidates:
     """Candidates of a search on ``moves``, as points in log space. The point 0 has the designed
     gains.
 

@@ -10,8 +10,9 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.diagnosis.text import table
+from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.options.groups import ControlMode
+from batchpid.sim.robot.reading import tuned_file
 from batchpid.sim.robot.robot import Robot
 
 
@@ -21,13 +22,6 @@ class GainSet(NamedTuple):
     name: str
     params: bp.PIDParams
     control: ControlMode = "pid"
-
-
-def default_gains(robot: Robot) -> str:
-    """Return the name of the gains that a robot has by default."""
-    if robot.has_tuned:
-        return "tuned"
-    return "designed"
 
 
 def gain_set(robot: Robot, name: str | None = None) -> GainSet:
@@ -44,7 +38,8 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     InvalidArgumentError
         There is no such name or file, or the robot lacks these gains.
     """
-    name = name or default_gains(robot)
+    if name is None:
+        name = "designed" if tuned_file(robot) is None else "tuned"
     named = {
         "tuned": robot.tuned,
         "designed": robot.designed,

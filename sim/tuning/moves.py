@@ -164,7 +164,9 @@ def random_moves(
             kind = f"{robot.joint_names[joint]} alone"
         step *= movable * share * np.minimum(size, reach)
         target = np.clip(start + step, low, high)
-        move = Moves(robot.coupled(start[None]), robot.coupled(target[None]), (kind,))
+        move = Moves(
+            robot.coupling.positions(start[None]), robot.coupling.positions(target[None]), (kind,)
+        )
         # The ends are tested first: most moves in contact are so at an end.
         path = move.start + line * (move.target - move.start)
         touches = any(dynamics.in_contact(q, clearance).any() for q in (path[[0, -1]], path))
@@ -201,7 +203,7 @@ def easy_pose(
     movable = weak.mean(0) <= STUCK
     spreads = np.geomspace(1.0, 0.05, 8)[:, None, None]
     near = robot.start + spreads * (poses - robot.start)
-    candidates = robot.coupled(np.vstack([robot.start[None], *near]))
+    candidates = robot.coupling.positions(np.vstack([robot.start[None], *near]))
     # Contact takes long to compute. A stable order has the start first among the easy poses.
     order = np.argsort(np.maximum(shares(candidates).max(1), EASY), kind="stable")
     for pose in candidates[order[:TRIED_POSES]]:

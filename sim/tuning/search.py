@@ -32,10 +32,10 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import package_versions
 from batchpid.sim.options.groups import DEFAULT_ENGINE, EngineName
 from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.robot.reading import describe
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tuning.candidates import FACTORS, Candidates
-from batchpid.sim.tuning.comparison import Comparison, compare
-from batchpid.sim.tuning.evaluation import EVALUATION_SUBSTEPS, reseeded
+from batchpid.sim.tuning.candidates import FACTORS, GainCandidates
+from batchpid.sim.tuning.evaluation import EVALUATION_SUBSTEPS, Comparison, compare, reseeded
 from batchpid.sim.tuning.gain_sets import GainSet, gain_table
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
@@ -199,8 +199,8 @@ def tune(
         if robot.fixed_base and build is None:
             fast = SEARCH_SCENE
 
-    def candidates(moves: Moves, headroom: float) -> Candidates:
-        return Candidates(
+    def candidates(moves: Moves, headroom: float) -> GainCandidates:
+        return GainCandidates(
             robot,
             gain_units,
             moves,
@@ -237,7 +237,7 @@ def tune(
     best = int(finalists[np.argmin(final_costs)])
 
     settings: Document = {
-        **robot.describe(),
+        **describe(robot),
         "seed": seed,
         "generations": len(history),
         "population": population,

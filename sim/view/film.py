@@ -25,8 +25,7 @@ from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependen
 from batchpid.io.files import replacing
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.rollout import Rollout
-from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
-from batchpid.sim.view.surfaces import Surface
+from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene, Surface
 from batchpid.sim.view.view_data import Playback, rows_at
 from batchpid.task_space.frames import matrix_of, rotate
 

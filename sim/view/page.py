@@ -1,22 +1,26 @@
-"""Page that shows robots: their scene, a chart of a joint, controls, and the loop that keeps real
-time.
+"""Page that shows robots: their scene, a chart of a joint, controls, the loop that keeps real time,
+and the gate that only the owner of its address passes.
 """
 
 from __future__ import annotations
 
+import errno
 import io
+import re
+import secrets
+import socket
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, redirect_stdout
 from functools import partial
+from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from batchpid.errors import MissingDependencyError
-from batchpid.io.packages import uninterrupted
+from batchpid.errors import BatchPIDError, MissingDependencyError
+from batchpid.io.files import uninterrupted
 from batchpid.sim.findings import summary
-from batchpid.sim.rollout import Rollout
 from batchpid.sim.view.panel import Panel
 from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
 from batchpid.sim.view.view_data import HISTORY_SECONDS, ViewData
@@ -24,6 +28,8 @@ from batchpid.sim.view.view_data import HISTORY_SECONDS, ViewData
 if TYPE_CHECKING:
     from viser import ViserServer
 
+HOST = "127.0.0.1"
+"""Address of the server: only this machine reaches it."""
 CHART_FRAMES = 5
 """Frames between two updates of chart and status."""
 CURVE = {"label": "qpos", "stroke": "#15803d", "width": 2}
@@ -57,9 +63,6 @@ class View(AbstractContextManager["View"]):
         try:
             with uninterrupted():
                 import viser
-
-                # It needs what viser needs.
-                from batchpid.sim.view.gate import HOST, Gate
         except ImportError:
             raise MissingDependencyError("viser", "the browser view", "view") from None
         self.data = data
@@ -88,10 +91,10 @@ class View(AbstractContextManager["View"]):
         left.set_width(380)
         # A browser without a GPU transforms every vertex in software: the more robots, the coarser.
         deviation = min(6e-3, 2.5e-4 + 1.25e-4 * data.num_envs)
-        scene = RobotScene(data.robot, data.num_envs, data.ground, deviation)
-        self.findings = summary(scene.findings)
+        self._scene = RobotScene(data.robot, data.num_envs, data.ground, deviation)
+        self.findings = summary(self._scene.findings)
         """Sentences on meshes that cannot be read."""
-        self._nodes = SceneNodes(self._server, scene, self.panel.select)
+        self._nodes = self._add_robots()
 
     def run(self, seconds: float | None = None) -> None:
         """Serve the page for ``seconds`` of wall time, or until :meth:`stop` or Ctrl-C."""
@@ -138,10 +141,59 @@ class View(AbstractContextManager["View"]):
         the number of frames per second of wall time.
         """
         frame = self.data.frame()
-        self._nodes.update(frame)
+        base = None if frame.base_pose is None else frame.base_pose[0]
+        poses = self._scene.place(frame.qpos[0], base).astype(np.float32).swapaxes(0, 1)
+        with self._server.atomic():
+            for node, pose in zip(self._nodes, poses, strict=True):
+                node.batched_positions = np.ascontiguousarray(pose[:, :3])
+                node.batched_wxyzs = np.ascontiguousarray(pose[:, 3:])
         if chart:
             self._draw_chart()
             self.panel.update_status(frame, rate)
+
+    def _add_robots(self) -> list[Any]:
+        """Add the scene to the page; return a node for each surface, which is placed once for each
+        robot. A frame is therefore two small arrays for each surface, for any number of robots.
+        """
+        scene = self._scene
+        api = self._server.scene
+        api.set_up_direction("+z")
+        # Where a browser draws in software, the environment map costs more than all robots.
+        api.configure_environment_map(None)
+        api.configure_default_lights(enabled=True, cast_shadow=False)
+        api.add_light_ambient("/lights/ambient", color=(235, 240, 255), intensity=1.3)
+        api.add_grid(
+            "/floor",
+            *(2 * scene.half_floor),
+            cell_size=TILE,
+            section_size=2 * TILE,
+            shadow_opacity=0.0,
+            plane_color=(200, 208, 220),
+            plane_opacity=float(scene.ground),
+            position=(0.0, 0.0, scene.floor),
+        )
+        copies = len(scene.positions)
+        nodes: list[Any] = []
+        for index, surface in enumerate(scene.surfaces):
+            colour = np.round(255 * np.asarray(surface.rgba)).astype(np.uint8)
+            alpha = surface.rgba[3]
+            node: Any = api.add_batched_meshes_simple(
+                f"/robots/{index}",
+                surface.vertices.astype(np.float32),
+                surface.faces.astype(np.uint32),
+                batched_wxyzs=np.tile(np.array([1, 0, 0, 0], np.float32), (copies, 1)),
+                batched_positions=np.zeros((copies, 3), np.float32),
+                batched_colors=np.tile(colour[:3], (copies, 1)),
+                opacity=alpha if alpha < 1 else None,
+                lod="off",
+            )
+            node.on_click(lambda event: self.panel.select(event.instance_index))
+            nodes.append(node)
+        camera = self._server.initial_camera
+        camera.position = tuple(scene.eye)
+        camera.look_at = tuple(scene.target)
+        camera.fov = FIELD_OF_VIEW
+        return nodes
 
     def _draw_chart(self) -> None:
         """Draw the recent past of the watched joint: position and setpoint."""
@@ -162,66 +214,73 @@ class View(AbstractContextManager["View"]):
         self._chart.data = (past, *rounded)
 
 
-class SceneNodes:
-    """A ``scene`` on a viser ``server``; ``select(robot)`` is called when a robot is clicked.
-
-    Every surface is one node, which is placed once for each robot. A frame is therefore two small
-    arrays for each surface, for any number of robots.
+class Gate:
+    """Socket at ``port``, or at a free port if that is in use, and the rule for requests to it: a
+    request needs this server as its Host, no other page as its Origin, and the token.
     """
 
-    def __init__(
-        self, server: ViserServer, scene: RobotScene, select: Callable[[int], None]
-    ) -> None:
-        self._server = server
-        self._scene = scene
-        api = server.scene
-        api.set_up_direction("+z")
-        # Where a browser draws in software, the environment map costs more than all robots.
-        api.configure_environment_map(None)
-        api.configure_default_lights(enabled=True, cast_shadow=False)
-        api.add_light_ambient("/lights/ambient", color=(235, 240, 255), intensity=1.3)
-        api.add_grid(
-            "/floor",
-            *(2 * scene.half_floor),
-            cell_size=TILE,
-            section_size=2 * TILE,
-            shadow_opacity=0.0,
-            plane_color=(200, 208, 220),
-            plane_opacity=float(scene.ground),
-            position=(0.0, 0.0, scene.floor),
-        )
-        copies = len(scene.positions)
-        self._robots: list[Any] = []
-        for index, surface in enumerate(scene.surfaces):
-            colour = np.round(255 * np.asarray(surface.rgba)).astype(np.uint8)
-            alpha = surface.rgba[3]
-            node: Any = api.add_batched_meshes_simple(
-                f"/robots/{index}",
-                surface.vertices.astype(np.float32),
-                surface.faces.astype(np.uint32),
-                batched_wxyzs=np.tile(np.array([1, 0, 0, 0], np.float32), (copies, 1)),
-                batched_positions=np.zeros((copies, 3), np.float32),
-                batched_colors=np.tile(colour[:3], (copies, 1)),
-                opacity=alpha if alpha < 1 else None,
-                lod="off",
-            )
-            node.on_click(lambda event: select(event.instance_index))
-            self._robots.append(node)
-        camera = server.initial_camera
-        camera.position = tuple(scene.eye)
-        camera.look_at = tuple(scene.target)
-        camera.fov = FIELD_OF_VIEW
+    def __init__(self, port: int) -> None:
+        try:
+            self.socket = socket.create_server((HOST, port))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            self.socket = socket.create_server((HOST, 0))
+        self.port: int = self.socket.getsockname()[1]
+        self.token = secrets.token_urlsafe(16)
 
-    def update(self, frame: Rollout) -> None:
-        """Place every robot."""
-        base = None
-        if frame.base_pose is not None:
-            base = frame.base_pose[0]
-        poses = self._scene.place(frame.qpos[0], base).astype(np.float32).swapaxes(0, 1)
-        with self._server.atomic():
-            for node, pose in zip(self._robots, poses, strict=True):
-                node.batched_positions = np.ascontiguousarray(pose[:, :3])
-                node.batched_wxyzs = np.ascontiguousarray(pose[:, 3:])
+    def problem(self, hosts: list[str], origins: list[str], path: str) -> str | None:
+        """Return why a request is refused, or None."""
+        # A site can let its name point here: hence the check of Host. Its port may be a tunnel's.
+        if len(hosts) != 1 or not re.fullmatch(r"(localhost|127\.0\.0\.1)(:\d+)?", hosts[0]):
+            return "this server has another name; open the address that was printed"
+        if origins not in ([], [f"http://{hosts[0]}"]):
+            return "pages of other sites have no access"
+        token = path[1 : 1 + len(self.token)].encode(errors="replace")
+        if not secrets.compare_digest(token, self.token.encode()):
+            return "the token is missing; open the address that was printed"
+        return None
+
+    def start(self, make: Callable[[], ViserServer]) -> ViserServer:
+        """Return the server of viser that ``make()`` starts, behind this gate."""
+        # viser passes no options on to it: it is replaced while viser starts.
+        import websockets.asyncio.server as websocket_server
+
+        serve = websocket_server.serve
+        handlers = []
+
+        def guarded(
+            handler: Any,
+            *_: Any,
+            process_request: Any,
+            **options: Any,
+        ) -> Any:
+            def process(connection: Any, request: Any) -> Any:
+                hosts = request.headers.get_all("Host")
+                origins = request.headers.get_all("Origin")
+                problem = self.problem(hosts, origins, request.path)
+                if problem is not None:
+                    return connection.respond(HTTPStatus.FORBIDDEN, f"{problem}\n")
+                request.path = request.path[1 + len(self.token) :] or "/"
+                response = process_request(connection, request)
+                if response is not None:
+                    # The address holds the token.
+                    response.headers["Referrer-Policy"] = "no-referrer"
+                return response
+
+            handlers.append(handler)
+            return serve(handler, sock=self.socket, process_request=process, **options)
+
+        websocket_server.serve = guarded  # type: ignore[assignment, misc]
+        try:
+            server = make()
+        finally:
+            websocket_server.serve = serve  # type: ignore[misc]
+        # A viser that starts its server in another way would be open to everybody.
+        if not handlers:
+            server.stop()
+            raise BatchPIDError("this version of viser cannot be guarded; install version 1.1")
+        return server
 
 
 def _add_chart(gui: Any) -> Any:

@@ -1,17 +1,27 @@
-"""Robots on a floor: the scene that the page and films draw."""
+"""Robots on a floor: the scene that the page and films draw, as coloured triangles.
+
+The triangles are made, or read from mesh files, by ``trimesh``.
+"""
 
 from __future__ import annotations
 
 import math
+import zlib
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64, Rows
+from batchpid.io.files import imported
 from batchpid.sim.findings import Finding
+from batchpid.sim.geometry.mesh_files import find_mesh, read_mesh
+from batchpid.sim.geometry.shapes import convex_hull
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.view.surfaces import surfaces
-from batchpid.task_space.frames import placed
+from batchpid.sim.robot.robot_model import link_tree
+from batchpid.sim.robot.tables import Visual
+from batchpid.task_space.frames import matrix_of, placed, rotate
 
 MAX_ROBOTS = 64
 """Largest number of robots in a scene."""
@@ -22,6 +32,35 @@ TILE = 0.5
 _PITCH = 1.3
 """Distance between neighbours, in reaches: two robots overlap only when both stretch out."""
 _CAMERA_DIRECTION = np.array([-0.62, -0.80, 0.52])
+Rgba = tuple[float, ...]
+_REMEDY = (
+    "repair the file, put it next to the URDF, pass package_dirs=[...] to Robot.load"
+    ", or set ROS_PACKAGE_PATH"
+)
+
+DEVIATION = 2e-3  # default distance allowed between a chord and its arc [m]
+FEWEST, MOST = 6, 48  # bounds of the number of segments of a circle
+_ROD = 0.08  # thickness of a rod, as a share of the longest one
+_PALETTE = ((0.62, 0.65, 0.70, 1.0), (0.42, 0.46, 0.53, 1.0), (0.80, 0.81, 0.83, 1.0))
+_CYLINDER = (
+    (0.0, -0.5),
+    (1.0, -0.5),
+    (1.0, -0.5),
+    (1.0, 0.5),
+    (1.0, 0.5),
+    (0.0, 0.5),
+)  # (radius, z), rims twice
+
+
+class Surface(NamedTuple):
+    """Triangles of one colour that move with a link: ``vertices`` (v, 3) [m] in its frame,
+    ``faces`` (f, 3).
+    """
+
+    link: str
+    rgba: Rgba
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
 
 
 class RobotScene:
@@ -38,7 +77,7 @@ class RobotScene:
         ground: bool,
         deviation: float,
     ) -> None:
-        self._tree = robot.rigid_tree
+        self._tree = link_tree(robot)
         self.ground = ground
         self.findings: list[Finding] = []
         """Meshes that cannot be read. Their links are drawn by the collision shapes, or not at
@@ -88,3 +127,135 @@ class RobotScene:
         poses = placed(self._base[:, None], links)
         poses[..., :3] += self.positions[:, None]
         return poses
+
+
+def surfaces(
+    robot: Robot, deviation: float = DEVIATION, findings: list[Finding] | None = None
+) -> list[Surface]:
+    """Return the surfaces of ``robot``, one for each link and colour; ``deviation`` [m] as in
+    :func:`segments_of`.
+
+    A link is drawn by its visuals; where it has none, or one of them cannot be read, by its
+    collision shapes. A robot of which nothing can be drawn is drawn by rods between its joints.
+    Shapes that cannot be read are appended to ``findings``.
+
+    Vertices are not shared across sharp edges, so that averaged normals shade correctly.
+    """
+    result = []
+    for name in robot.tables.links:
+        solid = [Visual(shape) for shape in robot.tables.shapes_of(name)]
+        for visuals in (robot.tables.visuals.get(name, ()), solid):
+            colours = [visual.rgba or _default_colour(name) for visual in visuals]
+            try:
+                meshes = [_mesh(visual, robot, deviation) for visual in visuals]
+            except OSError as error:
+                shape, reason = error.args
+                text = f"cannot be drawn ({reason}): collision shapes are drawn, if any"
+                finding = Finding("missing-mesh", text, _REMEDY, link=name, detail=repr(shape))
+                if findings is not None:
+                    findings.append(finding)
+                continue
+            for rgba in dict.fromkeys(colours):
+                parts = [
+                    mesh for mesh, colour in zip(meshes, colours, strict=True) if colour == rgba
+                ]
+                joined: Any = imported("trimesh.util").concatenate(parts)
+                vertices = np.asarray(joined.vertices)
+                result.append(Surface(name, rgba, vertices, np.asarray(joined.faces)))
+            if meshes:
+                break
+    return result or _rods(robot)
+
+
+def _rods(robot: Robot) -> list[Surface]:
+    """Return a rod from the frame of each link to each joint on it, from the last links to their
+    centers of mass.
+    """
+    creation = imported("trimesh.creation")
+
+    tree = link_tree(robot)
+    ends = [(parent, tree.position[link]) for link, parent in enumerate(tree.parent) if parent >= 0]
+    ends += [
+        (link, tree.center[link]) for link in range(len(tree.links)) if link not in tree.parent
+    ]
+    lengths = [float(np.linalg.norm(end)) for _, end in ends]
+    thickness = _ROD * max(lengths)
+    rods = []
+    for (link, end), length in zip(ends, lengths, strict=True):
+        if length > thickness:
+            name = tree.links[link]
+            rod: Any = creation.cylinder(thickness / 2, segment=[np.zeros(3), end], sections=FEWEST)
+            rods.append(
+                Surface(
+                    name, _default_colour(name), np.asarray(rod.vertices), np.asarray(rod.faces)
+                )
+            )
+    return rods
+
+
+def segments_of(radius: float, deviation: float) -> int:
+    """Return how many chords, within FEWEST and MOST, keep a circle within ``deviation`` [m] of its
+    arc.
+
+    A chord over the angle 2a is r (1 - cos a) away from the arc.
+    """
+    if radius <= deviation:
+        return FEWEST
+    return min(MOST, max(FEWEST, math.ceil(math.pi / math.acos(1 - deviation / radius))))
+
+
+def _read_mesh(name: str, robot: Robot) -> Any:
+    """Return the result of ``trimesh`` for a mesh file of the robot, in metres. Raises
+    OSError with the name and the reason.
+    """
+    path = find_mesh(name, robot.path, robot.source.package_dirs)
+    if path is None:
+        raise OSError(name, "not found")
+    try:
+        loaded = read_mesh(path)
+    except Exception as error:
+        raise OSError(name, f"{type(error).__name__}: {error}") from error
+    if not len(loaded.faces):
+        raise OSError(name, "no triangles")
+    return loaded
+
+
+def _mesh(visual: Visual, robot: Robot, deviation: float) -> Any:
+    """Return the ``trimesh.Trimesh`` of a shape in its link's frame.
+
+    Raises OSError with the name of a shape that cannot be read, and the reason.
+    """
+    shape = visual.shape
+    if shape is None:
+        raise OSError("<visual>", visual.problem)
+    trimesh = imported("trimesh")
+    creation = imported("trimesh.creation")
+    if shape.kind == "mesh":
+        if shape.vertices is not None:
+            surface: Any = convex_hull(shape.vertices)
+        else:
+            surface = _read_mesh(shape.file, robot)
+        mesh: Any = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+        mesh.apply_scale(shape.scale)
+    elif shape.kind == "box":
+        mesh = creation.box([2 * side for side in shape.size])
+        mesh.unmerge_vertices()
+    else:
+        radius = shape.size[0]
+        length = 2 * sum(shape.size[1:])
+        segments = segments_of(radius, deviation)
+        # Made with radius 1 and scaled: trimesh drops triangles smaller than 1e-8 m^2.
+        if shape.kind == "cylinder":
+            mesh = creation.revolve(_CYLINDER, sections=segments, process=False)
+            mesh.vertices *= (radius, radius, length)
+        else:
+            count = ((segments + 1) // 2, segments)
+            mesh = creation.capsule(length / max(radius, 1e-9), 1.0, count=count)
+            mesh.vertices *= radius
+    mesh.vertices = rotate(matrix_of(shape.wxyz), np.asarray(mesh.vertices)) + shape.position
+    return mesh
+
+
+def _default_colour(link: str) -> Rgba:
+    # The same in every run, unlike hash().
+    return _PALETTE[zlib.crc32(link.encode()) % len(_PALETTE)]

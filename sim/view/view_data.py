@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.digest import digest
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.robot.reading import content
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.rollout import Rollout, RunInfo
 from batchpid.sim.runner.runner import Runner
@@ -81,7 +80,7 @@ class LiveSimulation:
         """
         joints = slice(None) if joint is None else joint
         self.setpoint[:, joints] = position
-        self.setpoint = self.robot.coupled(self.setpoint)
+        self.setpoint = self.robot.coupling.positions(self.setpoint)
 
     def randomize_setpoints(self) -> None:
         """Draw a setpoint for each env, within the joint limits and 1 rad (or m) of the start
@@ -204,23 +203,16 @@ def recorded_robot(rollout: Rollout) -> Robot:
     # Another robot may have the name of a bundled one.
     if info.robot in Robot.bundled():
         bundled = Robot.load(info.robot, fixed_base=info.fixed_base)
-        if info.digest in (None, bundled.digest):
+        if info.digest in (None, content(bundled)):
             return bundled
     if info.urdf is None:
         problem = f"{info.robot!r} is not bundled, and the recording holds no description of it"
         remedy = "name its URDF or MJCF file"
         raise InvalidArgumentError("robot", problem, remedy=remedy)
-    path = Path(_folder().name, f"{digest(info.urdf)[:32]}.urdf")
-    path.write_text(info.urdf, encoding="utf-8")
-    return Robot.load(path, fixed_base=info.fixed_base)
-
-
-@cache
-def _folder() -> TemporaryDirectory[str]:
-    """Return the folder of recorded robots, whose files are read again when they are drawn; it is
-    removed at the end of the process.
-    """
-    return TemporaryDirectory(prefix="batchpid-")
+    with TemporaryDirectory(prefix="batchpid-") as folder:
+        path = Path(folder, "robot.urdf")
+        path.write_text(info.urdf, encoding="utf-8")
+        return Robot.load(path, fixed_base=info.fixed_base)
 
 
 def rows_at(rollout: Rollout, seconds: NDArray[np.float64]) -> NDArray[np.int64]:

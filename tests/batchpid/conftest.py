@@ -6,6 +6,9 @@ import jax
 import pytest
 from law_cases import OPTIONS, Inputs, made_up_inputs
 
+# Before JAX begins: tests of programs on several devices.
+jax.config.update("jax_num_cpu_devices", 4)
+
 
 @pytest.fixture(autouse=True)
 def strict() -> Any:

@@ -1,11 +1,21 @@
-"""Cases that the tests of the law share: every option, array libraries, a made-up run."""
+"""Cases that the tests of the law share: every option, a made-up run, and its efforts."""
 
 import math
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
+from c_programs import RESET, efforts_in_c
+
+import batchpid as bp
+from batchpid.export import to_c
+from batchpid.law import advance_with_mass_matrix
 
 JOINTS, ENVS, DT = 3, 4, 0.01
+UNITS = ("effort", "mass_matrix", "implicit")
+"""Kinds of law of generated_options."""
 
 GAINS = {"kp": [40.0, 20.0, 0.5], "ki": [5.0, 50.0, 0.0], "kd": [2.0, 0.3, 0.02]}
 LIMITED = GAINS | {"effort_limit": [30.0, 8.0, 1.0]}
@@ -73,36 +83,35 @@ NUMBERS = {
     "integral_max": (math.inf, 4.0),
 }
 """Options that are numbers: the value that is off, and one that has an effect."""
-NAMES = {
-    "non_finite": ("propagate", "zero", "hold"),
-}
 
 
-def generated_options(seed: int, envs: int = ENVS) -> dict[str, Any]:
+def generated_options(
+    seed: int, envs: int = ENVS, joints: int = JOINTS, units: str = "effort"
+) -> dict[str, Any]:
     """Return arguments of make_params of any combination, with an entry for each env and joint,
-    some of them off.
+    some of them off. ``units`` are the gain_units; "implicit" is the law of that name.
     """
-    rng, shape = np.random.default_rng(seed), (envs, JOINTS)
+    rng, shape = np.random.default_rng(seed), (envs, joints)
     options: dict[str, Any] = {"kp": rng.uniform(0.5, 40, shape)}
     for name, (off, on) in NUMBERS.items():
         if rng.random() < 0.6:
             options[name] = np.where(
                 rng.random(shape) < 0.3, off, on * rng.uniform(0.1, 1.0, shape)
             )
-    strategies = [
-        "none",
-        "conditional",
-        "back_calculation",
-        *(["clamp"] if "effort_max" in options else []),
-    ]
+    strategies = ["none", "conditional"]
+    if np.isfinite(options.get("effort_max", np.inf)).any():
+        strategies.append("clamp")
+    if units == "effort":
+        options["non_finite"] = rng.choice(["propagate", "zero", "hold"]).item()
+        strategies.append("back_calculation")
     options["anti_windup"] = rng.choice(strategies, shape).tolist()
-    options["tracking_time"] = (
-        rng.uniform(0.001, 0.3, shape)
-        if "back_calculation" in np.ravel(options["anti_windup"])
-        else None
-    )
+    if "back_calculation" in np.ravel(options["anti_windup"]):
+        options["tracking_time"] = rng.uniform(0.001, 0.3, shape)
     options["continuous"] = rng.random(shape) < 0.5
-    return options | {name: rng.choice(names).item() for name, names in NAMES.items()}
+    if units == "implicit":
+        options.pop("derivative_filter_time", None)
+        options["discretization"] = "implicit"
+    return options | {"gain_units": "effort" if units == "effort" else "mass_matrix"}
 
 
 def read_only(value: Any, dtype: Any = np.float64) -> Any:
@@ -119,18 +128,87 @@ class Inputs(NamedTuple):
     measurement_rate: Any = None
     setpoint_rate: Any = None
     feedforward: Any = None
+    setpoint_acceleration: Any = None
+    """For gains per mass matrix alone."""
+    mass_matrix: Any = None
+    """(steps, envs, joints, joints), for gains per mass matrix."""
+
+    def given(self, *names: str) -> Any:
+        """Return these inputs with the optional ones of ``names`` alone."""
+        return Inputs(*self[:2], **{name: getattr(self, name) for name in names})
+
+    def at(self, step: int, array: Callable[..., Any] = np.asarray) -> dict[str, Any]:
+        """Return the given inputs of a step, by name."""
+        return {
+            name: array(rows[step]) for name, rows in self._asdict().items() if rows is not None
+        }
 
 
-def made_up_inputs(envs: int = ENVS) -> Inputs:
-    """Thirty steps that saturate, wrap and reverse; float32 numbers, so that every executor gets
-    the same.
+def made_up_inputs(envs: int = ENVS, joints: int = JOINTS, count: int = 30) -> Inputs:
+    """Return ``count`` steps that saturate, wrap and reverse; float32 numbers, so that every executor gets the
+    same.
     """
     rng = np.random.default_rng(7)
-    steps = np.arange(30)[:, None, None]
-    phase = rng.uniform(0, 6, (1, envs, JOINTS))
+    steps = np.arange(count)[:, None, None]
+    phase = rng.uniform(0, 6, (1, envs, joints))
     measurement = 3 * np.sin(0.15 * steps + phase) + 0.3 * steps
+    measurement[..., 0] = (measurement[..., 0] + np.pi) % (2 * np.pi) - np.pi
     setpoint = np.where(steps < 12, 1.0, -2.0) * np.cos(phase) + 0.01 * steps
-    noise = [rng.normal(size=measurement.shape) for _ in range(3)]
-    return Inputs(
-        *(np.asarray(x, np.float32).astype(float) for x in (setpoint, measurement, *noise))
-    )
+    noise = [scale * rng.normal(size=measurement.shape) for scale in (1, 1, 5, 1)]
+    root = rng.normal(size=(count, envs, joints, joints))
+    matrix = 0.1 * (root @ root.mT + np.eye(joints))
+    arrays = setpoint, measurement, *noise, matrix
+    return Inputs(*(np.asarray(each, np.float32).astype(float) for each in arrays))
+
+
+def advanced(params: bp.PIDParams, state: bp.PIDState, row: dict[str, Any]) -> tuple[Any, Any]:
+    """Return state and effort of the pure functions after a step with the inputs ``row``."""
+    if "mass_matrix" not in row:
+        return bp.step(params, state, dt=DT, **row)
+    state, terms = advance_with_mass_matrix(bp.discretise(params, DT), state, **row)
+    return state, terms.effort
+
+
+def by_steps(
+    params: bp.PIDParams,
+    inputs: Inputs,
+    step: Callable[..., Any] = advanced,
+    array: Callable[..., Any] = read_only,
+) -> np.ndarray:
+    """Return the efforts (steps, envs, joints) of ``step``; ``array`` makes its arrays, by default
+    read-only ones.
+    """
+    own = [array(leaf, params.dtype) if isinstance(leaf, np.ndarray) else leaf for leaf in params]
+    params = bp.PIDParams(*own)
+    state, efforts = bp.init(params, array(inputs.measurement[0], params.dtype)), []
+    for at in range(len(inputs.setpoint)):
+        row = inputs.at(at, lambda rows: array(rows, params.dtype))
+        if at == RESET:
+            mask = np.ones(len(row["measurement"]), bool)
+            state = bp.reset(params, state, row["measurement"], mask, keep_integral=True)
+        state, effort = step(params, state, row)
+        assert effort.dtype == params.dtype
+        efforts.append(np.asarray(effort, float))
+    return np.array(efforts)
+
+
+def by_c(
+    params: bp.PIDParams,
+    inputs: Inputs,
+    *flags: str,
+    compiler: str | None = None,
+    guard: bp.Guard | None = None,
+) -> np.ndarray:
+    """Return the efforts (steps, 1, joints) of the header for the first env."""
+    params = params.for_envs(slice(1))
+    columns = {
+        name: rows[:, 0].astype(params.dtype)
+        for name, rows in inputs._asdict().items()
+        if rows is not None
+    }
+    names = [name for name in columns if name not in ("setpoint", "measurement", "mass_matrix")]
+    with TemporaryDirectory() as folder:
+        header = to_c(params, DT, inputs=names, guard=guard, prefix="arm").text
+        options = {"prefix": "arm", "compiler": compiler}
+        found = efforts_in_c(Path(folder), params, header, columns, *flags, **options)
+    return found[:, None].astype(float)

@@ -11,6 +11,10 @@ from typing import Any
 from batchpid import PIDParams
 
 
+def within(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
 @dataclass
 class ScalarPID:
     """One PID loop of one joint; the options are as in :func:`batchpid.make_params`, each a number
@@ -33,79 +37,134 @@ class ScalarPID:
     tracking_time: float = math.inf
     continuous: bool = False
     non_finite: str = "propagate"
+    discretization: str = "explicit"
 
-    def start(self, measurement: float) -> None:
+    def start(self, measurement: float, integral: float = 0.0) -> None:
         """Forget the past; the next step is the first after this measurement."""
-        self.integral = min(max(0.0, self.integral_min), self.integral_max)
-        self.measurement = measurement
-        self.derivative = 0.0
+        self.integral = within(integral, self.integral_min, self.integral_max)
+        self.measurement = self.origin = measurement
+        self.derivative = self.effort = self.size = 0.0
         self.setpoint: float | None = None
-        self.effort = self.size = 0.0
-        self.origin = measurement
 
-    def step(
+    def step(self, setpoint: float, measurement: float, dt: float, **optional: float) -> float:
+        """Return the effort after ``dt`` more seconds."""
+        if self.non_finite != "propagate" and not all(
+            map(math.isfinite, (setpoint, measurement, *optional.values()))
+        ):
+            return self.effort if self.non_finite == "hold" else 0.0
+        total = self.total(setpoint, measurement, dt, **optional)
+        change = self.effort_rate_limit * dt
+        effort = within(total, self.effort - change, self.effort + change)
+        effort = within(effort, self.effort_min, self.effort_max)
+        if self.anti_windup == "back_calculation":
+            share = dt / self.tracking_time if self.tracking_time > 0 else 1.0
+            self.integral += min(share, 1.0) * (effort - total)
+        self.settle(effort, (total - effort) * self.error > 0)
+        return effort
+
+    def total(
         self,
         setpoint: float,
         measurement: float,
         dt: float,
         measurement_rate: float | None = None,
         setpoint_rate: float | None = None,
-        feedforward: float | None = None,
+        feedforward: float = 0.0,
     ) -> float:
-        """Return the effort after ``dt`` more seconds."""
-        inputs = [setpoint, measurement, measurement_rate, setpoint_rate, feedforward]
-        if self.non_finite != "propagate" and not all(
-            math.isfinite(x) for x in inputs if x is not None
-        ):
-            return self.effort if self.non_finite == "hold" else 0.0
-
+        """Return the sum of the terms, without the limits of the effort."""
         error = self.difference(setpoint, measurement)
-        if abs(error) <= self.deadband:
-            error = 0.0
-        else:
-            error -= math.copysign(self.deadband, error)
-
+        self.error = error = math.copysign(max(abs(error) - self.deadband, 0.0), error)
         moved = self.difference(measurement, self.measurement)
-        self.origin += (measurement - self.measurement) - moved
-        weight = self.setpoint_weight
-        proportional = self.kp * (weight * error - (1 - weight) * (measurement - self.origin))
-        self.origin += dt * (setpoint_rate or 0.0)
-
-        rate = -(moved / dt) if measurement_rate is None else -measurement_rate
+        velocity = moved / dt if measurement_rate is None else measurement_rate
+        weight = self.setpoint_weight_derivative
         if setpoint_rate is not None:
-            weight = (
-                1.0 if self.setpoint_weight_derivative is None else self.setpoint_weight_derivative
-            )
-            rate += weight * setpoint_rate
-        elif self.setpoint_weight_derivative is not None and self.setpoint is not None:
-            rate += self.setpoint_weight_derivative * self.difference(setpoint, self.setpoint) / dt
-        time = self.derivative_filter_time
-        self.derivative = (time * self.derivative + dt * rate) / (time + dt)
+            wanted = (1.0 if weight is None else weight) * setpoint_rate
+        elif weight is not None and self.setpoint is not None:
+            wanted = weight * self.difference(setpoint, self.setpoint) / dt
+        else:
+            wanted = 0.0
+        self.origin += (measurement - self.measurement) - moved
+        late = dt * (setpoint_rate or 0.0)
+        self.before, self.per_step = self.integral, 1.0
+        if self.discretization == "explicit":
+            weighted = self.weighted(error, measurement)
+            time = self.derivative_filter_time
+            self.derivative = (time * self.derivative + dt * (wanted - velocity)) / (time + dt)
+            terms = [self.kp * weighted, self.kd * self.derivative]
+            self.integral += self.ki * error * dt
+        self.origin += late
+        if self.discretization == "implicit":
 
-        before = self.integral
-        self.integral += self.ki * error * dt
-        terms = proportional, before, self.kd * self.derivative, feedforward or 0.0
+            def law(acceleration: float) -> float:
+                """Return the terms at the end of the step, but for the integral so far."""
+                ahead = dt * (velocity + dt * acceleration)
+                weighted = self.weighted(error - ahead, measurement + ahead)
+                on_errors = self.ki * dt * (error - late + error - ahead)
+                return self.kp * weighted + self.kd * (wanted - ahead / dt) + on_errors
+
+            # A linear equation: law(a) = a.
+            self.per_step = 1 / (1 + law(0.0) - law(1.0))
+            terms = [law(0.0) * self.per_step]
+            self.integral += self.ki * dt * (error - late) * self.per_step
+        terms += [self.before, feedforward]
         self.size = sum(map(abs, terms))
-        self.unsaturated = proportional + before + self.kd * self.derivative + (feedforward or 0.0)
-        change = self.effort_rate_limit * dt
-        effort = min(max(self.unsaturated, self.effort - change), self.effort + change)
-        effort = min(max(effort, self.effort_min), self.effort_max)
-        self.saturated = effort != self.unsaturated
+        self.measurement, self.setpoint = measurement, setpoint
+        return sum(terms)
 
-        if self.anti_windup == "conditional" and (self.unsaturated - effort) * error > 0:
-            self.integral = before
-        if self.anti_windup == "back_calculation":
-            self.integral += min(
-                dt / self.tracking_time if self.tracking_time > 0 else 1.0, 1.0
-            ) * (effort - self.unsaturated)
-        self.integral = min(max(self.integral, self.integral_min), self.integral_max)
+    def weighted(self, error: float, measurement: float) -> float:
+        """Return the error with the weight of the setpoint."""
+        weight = self.setpoint_weight
+        return weight * error - (1 - weight) * (measurement - self.origin)
 
-        self.measurement, self.setpoint, self.effort = measurement, setpoint, effort
-        return effort
+    def settle(self, effort: float, deeper: bool) -> None:
+        """Finish a step that has given ``effort``; ``deeper`` says whether the integral would
+        saturate it more.
+        """
+        if self.anti_windup == "conditional" and deeper:
+            self.integral = self.before
+        self.integral = within(self.integral, self.integral_min, self.integral_max)
+        self.effort = effort
 
     def difference(self, a: float, b: float) -> float:
         """Return a - b, the short way round on a continuous joint."""
         return math.remainder(a - b, 2 * math.pi) if self.continuous else a - b
+
+
+def step_of_robot(pids: list[ScalarPID], dt: float, mass_matrix: Any, inputs: Any) -> list[float]:
+    """Return the efforts of the joints of one robot whose gains are per mass matrix; ``inputs``
+    are numbers by name, for each joint.
+    """
+    added = [row.pop("feedforward", 0.0) for row in inputs]
+    extra = [row.pop("setpoint_acceleration", 0.0) for row in inputs]
+    accelerations = [
+        pid.total(dt=dt, **row) + pid.per_step * more
+        for pid, row, more in zip(pids, inputs, extra, strict=True)
+    ]
+    demand = mass_matrix @ accelerations
+    # The largest share of the demand that every joint has room for, beside what is added.
+    share = 1.0
+    for pid, wanted, more in zip(pids, demand, added, strict=True):
+        room = pid.effort_max - more if wanted > 0 else more - pid.effort_min
+        if 0 < room < abs(wanted):
+            share = min(share, room / abs(wanted))
+    # And the largest share of the change that no joint needs longer than a step for.
+    reached = [
+        within(share * wanted + more, pid.effort_min, pid.effort_max)
+        for pid, wanted, more in zip(pids, demand, added, strict=True)
+    ]
+    changes = [goal - pid.effort for pid, goal in zip(pids, reached, strict=True)]
+    part = 1.0
+    for pid, change in zip(pids, changes, strict=True):
+        if abs(change) > pid.effort_rate_limit * dt:
+            part = min(part, pid.effort_rate_limit * dt / abs(change))
+    efforts = []
+    for pid, acceleration, change, goal in zip(pids, accelerations, changes, reached, strict=True):
+        effort = within(pid.effort + part * change, pid.effort_min, pid.effort_max)
+        moved = within(pid.integral, pid.integral_min, pid.integral_max) - pid.before
+        is_short = share < 1 and acceleration * moved > 0
+        pid.settle(effort, is_short or (part < 1 and (goal - effort) * moved > 0))
+        efforts.append(effort)
+    return efforts
 
 
 def scalar_pids(params: PIDParams, num_envs: int) -> list[list[ScalarPID]]:
@@ -116,11 +175,9 @@ def scalar_pids(params: PIDParams, num_envs: int) -> list[list[ScalarPID]]:
     options = {name: value for name, value in params.options().items() if name in known}
 
     def pick(value: Any, env: int, joint: int) -> Any:
-        return (
-            value
-            if isinstance(value, str)
-            else value.tolist()[env if value.shape[0] > 1 else 0][joint]
-        )
+        if isinstance(value, str):
+            return value
+        return value.tolist()[env if value.shape[0] > 1 else 0][joint]
 
     return [
         [

@@ -31,27 +31,6 @@ def run_motor(chosen, efforts, qpos=0.0, qvel=0.0, before=0.0):
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=15)
-def test_the_envelope_is_that_of_isaac_lab(seed):
-    """The formula of its DCMotor with its clip of the speed, stated again."""
-    rng = np.random.default_rng(seed)
-    stall, speed, limit = (10.0 ** rng.uniform(-1, 2, 50) for _ in range(3))
-    effort, v = 3 * stall * rng.normal(size=50), 2 * speed * rng.normal(size=50)
-    chosen = bp.make_actuators(50, saturation_effort=stall, no_load_speed=speed, effort_limit=limit)
-    ours = run_motor(chosen, effort[None], qvel=v)[0, 0]
-
-    corner = speed * (1 + limit / stall)
-    u = np.clip(v, -corner, corner)
-    high, low = (
-        np.minimum(stall * (1 - u / speed), limit),
-        np.maximum(stall * (-1 - u / speed), -limit),
-    )
-    np.testing.assert_allclose(
-        ours, np.clip(effort, low, high), rtol=1e-12, atol=1e-12 * stall.max()
-    )
-
-
-@given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=50)
 def test_the_command_limits_are_where_the_motor_clips(seed):
     """Clipped to them a command has the same effect, and within them it has all of its effect,
@@ -87,15 +66,6 @@ def test_the_command_limits_are_where_the_motor_clips(seed):
     works = static.strength[0] > 0 if static.strength is not None else np.ones(joints, bool)
     free = clipped * options.get("strength", 1.0) + options.get("bias", 0.0)
     np.testing.assert_allclose(delivered[0, 0, works], free[0, works], rtol=1e-10, atol=1e-10)
-
-
-def test_without_an_envelope_no_command_is_clipped():
-    chosen, q = (
-        bp.make_actuators(2, strength=0.5, bias=1.0, lag=0.1, command_delay=0.1),
-        np.zeros((3, 2)),
-    )
-    k = actuators.discretise(chosen, actuators.init(chosen, q, DT), DT)
-    assert actuators.command_limits(k, q) == (None, None)
 
 
 def test_noise_has_the_moments_of_a_normal_distribution():

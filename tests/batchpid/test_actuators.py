@@ -51,8 +51,3 @@ def test_a_longer_delay_in_flight_keeps_the_history():
     for step in range(7, 12):
         state, effort = bp.motors.deliver(long, state, q + step, q, q, DT)
     assert effort == 7.0
-
-
-def test_a_time_step_far_shorter_than_the_delay_is_refused():
-    with pytest.raises(InvalidArgumentError, match="needs 1000002 samples"):
-        bp.motors.init(bp.make_actuators(1, command_delay=1.0), np.zeros((1, 1)), 1e-6)

@@ -115,19 +115,3 @@ def test_repr_shows_the_laws():
         repr(Coupling.of(2, [Follower(1, 0, -0.5, 0.1)]))
         == "Coupling(2 joints: q1 = -0.5 q0 + 0.1)"
     )
-
-
-@settings(max_examples=25)
-@given(couplings())
-def test_arrays_of_a_coupling_that_robots_share_are_read_only(case):
-    coupling = case[0]
-    for name in (
-        "leader",
-        "multiplier",
-        "offset",
-        "independent",
-        "matrix",
-        "jacobian",
-        "followers",
-    ):
-        assert not getattr(coupling, name).flags.writeable

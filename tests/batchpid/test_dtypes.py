@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from law_cases import DT, ENVS, JOINTS, generated_options
+from law_cases import DT, ENVS, JOINTS, UNITS, advanced, generated_options, made_up_inputs
 from trees import tree_of
 
 import batchpid as bp
 import batchpid.task_space as ts
-from batchpid.law import advance_with_mass_matrix, convert_integral
+from batchpid.law import convert_integral
 from batchpid.motors import guard as guards
 
 OTHERS = (np.longdouble, np.float32, np.float16, np.int32)
@@ -23,62 +23,56 @@ def dtypes(*trees):
     return {str(leaf.dtype) for leaf in flat if leaf is not None and leaf.dtype.kind == "f"}
 
 
-def run_of(xp, dtype, options, own):
+def run_of(xp, dtype, seed, own):
     """Return all states and results of the law, a guard and motors, on inputs of ``dtype`` under
     params of ``own``.
     """
-    rows = np.random.default_rng(0).normal(size=(4, ENVS, JOINTS)) * 3
-    r, y, v, u = (xp.asarray(row.astype(dtype)) for row in rows)
-    params = bp.make_params(JOINTS, **options, dtype=own)
+    units = UNITS[seed % 3]
+    params = bp.make_params(JOINTS, **generated_options(seed, units=units), dtype=own)
+    names = "measurement_rate", "setpoint_rate", "feedforward"
+    more = () if units == "effort" else ("setpoint_acceleration", "mass_matrix")
+    inputs = made_up_inputs().given(*names, *more)
+    row = inputs.at(9, lambda rows: xp.asarray(rows.astype(dtype)))
+    y, v, u = (row[name] for name in ("measurement", "measurement_rate", "feedforward"))
     state = bp.init(params, y)
     yield state
-    yield from bp.step(params, state, r, y, DT)
-    stepped, terms = bp.step_terms(
-        params, state, r, y, DT, measurement_rate=v, setpoint_rate=v, feedforward=u
-    )
-    yield from (stepped, terms)
-    yield bp.reset(params, stepped, y, xp.asarray(np.arange(ENVS) > 1))
-    advanced, terms = bp.advance(bp.discretise(params, DT), state, r, y, v, v, u)
-    yield from (advanced, terms.effort)
-    if params.ki is not None:
-        yield bp.track(params, state, r, y, u)
-    matrix = xp.asarray(np.tile(np.eye(JOINTS), (ENVS, 1, 1)).astype(dtype))
-    accelerations = bp.make_params(
-        JOINTS, 4.0, 2.0, 1.0, gain_units="mass_matrix", effort_limit=1.0, dtype=own
-    )
-    law = bp.discretise(accelerations.replace(effort_rate_limit=9.0), DT)
-    started = bp.init(accelerations.replace(effort_rate_limit=9.0), y)
-    yield from (x for x in advance_with_mass_matrix(law, started, r, y, matrix, v, v, v, u)[:1])
-    yield convert_integral(
-        started, accelerations, accelerations.replace(gain_units="effort"), matrix
-    )
+    yield from advanced(params, state, row)
+    yield bp.reset(params, state, y, xp.asarray(np.arange(ENVS) > 1))
+    if units == "effort":
+        yield from bp.step_terms(params, state, dt=DT, **row)
+        if params.ki is not None:
+            yield bp.track(params, state, row["setpoint"], y, u)
+    else:
+        yield convert_integral(
+            state, params.replace(ki=1.0), PLAIN.replace(dtype=own), row["mass_matrix"]
+        )
     drive = bp.make_params(JOINTS, 4.0, 2.0, 1.0, dtype=own)
-    yield from bp.drive_target(drive, bp.init(drive, y), r, y, DT)
+    yield from bp.drive_target(drive, bp.init(drive, y), row["setpoint"], y, DT)
     limits = bp.make_guard(JOINTS, rate=1.0, acceleration=5.0, dtype=own)
     yield (guarded := guards.init(limits, y))
-    yield guards.advance(limits, guarded, r, DT)[0]
-    motors = bp.make_actuators(
-        JOINTS, command_delay=0.02, sensor_delay=0.01, lag=0.1, backlash=0.1, dtype=own
-    )
+    yield guards.advance(limits, guarded, row["setpoint"], DT)[0]
+    motors = bp.make_actuators(JOINTS, **MOTORS, dtype=own)
     yield (moved := bp.motors.init(motors, y, DT, qvel=v, effort=u))
     yield from bp.motors.deliver(motors, moved, u, y, v, DT)
     yield from bp.motors.measure(motors, moved, y, v, DT)
 
 
+PLAIN = bp.make_params(JOINTS, 1.0)
+MOTORS = {"command_delay": 0.02, "sensor_delay": 0.01, "lag": 0.1, "backlash": 0.1}
+
+
 @given(st.integers(0, 2**31), st.sampled_from(OTHERS), st.sampled_from([np.float64, np.float32]))
-@settings(max_examples=20)
+@settings(max_examples=30)
 def test_numpy(seed, dtype, own):
-    for result in run_of(np, dtype, generated_options(seed), own):
+    for result in run_of(np, dtype, seed, own):
         assert dtypes(result) <= {np.dtype(own).name}
 
 
 @pytest.mark.parametrize(("seed", "dtype"), [(0, np.float32), (1, np.int32)])
 def test_jax(seed, dtype, x64):
     jax = pytest.importorskip("jax")
-    options = generated_options(seed)
     # traced, which compiles nothing
-    results = jax.eval_shape(lambda: [*run_of(jax.numpy, dtype, options, np.float64)])
-    for result in results:
+    for result in jax.eval_shape(lambda: [*run_of(jax.numpy, dtype, seed, np.float64)]):
         assert dtypes(result) <= {"float64"}
 
 

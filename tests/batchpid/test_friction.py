@@ -104,24 +104,6 @@ def test_it_takes_its_share_of_the_velocity_that_a_joint_would_have_without_a_ch
         q += DT * v
 
 
-def test_a_static_friction_holds_until_the_joint_yields_and_again_after_it_has_stopped():
-    model = Friction(np.ones((1, 1)), np.zeros((1, 1)), np.full((1, 1), 2.0))
-    levels, steps = (1.9, 2.1, 1.5, 0.0, 1.9), (100, 100, 100, 300, 100)
-    velocity, total = simulate(
-        np.full((1, 1, 1), 0.01), model, np.repeat(levels, steps)[:, None, None]
-    )
-    held, let_go, slides, stops, held_again = np.split(velocity[:, 0, 0], np.cumsum(steps)[:-1])
-    assert (held == 0).all()
-    assert let_go[-1] > 0
-    np.testing.assert_allclose(
-        np.diff(slides), DT * (1.5 - 1.0) / 0.01, rtol=1e-9
-    )  # the friction of motion
-    assert stops[-1] < slides[-1]
-    assert abs(stops[-1]) < 1e-9
-    assert np.abs(held_again).max() < 1e-9
-    np.testing.assert_allclose(total[-1], 0.0, atol=1e-9)
-
-
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=40, deadline=None)
 def test_compensation_never_exceeds_the_friction_it_works_against(seed):

@@ -96,12 +96,3 @@ def test_a_setpoint_within_the_limits_passes_unchanged_once_it_has_been_reached(
         assert missed.max(initial=0) < steps - 1
         # Two steps have the setpoint's position and rate: it is not missed again behind them.
         assert (np.diff(missed) <= 2).all()
-
-
-def test_what_is_allowed_passes_unchanged():
-    path = 0.5 * np.sin(0.5 * DT * np.arange(1000))[:, None]
-    limits = bp.make_guard(1, lower=-1.0, upper=1.0, rate=1.0, acceleration=100.0)
-    setpoint, _, changed = run(limits, path)
-    np.testing.assert_array_equal(setpoint[:, 0], path)
-    assert not changed.any()
-    assert run(bp.make_guard(1), 9 * path)[2].sum() == 0

@@ -1,27 +1,27 @@
 """Every executor of the law agrees with a scalar controller (scalar_pid.py), for params of any
-combination of options.
-
-Native programs and exported C: test_compiled_law.py and test_c_header.py.
+combination of options: NumPy, JAX, BatchPID on both and by its native extension, and exported C.
+Native code and C are bit-identical to NumPy.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 from unittest import mock
 
 import jax
 import numpy as np
 import pytest
-from law_cases import DT, JOINTS, Inputs, generated_options, made_up_inputs, read_only
+from c_programs import COMPILERS, RESET
+from law_cases import DT, JOINTS, UNITS, advanced, by_c, by_steps, generated_options, made_up_inputs
 from quick_jit import quick_jit
-from scalar_pid import scalar_pids
+from scalar_pid import scalar_pids, step_of_robot
 
 import batchpid as bp
 
-RATES = ("measurement_rate", "setpoint_rate", "feedforward")
 GIVEN = [
     (),
-    RATES,
+    ("measurement_rate", "setpoint_rate", "feedforward"),
     ("measurement_rate",),
     ("setpoint_rate",),
     ("measurement_rate", "setpoint_rate"),
@@ -29,41 +29,20 @@ GIVEN = [
 ]
 
 
-def by_steps(params, inputs, step=bp.step, array=read_only):
-    """Return the efforts (steps, envs, joints) of ``step``; ``array`` makes its arrays, by default
-    read-only ones.
-    """
-    params = bp.PIDParams(
-        *(array(x, params.dtype) if isinstance(x, np.ndarray) else x for x in params)
-    )
-    rows = [
-        [None if x is None else array(x[t], params.dtype) for x in inputs]
-        for t in range(len(inputs.setpoint))
-    ]
-    state, efforts = bp.init(params, rows[0][1]), []
-    for setpoint, measurement, *rates in rows:
-        state, effort = step(
-            params, state, setpoint, measurement, DT, **dict(zip(RATES, rates, strict=True))
-        )
-        assert effort.dtype == params.dtype
-        efforts.append(np.asarray(effort, float))
-    return np.array(efforts)
-
-
 def by_jax(params, inputs):
-    return by_steps(params, inputs, quick_jit(bp.step, static_argnames="dt"), jax.numpy.asarray)
+    return by_steps(params, inputs, quick_jit(advanced), jax.numpy.asarray)
 
 
 def by_controller(params, inputs, backend="numpy"):
     pid = bp.BatchPID(params, inputs.setpoint.shape[1], DT, backend)
-    rows = zip(
-        *(x if x is not None else [None] * len(inputs.setpoint) for x in inputs), strict=True
-    )
-    efforts = np.array(
-        [pid(*(None if x is None else x.astype(params.dtype) for x in row)) for row in rows]
-    )
-    assert efforts.dtype == params.dtype
-    return efforts.astype(float)
+    efforts = []
+    for at in range(len(inputs.setpoint)):
+        row = inputs.at(at, lambda rows: rows.astype(params.dtype))
+        if at == RESET:
+            pid.reset(row["measurement"], keep_integral=True)
+        efforts.append(pid(**row))
+        assert efforts[-1].dtype == params.dtype
+    return np.array(efforts, float)
 
 
 def by_numpys_controller(params, inputs):
@@ -81,23 +60,34 @@ class Executor(NamedTuple):
     properties.
     """
 
-    run: Any
+    run: Callable[..., np.ndarray]
     dtype: Any = np.float64
-    seeds: int = 12
-    """Number of generated params to test."""
-    bits: bool = False
+    units: tuple[str, ...] = UNITS
+    seeds: int = 6
+    """Number of generated params to test, for each of the units."""
+    bits: bool = True
     """Whether results are bit-identical to NumPy's."""
 
 
+ALONE = UNITS[:1]
 EXECUTORS = {
-    "numpy": Executor(by_steps, seeds=24),
+    "numpy": Executor(by_steps, seeds=12),
     "numpy float32": Executor(by_steps, np.float32),
-    "controller": Executor(by_numpys_controller, bits=True),
-    "jax": Executor(by_jax, seeds=3),
-    "jax float32": Executor(by_jax, np.float32, seeds=3),
-    "jax controller": Executor(by_jaxs_controller, np.float32, seeds=2),
+    "controller": Executor(by_numpys_controller, units=ALONE, seeds=12),
+    "native controller": Executor(by_controller, units=ALONE, seeds=12),
+    "native controller float32": Executor(by_controller, np.float32, ALONE),
+    "c": Executor(by_c, seeds=2),
+    "c float32": Executor(by_c, np.float32, seeds=2),
+    "jax": Executor(by_jax, seeds=2, bits=False),
+    "jax float32": Executor(by_jax, np.float32, seeds=1, bits=False),
+    "jax controller": Executor(by_jaxs_controller, np.float32, ALONE, 2, bits=False),
 }
-CASES = [(name, seed) for name, executor in EXECUTORS.items() for seed in range(executor.seeds)]
+CASES = [
+    (name, units, seed)
+    for name, executor in EXECUTORS.items()
+    for units in executor.units
+    for seed in range(executor.seeds)
+]
 
 
 def oracle(params, inputs):
@@ -105,56 +95,63 @@ def oracle(params, inputs):
     magnitudes of their terms.
     """
     efforts, sizes = np.zeros((2, *inputs.setpoint.shape))
-    for (env, joint), pid in np.ndenumerate(
-        np.array(scalar_pids(params, inputs.setpoint.shape[1]), object)
-    ):
-        pid.start(inputs.measurement[0, env, joint])
-        for t in range(len(efforts)):
-            now = {
-                name: None if (x := getattr(inputs, name)) is None else x[t, env, joint]
-                for name in RATES
-            }
-            setpoint, measurement = (
-                inputs.setpoint[t, env, joint],
-                inputs.measurement[t, env, joint],
-            )
-            efforts[t, env, joint] = pid.step(setpoint, measurement, DT, **now)
-            sizes[t, env, joint] = pid.size
+    for env, pids in enumerate(scalar_pids(params, inputs.setpoint.shape[1])):
+        for at in range(len(efforts)):
+            now = {name: rows[env] for name, rows in inputs.at(at).items()}
+            matrix = now.pop("mass_matrix", None)
+            rows = [
+                {name: row[joint].item() for name, row in now.items()} for joint in range(len(pids))
+            ]
+            if at in (0, RESET):
+                for pid, row in zip(pids, rows, strict=True):
+                    pid.start(row["measurement"], pid.integral if at else 0.0)
+            if matrix is None:
+                efforts[at, env] = [
+                    pid.step(dt=DT, **row) for pid, row in zip(pids, rows, strict=True)
+                ]
+                sizes[at, env] = [pid.size for pid in pids]
+            else:
+                efforts[at, env] = step_of_robot(pids, DT, matrix, rows)
+                demand = [pid.size for pid in pids]
+                sizes[at, env] = np.abs(matrix) @ demand + sum(np.abs(now.get("feedforward", [0])))
     return efforts, sizes
 
 
 def check(executor, params, inputs):
-    efforts, sizes = oracle(params, inputs)
-    found = executor.run(params, inputs)
-    error = np.abs(found - efforts) / (1 + np.maximum.accumulate(sizes, axis=0))
-    assert error.max() < (1e-12 if executor.dtype == np.float64 else 1e-5)
+    found, expected = executor.run(params, inputs), by_steps(params, inputs)
+    envs = found.shape[1]
     if executor.bits:
-        np.testing.assert_array_equal(found, by_steps(params, inputs))
-    return found
+        np.testing.assert_array_equal(found, expected[:, :envs])
+    expected, sizes = oracle(params, inputs)
+    error = np.abs(found - expected[:, :envs])
+    size = 1 + np.maximum.accumulate(sizes, axis=0)[:, :envs]
+    assert (error / size).max() < (1e-12 if executor.dtype == np.float64 else 1e-5)
 
 
-@pytest.mark.parametrize(("name", "seed"), CASES)
-def test_efforts_are_those_of_the_law_on_plain_numbers(name, seed, request):
-    executor = EXECUTORS[name]
-    if executor.run is by_jax and executor.dtype == np.float64:
-        request.getfixturevalue("x64")
-    params = bp.make_params(JOINTS, **generated_options(seed), dtype=executor.dtype)
+def check_generated(executor, units, seed):
+    params = bp.make_params(JOINTS, **generated_options(seed, units=units), dtype=executor.dtype)
     inputs = made_up_inputs()
     if params.non_finite is not None:
         inputs.measurement[5, 1, 0], inputs.setpoint[9, 0] = np.nan, np.inf
-    given = GIVEN[seed % len(GIVEN)]
-    inputs = Inputs(*inputs[:2], **{each: getattr(inputs, each) for each in given})
-    check(executor, params, inputs)
+    more = () if units == "effort" else ("mass_matrix",)
+    if more and executor.run is not by_c:  # it has no input for an acceleration
+        more += ("setpoint_acceleration",)
+    check(executor, params, inputs.given(*GIVEN[seed % len(GIVEN)], *more))
+
+
+@pytest.mark.parametrize(("name", "units", "seed"), CASES)
+def test_efforts_are_those_of_the_law_on_plain_numbers(name, units, seed, request):
+    executor = EXECUTORS[name]
+    if executor.run is by_jax and executor.dtype == np.float64:
+        request.getfixturevalue("x64")
+    if executor.run is by_c and not COMPILERS:
+        pytest.skip("no C compiler")
+    check_generated(executor, units, seed)
 
 
 @pytest.mark.parametrize("given", GIVEN, ids=" ".join)
 def test_efforts_with_each_option_alone_on_any_inputs(options, given, inputs):
-    params = bp.make_params(JOINTS, **options)
-    check(
-        EXECUTORS["numpy"],
-        params,
-        Inputs(*inputs[:2], **{each: getattr(inputs, each) for each in given}),
-    )
+    check(EXECUTORS["numpy"], bp.make_params(JOINTS, **options), inputs.given(*given))
 
 
 def test_terms_add_up_and_say_what_saturates(options, inputs):

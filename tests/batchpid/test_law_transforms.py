@@ -7,7 +7,8 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from law_cases import DT, JOINTS, OPTIONS
+from c_programs import RESET
+from law_cases import DT, JOINTS, OPTIONS, Inputs, by_steps
 from quick_jit import quick_jit
 
 import batchpid as bp
@@ -19,14 +20,8 @@ GRADIENTS = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def _strict():
-    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
-        yield
-
-
-def on_jax(tree, dtype):
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), tree)
+def on_jax(tree):
+    return jax.tree.map(jnp.asarray, tree)
 
 
 def rollout(params, setpoint, measurement):
@@ -38,47 +33,12 @@ def rollout(params, setpoint, measurement):
     return jax.lax.scan(body, bp.init(params, measurement[0]), (setpoint, measurement))[1]
 
 
-def numpy_rollout(params, setpoint, measurement):
-    """Return the efforts of :func:`rollout`, step by step in NumPy."""
-    state, efforts = bp.init(params, measurement[0]), []
-    for r, y in zip(setpoint, measurement, strict=True):
-        state, effort = bp.step(params, state, r, y, DT)
-        efforts.append(effort)
-    return np.array(efforts)
-
-
-def test_scan_vmap_and_grad(inputs, x64):
-    """Scan over time, vmap over the gains, grad with respect to every leaf; gradients of gains are
-    compared below.
-    """
-    numpy_params, tolerance = (
-        bp.make_params(JOINTS, **OPTIONS["mixed per env"]),
-        {"rtol": 1e-12, "atol": 1e-11},
-    )
-    params, run = on_jax(numpy_params, np.float64), (inputs.setpoint, inputs.measurement)
-    r, y = map(jnp.asarray, run)
-
-    @quick_jit
-    def slopes(candidates):
-        def total(candidates):
-            efforts = jax.vmap(rollout, (0, None, None))(candidates, r, y)
-            return jnp.sum(efforts), efforts
-
-        return jax.grad(total, has_aux=True)(candidates)
-
-    gradients, many = slopes(jax.tree.map(lambda leaf: jnp.stack([leaf, 2 * leaf, leaf]), params))
-    np.testing.assert_allclose(many[0], numpy_rollout(numpy_params, *run), **tolerance)
-    np.testing.assert_allclose(many[2], many[0], **tolerance)
-    assert not np.allclose(many[1], many[0])
-    assert jax.tree.structure(gradients) == jax.tree.structure(params)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
-
-
 @pytest.mark.parametrize("transform", ["vmap", "export"])
 def test_functions_of_one_robot(transform, inputs, x64):
     """Arrays (joints,) in, arrays (joints,) out: under vmap, and from a serialized program."""
     params = bp.make_params(JOINTS, kp=40.0, ki=5.0, kd=2.0, effort_limit=9.0, setpoint_weight=0.7)
-    expected = numpy_rollout(params, inputs.setpoint, inputs.measurement)
+    run = Inputs(*(rows[:RESET] for rows in inputs[:2]))
+    expected = by_steps(params, run)
 
     def last_state(setpoint, measurement):
         state = bp.init(params, measurement[0])
@@ -86,27 +46,27 @@ def test_functions_of_one_robot(transform, inputs, x64):
             lambda state, now: bp.step(params, state, *now, DT), state, (setpoint, measurement)
         )
 
+    def kept(state, mask):
+        return bp.reset(params, state, state.origin, mask)
+
+    mask = jnp.zeros(4, bool)
     if transform == "export":
-        one = [jnp.asarray(array[:, 0]) for array in (inputs.setpoint, inputs.measurement)]
+        one = [jnp.asarray(rows[:, 0]) for rows in run[:2]]
         program = jax.export.export(jax.jit(last_state))(*one)
         state, efforts = jax.export.deserialize(program.serialize()).call(*one)
-        expected, reset_shape = expected[:, 0], ()
+        expected, again = expected[:, 0], kept(state, mask[0])
     else:
-        state, efforts = jax.vmap(last_state, 1, (0, 1))(inputs.setpoint, inputs.measurement)
-        reset_shape = (expected.shape[1],)
+        state, efforts = jax.vmap(last_state, 1, (0, 1))(*run[:2])
+        again = jax.vmap(kept)(state, mask)
     np.testing.assert_allclose(efforts, expected, rtol=1e-12, atol=1e-11)
     assert isinstance(state, bp.PIDState)
-    # A reset by a mask () of one robot.
-    mask = jnp.zeros(reset_shape, bool)
-    reset = lambda state, mask: bp.reset(params, state, state.origin, mask)  # noqa: E731
-    kept = jax.vmap(reset)(state, mask) if reset_shape else reset(state, mask)
-    assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), kept, state))
+    assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), again, state))
 
 
 @pytest.mark.parametrize("options", GRADIENTS, indirect=True)
 def test_gradients_equal_finite_differences(options, inputs, x64):
-    """Those of the law in NumPy. Away from saturation: the made-up run is scaled down, so that no
-    limit is near.
+    """Gradients through a scan are those of the law in NumPy. Away from saturation: the made-up run
+    is scaled down, so that no limit is near.
     """
     options.pop("effort_rate_limit", None)
     params = bp.make_params(JOINTS, **options)
@@ -116,44 +76,47 @@ def test_gradients_equal_finite_differences(options, inputs, x64):
         )
     if params.deadband is not None:
         params = params._replace(deadband=1e-3 * params.deadband)
-    run, weights = [x * 1e-3 for x in (inputs.setpoint, inputs.measurement)], inputs.feedforward
-    gains = {name: getattr(params, name) for name in GAINS if getattr(params, name) is not None}
+    run = Inputs(*(1e-3 * rows[:RESET] for rows in inputs[:2]))
+    weights = inputs.feedforward[:RESET]
 
     @quick_jit
     @jax.grad
-    def gradient_of(gains):
-        return jnp.sum(
-            weights * rollout(on_jax(params, np.float64)._replace(**gains), *map(jnp.asarray, run))
-        )
+    def gradient_of(params):
+        return jnp.sum(weights * rollout(params, *map(jnp.asarray, run[:2])))
 
-    gradient, h, rng = gradient_of(on_jax(gains, np.float64)), 1e-4, np.random.default_rng(0)
-    for name, value in gains.items():
+    gradient = gradient_of(on_jax(params))
+    assert jax.tree.structure(gradient) == jax.tree.structure(params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    h, rng = 1e-4, np.random.default_rng(0)
+    for name in GAINS:
+        if (value := getattr(params, name)) is None:
+            continue
         shift = rng.normal(size=value.shape)
         up, down = (
-            np.sum(weights * numpy_rollout(params._replace(**{name: value + s * h * shift}), *run))
+            np.sum(weights * by_steps(params._replace(**{name: value + s * h * shift}), run))
             for s in (1, -1)
         )
-        slope = np.sum(gradient[name] * shift)
+        slope = np.sum(getattr(gradient, name) * shift)
         np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-6, atol=1e-9)
         assert slope != 0
 
 
-@pytest.mark.parametrize("zero", ["derivative_filter_time", "tracking_time"])
-def test_gradients_survive_times_of_zero(zero, inputs, x64):
-    times = {"derivative_filter_time": [0.0, 0.0, 0.1], "tracking_time": [0.0, 0.0, 0.1]}
-    strategy = {"anti_windup": "back_calculation"} if zero == "tracking_time" else {}
-    params = on_jax(
-        bp.make_params(JOINTS, 40, 5, 2, effort_limit=1.0, **{zero: times[zero]}, **strategy),
-        np.float64,
-    )
-    r, y = jnp.asarray(inputs.setpoint), jnp.asarray(inputs.measurement)
-    gradients = quick_jit(jax.grad(lambda params: jnp.sum(rollout(params, r, y))))(params)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+TIMES = [0.0, 0.0, 0.1]
 
 
-def test_gradients_survive_non_finite_inputs(inputs, x64):
-    params = on_jax(bp.make_params(JOINTS, 40.0, 5.0, 2.0, non_finite="zero"), np.float64)
-    r, y = jnp.asarray(inputs.setpoint), jnp.asarray(inputs.measurement).at[3, 0, 0].set(jnp.nan)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"derivative_filter_time": TIMES},
+        {"tracking_time": TIMES, "anti_windup": "back_calculation"},
+        {"non_finite": "zero"},
+    ],
+)
+def test_gradients_survive_times_of_zero_and_non_finite_inputs(options, inputs, x64):
+    params = on_jax(bp.make_params(JOINTS, 40, 5, 2, effort_limit=1.0, **options))
+    r, y = map(jnp.asarray, inputs[:2])
+    if params.non_finite is not None:
+        y = y.at[3, 0, 0].set(jnp.nan)
     gradients = quick_jit(jax.grad(lambda params: jnp.sum(rollout(params, r, y))))(params)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 

@@ -6,6 +6,8 @@ Executors are NumPy on read-only arrays, JAX, and native programs, which are bit
 
 from __future__ import annotations
 
+import re
+
 import jax
 import numpy as np
 import pytest
@@ -16,8 +18,7 @@ from scalar_motors import ScalarFriction, ScalarGuard, ScalarMotor, friction_gai
 import batchpid as bp
 from batchpid import motors
 from batchpid.motors import friction, guard
-from batchpid.native.array_program import ArrayProgram
-from batchpid.native.availability import obstacle
+from batchpid.native.array_program import ArrayProgram, obstacle
 from batchpid.native.tracing import trace
 
 DT, STEPS, ENVS, JOINTS = 1 / 500, 40, 5, 3
@@ -255,3 +256,64 @@ def test_signals_are_those_of_plain_numbers(case, name, seed, request):
     np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=tolerance)
     if name == "programs":
         np.testing.assert_array_equal(found, signals(by_numpy(made, dtype)))
+
+
+@pytest.mark.parametrize("form", ["one robot under vmap", "rows"])
+def test_robots_do_not_need_each_other(form, x64):
+    """Arrays (joints,) in and out under vmap, or (envs, joints): the same numbers, and devices that
+    share the envs do not communicate.
+    """
+    rng, envs = np.random.default_rng(0), 8
+    options, limits, rubs = (
+        {name: on * rng.uniform(0.2, 1.0, JOINTS) for name, (_, on) in ranges.items()}
+        for ranges in (MOTORS, GUARD, FRICTION)
+    )
+    actuators = bp.make_actuators(
+        JOINTS, **options, continuous=[True, False, True], velocity_noise=0.01
+    )
+    limits = bp.make_guard(JOINTS, **limits)
+    shape = (JOINTS,) if "vmap" in form else (1, JOINTS)
+    rubs = {name: row.reshape(shape) for name, row in rubs.items()}
+    rubs = friction.Friction(coulomb=rng.uniform(0.2, 2.0, shape), **rubs)
+
+    def start(env, qpos):
+        rest = 0 * qpos
+        masses = np.broadcast_to(np.eye(JOINTS), (*qpos.shape, JOINTS))
+        return (
+            guard.init(limits, qpos),
+            motors.init(actuators, qpos, DT, envs=env, samples=9),
+            friction.init(rubs, rest, rest, masses, DT),
+        )
+
+    def step(state, now):
+        guards, motor, rubbing = state
+        asked, qpos, qvel = now
+        guards, _ = guard.advance(limits, guards, asked, DT)
+        motor, *seen = motors.measure(actuators, motor, qpos, qvel, DT)
+        motor, effort = motors.deliver(actuators, motor, guards.setpoint, qpos, qvel, DT)
+        rubbing, total = friction.advance(rubs, rubbing, effort, qvel)
+        return (guards, motor, rubbing), (*seen, effort, total)
+
+    def rollout(env, qpos, inputs):
+        return jax.lax.scan(step, start(env, qpos), inputs)[1]
+
+    inputs = rng.normal(0, 2.0, (STEPS, 3, envs, JOINTS))
+    qpos = rng.normal(size=(envs, JOINTS))
+    state, expected = start(np.arange(envs), qpos), []
+    for row in inputs:
+        state, seen = step(state, row)
+        expected.append(seen)
+
+    program = rollout if form == "rows" else jax.vmap(rollout, (0, 0, 2), 1)
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), "envs")
+    assert mesh.size == 4
+    places = [jax.sharding.PartitionSpec(*[None] * at, "envs") for at in (0, 0, 2)]
+    arrays = [
+        jax.device_put(array, jax.sharding.NamedSharding(mesh, place))
+        for array, place in zip((np.arange(envs), qpos, inputs), places, strict=True)
+    ]
+    compiled = jax.jit(program).lower(*arrays).compile()
+    for ours, theirs in zip(compiled(*arrays), zip(*expected, strict=True), strict=True):
+        np.testing.assert_allclose(ours, np.array(theirs), rtol=1e-9, atol=1e-9)
+        assert len(ours.sharding.device_set) == 4
+    assert not re.search("all-|collective", compiled.as_text())

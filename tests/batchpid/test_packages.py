@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from batchpid.io.packages import imported, uninterrupted
+from batchpid.io.files import imported, uninterrupted
 
 SWALLOWS = """
 import os, signal

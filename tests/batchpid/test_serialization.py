@@ -118,16 +118,15 @@ def test_a_save_that_is_refused_changes_no_file(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".yaml", ".json"])
 def test_about_survives_and_does_not_affect_the_params(tmp_path, suffix):
-    params = bp.make_params(2, [1.0, 2.0], 0.5, gain_units="mass_matrix")
+    units = {"gain_units": "mass_matrix", "discretization": "implicit"}
+    params = bp.make_params(2, [1.0, 2.0], 0.5, **units)
     about = {"seed": 3, "versions": {"numpy": "2"}, "moves": ["a", "b"], "measurement_rate": True}
     with_about, without = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
     bp.save_params(with_about, params, ["x", "y"], about)
     bp.save_params(without, params, ["x", "y"])
     assert bp.load_about(with_about) == about
     assert bp.load_about(without) == {}
-    loaded = [bp.load_params(path)[0] for path in (with_about, without)]
-    assert loaded[0].gain_units == loaded[1].gain_units == params.gain_units
-    assert (loaded[0].kp == params.kp).all()
+    assert all(same(bp.load_params(path)[0], params) for path in (with_about, without))
 
 
 @pytest.mark.parametrize(
@@ -162,16 +161,6 @@ def test_files_that_cannot_be_opened_are_named(tmp_path):
             bp.load_params(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("format: batchpid-params-2\njoints: {a: {kp: 1.0}}", r"batchpid-params-2; this one reads"),
-        (
-            "format: batchpid-params-1\nintegration: output_first\njoints: {a: {kp: 1.0}}",
-            r"What changed: integration: the effort is computed before",
-        ),
-    ],
-)
-def test_a_file_of_another_version_is_refused_with_what_changed(text, problem):
-    with pytest.raises(bp.InvalidArgumentError, match=problem):
-        bp.loads_params(text)
+def test_a_file_of_another_version_is_refused():
+    with pytest.raises(bp.InvalidArgumentError, match=r"batchpid-params-2; this one reads"):
+        bp.loads_params("format: batchpid-params-2\njoints: {a: {kp: 1.0}}")

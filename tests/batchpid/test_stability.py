@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampled_loop import spectral_radius
 
 import batchpid as bp
-from batchpid import spectral_radius, stability_bound
+from batchpid import stability_bound
 
 DT = 1 / 2000
 

@@ -163,12 +163,11 @@ def test_a_late_sensor_shows_a_law_the_state_from_which_it_starts():
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_a_delay_of_whole_steps_is_one_but_for_rounding(dtype):
     """Written in seconds it is no whole number of steps in binary; a longer one is interpolated."""
-    history = np.zeros((1, 64, 1), dtype)
     for steps in range(40):
         seconds = np.full((1, 1), round(steps * DT, 7), dtype)
-        k = delay.discretise(seconds, dtype(DT), history)
-        assert (k.index.ravel().tolist(), k.fraction) == ([steps], None)
+        k = delay.discretise(seconds, dtype(DT), 64)
+        assert (k.whole.ravel().tolist(), k.fraction) == ([steps], None)
         assert delay.samples_of(seconds, DT) == steps + 2
-        k = delay.discretise(seconds + dtype(1e-4 * DT), dtype(DT), history)
-        assert k.index[0, 0, 0] == steps
+        k = delay.discretise(seconds + dtype(1e-4 * DT), dtype(DT), 64)
+        assert k.whole[0, 0] == steps
         assert k.fraction[0, 0] == pytest.approx(1e-4, rel=0.2)

@@ -95,6 +95,7 @@ def test_choices_of_the_law(name):
 
 
 AXIS = [True] + [False] * 5
+LATE = bp.make_params(2, 1.0, 1.0, gain_units="mass_matrix", discretization="implicit")
 COMBINATIONS = {
     bp.make_params: [
         {"kp": None},
@@ -117,8 +118,19 @@ COMBINATIONS = {
         {"saturation_effort": ..., "no_load_speed": 10.0},
         {"stribeck": 0.1, "coulomb": 0.2},
     ],
+    motors.init: [
+        {
+            "max_delay": ...,
+            "actuators": bp.make_actuators(2, lag=1.0, command_delay=1.0),
+            "dt": 1e-6,
+        }
+    ],
     motors.dumps_actuators: [{"actuators": ..., "record": {}}],
     bp.make_guard: [{"lower": 1.0, "upper": 0.0}],
+    bp.make_plan: [
+        {"fade": 1.0, "blend": "newest"},
+        *({"taper": 0.1}, {"latest": [3]}, {"acceleration": 0.0}, {"period": 0.0}, {"horizon": 0}),
+    ],
     ts.make_osc_params: [
         {"stiffness": [1.0, 2.0]},
         {"damping_ratio": math.nan},
@@ -135,6 +147,10 @@ COMBINATIONS = {
         {"limit_margin": -0.1},
         {"limit_stiffness": [10.0, 20.0]},
         *({name: "other"} for name in osc_params.TASK_CHOICES),
+    ],
+    bp.track: [
+        {"ki": ..., "params": bp.make_params(2, 1.0)},
+        {"dt": None, "params": LATE._replace(gain_units=None)},
     ],
     bp.drive_target: [
         {"state": 3},

@@ -75,28 +75,3 @@ def planar(
         inertia=inertia,
         gravity=gravity,
     )
-
-
-def serial() -> RigidTree:
-    """Return an arm of six joints, yaw, pitch, pitch, roll, pitch, roll, with links of 0.3 m and 2
-    kg along z.
-    """
-    axes = np.array(
-        [[0, 0, 1], [0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1], [0, 0, 1]],
-        float,
-    )
-    mass = np.array([0.0, *[2.0] * 6, 0.0])
-    return RigidTree(
-        links=("base", *(f"link{n}" for n in range(1, 7)), "tip"),
-        parent=np.arange(-1, 7),
-        joint_types=("fixed", *["revolute"] * 6, "fixed"),
-        joint_names=tuple(f"joint{n}" for n in range(1, 7)),
-        position=np.array([[0, 0, 0.0], *[[0, 0, 0.3]] * 6, [0, 0, 0.1]]),
-        wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (8, 1)),
-        axis=axes,
-        mass=mass,
-        center=np.outer(mass > 0, [0, 0, 0.15]),
-        inertia=np.where(mass > 0, 1.0, 0.0)[:, None, None] * np.diag([0.02, 0.02, 0.01]),
-        lower=-3.0,
-        upper=3.0,
-    )

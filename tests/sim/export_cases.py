@@ -83,22 +83,3 @@ def values(params, name):
     if isinstance(leaf, tuple):
         return [1.0] * 3
     return [NEUTRAL.get(name, 0.0)] * 3 if leaf is None else leaf[0].astype(float).tolist()
-
-
-def motion(steps=200):
-    """Return setpoint, measurement, their rates and a feedforward (steps, joints)."""
-    t = np.arange(steps)[:, None] * DT
-    w, far = np.array([3.0, 7.0, 11.0]), np.array([1.0, 0.5, 2.0])
-    setpoint, measurement = far * np.sin(w * t) + 0.3, 0.7 * far * np.sin(0.8 * w * t)
-    rates = far * w * np.cos(w * t), 0.56 * far * w * np.cos(0.8 * w * t)
-    return setpoint, measurement, *rates, 0.5 * np.sin(2 * t) * far
-
-
-def run(params, columns):
-    """Return the efforts (steps, joints) of the law."""
-    state, efforts = bp.init(params, columns[1][:1]), []
-    for r, q, v_d, v, ff in zip(*(column[:, None] for column in columns), strict=True):
-        rates = {"setpoint_rate": v_d, "measurement_rate": v, "feedforward": ff}
-        state, effort = bp.step(params, state, r, q, DT, **rates)
-        efforts.append(effort[0])
-    return np.array(efforts)

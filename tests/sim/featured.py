@@ -93,4 +93,5 @@ def robot_with(*features: str, folder: Path | None = None) -> Robot:
 def poses(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Return the joint positions of a start and a goal (dof,)."""
     bent = np.where(robot.continuous, TURNED, [0.2, 0.7, 0.6, 0.9, -0.8, 0.6, 1.1, 0.7, 0.6])
-    return robot.coupled(bent), robot.coupled(bent + 0.3 * np.array([1, 1, -1, 1, 1, -1, 1, 1, -1]))
+    ends = bent, bent + 0.3 * np.array([1, 1, -1, 1, 1, -1, 1, 1, -1])
+    return tuple(map(robot.coupling.positions, ends))

@@ -29,7 +29,7 @@ PAIRS = [
     for pair in itertools.combinations(FEATURES, 2)
     if not joints_of(pair[0]) & joints_of(pair[1])
 ]
-CONTROLS = ["pid", "drive", "osc"]
+CONTROLS = ["pid", "drive", "osc", "effort"]
 REFUSED = {"floating base": {"osc"}}
 """Controls that refuse a feature; all others have to reach their goal."""
 
@@ -38,21 +38,31 @@ def reach(robot: Robot, control: str, engine: str) -> None:
     """Assert that the robot reaches its goal, within a turn of each continuous joint."""
     start, goal = poses(robot)
     options: dict = {"control": control}
+    setpoint, ticks, error = goal, 250, 0.02
     if control == "osc":
         options = {"control": OperationalSpace(robot, "l8", posture=goal)}
-    with_pose = control == "osc"
-    setpoint = ts.link_poses(robot.kinematic_tree(), goal, ["l8"])[0] if with_pose else goal
+        setpoint = ts.link_poses(robot.kinematic_tree(), goal, ["l8"])[0]
+    if control == "effort":
+        # The law is outside of the runner, whose setpoints are its efforts.
+        options["substeps"], ticks, error = 1, 3000, 0.03
+        params = robot.designed("effort").replace(measurement_rate="difference")
+        pid = bp.BatchPID(params, 1, 1 / 2000)
     with Runner(robot, 1, workers=0, engine=engine, ground=False, **options) as runner:
-        runner.reset(start)
-        seen = runner.rollout(np.tile(setpoint, (250, 1)))
+        seen = runner.reset(start)
+        if control == "effort":
+            for _ in range(ticks):
+                seen = runner.step(pid(goal[None], seen.qpos.astype(float)))
+            seen = seen.map(lambda rows: rows[None])
+        else:
+            seen = runner.rollout(np.tile(setpoint, (ticks, 1)))
     assert seen.ok.all()
     last = seen.qpos[-1, 0].astype(float)
-    if with_pose:
+    if control == "osc":
         pose = seen.tool_pose[-1, 0].astype(float)
         np.testing.assert_allclose(pose[:3], setpoint[:3], rtol=0, atol=2e-3)
         assert abs(pose[3:] @ setpoint[3:]) > 1 - 1e-6  # cosine of half the angle
     else:
-        np.testing.assert_allclose(off(robot, last, goal), 0.0, atol=0.02)
+        np.testing.assert_allclose(off(robot, last, goal), 0.0, atol=error)
     followers = robot.coupling.followers
     rates = robot.coupling.rates(seen.qvel[-20:])[..., followers]
     np.testing.assert_allclose(seen.qvel[-20:, :, followers], rates, atol=0.02)
@@ -116,7 +126,7 @@ def test_kinematics_and_dynamics_are_those_of_the_leaders(feature, native, monke
     tree, g, own = robot.kinematic_tree(), robot.coupling.matrix, robot.independent
     free = replace(tree, coupling=None)
     rng = np.random.default_rng(0)
-    qpos = robot.coupled(rng.normal(size=(5, robot.dof)))
+    qpos = robot.coupling.positions(rng.normal(size=(5, robot.dof)))
     qvel, qacc = (robot.coupling.rates(rng.normal(size=(5, robot.dof))) for _ in range(2))
     close = functools.partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
     close(ts.jacobian(tree, qpos, "l8")[..., own], ts.jacobian(free, qpos, "l8") @ g)
@@ -132,8 +142,8 @@ def test_kinematics_and_dynamics_are_those_of_the_leaders(feature, native, monke
     ):
         assert not unused.any()
     goal = ts.link_poses(tree, qpos, ["l8"])[:, 0]
-    found = ts.inverse_kinematics(tree, "l8", goal, robot.coupled(qpos + 0.1))
-    close(found.qpos, robot.coupled(found.qpos))
+    found = ts.inverse_kinematics(tree, "l8", goal, robot.coupling.positions(qpos + 0.1))
+    close(found.qpos, robot.coupling.positions(found.qpos))
     close(ts.link_poses(tree, found.qpos, ["l8"])[:, 0, :3], goal[:, :3], atol=2e-5)
 
 
@@ -149,23 +159,6 @@ def test_every_feature_is_followed_along_a_trajectory(feature, engine):
     assert np.abs(off(robot, seen.qpos[:, 0], move.position)).max() < most
 
 
-@pytest.mark.parametrize(("feature", "engine"), [*in_both_engines(*FEATURES)])
-def test_every_feature_reaches_its_goal_by_efforts(feature, engine):
-    """The law outside of the runner, whose setpoints are its efforts."""
-    robot = robot_with(feature)
-    start, goal = poses(robot)
-    pid = bp.BatchPID(robot.designed("effort").replace(measurement_rate="difference"), 1, 1 / 2000)
-    with Runner(
-        robot, 1, workers=0, engine=engine, ground=False, control="effort", substeps=1
-    ) as runner:
-        seen = runner.reset(start)
-        pid.reset(seen.qpos.astype(float))
-        for _ in range(3000):
-            seen = runner.step(pid(goal[None], seen.qpos.astype(float)))
-    assert seen.ok.all()
-    np.testing.assert_allclose(off(robot, seen.qpos[0], goal), 0.0, atol=0.03)
-
-
 @pytest.mark.parametrize("kind", ["urdf", "xml"])
 @pytest.mark.parametrize("feature", FEATURES)
 def test_every_feature_is_in_an_exported_description(feature, kind, tmp_path):
@@ -179,8 +172,8 @@ def test_every_feature_is_in_an_exported_description(feature, kind, tmp_path):
         robot.fixed_base,
         tuple(robot.continuous),
     )
-    qpos = robot.coupled(np.random.default_rng(0).normal(size=(4, robot.dof)))
-    np.testing.assert_allclose(other.coupled(qpos), qpos, atol=1e-6)
+    qpos = robot.coupling.positions(np.random.default_rng(0).normal(size=(4, robot.dof)))
+    np.testing.assert_allclose(other.coupling.positions(qpos), qpos, atol=1e-6)
     np.testing.assert_allclose(
         other.mass_matrix(qpos), robot.mass_matrix(qpos), rtol=1e-5, atol=1e-6
     )
@@ -198,7 +191,7 @@ def test_every_feature_is_identified_or_refused(feature, tmp_path):
     motors = bp.make_actuators(robot.dof, armature=0.05, coulomb=1.0, viscous=2.0)
     with Runner(robot, 1, workers=0, ground=False, params=params, actuators=motors) as runner:
         runner.reset(start)
-        run = runner.rollout(robot.coupled(start + swing)[:, None])
+        run = runner.rollout(robot.coupling.positions(start + swing)[:, None])
     assert run.ok.all()
     path = write_recording(run, tmp_path / "run.h5")
     try:
@@ -217,7 +210,7 @@ def test_every_feature_is_identified_or_refused(feature, tmp_path):
 def test_every_feature_is_in_the_dynamics_of_the_c_header(feature, tmp_path):
     robot = robot_with(feature)
     n, rng = robot.dof, np.random.default_rng(0)
-    qpos, qvel = robot.coupled(rng.normal(size=(4, n))), rng.normal(size=(4, n))
+    qpos, qvel = robot.coupling.positions(rng.normal(size=(4, n))), rng.normal(size=(4, n))
     try:
         tree = robot.kinematic_tree()
         header = to_c(

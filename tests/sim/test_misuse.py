@@ -24,8 +24,8 @@ PARAMS = ARM.params(kp=20.0, ki=1.0, kd=2.0)
 TABLE = np.random.default_rng(0).uniform(-0.2, 0.2, (4, N, ARM.dof))
 
 
-def make(workers: int = 0, num_envs: int = N) -> Runner:
-    return Runner(ARM, num_envs, params=PARAMS, workers=workers, substeps=5)
+def make(workers: int = 0) -> Runner:
+    return Runner(ARM, N, params=PARAMS, workers=workers, substeps=5)
 
 
 @pytest.fixture(params=[0, 1])
@@ -46,25 +46,6 @@ def on_alarm() -> Any:
     yield on_alarm
     signal.setitimer(signal.ITIMER_REAL, 0)
     signal.signal(signal.SIGALRM, before)
-
-
-# -- send and recv
-
-
-def test_halves_in_turns_are_bit_identical_to_the_whole() -> None:
-    halves = [make(1, N // 2) for _ in range(2)]
-    for half in halves:
-        half.send(half.observe().qpos + 0.1)
-    for _ in range(3):
-        for half in halves:
-            half.send(half.recv().qpos + 0.1)
-    ends = [half.recv() for half in halves]
-    with make() as whole:
-        for _ in range(4):
-            end = whole.step(whole.observe().qpos + 0.1)
-    assert_identical(type(end).join(ends), end)
-    for half in halves:
-        half.close()
 
 
 def test_calls_out_of_order_are_named(runner: Runner) -> None:

@@ -45,7 +45,7 @@ def tokens(header, standard):
 @given(name=names_of_joints)
 @example("a*\\/ int stranger; /\\*")
 @example("a??/")
-@settings(max_examples=60)
+@settings(max_examples=20)
 def test_c_reads_nothing_from_a_name(name):
     params = bp.make_params(1, 1.0)
     for standard in ("c99", "c11"):
@@ -60,7 +60,7 @@ def test_c_reads_nothing_from_a_name(name):
 @example('a,"b;')
 @example("$\\foo$")
 @example("$a$")
-@settings(max_examples=15)
+@settings(max_examples=8)
 def test_files_hold_the_name_and_pictures_show_it(tmp_path_factory, name):
     folder = tmp_path_factory.mktemp("names")
     loaded = robot_with(folder, name)

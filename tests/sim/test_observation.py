@@ -27,16 +27,12 @@ def test_some_envs_keep_their_rows_and_their_params(rollout):
 
 def test_the_tick_does_not_depend_on_the_time_of_the_start(panda):
     with Runner(panda, 1, workers=0, substeps=3) as runner:
-        first = runner.rollout(np.tile(panda.start, (2, 1)))
-        runner.rollout(np.tile(panda.start, (50, 1)))
+        first = runner.rollout(np.tile(panda.start, (20, 1)))
         later = runner.rollout(np.tile(panda.start, (2, 1)))
     assert first.tick == later.tick == 3 / 2000
     assert later.for_ticks(slice(None, None, 2)).tick == 2 * later.tick
-
-
-def test_representations_are_one_line(rollout):
-    for each in (rollout, rollout.info, rollout.for_ticks(slice(0, 0))):
-        assert "\n" not in repr(each)
+    for each in (later, later.info, later.for_ticks(slice(0, 0))):
+        assert len(repr(each).splitlines()) == 1
         assert len(repr(each)) < 100
 
 

@@ -10,7 +10,6 @@ import re
 import sys
 from dataclasses import fields
 from itertools import pairwise
-from pathlib import Path
 from typing import get_type_hints
 
 import numpy as np
@@ -79,26 +78,6 @@ def test_every_option_is_documented_where_it_is_declared():
                 texts[declaration.target.id] = text
     assert texts.keys() == DECLARED.keys()
     assert all(isinstance(text, ast.Expr) for text in texts.values())
-
-
-def test_commands_and_recordings_take_switches_from_their_declaration():
-    """A new switch changes its declaration and the code where it acts, and no other module."""
-    switches = [each.name for each in fields(RunnerKeywords) if isinstance(each.default, bool)]
-    assert "collisions" in switches
-    root = Path(inspect.getfile(RunnerKeywords)).parents[1]
-    texts = {
-        path.name: path.read_text()
-        for folder in ("cli", "recording")
-        for path in (root / folder).glob("*.py")
-    }
-    assert {"rollout.py", "recording_files.py"} <= texts.keys()
-    named = [
-        (path, name)
-        for path, text in texts.items()
-        for name in switches
-        if re.search(rf"\b{name}\b", text)
-    ]
-    assert named == []
 
 
 def test_options_are_plain_values_of_their_documented_type():

@@ -2,8 +2,6 @@
 recordings.
 """
 
-import warnings
-
 import numpy as np
 import pytest
 from identical import assert_identical
@@ -47,23 +45,12 @@ EVERYTHING = Randomization(
 PANDA = load_bundled("panda")
 
 
-def make(robot=PANDA, num_envs=N, **options):
-    return Runner(
-        robot, num_envs, **{"workers": 0, "randomization": EVERYTHING, "substeps": 10, **options}
-    )
+NOISE = np.random.default_rng(1).uniform(-0.3, 0.3, (TICKS, N, PANDA.dof))
+SETPOINTS = np.clip(PANDA.settings.target + NOISE, PANDA.lower, PANDA.upper)
 
 
-def setpoints(robot=PANDA, num_envs=N, ticks=TICKS):
-    noise = np.random.default_rng(1).uniform(-0.3, 0.3, (ticks, N, robot.dof))[:, :num_envs]
-    return np.clip(robot.settings.target + noise, robot.lower, robot.upper)
-
-
-def episodes(runner, num_envs=N):
-    """Return two rollouts, with a reset of every other env in between."""
-    command = setpoints(runner.robot, num_envs)
-    first = runner.rollout(command)
-    runner.reset(mask=np.arange(num_envs) % 2 == 0)
-    return first, runner.rollout(command)
+def make(**options):
+    return Runner(PANDA, N, workers=0, randomization=EVERYTHING, substeps=10, **options)
 
 
 def test_a_reset_draws_for_the_envs_of_its_mask():
@@ -86,32 +73,28 @@ def test_a_reset_draws_for_the_envs_of_its_mask():
 
 
 def test_new_params_are_randomized_and_an_env_keeps_its_draws():
-    runs = []
-    for change in (True, False):
-        with make() as runner:
-            if not change:
-                runner.rollout(setpoints())
-            else:
-                runner.params = runner.params
-                runner.rollout(setpoints())
-            runs.append(runner.rollout(setpoints()))
-            assert runner.params.num_envs == 1
-    assert_identical(*runs)
-    with make() as runner, pytest.raises(InvalidArgumentError, match=r"params\.kd: is off"):
-        runner.params = PANDA.params(kd=None)
+    with make() as runner, make() as other:
+        runner.rollout(SETPOINTS)
+        other.rollout(SETPOINTS)
+        runner.params = runner.params
+        assert_identical(runner.rollout(SETPOINTS), other.rollout(SETPOINTS))
+        assert runner.params.num_envs == 1
+        with pytest.raises(InvalidArgumentError, match=r"params\.kd: is off"):
+            runner.params = PANDA.params(kd=None)
 
 
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 def test_a_fault_that_resets_keeps_the_draws():
-    command = setpoints()
-    with make(on_fault="reset", on_invalid_input="contain") as runner, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        first, draws = runner.rollout(command), runner.draws
-        broken = command[0].copy()
-        broken[2, 0] = np.nan
+    broken = SETPOINTS[0].copy()
+    broken[2, 0] = np.nan
+    with make(on_fault="reset", on_invalid_input="contain") as runner:
+        first, draws = runner.rollout(SETPOINTS), runner.draws
         assert not runner.step(broken).ok[2]
         np.testing.assert_array_equal(runner.draws["payload"], draws["payload"])
         runner.reset(mask=np.arange(N) == 2, seed=0)
-        assert_identical(runner.rollout(command).for_envs([2]), first.for_envs([2]), skip=["time"])
+        assert_identical(
+            runner.rollout(SETPOINTS).for_envs([2]), first.for_envs([2]), skip=["time"]
+        )
 
 
 def test_a_recording_holds_the_distributions_and_the_draws(tmp_path):
@@ -119,7 +102,7 @@ def test_a_recording_holds_the_distributions_and_the_draws(tmp_path):
     with make() as runner:
         runner.reset()
         with Recorder(path, runner):
-            runner.rollout(setpoints())
+            runner.rollout(SETPOINTS)
         draws, order = runner.draws, runner.episodes
     info = read_recording(path).info
     assert Randomization.from_dict(info.randomization) == EVERYTHING

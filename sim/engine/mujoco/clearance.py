@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
-from batchpid.sim.engine.native.interface import WIDTH, Clearance
+from batchpid.sim.engine.native.interface import WIDTH, structure
+from batchpid.sim.engine.native_model import aligned
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -37,17 +38,6 @@ _LONGEST = 10.0
 """Largest position of a sliding joint in which bounds of speeds hold [m]."""
 _BEYOND = 0.01
 """Distance beyond the limits of a sliding joint up to which they hold [m]: limits are soft."""
-_ALIGNMENT = 64
-"""Alignment of vectors in memory [bytes]."""
-
-
-def aligned(*shape: int) -> Float64:
-    """Return an array of zeros whose memory begins where a vector may."""
-    size = 8 * int(np.prod(shape))
-    memory = np.zeros(size + _ALIGNMENT, np.uint8)
-    start = -memory.ctypes.data % _ALIGNMENT
-    rows: Float64 = memory[start : start + size].view(np.float64).reshape(shape)
-    return rows
 
 
 @lru_cache(maxsize=8)
@@ -243,7 +233,7 @@ class GroupClearance:
         # Native code has their addresses.
         self._kept = [*models], data
         fields = zip(("flags", "counts", "types_at", "affinities_at"), places() or (), strict=True)
-        self._fields = Clearance(
+        self._fields = structure("Clearance")(
             kinematics=kinematics,
             number=pairs,
             ways=ways,

@@ -16,12 +16,11 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel, Rows
-from batchpid.sim.engine.mujoco.clearance import aligned, touching_pairs
+from batchpid.sim.engine.mujoco.clearance import touching_pairs
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
-from batchpid.sim.engine.native.interface import CONTACT, FARTHEST, WIDTH, FreeMotion
-from batchpid.sim.engine.native_model import NativeModel
+from batchpid.sim.engine.native.interface import FARTHEST, WIDTH, number, structure
+from batchpid.sim.engine.native_model import NativeModel, aligned, table
 
-_NONE, _SOME, _UNKNOWN = range(len(CONTACT))
 _COUNT = 37
 """Number of contacts by which its place in ``mjData`` is found: no other number there is equal."""
 
@@ -45,24 +44,13 @@ def place_of_contacts() -> int | None:
     return start - data._address + 4 * int(places[0]) if len(places) == 1 else None
 
 
-def _table(rows: Rows, size: int) -> Float64:
-    """Return ``rows`` (size | 1, columns) in blocks (blocks, columns, WIDTH)."""
-    blocks = -(-size // WIDTH)
-    out = aligned(blocks, rows.shape[1], WIDTH)
-    padded = np.broadcast_to(rows, (size, rows.shape[1]))[
-        np.minimum(np.arange(blocks * WIDTH), size - 1)
-    ]
-    out[...] = padded.reshape(blocks, WIDTH, -1).swapaxes(1, 2)
-    return out
-
-
 class FreeMotions:
     """States of ``size`` robots of ``robot``, whose rigid bodies are those of ``model``.
 
     Attributes
     ----------
     contact
-        What is known about the contacts of each robot (M,), by number in :data:`CONTACT`.
+        What is known about the contacts of each robot (M,), by number of Contact in free_motion.h.
     time
         Time of each robot (M,) [s].
     ctrl
@@ -79,7 +67,7 @@ class FreeMotions:
         blocks = -(-size // WIDTH)
         limited = scene.jnt_limited[joints] != 0
         ends = np.where(limited, scene.jnt_range[joints].T, [[-np.inf], [np.inf]])
-        self.contact = np.full(size, _UNKNOWN, np.int8)
+        self.contact = np.full(size, number("Contact", "UNKNOWN"), np.int8)
         self.time = np.zeros(size)
         self.ctrl = np.zeros((size, dof))
         self._states = [aligned(blocks, dof, WIDTH) for _ in range(3)]
@@ -94,7 +82,7 @@ class FreeMotions:
         }
         least, most, width, *_ = scene.jnt_solimp[joints[0]]
         time, ratio = scene.jnt_solref[joints[0]]
-        self._structure = FreeMotion(
+        self._structure = structure("FreeMotion")(
             # The reference acceleration of a limit: "Computation" in MuJoCo's documentation.
             stiffness=1 / (most * time * ratio) ** 2,
             rate_gain=2 / (most * time),
@@ -122,12 +110,12 @@ class FreeMotions:
                 "drive_rate_gain": [model.actuator_biasprm[:, 2] for model in kinds],
                 "drive_limit": [model.actuator_forcerange[:, 1] for model in kinds],
             }
-        self._arrays |= {name: _table(np.array(rows), self.size) for name, rows in columns.items()}
+        self._arrays |= {name: table(np.array(rows), self.size) for name, rows in columns.items()}
         # In place, since native code has the address.
         self._structure.model = self._rigid.address
         for name, array in self._arrays.items():
             setattr(self._structure, name, array.ctypes.data)
-        self.contact[...] = _UNKNOWN
+        self.contact[...] = number("Contact", "UNKNOWN")
 
     @property
     def address(self) -> int:
@@ -136,7 +124,8 @@ class FreeMotions:
 
     def forget_contacts(self) -> None:
         """Look for the contacts of robots in contact anew: their ``mujoco.MjData`` have changed."""
-        self.contact[self.contact == _SOME] = _UNKNOWN
+        is_touching = self.contact == number("Contact", "SOME")
+        self.contact[is_touching] = number("Contact", "UNKNOWN")
 
     def read(self) -> tuple[Float64, Float64, Float64]:
         """Return positions, velocities and last accelerations (M, dof)."""
@@ -151,7 +140,7 @@ class FreeMotions:
         numbers = np.arange(self.size)[rows]
         for array, values in zip(self._states, states, strict=True):
             array[numbers // WIDTH, :, numbers % WIDTH] = values
-        self.contact[numbers] = _UNKNOWN
+        self.contact[numbers] = number("Contact", "UNKNOWN")
 
     def load(self, row: int, data: MjData) -> None:
         """Take the state of a robot from its data."""

@@ -33,7 +33,7 @@ from batchpid.sim.engine.mujoco.mujoco_sensors import add_link_sensors
 from batchpid.sim.engine.physics import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.geometry.shapes import add_geom
-from batchpid.sim.robot.parts import CONTACT_FRICTION, Joint, MjcfFile
+from batchpid.sim.robot.tables import CONTACT_FRICTION, Joint, MjcfFile
 from batchpid.task_space.frames import SpatialInertia
 
 FLOATING = 6

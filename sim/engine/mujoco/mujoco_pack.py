@@ -34,8 +34,8 @@ from batchpid.sim.engine.native_model import NativeModel, passive_force
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.parts import CONTACT_FRICTION
+from batchpid.sim.robot.merging import coupling_of
+from batchpid.sim.robot.tables import CONTACT_FRICTION
 from batchpid.task_space.frames import matrix_of, rotate, unrotate
 
 _KEPT_STATE = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)

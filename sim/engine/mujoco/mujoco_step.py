@@ -20,7 +20,7 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
 from batchpid.sim.engine.mujoco.data_pool import DataPool
 from batchpid.sim.engine.mujoco.free_motion import FreeMotions, place_of_contacts
-from batchpid.sim.engine.native.interface import Mujoco
+from batchpid.sim.engine.native.interface import structure
 from batchpid.sim.engine.native_model import NativeStep
 
 FUNCTIONS = {
@@ -127,7 +127,9 @@ class MujocoStep(NativeStep):
         tables["contacts"] = [row._address + (place_of_contacts() or 0) for row in data]
         arrays = arrays | {name: np.array(rows, np.uint64) for name, rows in tables.items()}
         arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64)}
-        robots = Mujoco(**addresses, **{name: array.ctypes.data for name, array in arrays.items()})
+        robots = structure("Mujoco")(
+            **addresses, **{name: array.ctypes.data for name, array in arrays.items()}
+        )
         robots.sensor_size = arrays["sensed"].shape[1]
         robots.base_qpos, robots.base_qvel = robot.base or (0, 0)
         if free is not None:

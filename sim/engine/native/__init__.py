@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from batchpid.native import availability
-from batchpid.native.availability import SWITCH
+from batchpid.native import array_program
+from batchpid.native.array_program import SWITCH
 from batchpid.native.extensions import load
 from batchpid.sim.engine.native.interface import EXTENSIONS
 
@@ -20,7 +20,7 @@ def obstacle() -> str:
     """Return why native code is not used, "" if it is; further reasons are
     :meth:`Engine.native_obstacle`.
     """
-    return availability.obstacle(*EXTENSIONS.values())
+    return array_program.obstacle(*EXTENSIONS.values())
 
 
 def describe_calls(engine: str, obstacle: str) -> str:

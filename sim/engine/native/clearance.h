@@ -20,9 +20,9 @@ namespace batchpid {
 // Kinds of shapes: mjtGeom.
 enum ShapeKind : std::int32_t { PLANE = 0, SPHERE = 2, CAPSULE = 3, CYLINDER = 5, BOX = 6, HULL = 7 };
 
-// Shapes of a robot, and the proofs for the robots of a group. Python fills in the fields (Clearance in interface.py)
+// Shapes of a robot, and the proofs for the robots of a group. Python fills in the fields
 // and owns the memory behind the pointers. A way is a joint, or the displacement or rotation angle of a floating base.
-struct Clearance {
+struct FOR_PYTHON Clearance {
   void (*kinematics)(void const *model, void *data);  // mj_kinematics
   void *const *models;               // (robots,): mjModel, not shared with another group
   double *const *places, *const *turns;  // (robots,): positions (shapes, 3) and rotations (shapes, 9), in mjData

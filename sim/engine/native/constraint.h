@@ -7,8 +7,8 @@
 
 namespace batchpid {
 
-// Python fills in the fields (Constraint in interface.py) and owns what they point to.
-struct Constraint {
+// Python fills in the fields and owns what they point to.
+struct FOR_PYTHON Constraint {
   double *response;                        // (robots, followers, dof): J M^-1
   double *push;                            // (robots, dof, followers): J^T (J M^-1 J^T)^-1
   double *passive;                         // (robots, dof)

@@ -18,9 +18,9 @@ namespace batchpid {
 // What is known about the contacts of a robot at its present state. UNKNOWN: its state was written from outside.
 enum class Contact : char { NONE, SOME, UNKNOWN };
 
-// Robots of a group. Python fills in the fields (FreeMotion in interface.py) and owns the memory behind the pointers.
+// Robots of a group. Python fills in the fields and owns the memory behind the pointers.
 // The state is the truth for every robot, also for one in contact; mjData is working memory.
-struct FreeMotion {
+struct FOR_PYTHON FreeMotion {
   Model const *model;
   Lanes *qpos, *qvel, *acceleration;  // (blocks, dof)
   Lanes *bias;                        // (blocks, dof): gravity, Coriolis and centrifugal forces

@@ -7,6 +7,8 @@
 
 #include "tick.h"
 
+#include "structures.h"
+
 using namespace batchpid;
 
 namespace {
@@ -65,7 +67,7 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
     if (!array.open(PyTuple_GetItem(arguments[2], i), numbers, 0, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) return nullptr;
     bound->outputs.push_back({array.as<void>(), array.itemsize() == 1});
   }
-  if (!tables_fit(program, program.rows, bound->inputs)) return misfit();
+  if (!tables_fit(program, bound->inputs)) return misfit();
   return capsule_of(std::move(bound));
 }
 
@@ -141,6 +143,34 @@ PyObject *update(PyObject *, PyObject *const *arguments, Py_ssize_t) {
                     [&](auto const &at) { update_constraint(*of, rows, at[0], at[1], wanted.as<char>()); });
 }
 
+// Add (structure, field, letter of its type, count, offset, size of the structure) to a list.
+template <class T>
+bool add_field(PyObject *list, char const *structure, char const *path, std::size_t offset, std::size_t size) {
+  using Entry = std::remove_all_extents_t<T>;
+  char letter = 'c';
+  if (std::is_pointer_v<Entry>) {
+    letter = 'P';
+  } else if (std::is_floating_point_v<Entry>) {
+    letter = 'd';
+  } else if (sizeof(Entry) > 1) {
+    letter = sizeof(Entry) == sizeof(std::int64_t) ? 'q' : 'i';
+  }
+  char const *dot = std::strrchr(path, '.');
+  auto const count = static_cast<Py_ssize_t>(sizeof(T) / sizeof(Entry));
+  PyObject *row = Py_BuildValue("(ssCnnn)", structure, dot == nullptr ? path : dot + 1, letter, count,
+                                static_cast<Py_ssize_t>(offset), static_cast<Py_ssize_t>(size));
+  bool const good = row != nullptr && PyList_Append(list, row) == 0;
+  Py_XDECREF(row);
+  return good;
+}
+
+bool add_number(PyObject *numbers, char const *name, long value) {
+  PyObject *number = PyLong_FromLong(value);
+  bool const good = number != nullptr && PyDict_SetItemString(numbers, name, number) == 0;
+  Py_XDECREF(number);
+  return good;
+}
+
 PyMethodDef METHODS[] = {
     {"type_info", type_info, METH_O, nullptr},
     {"sim_step", method(step_group), METH_FASTCALL, nullptr},
@@ -158,4 +188,20 @@ PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "_gateway", nullptr, -1, METHODS, n
 
 }  // namespace
 
-PyMODINIT_FUNC PyInit__gateway() { return batchpid::make_module(MODULE); }
+PyMODINIT_FUNC PyInit__gateway() {
+  PyObject *module = batchpid::make_module(MODULE);
+  PyObject *fields = PyList_New(0), *numbers = PyDict_New();
+  bool good = module != nullptr && fields != nullptr && numbers != nullptr;
+#define FIELD(T, path)                                                                                              \
+  good = good && add_field<decltype(std::declval<T>().path)>(fields, #T, #path, offsetof(T, path), sizeof(T));
+#define NUMBER(T, name) good = good && add_number(numbers, #T "." #name, static_cast<long>(T::name));
+  FOR_ALL
+#undef FIELD
+#undef NUMBER
+  good = good && PyModule_AddObjectRef(module, "fields", fields) == 0;
+  good = good && PyModule_AddObjectRef(module, "numbers", numbers) == 0;
+  Py_XDECREF(fields);
+  Py_XDECREF(numbers);
+  if (!good) Py_CLEAR(module);
+  return module;
+}

@@ -40,8 +40,8 @@ struct Vec3 {
   float x, y, z;
 };
 
-// Exported functions, in the order of SYMBOLS in interface.py.
-struct Functions {
+// Exported functions of SAPIEN.
+struct FOR_PYTHON Functions {
   VectorXf (*get_qpos)(Articulation *);
   VectorXf (*get_qvel)(Articulation *);
   VectorXf (*compute_passive_force)(Articulation *, bool gravity, bool coriolis);

@@ -23,8 +23,8 @@ enum class Base : std::int32_t { FIXED, FREE, HELD };
 // Numbers of a base that is not fixed, in its own axes: gravity, and the rate at which it turns.
 constexpr std::int64_t BASE_SIZE = 6;
 
-// Robots of one kind that may differ in their masses; Python fills in the fields (Model in interface.py).
-struct Model {
+// Robots of one kind that may differ in their masses; Python fills in the fields.
+struct FOR_PYTHON Model {
   std::int32_t const *tree;  // (dof, 2)
   double const *rows;        // (dof, 25); the places of the joints are used
   double const *inertias;    // (robots or 1, dof + 1, 13), of BodyInertia; the last is the base's

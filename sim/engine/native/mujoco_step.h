@@ -23,8 +23,8 @@ using LogHandler = void (*)(LogMessage const *);
 using MujocoStage = void (*)(void const *model, void *data);
 using Clock = double (*)();
 
-// Robots in MuJoCo. Python fills in the fields (Mujoco in interface.py) and owns the memory behind the pointers.
-struct Mujoco {
+// Robots in MuJoCo. Python fills in the fields and owns the memory behind the pointers.
+struct FOR_PYTHON Mujoco {
   MujocoStage step1, step2;                 // mj_step1, mj_step2
   LogHandler (*set_log_handler)(LogHandler);  // mju_setLogHandler
   Clock *clock;                             // mjcb_time

@@ -6,8 +6,8 @@
 
 namespace batchpid {
 
-// Constants of the friction model; Python fills in the fields (Refresh in interface.py).
-struct Refresh {
+// Constants of the friction model; Python fills in the fields.
+struct FOR_PYTHON Refresh {
   Model const *model;
   double const *armature, *coulomb, *viscous, *damping, *stiffness;  // (robots, dof)
   Coupling coupling;

@@ -11,11 +11,11 @@ namespace batchpid {
 // Largest position of a robot that has not failed [rad or m].
 constexpr double FARTHEST = 1e6;
 
-// Reasons for which a loop over sim steps has to stop, as bits: STATUS in interface.py.
+// Reasons for which a loop over sim steps has to stop, as bits.
 enum Status : std::int32_t { NOT_FINITE = 1, TOO_FAST = 2, FAILED = 4, NO_NOISE = 8, SENSE = 16 };
 
-// Group of robots; Python fills in the fields (Group in interface.py) and owns what they point to.
-struct Group {
+// Group of robots; Python fills in the fields and owns what they point to.
+struct FOR_PYTHON Group {
   Functions const *functions;        // of SAPIEN
   Articulation *const *articulations;  // (robots,): in SAPIEN
   System *const *systems;            // (robots,): of each robot
@@ -25,6 +25,7 @@ struct Group {
   Mujoco const *mujoco;              // robots in MuJoCo, or null
   Constraint const *constraint;      // of coupled joints, or null
   Joint *const *joints;              // (robots, dof): in SAPIEN, or null without targets of drives that move
+  FreeMotion const *lanes;           // robots without an engine, or null
   std::int64_t robots, dof;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
   std::int32_t senses;               // whether Python reads sensors after each sim step
@@ -246,9 +247,32 @@ inline bool step_in_mujoco(Group &group, double const *effort, double *qpos, dou
   return good;
 }
 
+// Do a sim step of robots that have no engine. A robot that has diverged rests where it is.
+inline void step_in_lanes(FreeMotion const &lanes, double const *effort, double *qpos, double *qvel) {
+  std::int64_t const dof = lanes.model->dof;
+  FreeRoom &room = FreeRoom::of(dof);
+  for (std::int64_t number = 0; number * WIDTH < lanes.robots; ++number) {
+    std::int64_t const first = number * WIDTH;
+    Lanes all = 1.0;
+    evaluate(lanes, number, room);
+    advance_freely(lanes, number, Efforts{effort, first, lanes.robots}, room, all);
+    for (std::int64_t at = number * dof, j = 0; j < dof; ++j, ++at) {
+      Lanes const near = below_mask(absolute(lanes.qpos[at]), FARTHEST);  // 0 for NaN
+      lanes.qpos[at] = where_positive(near, lanes.qpos[at], FARTHEST);
+      lanes.qvel[at] = where_positive(near, lanes.qvel[at], 0.0);
+      scatter(lanes.qpos[at], qpos, dof, j, first, lanes.robots);
+      scatter(lanes.qvel[at], qvel, dof, j, first, lanes.robots);
+    }
+  }
+}
+
 // Do one sim step in the engine of the group; rows beyond its robots repeat the first one. Return the status.
 inline std::int32_t try_sim_step(Group &group, std::int64_t rows, double const *effort, double *qpos, double *qvel,
                                  double *passive) {
+  if (group.lanes != nullptr) {
+    step_in_lanes(*group.lanes, effort, qpos, qvel);
+    return 0;
+  }
   auto const in_sapien = [&] { step_in_sapien(group, effort, qpos, qvel, passive); };
   bool const good = group.mujoco != nullptr ? step_in_mujoco(group, effort, qpos, qvel, passive)
                                             : succeeds(group.message, in_sapien);

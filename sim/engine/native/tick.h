@@ -1,7 +1,7 @@
 // Ticks of a group of robots in one call, as long as nothing happens that Python has to handle.
 //
-// The stages of a sim step come from Python, in the order of sim/loop/control_step.py. Those that are functions of arrays
-// are Programs, traced from there; their state is in the arrays that they read and write. The others are here.
+// The stages of a sim step come from Python in their order (batchpid/stages). Those that are functions of arrays are
+// Programs, traced from there; their state is in the arrays that they read and write. The others are here.
 
 #pragma once
 
@@ -17,8 +17,8 @@ enum class StageKind : std::int32_t {
   PROGRAM, FORCE, INERTIA, MASS_MATRIX, CONTROLLER, TARGETS, CONSTRAINT, ENGINE
 };
 
-// Stage of a sim step: Stage in interface.py.
-struct Stage {
+// Stage of a sim step.
+struct FOR_PYTHON Stage {
   StageKind kind;
   std::int32_t program;   // number of a PROGRAM
   std::int32_t noise[2];  // its inputs that are noise of the sensors, or -1
@@ -27,8 +27,8 @@ struct Stage {
 
 enum class TransferKind : std::int32_t { READ, WRITE_FLOATS, WRITE_BYTES };
 
-// Copy between a row, which is the same in every tick, and a table with an entry for each tick: Transfer in interface.py.
-struct Transfer {
+// Copy between a row, which is the same in every tick, and a table with an entry for each tick.
+struct FOR_PYTHON Transfer {
   char *table;          // double to READ, float to WRITE_FLOATS
   char *row;            // double, except to WRITE_BYTES
   std::int64_t stride;  // of the table's ticks [bytes]; 0: each tick overwrites the one before
@@ -38,12 +38,12 @@ struct Transfer {
 };
 
 // Place in ticks: a tick, and the sim steps of it that are done.
-struct Place {
+struct FOR_PYTHON Place {
   std::int64_t tick, step;
 };
 
-// Arrays (robots, dof) of double, which Python owns: Tick in interface.py.
-struct Tick {
+// Arrays (robots, dof) of double, which Python owns.
+struct FOR_PYTHON Tick {
   Stage const *stages;
   Transfer const *transfers;      // of commands and observations
   double *qpos, *qvel, *passive;  // reading, before and after each sim step

@@ -22,12 +22,13 @@ from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.geometry.mesh_files import mesh_bytes
 from batchpid.sim.geometry.shapes import Shape, hull, mesh_file
-from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
-from batchpid.sim.robot.simulated_links import body_tree
-from batchpid.sim.robot.tables import Body, Tables
+from batchpid.sim.robot.merging import body_tree
+from batchpid.sim.robot.tables import CONTACT_FRICTION, Body, Tables
 from batchpid.task_space.frames import SpatialInertia, from_rpy, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 
+SAPIEN_DISSIPATION = 0.05
+"""SAPIEN 3's default of the friction of joints, and of the damping of links [1/s]."""
 FASTEST = 1000.0
 """Largest speed of links and joints [m/s or rad/s]. PhysX's defaults stop links at 10 m/s and 50
 rad/s, and joints at 100 rad/s. Without a limit, a robot that starts deep in a contact diverges.
@@ -222,17 +223,17 @@ def build_scene(
             scene.add_ground(0.0, render=False)
     _set_words(spec, robot)
     robot.set_sleep_threshold(0.0)
-    dissipation = DISSIPATION[spec.dissipation]
+    dissipation = SAPIEN_DISSIPATION if spec.dissipation == "sapien" else 0.0
     for link in robot.links:
-        link.set_linear_damping(dissipation.link_damping)
-        link.set_angular_damping(dissipation.link_damping)
+        link.set_linear_damping(dissipation)
+        link.set_angular_damping(dissipation)
         link.max_linear_velocity = link.max_angular_velocity = FASTEST
     for built, joint in zip(robot.active_joints, spec.joints, strict=True):
         if joint.mimic is not None and not joint.continuous:
             built.set_limits([[joint.lower, joint.upper]])  # the URDF's may keep it from following
-        built.set_friction(dissipation.joint_friction)
+        built.set_friction(dissipation)
         built.max_velocity = FASTEST
-        if dissipation.modelled:
+        if spec.dissipation == "urdf":
             # SAPIEN implements the URDF's damping as a drive, with an error that depends on the
             # solver; this is exact, with the effort of batchpid.motors.friction.
             built.set_drive_properties(0.0, 0.0)

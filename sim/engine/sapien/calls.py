@@ -20,7 +20,7 @@ from sapien.physx import PhysxArticulation, PhysxCpuSystem
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import SWITCH, extension
-from batchpid.sim.engine.native.interface import STATUS, SYMBOLS
+from batchpid.sim.engine.native.interface import number, structure
 from batchpid.sim.engine.native_model import NativeStep
 
 TESTED = ("3.0.3",)
@@ -30,6 +30,18 @@ The gateway repeats the layout of three types of SAPIEN (gateway.h). No header p
 names of the functions do not contain the type that they return: a version that changes it would
 corrupt memory.
 """
+SYMBOLS = {
+    "get_qpos": "_ZN6sapien5physx17PhysxArticulation7getQposEv",
+    "get_qvel": "_ZN6sapien5physx17PhysxArticulation7getQvelEv",
+    "compute_passive_force": "_ZN6sapien5physx17PhysxArticulation19computePassiveForceEbb",
+    "set_qf": "_ZN6sapien5physx17PhysxArticulation5setQfERKN5Eigen6MatrixIfLin1ELi1ELi0ELin1ELi1EEE",
+    "step": "_ZN6sapien5physx14PhysxSystemCpu4stepEv",
+    "set_drive_position": "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetPositionEf",
+    "set_drive_velocity": "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetVelocityEf",
+    "get_root_pose": "_ZN6sapien5physx17PhysxArticulation11getRootPoseEv",
+    "get_root_angular_velocity": "_ZN6sapien5physx17PhysxArticulation22getRootAngularVelocityEv",
+}
+"""Functions of SAPIEN, by their names in Functions of gateway.h."""
 
 
 def obstacle() -> str:
@@ -46,8 +58,10 @@ def obstacle() -> str:
 
 
 @cache
-def functions() -> tuple[int, ...]:
-    """Return the addresses of the exported functions; AttributeError names one that is missing."""
+def functions() -> Any:
+    """Return Functions of gateway.h with the exported functions; AttributeError names one that is
+    missing.
+    """
     folder = Path(sapien.__file__).parent
     paths = [
         path
@@ -57,12 +71,13 @@ def functions() -> tuple[int, ...]:
     if len(paths) != 1:
         raise OSError("libsapien.so is missing, or there is more than one")
     library = ctypes.CDLL(str(paths[0]))
-    return tuple(
-        ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value or 0 for symbol in SYMBOLS
-    )
+    addresses = {
+        name: ctypes.cast(getattr(library, symbol), ctypes.c_void_p)
+        for name, symbol in SYMBOLS.items()
+    }
+    return structure("Functions")(**addresses)
 
 
-_SENSE = 1 << STATUS.index("sense")
 _ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
 _capsule_name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(
     ("PyCapsule_GetName", ctypes.pythonapi)
@@ -112,7 +127,7 @@ class SapienStep(NativeStep):
         calls.
     fields
         Parts of the passive force that is read, and address of the constraint: see
-        :class:`batchpid.sim.engine.native.interface.Group`.
+        Group of sim_step.h.
     """
 
     def __init__(
@@ -128,7 +143,7 @@ class SapienStep(NativeStep):
     ) -> None:
         self._stepped = stepped
         self._sense = sense
-        pointers = {"functions": np.array(functions(), np.uint64)}
+        pointers = {}
         for name, kind, objects in (
             ("articulations", "robot", robots),
             ("systems", "system", systems),
@@ -138,7 +153,9 @@ class SapienStep(NativeStep):
                 pointers[name] = np.array([pointer(item, kind) for item in objects], np.uint64)
         size, dof = arrays["qf"].shape
         senses = sense is not None
-        super().__init__(size, dof, {**arrays, **pointers}, speed_limit, senses=senses, **fields)
+        address = ctypes.addressof(functions())
+        arrays = {**arrays, **pointers}
+        super().__init__(size, dof, arrays, speed_limit, senses=senses, functions=address, **fields)
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension that does a sim
@@ -149,7 +166,7 @@ class SapienStep(NativeStep):
 
     def may_have_failed(self, status: int) -> bool:
         # A call also returns to Python for the sensors; that is not a failure.
-        failed = super().may_have_failed(status & ~_SENSE)
+        failed = super().may_have_failed(status & ~number("Status", "SENSE"))
         if self._sense is not None:
             self._sense()
         return failed

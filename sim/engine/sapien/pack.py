@@ -40,7 +40,7 @@ from batchpid.sim.engine.sapien.limits import refusals, shortfalls
 from batchpid.sim.engine.sapien.sapien_sensors import SapienLinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.merging import coupling_of
 from batchpid.task_space.frames import matrix_of, unrotate
 from batchpid.task_space.rigid_tree import RigidTree
 

@@ -21,18 +21,19 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjModel
-from batchpid.sim.findings import Finding, Notes
-from batchpid.sim.geometry.inertia import possible_inertia
-from batchpid.sim.geometry.shapes import Shape, ShapeKind
-from batchpid.sim.robot.mjcf.model import RobotInFile, can_collide, label, unique
-from batchpid.sim.robot.mjcf.motors import Couplings, Motors
-from batchpid.sim.robot.parts import DisabledPair, Joint, Mimic
+from batchpid.sim.geometry.shapes import Shape, ShapeKind, possible_inertia
+from batchpid.sim.robot.mjcf.model import RobotInFile, can_collide, label
+from batchpid.sim.robot.mjcf.motors import Couplings, JointMotors
 from batchpid.sim.robot.tables import (
     NO_TURN,
     ORIGIN,
     Body,
+    DisabledPair,
+    Joint,
+    Mimic,
     Tables,
     breadth_first,
+    unique,
     without_mass,
 )
 from batchpid.task_space.frames import about, compose, matrix_of, rotate
@@ -49,21 +50,14 @@ _PARALLELS, _MERIDIANS = 12, 16
 
 
 class TableReader:
-    """Reader of the tables of ``robot`` in ``model``.
+    """Reader of the tables of ``robot``.
 
     ``solid`` is the row of each body that has shapes, by the body's number.
     """
 
-    def __init__(
-        self,
-        model: MjModel,
-        robot: RobotInFile,
-        notes: Notes,
-        motors: Motors,
-    ) -> None:
-        self._model = model
+    def __init__(self, robot: RobotInFile, motors: JointMotors) -> None:
+        self._model = robot.model
         self._robot = robot
-        self._notes = notes
         self._motors = motors
         self._anchors = {0: ORIGIN}  # origin of each body's row, in the frame of the body
         self._bodies: list[Body] = []
@@ -153,8 +147,7 @@ class TableReader:
             text = "its servo in the file limits position or rate of the setpoint"
             remedy = "pass guard=True to a runner for these limits"
             detail = f"{soft_lower:g} to {soft_upper:g}, {rate:g}/s"
-            finding = Finding("limits", text, remedy, name, detail=detail)
-            self._notes.repairs.append(finding)
+            self._robot.repair("limits", text, remedy, name, detail=detail)
         return Joint(
             name,
             kind,
@@ -192,9 +185,7 @@ class TableReader:
             if repair is not None:
                 text, detail = repair
                 remedy = "correct <inertia>"
-                self._notes.repairs.append(
-                    Finding("inertia", text, remedy, link=row.name, detail=detail)
-                )
+                self._robot.repair("inertia", text, remedy, link=row.name, detail=detail)
             axes = model.body_iquat[body].copy()
             row = row._replace(mass=mass, center=center, inertia=inertia, inertia_wxyz=axes)
         self._bodies.append(row)
@@ -239,7 +230,7 @@ class TableReader:
                 absent.append(f"{kind} {label(model.geom(geom))}")
         if absent:
             text = f"without planes, height fields and shapes of the world: {', '.join(absent)}"
-            self._notes.lose(text)
+            self._robot.lose(text)
 
 
 def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair, ...]:

@@ -19,7 +19,8 @@ import numpy as np
 from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
-from batchpid.sim.findings import Finding, Notes
+from batchpid.sim.findings import Finding
+from batchpid.sim.robot.tables import unique
 
 PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 _PREFIXES = (
@@ -180,28 +181,21 @@ def can_collide(model: MjModel, geom: int) -> bool:
     return bool(model.geom_contype[geom] | model.geom_conaffinity[geom]) or paired
 
 
-def unique(name: str, names: set[str]) -> str:
-    """Return ``name``, with a number if it is one of ``names``, and add it to them."""
-    new = name
-    number = 2
-    while new in names:
-        new = f"{name}_{number}"
-        number += 1
-    names.add(new)
-    return new
-
-
 class RobotInFile:
     """Robot of a compiled file: names of its parts, by their numbers in the model.
 
     ``bodies`` has all bodies of the file, ``joints`` the hinges and slides of the robot, ``base``
     is the body of the root, 0 for the world. ``link_names`` and ``joint_names`` are all names in
-    use.
+    use. ``repairs`` are findings of what is simulated otherwise than the file says, ``losses`` of
+    what is lost where MuJoCo does not simulate the file itself.
 
     Raises RobotError for a ball joint, and for several robots.
     """
 
-    def __init__(self, model: MjModel, path: Path, notes: Notes) -> None:
+    def __init__(self, model: MjModel, path: Path, repairs: list[Finding]) -> None:
+        self.model = model
+        self.repairs = repairs
+        self.losses: list[Finding] = []
         names = [model.body(body).name for body in range(1, model.nbody)]
         self.link_names = {"world", *names}
         self.joint_names = {model.joint(joint).name for joint in range(model.njnt)}
@@ -215,7 +209,7 @@ class RobotInFile:
             for joint in range(model.njnt)
             if int(model.jnt_type[joint]) not in (_FREE, _BALL)
         }
-        self.base = self._find_base(model, joints, path, notes)
+        self.base = self._find_base(joints, path)
         self.joints = {
             joint: name
             for joint, name in joints.items()
@@ -226,14 +220,26 @@ class RobotInFile:
         """Return whether a body, or the world, is of the robot."""
         return int(self._roots[body]) not in self._left_out
 
-    def _find_base(
+    def repair(
         self,
-        model: MjModel,
-        joints: dict[int, str],
-        path: Path,
-        notes: Notes,
-    ) -> int:
+        code: str,
+        text: str,
+        remedy: str,
+        joint: str | None = None,
+        link: str | None = None,
+        detail: str = "",
+    ) -> None:
+        """Report what is simulated otherwise in every engine."""
+        self.repairs.append(Finding(code, text, remedy, joint, link, detail))
+
+    def lose(self, text: str, joint: str | None = None, link: str | None = None) -> None:
+        """Report what an engine loses that does not simulate the file."""
+        remedy = "use the engine 'mujoco', which simulates the file itself"
+        self.losses.append(Finding("engine", text, remedy, joint, link))
+
+    def _find_base(self, joints: dict[int, str], path: Path) -> int:
         """Return the base, after the bodies that are not of the robot are left out."""
+        model = self.model
         # Every child of the world is the root of an object; some of them are the robot.
         tops = {body for body in range(1, model.nbody) if model.body_parentid[body] == 0}
         roots = model.body_rootid[model.jnt_bodyid]
@@ -265,8 +271,7 @@ class RobotInFile:
                 problem = f"the ball joint {label(model.joint(joint))} has no single position"
                 raise RobotError(f"{where}: {problem} to control; replace it by three hinges")
         for body in sorted(self._left_out - soft):
-            text = "is apart from the robot: left out"
-            notes.lose(text, link=self.bodies[body])
+            self.lose("is apart from the robot: left out", link=self.bodies[body])
         if floating:
             return floating.pop()
         # The only body, if it is held at the origin, is the root in place of the world.

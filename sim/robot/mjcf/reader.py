@@ -4,7 +4,7 @@ pose.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
@@ -12,8 +12,9 @@ import numpy as np
 
 from batchpid.arrays.array_types import Document, Float64, MjModel
 from batchpid.arrays.elementwise import read_only
+from batchpid.errors import RobotError
 from batchpid.motors import make_actuators
-from batchpid.sim.findings import Finding, Notes
+from batchpid.sim.findings import Finding
 from batchpid.sim.robot.mjcf.bodies import TableReader, excluded_pairs
 from batchpid.sim.robot.mjcf.model import (
     PLANE,
@@ -24,8 +25,7 @@ from batchpid.sim.robot.mjcf.model import (
     label,
 )
 from batchpid.sim.robot.mjcf.motors import read_couplings, read_motors
-from batchpid.sim.robot.parts import FileDefaults, MjcfFile
-from batchpid.sim.robot.tables import Source
+from batchpid.sim.robot.tables import MjcfFile, Source
 from batchpid.task_space.rigid_tree import GRAVITY
 
 _KEYFRAME = "home"
@@ -44,26 +44,45 @@ _SWITCHES = (
 def read_mjcf(
     path: Path,
     name: str,
+    findings: list[Finding],
     fixed_base: bool | None,
     missing_meshes: str,
 ) -> Source:
-    """Return the content of the MJCF file at ``path`` as the robot ``name``.
+    """Return the content of the MJCF file at ``path`` as the robot ``name``, with ``findings`` of
+    reading the file.
 
     For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses
     the file, it has a ball joint or several robots, or missing meshes are refused.
     """
-    notes = Notes([], [])
-    compiled = compile_file(path, missing_meshes, notes.repairs)
+    # MuJoCo opens the file by its path, and workers do so again.
+    if not path.is_file():
+        raise RobotError(f"{path}: an MJCF file is read several times; save it as a file first")
+    try:
+        return _read(path, name, findings, fixed_base, missing_meshes)
+    except UnicodeDecodeError as error:
+        raise RobotError(
+            f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
+        ) from error
+
+
+def _read(
+    path: Path,
+    name: str,
+    findings: list[Finding],
+    fixed_base: bool | None,
+    missing_meshes: str,
+) -> Source:
+    compiled = compile_file(path, missing_meshes, findings)
     model = compiled.model
-    robot = RobotInFile(model, path, notes)
+    robot = RobotInFile(model, path, findings)
     # A base is free where the file has a free joint, unless the caller fixes it.
     if fixed_base is None:
         fixed_base = not (robot.base and model.body_jntnum[robot.base])
-    couplings = read_couplings(model, robot, notes)
-    motors = read_motors(model, robot, couplings, notes)
-    reader = TableReader(model, robot, notes, motors)
+    couplings = read_couplings(robot)
+    motors = read_motors(robot, couplings)
+    reader = TableReader(robot, motors)
     tables = reader.read(couplings, is_held=fixed_base)
-    _report_unused(model, robot, notes)
+    _report_unused(robot)
     # The start pose is that of the keyframe, else the reference pose.
     key = home(model)
     pose = model.qpos0 if key is None else model.key_qpos[key]
@@ -77,13 +96,10 @@ def read_mjcf(
     def column(values: Mapping[str, float], missing: float = 0.0) -> Float64:
         return read_only(np.array([values.get(joint, missing) for joint in joints], np.float64))
 
-    gains = {"kp": motors.kp, "ki": motors.ki, "kd": motors.kd}
-    columns = {name: column(gain) for name, gain in gains.items()}
+    gains = {name: column(getattr(motors, name)) for name in ("kp", "ki", "kd")}
     # A file of motors alone has no gains to offer.
-    if any(gain.any() for gain in columns.values()):
-        columns["integral_limit"] = column(motors.integral_limit, np.inf)
-    else:
-        columns = {}
+    has_gains = any(gain.any() for gain in gains.values())
+    gains["integral_limit"] = column(motors.integral_limit, np.inf)
     effects: Document = {"armature": column(motors.armature), "lag": column(motors.lag)}
     for effect in ("saturation_effort", "no_load_speed"):
         effects[effect] = column(getattr(motors, effect), np.inf)
@@ -91,14 +107,16 @@ def read_mjcf(
     if joints:
         actuators = make_actuators(len(joints), **effects)
     return Source(
+        path,
         name,
         tables,
-        tuple(notes.repairs),
+        tuple(findings),
         fixed_base,
         base_start,
-        mjcf=_file(path, compiled, robot, fixed_base, notes.losses),
-        pairs=excluded_pairs(model, reader.solid),
-        defaults=FileDefaults(column(start), **columns),
+        column(start),
+        gains if has_gains else None,
+        mjcf=_file(path, compiled, robot, fixed_base),
+        disabled=excluded_pairs(model, reader.solid),
         actuators=actuators if actuators is not None and actuators.num_joints else None,
     )
 
@@ -113,7 +131,6 @@ def _file(
     compiled: Compiled,
     robot: RobotInFile,
     fixed_base: bool,
-    losses: Iterable[Finding],
 ) -> MjcfFile:
     """Return the data of the file that the engine MuJoCo needs."""
     model = compiled.model
@@ -139,15 +156,16 @@ def _file(
         bodies=tuple(robot.bodies.values()),
         falling=tuple(robot.bodies[body] for body in free if not robot.is_of_robot(body)),
         loops=tuple(loops),
-        losses=tuple(losses),
+        losses=tuple(robot.losses),
         is_alone=all(robot.is_of_robot(body) for body in model.jnt_bodyid),
         has_floor=bool(grounds) and not (floats and fixed_base),
         friction=float(model.geom_friction[grounds[0], 0]) if grounds else 1.0,
     )
 
 
-def _report_unused(model: MjModel, robot: RobotInFile, notes: Notes) -> None:
+def _report_unused(robot: RobotInFile) -> None:
     """Report content that is not simulated, apart from motors, couplings and shapes."""
+    model = robot.model
     counts = {
         "sites": model.nsite,
         "sensors": model.nsensor,
@@ -158,18 +176,18 @@ def _report_unused(model: MjModel, robot: RobotInFile, notes: Notes) -> None:
     left_out = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
     if left_out:
         text = f"elements that the simulation does not use are left out: {left_out}"
-        notes.repairs.append(Finding("unknown-element", text, "expect no effect"))
+        robot.repair("unknown-element", text, "expect no effect")
     option = model.opt
     bits = mujoco.mjtDisableBit
     if tuple(option.gravity) != GRAVITY:
         text = f"gravity is {GRAVITY} m/s^2, not the file's"
         remedy = "draw the file's with Randomization(gravity=...)"
-        notes.repairs.append(Finding("option", text, remedy))
+        robot.repair("option", text, remedy)
     for switch in ("GRAVITY", "ACTUATION"):
         if option.disableflags & getattr(bits, f"mjDSBL_{switch}"):
             text = f"<flag {switch.lower()}='disable'/> has no effect"
             remedy = "expect gravity, and the efforts of the controller"
-            notes.repairs.append(Finding("option", text, remedy))
+            robot.repair("option", text, remedy)
     disabled = ", ".join(
         switch.lower()
         for switch in _SWITCHES
@@ -183,15 +201,14 @@ def _report_unused(model: MjModel, robot: RobotInFile, notes: Notes) -> None:
         ((model.body_plugin >= 0).any(), "without the plugins of bodies"),
     ):
         if is_there:
-            notes.lose(text)
+            robot.lose(text)
     for joint, name in robot.joints.items():
         if model.jnt_stiffness[joint] or model.jnt_stiffnesspoly[joint].any():
-            notes.lose("without the spring of the joint", name)
+            robot.lose("without the spring of the joint", name)
         if model.dof_dampingpoly[model.jnt_dofadr[joint]].any():
-            notes.lose("the damping that grows with the speed is left out", name)
+            robot.lose("the damping that grows with the speed is left out", name)
     for body in np.flatnonzero(model.body_gravcomp).tolist():
         if robot.is_of_robot(body):
             text = "gravity compensation of this body (gravcomp) is not simulated"
             remedy = "let the controller compensate"
-            finding = Finding("option", text, remedy, link=robot.bodies[body])
-            notes.repairs.append(finding)
+            robot.repair("option", text, remedy, link=robot.bodies[body])

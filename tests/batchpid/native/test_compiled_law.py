@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from law_cases import generated_options
 from native_cases import bits, numbers
 
 import batchpid as bp
@@ -23,21 +24,6 @@ from batchpid.native.passes import header, law_segments
 NATIVE = bp.BatchPID(bp.make_params(1, 1.0), 1, 0.01).native
 needs_extension = pytest.mark.skipif(not NATIVE, reason="there are no native programs")
 DT = 1 / 2000
-CHOICES = {
-    "ki": st.sampled_from([0.0, 50.0, [[5.0]]]),
-    "kd": st.sampled_from([0.0, 2.0]),
-    "effort_limit": st.sampled_from([0.0, 5.0, 80.0]),
-    "effort_rate_limit": st.just(900.0),
-    "integral_limit": st.just(0.2),
-    "derivative_filter_time": st.just(0.01),
-    "setpoint_weight": st.just(0.7),
-    "setpoint_weight_derivative": st.just(0.3),
-    "deadband": st.just(0.3),
-    "anti_windup": st.sampled_from(["none", "clamp", "conditional", "back_calculation"]),
-    "non_finite": st.sampled_from(["zero", "hold"]),
-    "continuous": st.just(True),
-}
-OPTIONS = st.fixed_dictionaries({"kp": st.just(40.0)}, optional=CHOICES)
 EVERYTHING = {
     "kp": 40.0,
     "ki": 5.0,
@@ -48,19 +34,6 @@ EVERYTHING = {
 }
 
 
-def params_of(joints, options, dtype):
-    """Return params with these options, without those that do not go together."""
-    try:
-        return bp.make_params(joints, **options, dtype=dtype)
-    except InvalidArgumentError as error:
-        options = {
-            name: value
-            for name, value in options.items()
-            if name not in (error.argument, "anti_windup")
-        }
-        return params_of(joints, options, dtype)
-
-
 def in_numpy(*arguments, **options):
     """Return a controller that NumPy computes."""
     with mock.patch.dict("os.environ", {"BATCHPID_NATIVE": "0"}):
@@ -69,7 +42,6 @@ def in_numpy(*arguments, **options):
 
 @needs_extension
 @given(
-    OPTIONS,
     st.sampled_from([1, 2, 7, 8, 9, 20, 130]),
     st.sampled_from([1, 2, 5, 57, 120, 300]),
     st.sampled_from([np.float64, np.float32]),
@@ -78,13 +50,10 @@ def in_numpy(*arguments, **options):
     st.integers(0, 2**32),
     st.data(),
 )
-def test_a_native_controller_is_bit_identical_to_numpy(
-    options, joints, envs, dtype, odd, terms, seed, data
-):
+def test_a_native_controller_is_bit_identical_to_numpy(joints, envs, dtype, odd, terms, seed, data):
     rng, shape = np.random.default_rng(seed), (envs, joints)
-    if data.draw(st.booleans(), "gains of each env"):
-        options = {**options, "kp": rng.uniform(1, 50, shape)}
-    params = params_of(joints, options, dtype)
+    options = generated_options(seed, data.draw(st.sampled_from([1, envs]), "envs"), joints)
+    params = bp.make_params(joints, **options, dtype=dtype)
     setpoint_shape = data.draw(
         st.sampled_from([shape, (1, joints), (joints,), (envs, 1), ()]), "setpoint"
     )
@@ -169,30 +138,6 @@ def test_a_copy_goes_its_own_way(copied):
     assert all(
         a is b is None or np.array_equal(a, b) for a, b in zip(state, ours.state, strict=True)
     )
-
-
-def test_reset_track_and_other_params_take_effect_in_between():
-    ours, theirs, y = both()
-    for pid in (ours, theirs):
-        for step in range(3):
-            pid(y[8], y[step])
-    before = ours.state
-    for act in (
-        lambda pid: pid.reset(y[3], np.arange(5) < 2, keep_integral=True),
-        lambda pid: pid.track(y[8, :1], y[4], 3.0, y[5, :1]),
-        lambda pid: setattr(pid, "params", pid.params.replace(kp=9.0, effort_rate_limit=300.0)),
-        lambda pid: setattr(
-            pid, "params", pid.params.replace(anti_windup="conditional", effort_rate_limit=None)
-        ),
-    ):
-        for pid in (ours, theirs):
-            act(pid)
-        for step in range(3):
-            np.testing.assert_array_equal(ours(y[8], y[step]), theirs(y[8], y[step]))
-            np.testing.assert_array_equal(
-                ours(2.0, y[step], feedforward=y[6]), theirs(2.0, y[step], feedforward=y[6])
-            )
-    assert not np.array_equal(before.integral, ours.state.integral)
 
 
 @pytest.mark.parametrize(

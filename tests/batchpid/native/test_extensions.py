@@ -13,8 +13,8 @@ import pytest
 
 import batchpid as bp
 from batchpid import native
-from batchpid.native import array_program, availability, extensions
-from batchpid.native.availability import obstacle
+from batchpid.native import array_program, extensions
+from batchpid.native.array_program import obstacle
 from batchpid.native.extensions import PROGRAM, ROOT, TASK_SPACE, load
 from batchpid.sim.engine.native.interface import EXTENSIONS
 
@@ -29,7 +29,7 @@ ALL = {each.module: each for each in (PROGRAM, TASK_SPACE, *EXTENSIONS.values())
 def fresh(monkeypatch):
     """Reload and recheck the extension, in the test and after it."""
     monkeypatch.delenv("BATCHPID_NATIVE", raising=False)
-    caches = load, array_program.interpreter, availability._fault
+    caches = load, array_program.interpreter, array_program._fault
     for each in caches:
         each.cache_clear()
     yield
@@ -103,7 +103,7 @@ def test_a_stale_extension_is_one_warning_and_numpy_does_the_work(monkeypatch, f
     expected = steps()
     assert expected[1]
     load.cache_clear()
-    availability._fault.cache_clear()
+    array_program._fault.cache_clear()
     other_file(monkeypatch, file)
     reason = rf"_program was built from other sources \(\S*{file}\); "
     reason += "run 'python setup.py build_ext --inplace --force' in "
@@ -153,5 +153,5 @@ def test_an_extension_that_was_not_built_is_no_fault(monkeypatch, tmp_path):
 
 
 def test_a_variable_switches_native_programs_off(monkeypatch):
-    monkeypatch.setenv(availability.SWITCH, "0")
+    monkeypatch.setenv(array_program.SWITCH, "0")
     assert not steps()[1]

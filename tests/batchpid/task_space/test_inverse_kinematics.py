@@ -6,7 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from trees import TOOLS, planar, robot_of, serial, tree_of
+from osc_arms import six
+from trees import TOOLS, planar, robot_of, tree_of
 
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
@@ -47,22 +48,24 @@ def test_reachable_poses_are_reached(name):
     np.testing.assert_array_equal(found.qpos[:, others], np.tile(start[others], (rows, 1)))
 
 
-def test_an_arm_with_limits_of_half_a_turn_reaches_its_poses():
-    tree = dataclasses.replace(serial(), lower=-np.pi, upper=np.pi)
+def test_an_arm_with_limits_of_half_a_turn_reaches_its_poses(tmp_path):
+    tree = dataclasses.replace(six(tmp_path).kinematic_tree(), lower=-np.pi, upper=np.pi)
     rng = np.random.default_rng(0)
-    pose = ts.link_poses(tree, rng.uniform(tree.lower, tree.upper, (500, 6)), ["tip"])[:, 0]
+    pose = ts.link_poses(tree, rng.uniform(tree.lower, tree.upper, (500, 6)), ["l6"])[:, 0]
     start = np.array([0.0, -1.5, 1.5, -1.5, -1.5, 0.0])
-    found = ts.inverse_kinematics(tree, "tip", pose, start, on_failure="return")
-    check(tree, "tip", pose, found)
+    found = ts.inverse_kinematics(tree, "l6", pose, start, on_failure="return")
+    check(tree, "l6", pose, found)
     assert found.success.mean() >= 0.995
 
 
 @pytest.mark.parametrize("name", [*TOOLS, "six joints"])
-def test_five_steps_suffice_from_nearby(name):
+def test_five_steps_suffice_from_nearby(name, tmp_path):
     """From 0.3 rad away; without the acceleration, and with a bias of 1e-5 of the damping, for 98 %
     of them.
     """
-    tree, tool = (serial(), "tip") if name == "six joints" else (tree_of(name), TOOLS[name])
+    is_six = name == "six joints"
+    tree = six(tmp_path).kinematic_tree() if is_six else tree_of(name)
+    tool = "l6" if is_six else TOOLS[name]
     rng, chain = np.random.default_rng(5), tree.chain(tool)
     qpos = rng.uniform(
         np.maximum(tree.lower, -np.pi), np.minimum(tree.upper, np.pi), (1000, tree.dof)

@@ -9,25 +9,16 @@ import io
 import itertools
 import sys
 import warnings
+from collections import defaultdict
 from functools import cache
 from pathlib import Path
 
 import pytest
 import tyro
-from commands_that_write import WORDS, output, output_flags
+from commands_that_write import WORDS
 
 from batchpid.sim.cli.commands import COMMANDS, bar
 
-HAVE = {
-    "--gains": {"rollout", "compare", "identify", "export", "inspect", "view"},
-    "--seconds": {"demo", "rollout", "excite"},
-    "--engine": {"demo", "rollout", "compare", "view"},
-    "--base": {"rollout", "tune", "compare", "identify", "inspect", "view"},
-    "--actuators": {"rollout", "tune", "compare", "export", "view"},
-    "--out": {"rollout", "tune", "excite", "identify", "export"},
-    "--picture": {"demo", "rollout", "tune", "compare", "identify", "plot"},
-}
-"""Commands in which a flag has a meaning."""
 SEVERAL = {("compare", "--gains"), ("compare", "--engine")}
 """Flags that take several values in one command, and one in the others."""
 
@@ -59,13 +50,13 @@ def test_there_are_few_flags():
     assert sum(len(flags(command).keys() - {"-h", "--help"}) for command in COMMANDS) <= 81
 
 
-@pytest.mark.parametrize("flag", HAVE)
-def test_a_flag_is_in_every_command_where_it_has_a_meaning_and_takes_one_kind_of_value(flag):
-    have = {command for command in COMMANDS if flag in flags(command)}
-    assert have == HAVE[flag]
-    kinds = {flags(command)[flag] for command in have if (command, flag) not in SEVERAL}
-    kinds = {kind.replace("{None}|", "").replace("None,", "") for kind in kinds}
-    assert len(kinds) == 1, kinds
+def test_a_flag_takes_one_kind_of_value():
+    kinds = defaultdict(set)
+    for command in COMMANDS:
+        for flag, kind in flags(command).items():
+            if (command, flag) not in SEVERAL:
+                kinds[flag].add(kind.replace("{None}|", "").replace("None,", ""))
+    assert not {flag: seen for flag, seen in kinds.items() if len(seen) > 1}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -77,23 +68,6 @@ def test_a_wrong_flag_is_answered_with_the_help_of_its_command(command, batchpid
     assert not [
         other for other in COMMANDS if other != command and f"batchpid {other} " in complaint
     ]
-
-
-@pytest.mark.parametrize(("command", "flag"), output_flags())
-def test_an_output_without_a_folder_is_refused_before_the_run(
-    command,
-    flag,
-    files,
-    batchpid,
-    tmp_path,
-    monkeypatch,
-):
-    monkeypatch.chdir(files)
-    path = tmp_path / "missing" / output(command, flag)
-    status, said, complaint = batchpid(*WORDS[command], f"--{flag}", path)
-    assert (status, said) == (2, "")
-    assert complaint.splitlines()[-1].endswith(f"mkdir -p {path.parent}")
-    assert not path.parent.exists()
 
 
 BAD = {
@@ -163,24 +137,15 @@ def written(folder: Path) -> set[Path]:
         ("rollout --setpoint 1 2", "setpoint: has shape (2,)"),
         ("rollout --control osc --setpoint 1 2", "setpoint: has shape (2,)"),
         ("rollout --control osc --gains tuned", "gains: are for the control of joints"),
-        ("rollout --timestep 0", "timestep: out of range"),
         ("rollout --out a.npz", "out: unknown file format"),
         ("rollout --gains tunned", "use tuned, designed, "),
-        ("tune nobody", "no robot 'nobody'"),
-        ("tune arm.urdf --generations 0", "generations: out of range"),
         ("compare --gains drive:-1,3", "gains: is no drive"),
-        ("compare --gains drive:a,b", "DAMPING"),
         ("identify arm.urdf", "logs: are missing"),
-        ("identify arm.urdf run.h5 --extras speed", "extras"),
         ("export panda --gains drive", "gains: belong to a drive"),
         ("inspect panda2", "'panda2'"),
-        ("inspect --gains nothing", "gains: is neither"),
-        ("compare arm.urdf --moves 0", "moves: out of range"),
         ("plot /dev/null", "/dev/null"),
         ("plot .", "."),
         ("view --port 99999", "port: out of range (got 99999)"),
-        ("view --num-envs 65", "num_envs: out of range"),
-        ("view --play nothing.h5", "there is no such file"),
     ],
 )
 def test_flags_that_contradict_each_other_are_answered_in_one_line(

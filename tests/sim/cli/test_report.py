@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from batchpid.sim import Observation, Rollout, RunInfo
-from batchpid.sim.cli import report
+from batchpid.sim.cli.rollout import RunReport, speed_line
 
 TICKS, ENVS = 200, 5
 
@@ -38,7 +38,7 @@ def first_order_lag(panda, setpoint, time_constant=0.05):
 
 def report_of(panda, rollout):
     """Return the lines of the report, and those of the table by joint."""
-    lines = report.RunReport(panda, rollout, 5e-4, 1.0, "NumPy").report().splitlines()
+    lines = RunReport(panda, rollout, 5e-4, 1.0, "NumPy").report().splitlines()
     return lines, {
         name: next(line for line in lines if line.startswith(name)) for name in panda.joint_names
     }
@@ -80,7 +80,7 @@ def test_envs_that_failed_are_named_even_if_they_are_held_at_a_finite_pose(panda
 
 def test_the_speed_is_env_steps_and_real_time_factors():
     assert (
-        report.speed_line(64, 2.0, 1 / 2000, 4.0)
+        speed_line(64, 2.0, 1 / 2000, 4.0)
         == "64,000 env-steps/s: 2 s of 64 robots in 4.00 s; real-time factor 0.5 per robot, 32 in"
         " total"
     )

@@ -161,21 +161,14 @@ def test_a_trajectory_is_followed_as_by_a_runner_with_its_rates(
     np.testing.assert_allclose(following_errors(said), error, rtol=0.06, atol=1e-6)
 
 
-def test_a_file_without_a_row_at_time_0_begins_at_the_start_pose(saved, tmp_path, panda, motion):
-    path = tmp_path / "motion.csv"
-    path.write_text(csv(panda, motion, start=False))
-    run, said = saved("--trajectory", path, short=ONE)
-    np.testing.assert_array_equal(run.info.start[0], panda.start.astype(np.float32))
-    np.testing.assert_allclose(run.time, motion.time)
-    assert following_errors(said).max() < 2e-3
-
-
-def test_the_first_row_is_the_start_of_every_env(saved, tmp_path, panda, motion):
+@pytest.mark.parametrize("start", [False, True])
+def test_every_env_begins_at_the_start_pose(saved, tmp_path, panda, motion, start):
     """A start elsewhere would count as an error of following."""
     path = tmp_path / "motion.csv"
-    path.write_text(csv(panda, motion))
+    path.write_text(csv(panda, motion, start=start))
     run, said = saved("--trajectory", path, short=SHORT[:4])
     np.testing.assert_array_equal(run.info.start, np.tile(panda.start.astype(np.float32), (3, 1)))
+    np.testing.assert_allclose(run.time, motion.time)
     assert following_errors(said).max() < 2e-3
 
 
@@ -232,16 +225,6 @@ def test_rates_take_the_short_way_round_and_followers_need_no_column(saved, tmp_
     assert 0 < run.qvel[-1, 0, turn] < 5
 
 
-@pytest.mark.parametrize(
-    ("time", "message"),
-    [("0", "line 2: the only row is at 0 s; give a row for"), ("1e300", "has rows every 1e+300")],
-)
-def test_a_wrong_single_row_is_refused(batchpid, tmp_path, time, message):
-    (tmp_path / "motion.csv").write_text(f"time,setpoint:left\n{time},0.1\n")
-    arm = write(tmp_path, gripper())
-    assert message in batchpid("rollout", arm, "--trajectory", tmp_path / "motion.csv", *ONE)[2]
-
-
 LOOP = """<mujoco><worldbody>
   <body name="a"><joint name="a" axis="0 1 0"/><geom size=".1"/></body>
   <body name="b" pos="1 0 0"><joint name="b" axis="0 1 0"/><geom size=".1"/></body>
@@ -279,6 +262,10 @@ def in_column(column, function):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (
+            lambda text: "\n".join(text.splitlines()[:2]),
+            "line 2: the only row is at 0 s; give a row for",
+        ),
         (cut(lambda lines: lines.pop(20)), "line 21: time is 0.1 s, and not 0.095 s; .*apart"),
         (in_column(0, lambda cell: str(1000 * float(cell))), "rows every 5 s; .*seconds"),
         (
@@ -324,6 +311,16 @@ def test_a_wrong_trajectory_is_refused(batchpid, tmp_path, panda, motion, change
     assert error.startswith(f"batchpid: {path}: ")
     assert re.search(message, error), error
     assert error.count("\n") == 1
+
+
+def test_the_time_step_that_an_error_names_is_accepted(batchpid, tmp_path, panda, motion):
+    path = tmp_path / "motion.csv"
+    at_30_hz = in_column(0, lambda cell: f"{float(cell) * 20 / 3:.4f}")
+    path.write_text(at_30_hz(csv(panda, motion, "setpoint_rate")))
+    _, _, error = batchpid("rollout", "--trajectory", path, *ONE)
+    timestep = re.search(r"--timestep (\S+)", error)[1]
+    status, _, error = batchpid("rollout", "--trajectory", path, "--timestep", timestep, *ONE)
+    assert (status, error) == (0, "")
 
 
 @pytest.mark.parametrize(

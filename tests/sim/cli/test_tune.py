@@ -19,7 +19,7 @@ def few_moves(monkeypatch):
     monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
     monkeypatch.setattr("batchpid.sim.tuning.search.SEARCH_MOVES", 1)
     monkeypatch.setattr(
-        "batchpid.sim.tuning.comparison.random_moves",
+        "batchpid.sim.tuning.evaluation.random_moves",
         lambda robot, moves, seed: random_moves(robot, min(moves, 1), seed),
     )
 

@@ -129,7 +129,7 @@ def test_a_link_that_is_welded_far_out_stops_at_an_obstacle(tmp_path, monkeypatc
 def test_the_form_of_the_solver_changes_rounding_alone(tmp_path):
     """A sparse Jacobian without islands, against MuJoCo's default, with contacts."""
     of = shaped_tree(0, tmp_path, links=26, fixed_base=False)
-    parts = of.tables, of.ignored_pairs, of.joints, 1e-3, MujocoSolver()
+    parts = of.tables, of.self_contact.ignored, of.joints, 1e-3, MujocoSolver()
     ours = robot_model(SceneSpec(*parts, fixed_base=False)).model
     theirs = copy.copy(ours)
     theirs.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO

@@ -92,7 +92,7 @@ def test_free_motion_is_that_of_the_reduced_equations(physics, tmp_path):
     """
     robot = arm(tmp_path, joints=3)
     dynamics, free, still = robot.dynamics(), robot.independent, np.zeros((1, robot.dof))
-    q, v = robot.coupled([[0.3, 0.5, -0.4, 0.02, 0, 0]]), still.copy()
+    q, v = robot.coupling.positions(np.array([[0.3, 0.5, -0.4, 0.02, 0, 0]])), still.copy()
     with Runner(
         robot,
         1,

@@ -25,7 +25,10 @@ def engine(request):
 @pytest.mark.parametrize(("workers", "floats"), [(0, False), (2, True)])
 def test_a_mask_of_no_env(engine, workers, floats):
     robot = Robot.load("quadruped", fixed_base=not floats)
-    options = {"randomization": DRAWN if floats else None, "contacts": [robot.links[-1].name]}
+    options = {
+        "randomization": DRAWN if floats else None,
+        "contacts": [robot.tables.bodies[-1].name],
+    }
     with Runner(robot, 5, engine=engine, workers=workers, **options) as runner:
         runner.step(robot.start)
         before = runner.observe()

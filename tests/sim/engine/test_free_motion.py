@@ -39,7 +39,7 @@ def motion(of, monkeypatch, natively, to_limits, ticks, envs=8, **options):
     goals = of.start + 0.4 * (rng.uniform(low, high, (2, envs, of.dof)) - of.start)
     ends = np.where(rng.random(goals.shape) < 0.5, of.lower, of.upper)
     at_end = to_limits & np.isfinite(ends) & (rng.random(goals.shape) < 0.5)
-    goals = of.coupled(np.where(at_end, ends, np.clip(goals, of.lower, of.upper)))
+    goals = of.coupling.positions(np.where(at_end, ends, np.clip(goals, of.lower, of.upper)))
     rows = np.repeat(goals, ticks // 2, axis=0)
     # MuJoCo's default tolerance leaves errors of 1e-5 rad where joints strike their limits.
     options |= {"physics": MujocoSolver(tolerance=1e-13), "workers": 0, "ground": False}

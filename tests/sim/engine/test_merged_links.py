@@ -11,6 +11,7 @@ from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Randomization, Robot, Runner, Uniform
+from batchpid.sim.robot.robot_model import link_tree
 
 BOX = (
     '<collision><origin xyz="0.1 0 0" rpy="0.3 0 0"/><geometry><box size="0.1 0.2'
@@ -69,7 +70,7 @@ def test_motion_of_random_trees_is_that_of_all_links(seed, physics, tmp_path):
 def test_mass_is_that_of_all_links(tool, tmp_path):
     loaded = load(tmp_path, arm(tool))
     ours = loaded.mass_matrix([0.3, -0.4])
-    theirs = ts.mass_matrix(loaded.rigid_tree, np.array([0.3, -0.4]))
+    theirs = ts.mass_matrix(link_tree(loaded), np.array([0.3, -0.4]))
     np.testing.assert_allclose(ours[0], theirs, atol=2e-5)  # links of 1e-6 kg
 
 

@@ -16,6 +16,7 @@ from batchpid.sim.engine.mujoco.mujoco_pack import ENGINE
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.randomization.distributions import nominal_values
+from batchpid.sim.robot.reading import describe
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits"
@@ -319,7 +320,8 @@ def test_a_floating_base_behind_an_object(load):
             "compensate": compensate,
             "ground": False,
         }
-        shown = dataclasses.replace(robot, mjcf=None) if engine == "rebuilt" else robot
+        source = robot.source._replace(mjcf=None)
+        shown = dataclasses.replace(robot, source=source) if engine == "rebuilt" else robot
         with Runner(shown, 1, workers=0, control="effort", **options) as runner:
             obs = runner.reset(base_pose=pose, base_twist=twist)
             np.testing.assert_allclose(obs.base_pose[0], pose, atol=1e-6)
@@ -501,7 +503,7 @@ def test_every_file_that_a_load_opens_is_part_of_the_identity(tmp_path, changed)
         .replace(*(np.float32(x).tobytes() for x in (0.3, 0.5)))
     )
     os.utime(path, ns=(stamp, stamp))  # by which MuJoCo keeps meshes
-    assert Robot.load(tmp_path / "scene.xml").describe() != robot.describe()
+    assert describe(Robot.load(tmp_path / "scene.xml")) != describe(robot)
     robot_model.cache_clear()
     with pytest.raises(RobotError, match="has changed since the robot was loaded"):
         Runner(robot, 1, workers=0, engine="mujoco")
@@ -581,7 +583,7 @@ def test_a_sleep_policy_has_no_effect(load):
 
 def test_a_link_between_two_joints_of_a_body_has_no_sensor_and_no_payload(load):
     robot = load(ARM)
-    (between,) = {link.name for link in robot.links} - {*robot.mjcf.bodies}
+    (between,) = {link.name for link in robot.tables.bodies} - {*robot.mjcf.bodies}
     payload = Randomization(payload=Uniform(0.1, 0.2), payload_link=between)
     for options in ({"contacts": [between]}, {"wrenches": [between]}, {"randomization": payload}):
         with pytest.raises(RobotError, match=f"'{between}' lies between two joints of one body"):

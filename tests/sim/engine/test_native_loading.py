@@ -4,17 +4,18 @@ the work.
 
 from __future__ import annotations
 
+import ctypes
 import re
 
 import numpy as np
 import pytest
 from identical import assert_identical
 
-from batchpid.native import availability, extensions
-from batchpid.native.extensions import PROGRAM
+from batchpid.native import array_program, extensions
+from batchpid.native.extensions import PROGRAM, load
 from batchpid.sim import Runner
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import EXTENSIONS
+from batchpid.sim.engine.native.interface import EXTENSIONS, structure
 from batchpid.sim.engine.sapien import calls
 
 needs_extension = pytest.mark.skipif(bool(native.obstacle()), reason="there are no native calls")
@@ -24,7 +25,7 @@ needs_extension = pytest.mark.skipif(bool(native.obstacle()), reason="there are 
 def fresh(monkeypatch):
     """Reload and recheck extensions, in the test and after it."""
     monkeypatch.delenv("BATCHPID_NATIVE", raising=False)
-    caches = extensions.load, availability._fault, calls.functions
+    caches = extensions.load, array_program._fault, calls.functions
     for cache in caches:
         cache.cache_clear()
     yield
@@ -50,7 +51,7 @@ def make_stale(monkeypatch, module):
         lambda self: ["flags=other"] if self.module == module else real(self),
     )
     extensions.load.cache_clear()
-    availability._fault.cache_clear()
+    array_program._fault.cache_clear()
 
 
 @needs_extension
@@ -88,7 +89,7 @@ def test_worker_processes_give_no_warning_of_their_own(monkeypatch, panda, capfd
         ),
         (
             "SYMBOLS",
-            ("_ZN6sapien4noneEv",),
+            {"step": "_ZN6sapien4noneEv"},
             r"SAPIEN \S+ has another library: .*_ZN6sapien4noneEv; install sapien==",
         ),
     ],
@@ -102,6 +103,15 @@ def test_another_sapien_is_refused_by_name(monkeypatch, panda, name, value, reas
     assert_identical(expected, found)
     assert re.fullmatch(rf"law in NumPy, Python calls into SAPIEN \({reason}.*\)", backend)
     assert rollout(panda, engine="mujoco")[1] == "law as a native program, native calls into MuJoCo"
+
+
+@needs_extension
+def test_structures_of_python_have_the_places_and_sizes_of_the_compiler():
+    fields = load(EXTENSIONS["_gateway"]).fields
+    assert {name for name, *_ in fields} >= {"Group", "Mujoco", "Stage", "Tick"}
+    for name, field, _, _, place, size in fields:
+        kind = structure(name)
+        assert (getattr(kind, field).offset, ctypes.sizeof(kind)) == (place, size)
 
 
 @needs_extension

@@ -15,6 +15,7 @@ from tiny_urdf import random_tree, robot, write
 
 import batchpid.task_space as ts
 from batchpid.sim import Randomization, Robot, Runner, Uniform, to_urdf
+from batchpid.sim.robot.robot_model import link_tree
 
 ENGINES = ("sapien", "mujoco")
 FREE = {"control": "effort", "compensate": "none", "ground": False, "workers": 0}
@@ -41,7 +42,7 @@ def own_model(arm):
 
 def mass_matrix(arm, qpos):
     """Return the mass matrix of the joints, whose base may yield."""
-    return ts.mass_matrix(arm.rigid_tree, np.atleast_2d(qpos))[0]
+    return ts.mass_matrix(link_tree(arm), np.atleast_2d(qpos))[0]
 
 
 def states(arm, rows=5):

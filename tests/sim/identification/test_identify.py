@@ -89,7 +89,7 @@ def test_a_compensation_through_the_motors_is_part_of_the_model(tmp_path, compen
     robot = load(tmp_path, text)
     log = log_of(robot, run(robot, motion(), compensate=compensate), NOISE)
     found = identify(robot, [log], payload=False)
-    assert found.drive.through
+    assert not found.drive.further
     total = TRUTH | {"viscous": [0.4, 0.3], "coulomb": [0.7, 0.5]}
     assert_right(found, total)
 

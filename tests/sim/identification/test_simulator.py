@@ -7,15 +7,10 @@ import pytest
 from arms import DT, FALLING, STEPS, TRUTH, gains, load, motion, run
 
 import batchpid as bp
+from batchpid.motors.coupling import Coupling
 from batchpid.sim import Robot
-from batchpid.sim.identification.simulator import (
-    LogControl,
-    MassChange,
-    Plant,
-    PlantCandidates,
-    Stretch,
-    simulate,
-)
+from batchpid.sim.identification.simulator import Candidates, LogPlant, Stretch, simulate
+from batchpid.stages import Control
 
 MOTORS = {
     "ideal": dict.fromkeys(TRUTH),
@@ -29,7 +24,17 @@ MOTORS = {
 }
 
 
-def candidates(count=1, law=None, delay=0.0, lag=0.0, masses=None, **actuators) -> PlantCandidates:
+def control(params=None, compensate="none") -> Control:
+    """Return the control of a log of setpoints, or without params of efforts."""
+    mode = "effort" if params is None else "pid"
+    parts = "gravity" in compensate, "coriolis" in compensate
+    law = params or bp.PIDParams(kp=None)
+    return Control(DT, 1, Coupling.of(2), law, mode, gravity=parts[0], coriolis=parts[1])
+
+
+def candidates(
+    count=1, law=None, delay=0.0, lag=0.0, payload=None, mass=None, **actuators
+) -> Candidates:
     """Return equal candidates."""
     made = bp.make_actuators(
         2, **{name: value for name, value in actuators.items() if value is not None}
@@ -41,7 +46,7 @@ def candidates(count=1, law=None, delay=0.0, lag=0.0, masses=None, **actuators) 
     }
     spread |= {} if made.max_delay is None else {"max_delay": made.max_delay}
     late = (np.full(count, time) for time in (delay, lag))
-    return PlantCandidates(bp.Actuators(**spread), law or {}, *late, masses or {})
+    return Candidates(bp.Actuators(**spread), law or {}, *late, payload or {}, mass or {})
 
 
 def stretch_of(commands, start) -> Stretch:
@@ -51,11 +56,9 @@ def stretch_of(commands, start) -> Stretch:
     return Stretch(start, np.zeros(2), table, 0, ends, np.zeros(len(ends)))
 
 
-def simulated(
-    robot: Robot, commands, drive: LogControl, made: PlantCandidates, start
-) -> np.ndarray:
+def simulated(robot: Robot, commands, drive: Control, made: Candidates, start) -> np.ndarray:
     (table,) = simulate(
-        Plant(robot, (0, 1)), drive, made, np.zeros((1, 2, 2)), [stretch_of(commands, start)]
+        LogPlant(robot, (0, 1)), drive, made, np.zeros((1, 2, 2)), [stretch_of(commands, start)]
     )
     return table[0]
 
@@ -69,7 +72,7 @@ def test_a_log_of_setpoints_is_simulated_as_by_the_runner(
     monkeypatch.setenv("BATCHPID_NATIVE", native)
     robot, setpoints = load(tmp_path), motion(0.5)
     rollout = run(robot, setpoints, compensate=compensate, actuators=MOTORS[kind])
-    drive = LogControl(DT, gains(), compensate)
+    drive = control(gains(), compensate)
     offset = np.array(
         MOTORS[kind].get("position_offset", 0.0)
     )  # the log has the measured positions
@@ -88,13 +91,13 @@ def test_a_log_of_efforts_is_simulated_as_by_the_runner(tmp_path, kind):
         candidates(**(TRUTH | MOTORS[kind])),
         np.array(MOTORS[kind].get("position_offset", 0.0)),
     )
-    table = simulated(robot, commands, LogControl(DT, None, "none"), made, FALLING + offset)
+    table = simulated(robot, commands, control(), made, FALLING + offset)
     np.testing.assert_allclose(table - offset, rollout.qpos[:, 0], atol=1e-4)
 
 
 def test_delays_and_rate_limits_of_setpoints_are_those_of_late_rows_and_a_guard(tmp_path):
     robot, setpoints = load(tmp_path), motion(0.5)
-    drive = LogControl(DT, gains(), "none")
+    drive = control(gains())
     late = np.vstack([setpoints[:1]] * 4 + [setpoints[:-4]])
     expected = simulated(robot, late, drive, candidates(**TRUTH), setpoints[0])
     table = simulated(
@@ -112,12 +115,12 @@ def test_masses_are_those_of_another_description(tmp_path):
     text = (tmp_path / "arm.urdf").read_text()
     heavy = text.replace('mass value="1"', 'mass value="1.5"').replace('ixx="0.01"', 'ixx="0.015"')
     heavy = heavy.replace('iyy="0.01"', 'iyy="0.015"').replace('izz="0.002"', 'izz="0.003"')
-    drive = LogControl(DT, gains(), "none")
+    drive = control(gains())
     table = simulated(
         robot,
         setpoints,
         drive,
-        candidates(masses={MassChange("fore", False): np.array([1.5])}, **TRUTH),
+        candidates(mass={"fore": np.array([1.5])}, **TRUTH),
         setpoints[0],
     )
     other = load(tmp_path, heavy)
@@ -128,7 +131,7 @@ def test_masses_are_those_of_another_description(tmp_path):
         robot,
         setpoints,
         drive,
-        candidates(masses={MassChange("fore", True): np.array([0.5])}, **TRUTH),
+        candidates(payload={"fore": np.array([0.5])}, **TRUTH),
         setpoints[0],
     )
     assert np.abs(loaded - table).max() < np.abs(loaded - run(robot, setpoints).qpos[:, 0]).max()
@@ -136,7 +139,7 @@ def test_masses_are_those_of_another_description(tmp_path):
 
 def test_candidates_and_stretches_do_not_affect_each_other(tmp_path):
     robot, setpoints = load(tmp_path), motion(0.5)
-    plant, drive = Plant(robot, (0, 1)), LogControl(DT, gains(), "gravity+coriolis")
+    plant, drive = LogPlant(robot, (0, 1)), control(gains(), "gravity+coriolis")
     stretches = [stretch_of(setpoints, setpoints[0]), stretch_of(setpoints[20:60], setpoints[20])]
     # Each candidate comes once for each stretch.
     strengths = np.array([[1.0, 1.0], [0.9, 0.9], [0.5, 1.2]])

@@ -42,10 +42,10 @@ def params_of(arm, w, discretization="implicit", **options):
 def move_of(arm, dt):
     """Return a start, and a motion of up to 0.8 rad or m of every joint within its limits."""
     low, high = np.maximum(arm.lower, -2.0), np.minimum(arm.upper, 2.0)
-    start = arm.coupled(arm.start)
+    start = arm.coupling.positions(arm.start)
     way = np.where(high - start > start - low, 0.8, -0.8)
     margin = 0.02 * (high - low)
-    goal = arm.coupled(np.clip(start + way, low + margin, high - margin))
+    goal = arm.coupling.positions(np.clip(start + way, low + margin, high - margin))
     return start, minimum_jerk(start, goal, dt, duration=DURATION).hold(HELD)
 
 

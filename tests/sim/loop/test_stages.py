@@ -109,6 +109,32 @@ def test_a_stage_that_programs_cannot_have_runs_in_numpy_and_the_runner_says_so(
         assert "stage" not in repr(runner)
 
 
+@dataclass(frozen=True)
+class Wave(Stage):
+    """A stage with the functions of the C library."""
+
+    name = "wave"
+    after = "motors"
+
+    def step(self, state, values):
+        qvel = values.measured.qvel
+        xp = qvel.__array_namespace__()
+        return state, values.told(
+            qf=values.outputs.qf - xp.tanh(qvel) * xp.exp(-qvel * qvel) - 0.1 * xp.sin(qvel)
+        )
+
+
+def test_exp_tanh_and_sin_run_natively_as_in_numpy(panda, monkeypatch):
+    rows = []
+    for native in "10":
+        monkeypatch.setenv("BATCHPID_NATIVE", native)
+        with Runner(panda, 2, workers=0, stages=[Wave()]) as runner:
+            assert "stage" not in repr(runner)
+            rows.append(runner.rollout(np.broadcast_to(panda.target, (10, 2, panda.dof))))
+    np.testing.assert_allclose(rows[0].qpos, rows[1].qpos, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(rows[0].effort, rows[1].effort, rtol=1e-6, atol=1e-6)
+
+
 HOPPER = """<mujoco><worldbody><body pos="0 0 1"><joint name="rootz" type="slide" axis="0 0 1"/>
 <geom size=".1" mass="3"/><body pos="0 0 -.2"><joint name="hip" axis="0 1 0" range="-60 60"/>
 <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".04" mass="2"/></body></body></worldbody>

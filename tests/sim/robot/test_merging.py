@@ -6,8 +6,8 @@ from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
 import batchpid.task_space as ts
 from batchpid.sim import Robot
-from batchpid.sim.robot.merging import link_inertias, merge_links, place_links
-from batchpid.sim.robot.simulated_links import body_tree
+from batchpid.sim.robot.merging import body_tree, link_inertias, merge_links, place_links
+from batchpid.sim.robot.robot_model import link_tree
 from batchpid.task_space.frames import compose, matrix_of, rotate, total
 
 BOX = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
@@ -73,7 +73,7 @@ def test_poses_inertia_and_order_of_random_trees_stay(seed, tmp_path):
     rng = np.random.default_rng(seed)
     original = load(tmp_path, *random_tree(rng, 12))
     merged = merge_links(original.tables)
-    tree, reduced = original.rigid_tree, body_tree(merged)
+    tree, reduced = link_tree(original), body_tree(merged)
     assert reduced.joint_names == original.joint_names
     qpos = rng.uniform(-2, 2, original.dof)
     poses, bodies = ts.link_poses(tree, qpos), ts.link_poses(reduced, qpos)
@@ -115,17 +115,3 @@ def test_a_fixed_joint_is_kept_where_its_merge_would_change_the_order_of_the_joi
     merged = merge_links(original.tables)
     assert sorted(names_of(merged)) == ["a", "b", "base", "c", "d", "mount"]
     assert [each.name for each in merged.joints if not each.moves] == ["fixed"]
-
-
-def test_siblings_of_a_merged_link_stay_in_order(tmp_path):
-    """Joints below a fixed one come after the joints of their new siblings, in any order of the
-    file.
-    """
-    parts = (
-        joint("late", "mount", "c"),
-        joint("early", "base", "a"),
-        joint("fixed", "base", "mount", "fixed", ""),
-    )
-    original = load(tmp_path, *map(link, ("base", "a", "mount", "c")), *parts)
-    assert original.joint_names == ("early", "late")
-    assert [each.name for each in merge_links(original.tables).joints] == ["early", "late"]

@@ -14,6 +14,7 @@ from tiny_urdf import INERTIAL, one_joint, write
 
 from batchpid.errors import RobotError
 from batchpid.sim import Robot, Runner
+from batchpid.sim.robot.reading import describe
 
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
 CLAIM = 4_000_000_000
@@ -152,7 +153,7 @@ def test_another_digit_of_any_file_is_another_robot(tmp_path):
     """Whatever this process keeps of the files: size and time stamp stay."""
     (tmp_path / "d.obj").write_bytes(obj())
     path = write(tmp_path, arm("d.obj"))
-    first = Robot.load(path).describe()
+    first = describe(Robot.load(path))
     for file in (path, tmp_path / "d.obj"):
         text, stamp = file.read_text(), file.stat().st_mtime_ns
         # The version of the XML changes nothing.
@@ -161,9 +162,9 @@ def test_another_digit_of_any_file_is_another_robot(tmp_path):
             file.write_text(text[:at] + {"1": "2", "2": "1"}[text[at]] + text[at + 1 :])
             os.utime(file, ns=(stamp, stamp))
             # A mesh may be none any more, and is left out.
-            assert Robot.load(path).describe() != first, text[at - 9 : at + 9]
+            assert describe(Robot.load(path)) != first, text[at - 9 : at + 9]
         file.write_text(text)
-    assert Robot.load(path).describe() == first
+    assert describe(Robot.load(path)) == first
 
 
 def test_a_mesh_that_changed_since_it_was_loaded_is_refused(tmp_path):
@@ -191,8 +192,8 @@ def test_robots_of_other_content_differ_in_what_they_say_about_themselves(tmp_pa
     (tmp_path / "other").mkdir()
     (tmp_path / "other/m.stl").write_bytes(stl())
     moved = Robot.load(write(tmp_path / "other", one_joint(arm=arm)))
-    assert moved.describe() == first.describe(), "equal but for the folder"
+    assert describe(moved) == describe(first), "equal but for the folder"
     (tmp_path / "m.stl").write_bytes(ascii_stl())
-    assert Robot.load(path).describe()["content"] != first.describe()["content"]
+    assert describe(Robot.load(path))["content"] != describe(first)["content"]
     for name, value in (("fixed_base", False), ("self_collision", "none")):
-        assert Robot.load(path, **{name: value}).describe()[name] == value != first.describe()[name]
+        assert describe(Robot.load(path, **{name: value}))[name] == value != describe(first)[name]

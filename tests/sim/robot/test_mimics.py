@@ -33,7 +33,7 @@ def test_limits_of_a_leader_are_narrowed_by_its_followers_through_chains(tmp_pat
     np.testing.assert_allclose(fingers.lower, [-0.5, -0.5, -1.0])
     np.testing.assert_allclose(fingers.upper, [0.25, 1.0, 0.5])
     for poses in (fingers.sample(50), fingers.start[None]):
-        np.testing.assert_array_equal(poses, fingers.coupled(poses))
+        np.testing.assert_array_equal(poses, fingers.coupling.positions(poses))
         np.testing.assert_allclose(np.clip(poses, fingers.lower, fingers.upper), poses, atol=1e-6)
 
 

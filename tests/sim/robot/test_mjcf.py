@@ -17,7 +17,8 @@ from batchpid.sim import Robot, Runner, to_urdf
 from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.protocol import SceneSpec
-from batchpid.sim.view.surfaces import surfaces
+from batchpid.sim.robot.reading import describe
+from batchpid.sim.view.scene import surfaces
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
@@ -112,7 +113,7 @@ def spec_of(robot, **options):
         "ground": False,
     } | options
     return SceneSpec(
-        robot.tables, robot.ignored_pairs, robot.joints, 5e-4, SOLVERS["accurate"], **options
+        robot.tables, robot.self_contact.ignored, robot.joints, 5e-4, SOLVERS["accurate"], **options
     )
 
 
@@ -154,27 +155,9 @@ def test_joints_are_those_of_the_file(load):
     np.testing.assert_array_equal(robot.start, [0.7, 0.1, 0.2])
     np.testing.assert_allclose(load(CHAIN).start, [0.2, 0, np.deg2rad(30), 0])
     assert (
-        robot.describe()["settings"]
-        != load(ARM.replace('qpos=".7', 'qpos=".6')).describe()["settings"]
+        describe(robot)["settings"]
+        != describe(load(ARM.replace('qpos=".7', 'qpos=".6')))["settings"]
     )
-
-
-@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
-def test_swings_as_in_mujoco(load, engine):
-    text = ARM.replace('frictionloss=".1"', 'damping="9"')
-    robot = load(text, self_collision="none")
-    model = mujoco.MjModel.from_xml_string(text)
-    off = mujoco.mjtDisableBit
-    model.opt.timestep, model.opt.disableflags = 5e-4, off.mjDSBL_ACTUATION | off.mjDSBL_CONTACT
-    data = mujoco.MjData(model)
-    data.qpos[:] = robot.start
-    mujoco.mj_step(model, data, 200)
-    options = {"control": "effort", "compensate": "none", "ground": False, "workers": 0}
-    with Runner(robot, num_envs=1, substeps=200, engine=engine, **options) as runner:
-        runner.reset()
-        moved = runner.step(np.zeros(3)).qpos[0]
-    assert np.abs(moved - robot.start).max() > 0.01
-    np.testing.assert_allclose(moved, data.qpos, atol=1e-4)
 
 
 # of a geom in directions u (n, 3) in its frame, by type: capsule, ellipsoid, cylinder, box, mesh
@@ -248,7 +231,7 @@ def test_an_srdf_has_the_last_word(load, tmp_path):
     (tmp_path / "robot.srdf").write_text(
         '<robot><enable_collisions link1="base" link2="fore"/></robot>'
     )
-    assert load(ARM, self_collision="urdf").ignored_pairs == ()
+    assert load(ARM, self_collision="urdf").self_contact.ignored == ()
 
 
 def test_links_of_a_split_body_keep_their_pairs(load):
@@ -323,20 +306,13 @@ def test_the_gear_of_an_actuator_after_an_orientation_servo_is_its_own(load):
     np.testing.assert_array_equal(load(text.replace(BOX, sites, 1)).effort_limit, [6])
 
 
-def test_armature_of_actuators(load):
-    text = two_links(rest='<actuator><motor joint="j" armature=".3" gear="3"/></actuator>')
-    robot = load(text)
-    np.testing.assert_allclose(robot.actuators.armature, [[2.7]])
-    tendon = (
-        '<tendon><fixed name="t"><joint joint="j" coef="2"/><joint joint="k"'
-        ' coef="1"/></fixed></tendon>'
-    )
-    couple = '<equality><joint joint1="k" joint2="j" polycoef="0 3 0 0 0"/></equality>'
-    both = text.replace('joint="j" a', 'tendon="t" a').replace(
-        "</mujoco>", f"{tendon}{couple}</mujoco>"
-    )
-    both = both.replace('<joint name="j"/>', '<joint name="j"/><joint name="k"/>')
-    robot = load(both)  # the moment arm on the leader is 3 (2 + 3 1)
+def test_armature_of_an_actuator_of_coupled_joints(load):
+    text = f"""<mujoco><worldbody><body name="a">{BOX}<body name="b" pos="0 0 1">
+      <joint name="j"/><joint name="k"/>{BOX}</body></body></worldbody>
+      <actuator><motor tendon="t" armature=".3" gear="3"/></actuator>
+      <tendon><fixed name="t"><joint joint="j" coef="2"/><joint joint="k" coef="1"/></fixed></tendon>
+      <equality><joint joint1="k" joint2="j" polycoef="0 3 0 0 0"/></equality></mujoco>"""
+    robot = load(text)  # the moment arm on the leader is 3 (2 + 3 1)
     np.testing.assert_allclose(robot.actuators.armature, [[0.3 * 15**2, 0]])
 
 

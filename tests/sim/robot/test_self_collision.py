@@ -4,7 +4,6 @@ poses.
 
 from __future__ import annotations
 
-import pickle
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -121,13 +120,6 @@ def test_an_srdf_disables_and_enables_pairs_whatever_their_reason(tmp_path):
     ) == 2
 
 
-def test_the_pairs_of_a_robot_travel_with_it(tmp_path):
-    loaded = Robot.load(write(tmp_path, sliders(0.0, 0.1)))
-    pairs = loaded.self_contact
-    assert loaded.self_contact is pairs
-    assert vars(pickle.loads(pickle.dumps(loaded)))["self_contact"] == pairs
-
-
 def test_pairs_that_physx_cannot_hold_collide_in_sapien_alone(tmp_path):
     rng, count = np.random.default_rng(0), 60
     path = write(tmp_path, sliders(*(0.0 for _ in range(count))))
@@ -135,7 +127,7 @@ def test_pairs_that_physx_cannot_hold_collide_in_sapien_alone(tmp_path):
     lines = (f'<disable_collisions link1="l{a}" link2="l{b}"/>' for a, b in pairs)
     write(tmp_path, robot(*lines), "test.srdf")
     loaded = Robot.load(path, self_collision="urdf")
-    assert len(loaded.ignored_pairs) == len(pairs)
+    assert len(loaded.self_contact.ignored) == len(pairs)
     assert loaded.check(engine="mujoco") == loaded.check()
     left = [found for found in loaded.check(engine="sapien") if found.code == "engine"]
     assert 0 < len(left) < len(pairs)
@@ -156,7 +148,9 @@ def test_a_base_that_is_fixed_too_low_has_no_ground(tmp_path):
 
 
 def spec_of(loaded):
-    return SceneSpec(loaded.tables, loaded.ignored_pairs, loaded.joints, 1e-3, None, ground=False)
+    return SceneSpec(
+        loaded.tables, loaded.self_contact.ignored, loaded.joints, 1e-3, None, ground=False
+    )
 
 
 @given(st.integers(0, 2**32))

@@ -7,14 +7,11 @@ import re
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
 from robots import load_bundled
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
-from batchpid.errors import RobotError
 from batchpid.sim import Robot
-from batchpid.sim.view.surfaces import FEWEST, MOST, segments_of, surfaces
+from batchpid.sim.view.scene import surfaces
 
 RED = '<material name="red"><color rgba="1 0 0 0.5"/></material>'
 BOX = '<box size="0.1 0.2 0.4"/>'
@@ -88,20 +85,11 @@ def test_no_vertex_is_shared_across_a_sharp_edge(geometry, angle, tmp_path):
         assert (around @ around.T > np.cos(np.radians(angle))).all()
 
 
-@given(radius=st.floats(1e-3, 10), deviation=st.floats(1e-4, 1e-2))
-def test_chords_stay_within_the_deviation_asked_for(radius, deviation):
-    segments = segments_of(radius, deviation)
-    if FEWEST < segments < MOST:
-        assert radius * (1 - np.cos(np.pi / segments)) <= deviation * (1 + 1e-9)
-        assert radius * (1 - np.cos(np.pi / (segments - 1))) > deviation
-    assert FEWEST <= segments <= MOST
-
-
 @pytest.mark.parametrize("name", Robot.bundled())
 def test_every_link_of_a_bundled_robot_is_drawn(name):
     bundled = load_bundled(name)
     drawn = surfaces(bundled)
-    assert {surface.link for surface in drawn} == {link.name for link in bundled.links}
+    assert {surface.link for surface in drawn} == set(bundled.tables.links)
     for surface in drawn:
         assert surface.faces.max() < len(surface.vertices)
         assert np.abs(surface.vertices).max() < 1
@@ -170,7 +158,7 @@ def test_meshes_that_cannot_be_read_are_reported_with_link_file_and_remedy(tmp_p
     for name, reason, remedy in (
         ("lost.stl", r"\(not found\)", "package_dirs"),
         ("empty.stl", r"\(no triangles\)", "repair the file"),
-        ("box.dae", r"cannot be read \(", "repair the file"),
+        ("box.dae", r"cannot be drawn \(", "repair the file"),
     ):
         for shape in ("", visual(BOX, kind="collision")):
             findings = []
@@ -196,9 +184,14 @@ def test_visuals_are_looked_up_in_package_dirs(tmp_path):
     ] == ["b"]
 
 
-def test_a_malformed_visual_is_an_error_that_names_it(tmp_path):
-    with pytest.raises(RobotError, match=r"link 'a': <sphere radius='big'> needs 1 finite number"):
-        surfaces(load(tmp_path, a=visual('<sphere radius="big"/>')))
+def test_a_malformed_visual_is_reported_and_drawn_as_the_collision_shape(tmp_path):
+    shape = visual(BOX, kind="collision")
+    findings = []
+    (drawn,) = surfaces(
+        load(tmp_path, a=visual('<sphere radius="big"/>') + shape), findings=findings
+    )
+    assert np.ptp(drawn.vertices, axis=0) == pytest.approx((0.4, 0.2, 0.1))
+    assert "link 'a' ('<visual>'): cannot be drawn (<sphere radius='big'>" in str(findings[0])
 
 
 def test_what_was_repaired_is_drawn(tmp_path):

@@ -13,7 +13,7 @@ from robots import load_bundled
 
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError, RobotError
-from batchpid.native.availability import SWITCH
+from batchpid.native.array_program import SWITCH
 from batchpid.sim import OperationalSpace, Robot, Runner, StabilityWarning
 from batchpid.task_space.frames import about, compose
 
@@ -182,47 +182,35 @@ def test_the_robot_is_that_of_the_runner(panda, six_joints):
         Runner(panda, 1, control=OperationalSpace(six_joints, "l6"), **OPTIONS)
 
 
-def test_control_osc_moves_a_link(panda):
+def test_control_osc_is_a_controller_of_a_link(panda):
     goal = np.add(pose_of(panda, START, HAND), [0.05, 0, -0.05, 0, 0, 0, 0])
-    with Runner(panda, 2, control="osc", tool=HAND, **OPTIONS) as runner:
-        runner.reset(START)
-        rollout = runner.rollout(np.broadcast_to(goal, (80, 7)))
-    np.testing.assert_allclose(
-        pose_of(panda, rollout.qpos[-1], HAND)[:, :3], np.tile(goal[:3], (2, 1)), atol=2e-3
-    )
-    with Runner(panda, 2, control=OperationalSpace(panda, HAND), **OPTIONS) as runner:
-        runner.reset(START)
-        again = runner.rollout(np.broadcast_to(goal, (20, 7)))
-    np.testing.assert_array_equal(rollout.qpos[:20], again.qpos)
+    runs = []
+    for options in ({"control": "osc", "tool": HAND}, {"control": OperationalSpace(panda, HAND)}):
+        with Runner(panda, 2, **options, **OPTIONS) as runner:
+            runner.reset(START)
+            runs.append(runner.rollout(np.broadcast_to(goal, (20, 7))).qpos)
+    np.testing.assert_array_equal(*runs)
+    assert np.abs(runs[0] - START).max() > 0.01
     with Runner(panda, 1, control="osc", workers=0) as runner:  # the hand, and not a finger
         np.testing.assert_allclose(runner.command.neutral, pose_of(panda, panda.start, HAND))
 
 
-@pytest.mark.slow
-def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
-    from batchpid.sim import Recorder, plots, read_recording
-
+def test_the_pose_of_the_tool_is_observed(panda):
     control, point = OperationalSpace(panda, HAND, point=[0, 0, 0.1]), [0.0, 0.0, 0.1]
     goals = np.broadcast_to(
         np.multiply(control.command.neutral, [1, 1, 1, -1, -1, -1, -1]), (6, 2, 7)
     )
     with Runner(panda, 2, control=control, **OPTIONS) as runner:
         first = runner.reset()
-        with Recorder(tmp_path / "run.h5", runner):
-            rollout = runner.rollout(goals)
+        rollout = runner.rollout(goals)
         runner.send(goals[0])
         last = runner.recv()
     for seen in (first, last, rollout):
         wanted = ts.link_poses(panda.kinematic_tree(), seen.qpos, [HAND], point=point)[..., 0, :]
         np.testing.assert_array_equal(seen.tool_pose, wanted.astype(np.float32))
-    recorded = read_recording(tmp_path / "run.h5")
-    np.testing.assert_array_equal(recorded.tool_pose, rollout.tool_pose)
-    assert recorded.info.tool == HAND
-    assert recorded.info.units_of("tool_pose") == ("m",) * 3 + ("",) * 4
+    assert rollout.info.tool == HAND
+    assert rollout.info.units_of("tool_pose") == ("m",) * 3 + ("",) * 4
     assert rollout.for_envs([1]).for_ticks(slice(2)).tool_pose.shape == (2, 1, 7)
-    named = {axes.get_title(loc="left"): axes for axes in plots.step_responses(rollout).axes}
-    marked = [line.get_ydata() for line in named["setpoint qx"].get_lines()][-1]
-    np.testing.assert_allclose(marked, -rollout.tool_pose[:, 1, 4])
     with Runner(panda, 1, **OPTIONS) as runner:
         assert runner.reset().tool_pose is None
 

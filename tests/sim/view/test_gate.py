@@ -14,7 +14,7 @@ pytest.importorskip("viser")
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from batchpid.sim.view.gate import Gate
+from batchpid.sim.view.page import Gate
 
 
 @pytest.fixture

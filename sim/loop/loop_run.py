@@ -1,0 +1,205 @@
+"""Long runs of a closed loop: in native code where programs are used, with lanes of rigid trees in
+place of an engine, else step by step in NumPy.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+
+from batchpid.arrays.array_types import Array, Float64, Rows
+from batchpid.arrays.trees import mapped
+from batchpid.sim.engine import native
+from batchpid.sim.engine.native.interface import WIDTH, structure
+from batchpid.sim.engine.native_model import NativeModel, NativeRefresh, aligned, table
+from batchpid.sim.loop.closed_loop import ClosedLoop, LoopState
+from batchpid.sim.loop.group_control import GroupControl
+from batchpid.sim.loop.native_executor import Buffers, TickProgram
+from batchpid.sim.loop.tree_plant import IMPEDANCE, TreePlant
+from batchpid.stages import stages_of
+from batchpid.stages.friction import REFRESH_STEPS
+from batchpid.stages.stage import by_name, started
+from batchpid.stages.values import Command, Measured, Model, Step, Values
+
+
+class MotionPlant:
+    """Plant that moves as ``qpos`` and ``qvel`` (steps, envs, dof) say, whatever its efforts."""
+
+    def __init__(self, qpos: Float64, qvel: Float64) -> None:
+        self.motion = qpos, qvel
+
+    def init(self, qpos: Array, qvel: Array) -> int:
+        """Return the state at the first step."""
+        return 0
+
+    def read(self, state: Any) -> tuple[Float64, Float64]:
+        """Return positions and velocities (envs, dof)."""
+        qpos, qvel = self.motion
+        at = min(state, len(qpos) - 1)
+        return qpos[at], qvel[at]
+
+    def step(self, state: Any, effort: Array) -> int:
+        """Return the state of the next step."""
+        return int(state + 1)
+
+
+class LoopRun:
+    """Run of a closed loop from ``qpos`` and ``qvel`` (envs, dof) on, up to ``steps`` sim steps at
+    a time.
+
+    Its plant is a :class:`.TreePlant`, or a :class:`MotionPlant`, which runs once. ``setpoint`` (envs,
+    dof) is that at the start.
+
+    Attributes
+    ----------
+    setpoints
+        Setpoints or efforts of the next sim steps (steps, envs, dof), for the caller to fill in.
+    qpos, qvel, effort
+        Positions and velocities after each sim step, and the motors' effort in it (steps, envs,
+        dof).
+    measured
+        Reading before the first sim step.
+    states
+        States of the stages by name, whose arrays may be changed before the first sim step.
+    """
+
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        qpos: Float64,
+        qvel: Float64,
+        setpoint: Float64,
+        steps: int,
+    ) -> None:
+        self._loop = loop
+        self.setpoints, self.effort = np.zeros((2, steps, *qpos.shape))
+        if isinstance(loop.plant, MotionPlant):
+            self.qpos, self.qvel = loop.plant.motion
+        else:
+            self.qpos, self.qvel = np.zeros((2, steps, *qpos.shape))
+        self._plant = loop.plant.init(qpos, qvel)
+        stages = stages_of(loop.control)
+        command = Command(np.array(setpoint), feedforward=np.zeros_like(setpoint))
+        lanes = None
+        if not native.obstacle() and loop.control.coupling.is_identity:
+            lanes = Lanes(loop, qpos, qvel)
+            values = lanes.values(command)
+        else:
+            values = loop.values(self._plant, command, Step(0, 1), np.zeros(len(qpos), int))
+        self.measured = values.measured
+        states: Any = mapped(lambda leaf: np.array(leaf, order="C"), started(stages, values))
+        self._states = states
+        self.states = by_name(stages, states)
+        self._program = None
+        if lanes is not None:
+            setup: Any = GroupControl(None, lanes, loop.control, stages, values.model)  # type: ignore[arg-type]
+            buffers = Buffers(states, command, values.measured, np.zeros_like(qpos))
+            self._program = TickProgram(setup, buffers, self._copies, (), False, False)
+            lanes.prepare(self._program)
+
+    def run(self, steps: int) -> None:
+        """Run sim steps, at most as many as the tables have."""
+        program = self._program
+        if program is not None:
+            program.tick.tick = program.tick.step = 0
+            native.extension("_gateway").ticks((program.bound,), steps, 1, True)
+            if program.tick.tick != steps:
+                raise RuntimeError("a setpoint is not finite")
+            return
+        episode = np.zeros(self.setpoints.shape[1], int)
+        state = LoopState(self._plant, self._states, episode)
+        for at in range(steps):
+            state, seen = self._loop.step(state, self.setpoints[at])
+            self.effort[at] = seen.effort
+            if not isinstance(self._loop.plant, MotionPlant):
+                self.qpos[at], self.qvel[at] = seen[:2]
+        self._plant, self._states, _ = state
+
+    def _copies(self, program: TickProgram) -> list[tuple[Rows, Rows]]:
+        """Return the copies between the tables and the arrays of a sim step."""
+        command, measured = program.buffers.command, program.buffers.measured
+        copies = [(self.setpoints, command.setpoint)]
+        results = [(self.qpos, measured.qpos), (self.qvel, measured.qvel)]
+        if isinstance(self._loop.plant, MotionPlant):
+            copies += zip(self._loop.plant.motion, measured[:2], strict=True)
+            results = [(self.effort, program.outputs.motor)]
+        # Bytes are copied as they are, numbers of observations in single precision.
+        return copies + [(rows.view(np.bool_), row.view(np.bool_)) for rows, row in results]
+
+
+class Lanes:
+    """Robots of a closed loop in lanes of native code, for :class:`.TickProgram`; with a
+    :class:`MotionPlant` there are none.
+    """
+
+    def __init__(self, loop: ClosedLoop, qpos: Float64, qvel: Float64) -> None:
+        plant = loop.plant
+        self.rigid_tree = loop.tree
+        self.size, self.dof = qpos.shape
+        self.force_model = NativeModel(self)
+        self.joint_model = self.force_model
+        self.steps_natively = isinstance(plant, TreePlant)
+        self._control = loop.control
+        self._start = qpos, qvel
+        self._group = structure("Group")(robots=self.size, dof=self.dof)
+        if not isinstance(plant, TreePlant):
+            return
+        if plant.bodies.mass.ndim > 2:
+            self.joint_model = NativeModel(self, inertias=self.rigid_tree.inertias(plant.bodies))
+        least, most, width = IMPEDANCE
+        blocks = -(-self.size // WIDTH)
+        arrays = {
+            "bias": aligned(blocks, self.dof, WIDTH),
+            "mass": aligned(blocks, self.dof * (self.dof + 1) // 2, WIDTH),
+            "acceleration": aligned(blocks, self.dof, WIDTH),
+            "qpos": table(qpos, self.size),
+            "qvel": table(qvel, self.size),
+            "armature": table(plant.inertia, self.size),
+            "weight": table(plant.weight[None], self.size),
+            "gravity": table(plant.bodies.gravity[None], self.size),
+            "low": plant.low,
+            "high": plant.high,
+        }
+        free = structure("FreeMotion")(
+            model=self.joint_model.address,
+            stiffness=(most * plant.limit_time) ** -2.0,
+            rate_gain=2.0 / (most * plant.limit_time),
+            least=least,
+            most=most,
+            width=width,
+            timestep=plant.timestep,
+            robots=self.size,
+            **{name: array.ctypes.data for name, array in arrays.items()},
+        )
+        self._group.lanes = ctypes.addressof(free)
+        self._kept = arrays, free
+
+    def values(self, command: Command) -> Values:
+        """Return the values of the first sim step before its stages."""
+        control = self._control
+        force = self.force_model.passive_force
+        parts = control.gravity, control.coriolis
+        model = Model(
+            passive_force=lambda qpos, qvel: force(qpos, qvel, *parts),
+            load=lambda: force(*self._start, True, True),
+            envs=np.arange(self.size),
+        )
+        if control.friction.coulomb is not None:
+            armature = np.zeros((1, self.dof))
+            if control.actuators is not None and control.actuators.armature is not None:
+                armature = control.actuators.armature
+            constants = control.friction, control.drive, control.coupling, control.timestep
+            refresh = NativeRefresh(
+                self.joint_model, self.size, armature, *constants, REFRESH_STEPS
+            )
+            model = model._replace(refresh=refresh)
+        qpos, qvel = self._start
+        measured = Measured(qpos.copy(), qvel.copy(), force(qpos, qvel, *parts))
+        return Values(command, measured, measured, control.timestep, model=model)
+
+    def prepare(self, program: TickProgram) -> None:
+        """Let a program step these robots."""
+        program.tick.group = ctypes.addressof(self._group)
+        program.tick.drawn = -1
