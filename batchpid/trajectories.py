@@ -126,7 +126,15 @@ def minimum_jerk(
     s = tau**3 * (10 + tau * (6 * tau - 15))
     rate = 30 * tau**2 * (1 - tau) ** 2 / safe
     acceleration = 60 * tau * (1 - tau) * (1 - 2 * tau) / safe**2
-    return _trajectory(time, x0, move, s, rate, acceleration, done=tau >= 1 - _ROUNDING)
+    return _trajectory(
+        time,
+        x0,
+        move,
+        s,
+        rate,
+        acceleration,
+        done=tau >= 1 - _ROUNDING,
+    )
 
 
 def straight_line(
@@ -278,7 +286,15 @@ def trapezoidal(
         as_,
         np.where(left < ramp, -as_, 0.0),
     )
-    return _trajectory(time, x0, move, s, rate, acceleration, done=left <= _ROUNDING * total)
+    return _trajectory(
+        time,
+        x0,
+        move,
+        s,
+        rate,
+        acceleration,
+        done=left <= _ROUNDING * total,
+    )
 
 
 def _trajectory(

@@ -76,7 +76,13 @@ class CompiledLaw:
         key = tuple([leaf is None for leaf in (*state, *inputs)])
         if key not in self._programs:
             self._programs[key] = TreeProgram(
-                self._law, self._k, state, inputs, self._shape, self._k.kp.dtype, self._threads
+                self._law,
+                self._k,
+                state,
+                inputs,
+                self._shape,
+                self._k.kp.dtype,
+                self._threads,
             )
         tree = self._programs[key]
         bound = tree.bind(state, inputs, out)

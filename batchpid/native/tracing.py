@@ -16,7 +16,12 @@ from batchpid.arrays.array_types import Array, DType, Pytree
 from batchpid.arrays.trees import filled, leaves, structure
 from batchpid.native.extensions import MASKS, MOST_OPERANDS, OPERATIONS, ROW_WISE
 
-_OTHER_NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
+_OTHER_NAMES = {
+    "abs": "absolute",
+    "logical_and": "and",
+    "logical_or": "or",
+    "logical_not": "not",
+}
 """Operations that have another name in NumPy."""
 
 
@@ -373,7 +378,15 @@ def _assembled(
     masks = tuple(result.is_mask for result in results)
     segments = tuple(_segments(operations, places, results))
     ends = _packed(places[result] for result in results)
-    return Trace(_packed(rows), ends, segments, masks, registers, literals, prelude)
+    return Trace(
+        _packed(rows),
+        ends,
+        segments,
+        masks,
+        registers,
+        literals,
+        prelude,
+    )
 
 
 def _segments(

@@ -105,7 +105,16 @@ def _finding(
     numbers = tuple(envs[rows].tolist())
     time = times.min()
     kind = FINDING_KINDS[rule.code]
-    return Finding(kind.code, kind.when, kind.done, name, None, detail, numbers, time)
+    return Finding(
+        kind.code,
+        kind.when,
+        kind.done,
+        name,
+        None,
+        detail,
+        numbers,
+        time,
+    )
 
 
 class _Run:

@@ -133,7 +133,14 @@ def identify(
         places = _payload_links(robot, payload_link)
     read = _read(robot, logs, params, reading)
     moves, still = _moving(robot, read)
-    robot, data = _prepared(robot, read, moves, params, compensate, timestep)
+    robot, data = _prepared(
+        robot,
+        read,
+        moves,
+        params,
+        compensate,
+        timestep,
+    )
     law_unknown = bool({"kd", "gain"}.intersection(kinds))
     data, guesses = _regress(robot, data, law_unknown, progress)
     windows = windows_of(data)
@@ -142,7 +149,14 @@ def identify(
         starts = dict[Any, list[Problem]]()
         for place, share in product(places, SATURATIONS if "saturation" in kinds else (0.7,)):
             for guess in guesses:
-                unknowns = _unknowns(robot, data, guess, kinds, place, share)
+                unknowns = _unknowns(
+                    robot,
+                    data,
+                    guess,
+                    kinds,
+                    place,
+                    share,
+                )
                 starts.setdefault((place, share), []).append(Problem(data, windows, unknowns, run))
         solution = with_effects(fit(starts, evaluations, progress), evaluations, progress)
     # Worker processes end with the fit.

@@ -235,7 +235,17 @@ def _commanded(part: LogData) -> Float64:
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
     none = np.zeros(count)
     alone = drive._replace(gravity=False, coriolis=False, further=())
-    loop = plant.loop(alone, Candidates(Actuators(), {}, none, none, {}, {}))
+    loop = plant.loop(
+        alone,
+        Candidates(
+            Actuators(),
+            {},
+            none,
+            none,
+            {},
+            {},
+        ),
+    )
     loop = replace(loop, control=loop.control._replace(friction=Friction()))
     tables = [np.repeat(plant.spread(table)[:, None], count, axis=1) for table in motion[:2]]
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)

@@ -233,7 +233,14 @@ class ClosedLoop:
         if load is None or not (control.gravity and control.coriolis):
             load = passive(qpos, qvel)
         measured = Measured(qpos, qvel, load)
-        return Values(command, measured, measured, control.timestep, step, model)
+        return Values(
+            command,
+            measured,
+            measured,
+            control.timestep,
+            step,
+            model,
+        )
 
 
 def _when(due: Any, function: Callable[[], Any], otherwise: Any) -> Any:

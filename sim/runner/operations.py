@@ -276,4 +276,12 @@ def _fault(options: RunnerOptions, env: int, arrays: Arrays) -> Fault:
     if command is not None and cause in COMMAND_CAUSES:
         kind, names = "entry", command.names
     joint = names[arrays.fault.joint[env]]
-    return Fault(env, step, step * options.timestep, joint, cause, options.on_fault, kind)
+    return Fault(
+        env,
+        step,
+        step * options.timestep,
+        joint,
+        cause,
+        options.on_fault,
+        kind,
+    )

@@ -254,7 +254,12 @@ class GainCandidates:
         ratios = []
         for kp, kd, filter_time in zip(*leaves[..., self.robot.independent], strict=True):
             bound = stability_bound(
-                self._mass, kp, kd, dt, filter_time=filter_time, damping=self._damping
+                self._mass,
+                kp,
+                kd,
+                dt,
+                filter_time=filter_time,
+                damping=self._damping,
             )
             ratios.append(bound.ratio.max())
         return 10 * np.maximum(np.array(ratios) - PENALTY_RATIO, 0)

@@ -22,7 +22,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import MjModel
 from batchpid.sim.findings import Finding
-from batchpid.sim.robot.mjcf.model import RobotInFile, label
+from batchpid.sim.robot.mjcf.bodies import RobotInFile, label
 
 Couplings = dict[str, tuple[str, float, float]]
 """Leader, multiplier and offset of each follower, as in ``<mimic>``."""
