@@ -4,6 +4,7 @@ of controllers in Python; and in programs of JAX.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache, partial
 from itertools import groupby
 from typing import Any
@@ -67,6 +68,16 @@ class NumPyExecutor:
     def write_state(self, states: States) -> None:
         """Replace the states; they have the arrays of the states before."""
         self._states = states
+
+    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
+        """Change the state of the stage ``name``, between sim steps, to ``function(stage, state)``,
+        which has the same arrays or others in their place.
+        """
+        pairs = zip(self.setup.stages, self._states, strict=True)
+        changed = [
+            function(stage, state) if stage.name == name else state for stage, state in pairs
+        ]
+        self._states = tuple(changed)
 
     def results(self) -> Outputs:
         """Return the results of the last sim step as NumPy arrays."""
