@@ -1,6 +1,5 @@
-/* A plan: chunks of actions are added when they come, and sampled at any time. A header of batchpid.to_c has it with the
- * prefix and the type of its numbers, and the statements of its plan in place of the comments in brackets.
- */
+/* A plan: chunks of actions are added when they come, and sampled at any time. As in c_rigid_body.h, a header of
+ * batchpid.to_c has the statements of its plan in place of the comments in brackets. */
 
 /* Memory of a plan. */
 typedef struct {
