@@ -21,8 +21,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Document, DType
-from batchpid.arrays.choices import NamedChoice
+from batchpid.arrays.array_types import Array, Document, DType, NamedChoice
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.records import LeafBuilder, Record, with_fields
 from batchpid.checks.validate import choice, integer, positive

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjModel, MjSpec
-from batchpid.arrays.digest import digest
+from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
 from batchpid.sim.findings import Finding, Notes
 from batchpid.sim.robot.tables import unique
