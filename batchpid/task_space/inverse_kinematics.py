@@ -216,7 +216,14 @@ class _Search(NamedTuple):
     def solve(self, goal: Float64, qpos: Float64) -> _Found:
         """Return the results of searches that begin at ``qpos`` (n, dof), within the limits."""
         tool = self.tree, self.link, self.point
-        native = native_rows.search(*tool, self.limits, goal, qpos, self.tolerance, self.iterations)
+        native = native_rows.search(
+            *tool,
+            self.limits,
+            goal,
+            qpos,
+            self.tolerance,
+            self.iterations,
+        )
         if native is not None:
             return _Found(*native)
         # The same search in NumPy: the definition of the native one.
@@ -300,7 +307,15 @@ def _goals_and_starts(
     unit = np.abs(length - 1) < 1e-3
     problem = "has a quaternion whose length is not 1"
     remedy = "normalise w, x, y, z"
-    entries("pose", length, unit, problem, ["qw"], kind="entry", remedy=remedy)
+    entries(
+        "pose",
+        length,
+        unit,
+        problem,
+        ["qw"],
+        kind="entry",
+        remedy=remedy,
+    )
     goal[:, 3:] /= length
     return goal, tree.positions(np.clip(rows, tree.lower, tree.upper))
 

@@ -233,7 +233,14 @@ def evaluated(
     index = 0 if link is None else tree.index(link)
     point = read_point(q, point)
     if bodies is None:
-        native = native_rows.kinematics(tree, names, q, v, index, point)
+        native = native_rows.kinematics(
+            tree,
+            names,
+            q,
+            v,
+            index,
+            point,
+        )
         if native is not None:
             return native
     # The definition, for JAX, for varied bodies, and where no extension was built.
@@ -258,7 +265,14 @@ def evaluated(
             velocities = None
         else:
             speeds = v.reshape(-1, tree.dof).T
-            velocities = velocities_of(tree, of_robots, motions, speeds, xp, turning)
+            velocities = velocities_of(
+                tree,
+                of_robots,
+                motions,
+                speeds,
+                xp,
+                turning,
+            )
         if link is not None:
             tool = tool_frame(tree, of_robots, motions, index, place)
             results["pose"] = pose_of(tool)
@@ -270,7 +284,14 @@ def evaluated(
         if "mass_matrix" in names:
             results["mass_matrix"] = mass_matrix_of(tree, of_robots, motions, xp)
         if "bias" in names and velocities is not None:
-            results["bias"] = effort_of(tree, of_robots, motions, velocities, xp, turning)
+            results["bias"] = effort_of(
+                tree,
+                of_robots,
+                motions,
+                velocities,
+                xp,
+                turning,
+            )
     return {name: rows.reshape(*leading, *rows.shape[1:]) for name, rows in results.items()}
 
 
@@ -288,7 +309,17 @@ def link_poses(
     """
     prepared(tree, qpos=qpos)
     names = tree.links if links is None else links
-    poses = [evaluated(tree, ("pose",), qpos, None, link, point)["pose"] for link in names]
+    poses = [
+        evaluated(
+            tree,
+            ("pose",),
+            qpos,
+            None,
+            link,
+            point,
+        )["pose"]
+        for link in names
+    ]
     return namespace(*poses).stack(poses, axis=-2)
 
 
@@ -304,7 +335,14 @@ def jacobian(
 
     ``point`` is in the link's frame, (3,) or (..., 3) [m]; default its origin.
     """
-    return evaluated(tree, ("jacobian",), qpos, None, link, point)["jacobian"]
+    return evaluated(
+        tree,
+        ("jacobian",),
+        qpos,
+        None,
+        link,
+        point,
+    )["jacobian"]
 
 
 def jacobian_rate(
@@ -320,7 +358,14 @@ def jacobian_rate(
 
     ``qpos`` and ``qvel`` are (..., dof); ``point`` is as in :func:`jacobian`.
     """
-    return evaluated(tree, ("jacobian_rate",), qpos, qvel, link, point)["jacobian_rate"]
+    return evaluated(
+        tree,
+        ("jacobian_rate",),
+        qpos,
+        qvel,
+        link,
+        point,
+    )["jacobian_rate"]
 
 
 def mass_matrix(tree: RigidTree, qpos: Array, bodies: Bodies | None = None) -> Array:
@@ -347,7 +392,14 @@ def bias(
     A floating base turns at ``turning`` (..., 3) [rad/s], in its own axes; default 0. ``bodies``
     are as in :func:`mass_matrix`.
     """
-    return evaluated(tree, ("bias",), qpos, qvel, bodies=bodies, turning=turning)["bias"]
+    return evaluated(
+        tree,
+        ("bias",),
+        qpos,
+        qvel,
+        bodies=bodies,
+        turning=turning,
+    )["bias"]
 
 
 def gravity(tree: RigidTree, qpos: Array) -> Array:

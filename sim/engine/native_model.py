@@ -45,7 +45,7 @@ def passive_force(
     bodies = None
     if base is not None:
         turning = base[:, 3:]
-        bodies = tree.bodies._replace(gravity=base[:, None, :3])
+        bodies = tree.bodies._replace(gravity=base[:, :3])
     force = zero
     if coriolis or gravity:
         force = ts.bias(
@@ -167,7 +167,14 @@ class NativeModel:
             for rows in (qpos, qvel, base)
         ]
         out = np.empty(qpos.shape)
-        self._native.forces(self.address, gravity, coriolis, *state, out, len(out))
+        self._native.forces(
+            self.address,
+            gravity,
+            coriolis,
+            *state,
+            out,
+            len(out),
+        )
         return out
 
 
@@ -219,7 +226,11 @@ class NativeRefresh:
         arrays |= coupling.native()
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
         self._structure = structure("Refresh")(
-            model=model.address, timestep=timestep, share=DEADBEAT_SHARE, steps=steps, **addresses
+            model=model.address,
+            timestep=timestep,
+            share=DEADBEAT_SHARE,
+            steps=steps,
+            **addresses,
         )
         self._kept = model, arrays
 
@@ -258,7 +269,12 @@ class NativeStep:
             self._arrays["speed_limit"] = np.broadcast_to(speed_limit, dof).astype(np.float64)
         addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
         self._native = native.extension("_gateway")
-        self._group = structure("Group")(robots=robots, dof=dof, **addresses, **fields)
+        self._group = structure("Group")(
+            robots=robots,
+            dof=dof,
+            **addresses,
+            **fields,
+        )
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension that does a sim
@@ -277,7 +293,7 @@ class NativeStep:
         """Return whether an env may have failed in a sim step with this status; RuntimeError if the
         engine has.
         """
-        if status & number("Status", "FAILED"):
+        if status and status & number("Status", "FAILED"):
             raise RuntimeError(self._group.message.decode(errors="replace"))
         return bool(status)
 

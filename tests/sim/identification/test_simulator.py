@@ -9,7 +9,7 @@ from arms import DT, FALLING, STEPS, TRUTH, gains, load, motion, run
 import batchpid as bp
 from batchpid.motors.coupling import Coupling
 from batchpid.sim import Robot
-from batchpid.sim.identification.simulator import Candidates, Plant, Stretch, simulate
+from batchpid.sim.identification.simulator import Candidates, LogPlant, Stretch, simulate
 from batchpid.stages import Control
 
 MOTORS = {
@@ -58,7 +58,7 @@ def stretch_of(commands, start) -> Stretch:
 
 def simulated(robot: Robot, commands, drive: Control, made: Candidates, start) -> np.ndarray:
     (table,) = simulate(
-        Plant(robot, (0, 1)), drive, made, np.zeros((1, 2, 2)), [stretch_of(commands, start)]
+        LogPlant(robot, (0, 1)), drive, made, np.zeros((1, 2, 2)), [stretch_of(commands, start)]
     )
     return table[0]
 
@@ -139,7 +139,7 @@ def test_masses_are_those_of_another_description(tmp_path):
 
 def test_candidates_and_stretches_do_not_affect_each_other(tmp_path):
     robot, setpoints = load(tmp_path), motion(0.5)
-    plant, drive = Plant(robot, (0, 1)), control(gains(), "gravity+coriolis")
+    plant, drive = LogPlant(robot, (0, 1)), control(gains(), "gravity+coriolis")
     stretches = [stretch_of(setpoints, setpoints[0]), stretch_of(setpoints[20:60], setpoints[20])]
     # Each candidate comes once for each stretch.
     strengths = np.array([[1.0, 1.0], [0.9, 0.9], [0.5, 1.2]])
