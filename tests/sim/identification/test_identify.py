@@ -210,15 +210,6 @@ def test_an_effect_that_lowers_the_held_out_error_is_added(robot, tmp_path):
     assert corrected == pytest.approx(factors["fore"] * before)
 
 
-def test_an_unknown_that_nothing_shows_is_not_in_the_file(robot):
-    """Joint 1 is never commanded: it swings."""
-    log = log_of(robot, effort_run(robot, (1.0, 0.0)), NOISE)
-    found = identify(robot, [log], payload=False)
-    assert found.interval("strength", 1) is None
-    assert "elbow: strength" in found.not_shown
-    assert "not shown by these logs: elbow: strength" in found.report()
-
-
 READINGS = {
     "effort of all joints with the other sign": ("effort", lambda log: {"command": -log.command}),
     "effort in thousandths of SI units": ("effort", lambda log: {"command": 1e3 * log.command}),
@@ -287,6 +278,9 @@ def test_the_report_has_all_values_and_errors(found):
     document = found.document()
     assert document["intervals"]["elbow"]["strength"][0] == found.interval("strength", 1)[0]
     assert len(found.figure().axes) == 2
+    for place in (("strength", 5), ("delay", 0), ("mass", "fore"), ("speed", 0)):
+        with pytest.raises(bp.InvalidArgumentError):
+            found.interval(*place)
     with pytest.raises(bp.InvalidArgumentError, match="no mass was found"):
         found.corrected_urdf()
 
@@ -300,37 +294,26 @@ def test_held_out_logs_are_not_fitted(robot, log):
     assert found.interval("strength", 0)[0] == pytest.approx(0.9, rel=0.01)
 
 
+OTHER = bp.make_params(3, 1.0)
 WRONG = {
-    "contradict .* another kp": {"params": gains().replace(kp=100.0)},
-    "contradicts .*'none'": {"compensate": "gravity"},
-    "contradicts .*0.001": {"timestep": 0.002},
-    "extras": {"extras": ["speed"]},
-    "evaluations": {"evaluations": 0},
-    "hold 3 joints": {"params": bp.make_params(3, 1.0)},
+    "contradict .* another kp": (["log"], {"params": gains().replace(kp=100.0)}),
+    "contradicts .*'none'": (["log"], {"compensate": "gravity"}),
+    "contradicts .*0.001": (["log"], {"timestep": 0.002}),
+    "extras": (["log"], {"extras": ["speed"]}),
+    "evaluations": (["log"], {"evaluations": 0}),
+    "hold 3 joints": (["log"], {"params": OTHER}),
+    "is of a law": (["effort_log"], {"extras": ["slew"]}),
+    "give no params": (["effort_log"], {"params": gains()}),
+    "fit them one by one": (["effort_log", "log"], {}),
+    "are missing": ([], {}),
 }
 
 
 @pytest.mark.parametrize("problem", WRONG)
-def test_options_that_contradict_a_recording_are_refused(robot, log, problem):
+def test_options_that_contradict_the_logs_are_refused(robot, request, problem):
+    names, options = WRONG[problem]
     with pytest.raises(bp.InvalidArgumentError, match=problem):
-        identify(robot, [log], **WRONG[problem])
-
-
-def test_logs_of_efforts_refuse_what_is_of_a_law(robot, effort_log, log):
-    with pytest.raises(bp.InvalidArgumentError, match="is of a law"):
-        identify(robot, [effort_log], extras=["slew"])
-    with pytest.raises(bp.InvalidArgumentError, match="give no params"):
-        identify(robot, [effort_log], gains())
-    with pytest.raises(bp.InvalidArgumentError, match="fit them one by one"):
-        identify(robot, [effort_log, log])
-    with pytest.raises(bp.InvalidArgumentError, match="are missing"):
-        identify(robot, [])
-
-
-def test_intervals_name_unknowns_that_there_are(found):
-    for place in (("strength", 5), ("delay", 0), ("mass", "fore"), ("speed", 0)):
-        with pytest.raises(bp.InvalidArgumentError):
-            found.interval(*place)
+        identify(robot, [request.getfixturevalue(name) for name in names], **options)
 
 
 @pytest.mark.slow
