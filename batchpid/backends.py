@@ -148,11 +148,10 @@ class JAXBackend:
 
     def array(self, value: Array) -> Array:
         """Return ``value`` as an array of this backend."""
-        if isinstance(value, np.ndarray) or not isinstance(value, self.jax.Array):
-            return np.asarray(value, dtype=self.dtype)
-        if value.dtype == self.dtype:
+        if isinstance(value, self.jax.Array) and value.dtype == self.dtype:
             return value
-        return np.asarray(value, dtype=self.dtype)
+        # A copy: JAX may read it when the call has returned, and the caller writes to it.
+        return np.array(value, dtype=self.dtype)
 
     def call(self, function: Callable[..., PIDState], *inputs: Array, **named: Array) -> PIDState:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""

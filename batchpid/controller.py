@@ -202,7 +202,12 @@ class BatchPID:
         if measurement_rate is None:
             check_alone(self._params, None)
         effort = self._fast(
-            out, setpoint, measurement, measurement_rate, setpoint_rate, feedforward
+            out,
+            setpoint,
+            measurement,
+            measurement_rate,
+            setpoint_rate,
+            feedforward,
         )
         if effort is not NotImplemented:
             return effort
@@ -257,7 +262,13 @@ class BatchPID:
         )
         self._fast = declined
         self._state = self._engine.call(
-            bumpless.track, self._started(y), r, y, u, dt=self._dt, **rest
+            bumpless.track,
+            self._started(y),
+            r,
+            y,
+            u,
+            dt=self._dt,
+            **rest,
         )
 
     def _started(self, y: Array) -> PIDState:

@@ -163,7 +163,12 @@ class RunInfo:
 
         values = {name: getattr(robot, name) for name in _OF_ROBOT}
         values |= {"digest": content(robot), "dissipation": robot.source.dissipation}
-        return cls(robot=robot.name, description=robot, **values, **options)
+        return cls(
+            robot=robot.name,
+            description=robot,
+            **values,
+            **options,
+        )
 
     @property
     def command(self) -> CommandSpec:

@@ -256,24 +256,29 @@ def array(
     ``finite`` is False. ``names`` holds the name of each column. ``kind`` is the type of a column:
     a joint, or an entry of a command.
     """
-    remedy = (
-        f"the last axis counts the {'joints' if kind == 'joint' else 'entries'} {', '.join(names)}"
-    )
     is_read = type(value) is np.ndarray and value.dtype == np.float64  # nearly always
     result: NDArray[Any] = value if is_read else read_array(argument, value)  # type: ignore[assignment]
-    # One number for all joints is a scalar, not an array of one.
-    if result.ndim and result.shape[-1] != shape[-1]:
-        raise InvalidArgumentError(
-            argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy
-        )
     flat = result.reshape(-1)
     if not is_read or result.shape != shape:
+        columns = "joints" if kind == "joint" else "entries"
+        remedy = f"the last axis counts the {columns} {', '.join(names)}"
+        # One number for all joints is a scalar, not an array of one.
+        if result.ndim and result.shape[-1] != shape[-1]:
+            raise InvalidArgumentError(
+                argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy
+            )
         result = broadcast(argument, result, shape, remedy)
     # The sum of squares costs a third, and is finite for most; BLAS uses threads for a longer one.
     is_sound = flat.size < 10_000 and math.isfinite(flat.dot(flat))
     if finite and not is_sound and not (good := np.isfinite(result)).all():
         entries(
-            argument, result, good, "is not finite", names, kind=kind, remedy="pass finite numbers"
+            argument,
+            result,
+            good,
+            "is not finite",
+            names,
+            kind=kind,
+            remedy="pass finite numbers",
         )
     return result
 
@@ -329,7 +334,14 @@ def at_least(
         low
     )
     problem = f"must be {' and '.join(bounds) or 'a number'}"
-    entries(argument, values, good, problem, joint_names, kind=kind)
+    entries(
+        argument,
+        values,
+        good,
+        problem,
+        joint_names,
+        kind=kind,
+    )
     return values
 
 

@@ -86,7 +86,18 @@ def to_c(
         Params for several envs, options that exclude each other, names that C does not allow, or a
         tree with other joints.
     """
-    return Exported(Header(params, dt, joint_names, guard, inputs, prefix, tree, plan).text())
+    return Exported(
+        Header(
+            params,
+            dt,
+            joint_names,
+            guard,
+            inputs,
+            prefix,
+            tree,
+            plan,
+        ).text()
+    )
 
 
 class Header:

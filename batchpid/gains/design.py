@@ -192,7 +192,14 @@ def design_gains(
             inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping
         )
         if is_explicit:
-            filter_time = _filter_time(mass, gains, dt, viscous, gain_units, margin)
+            filter_time = _filter_time(
+                mass,
+                gains,
+                dt,
+                viscous,
+                gain_units,
+                margin,
+            )
         else:
             filter_time = 0.0
         if (
@@ -233,7 +240,12 @@ def _filter_time(
 
     def ratios(filter_time: float) -> Float64:
         return stability_bound(
-            mass, gains["kp"], gains["kd"], dt, filter_time=filter_time, damping=damping
+            mass,
+            gains["kp"],
+            gains["kd"],
+            dt,
+            filter_time=filter_time,
+            damping=damping,
         ).ratio
 
     low = FILTER_STEPS * dt

@@ -176,7 +176,14 @@ def implicit_gains(params: PIDParams, dt: Array) -> tuple[Array, ...]:
     kd = params.kd
     b = params.setpoint_weight
     c = params.setpoint_weight_derivative
-    xp = namespace(kp, ki, kd, b, c, dt)
+    xp = namespace(
+        kp,
+        ki,
+        kd,
+        b,
+        c,
+        dt,
+    )
     ki_dt = 0.0 if ki is None else ki * dt
     # The symbols of the equations above: numerators first, then 1 / D.
     stiffness = kp + 2 * ki_dt
@@ -210,5 +217,10 @@ def as_explicit(params: PIDParams, dt: Array) -> PIDParams:
         return params
     kp, ki, kd, b, _, c, _ = implicit_gains(params, dt)
     return params._replace(
-        kp=kp, ki=ki, kd=kd, setpoint_weight=b, setpoint_weight_derivative=c, discretization=None
+        kp=kp,
+        ki=ki,
+        kd=kd,
+        setpoint_weight=b,
+        setpoint_weight_derivative=c,
+        discretization=None,
     )

@@ -71,13 +71,27 @@ def advance_with_mass_matrix(
     )
     rates = measurement_rate, setpoint_rate, given_acceleration(k, setpoint_acceleration)
     new, terms = advance(_unlimited(k), state, setpoint, measurement, *rates)
-    new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
+    new, effort, unsaturated = _to_effort(
+        k,
+        state,
+        new,
+        terms.effort,
+        mass_matrix,
+        feedforward,
+    )
     p, i, d, arguments = (
         x if isinstance(x, float) else matrix_vector(mass_matrix, x) for x in terms[:4]
     )
     if feedforward is not None:
         arguments = arguments + feedforward
-    return new, Terms(p, i, d, arguments, unsaturated, effort)
+    return new, Terms(
+        p,
+        i,
+        d,
+        arguments,
+        unsaturated,
+        effort,
+    )
 
 
 def given_acceleration(k: Coefficients, setpoint_acceleration: Array) -> Array:
@@ -136,7 +150,12 @@ def convert_integral(
 
 
 def _unlimited(k: Coefficients) -> Coefficients:
-    return k._replace(effort_min=None, effort_max=None, effort_step=None, gain_units=None)
+    return k._replace(
+        effort_min=None,
+        effort_max=None,
+        effort_step=None,
+        gain_units=None,
+    )
 
 
 def _to_effort(

@@ -303,7 +303,14 @@ def _masks(build: LeafBuilder, names: str | Sequence[object]) -> list[Bool | Non
     array = build.rows("anti_windup", array)
     good = np.array([isinstance(name, str) and name in ANTI_WINDUP for name in array.flat], bool)
     good = good.reshape(array.shape)
-    entries("anti_windup", array, good, "unknown option", build.names, remedy=remedy)
+    entries(
+        "anti_windup",
+        array,
+        good,
+        "unknown option",
+        build.names,
+        remedy=remedy,
+    )
     # "none" needs no mask: it is where the others are not.
     joints = [array == strategy for strategy in ANTI_WINDUP[1:]]
     return [mask if mask.any() else None for mask in joints]

@@ -125,7 +125,14 @@ def step(
         "setpoint_rate": setpoint_rate,
         "feedforward": feedforward,
     }
-    state, terms = _step(params, state, setpoint, measurement, dt, **inputs)
+    state, terms = _step(
+        params,
+        state,
+        setpoint,
+        measurement,
+        dt,
+        **inputs,
+    )
     return state, terms.effort
 
 
@@ -140,7 +147,14 @@ def step_terms(
     """Advance the law as :func:`step`, with the same arguments; return the state and all terms,
     effort included.
     """
-    state, terms = _step(params, state, setpoint, measurement, dt, **inputs)
+    state, terms = _step(
+        params,
+        state,
+        setpoint,
+        measurement,
+        dt,
+        **inputs,
+    )
     return state, terms.filled()
 
 
@@ -191,9 +205,22 @@ def advance(
     measured rate that is not given. Gains per mass matrix: :mod:`batchpid.law.computed_torque`.
     """
     check_alone(k, measurement_rate)
-    xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
+    xp = namespace(
+        *k,
+        *state,
+        setpoint,
+        measurement,
+        measurement_rate,
+        setpoint_rate,
+        feedforward,
+    )
     r, y, r_rate, y_rate, ff = in_dtype_of(
-        k, setpoint, measurement, setpoint_rate, measurement_rate, feedforward
+        k,
+        setpoint,
+        measurement,
+        setpoint_rate,
+        measurement_rate,
+        feedforward,
     )
     finite = None
     if k.non_finite is not None:
@@ -283,7 +310,15 @@ def advance(
             finite, effort, state.effort if isinstance(k.non_finite, HoldEffort) else 0
         )
         u = xp.where(finite, u, effort)  # no limit has changed that
-    return new, Terms(p, i, d, 0.0 if ff is None else ff, u, effort, finite=finite)
+    return new, Terms(
+        p,
+        i,
+        d,
+        0.0 if ff is None else ff,
+        u,
+        effort,
+        finite=finite,
+    )
 
 
 def reset(

@@ -143,7 +143,15 @@ def init(
         episodes = xp.broadcast_to(xp.asarray(episode), leading)
         key = noise.keys(actuators.seed, numbers, episodes, xp)
         step = xp.zeros(leading, xp.uint32)
-    state = ActuatorState(command, None, positions, velocities, encoder, key, step)
+    state = ActuatorState(
+        command,
+        None,
+        positions,
+        velocities,
+        encoder,
+        key,
+        step,
+    )
     if actuators.lag is None:
         return state
     k = discretise(actuators, state, dt)
@@ -362,7 +370,19 @@ def advance_measurement(
             drawn = measurement_noise(k, key, step, qpos, xp)
         step = step + _ONE
     qpos, qvel = _encode(k, qpos, qvel, *(drawn or (None, None)))
-    return ActuatorState(command, effort, positions, velocities, encoder, key, step), qpos, qvel
+    return (
+        ActuatorState(
+            command,
+            effort,
+            positions,
+            velocities,
+            encoder,
+            key,
+            step,
+        ),
+        qpos,
+        qvel,
+    )
 
 
 def measurement_noise(

@@ -262,7 +262,14 @@ def _check_together(leaves: Document, joint_names: Sequence[str] | None) -> None
     elif not is_traced(static) and not is_traced(coulomb):
         good = (static == 0) | (static >= (0.0 if coulomb is None else coulomb))
         remedy = "give at least coulomb, or 0"
-        entries("static", static, good, "is less than coulomb", joint_names, remedy=remedy)
+        entries(
+            "static",
+            static,
+            good,
+            "is less than coulomb",
+            joint_names,
+            remedy=remedy,
+        )
 
 
 def _longest_delay(leaves: Document, max_delay: float | None) -> float | None:

@@ -14,14 +14,16 @@ import os
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import DType, Rows
+from batchpid.arrays.array_types import DType, Pytree, Rows
+from batchpid.arrays.trees import filled, leaves, structure
 from batchpid.errors import warn
 from batchpid.native.extensions import PROGRAM, TASK_SPACE, Extension, StaleExtensionError, load
-from batchpid.native.tracing import Trace
+from batchpid.native.tracing import Trace, trace_change
 
 NUMBERS_PER_THREAD = 2**17
 """Least share of an array, in numbers, for which another thread is worth its start (50 us)."""
@@ -146,6 +148,72 @@ class ArrayProgram:
         new = (self.shape, self.dtype)
         fixed = self._program, self.shape[0], tuple(inputs), tuple(outputs)
         return partial(native.call, native.bind(*fixed, given, full, new, self._threads))
+
+
+class Bound(NamedTuple):
+    """Arrays of a :class:`TreeProgram`."""
+
+    program: ArrayProgram
+    inputs: list[Rows]
+    outputs: list[Rows]
+    after: Any
+    """State, results and others after the program."""
+
+
+class TreeProgram:
+    """Program of a pure function of trees: ``function(constants, state, inputs)`` returns state,
+    results and others, as for :func:`.trace_change`.
+
+    ``state`` and ``inputs`` are arrays like those to :meth:`bind`; other arguments as for
+    :class:`ArrayProgram`.
+
+    Raises
+    ------
+    AttributeError, AssertionError, TypeError
+        The function uses an operation that programs do not have.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any, Any, Any], tuple[Pytree, Pytree, Pytree]],
+        constants: Pytree,
+        state: Pytree,
+        inputs: Pytree,
+        shape: tuple[int, int],
+        dtype: DType = np.float64,
+        threads: int | None = None,
+    ) -> None:
+        histories = tuple([array.ndim == 3 for array in leaves(state)])
+        trees = map(structure, (constants, state, inputs))
+        self._change = trace_change(function, histories, *trees, dtype=np.dtype(dtype))
+        count = len(leaves((state, inputs)))
+        trace = self._change.program
+        self.program = ArrayProgram(
+            trace,
+            leaves(constants),
+            count,
+            shape,
+            dtype,
+            threads,
+        )
+
+    def bind(self, state: Pytree, inputs: Pytree, last: Rows | None = None) -> Bound:
+        """Return arrays for the program: it changes those of the state in place, and makes its
+        results in new ones, the last one in ``last``.
+        """
+        program = self.program
+        read = leaves((state, inputs))
+        written = [
+            np.zeros(program.shape, bool if is_mask else program.dtype) for is_mask in program.masks
+        ]
+        if last is not None:
+            written[-1] = last
+        # The state comes first.
+        for array, place in zip(leaves(state), self._change.places, strict=False):
+            if place >= len(read):
+                written[place - len(read)] = array
+        arrays = iter([[*read, *written][place] for place in self._change.places])
+        return Bound(program, read, written, filled(self._change.after, arrays))
 
 
 SWITCH = "BATCHPID_NATIVE"

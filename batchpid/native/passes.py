@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.trees import structure
+from batchpid.arrays.trees import leaves, structure
 from batchpid.law.coefficients import discretise
 from batchpid.law.params import make_params
 from batchpid.law.pid import init
-from batchpid.native.compiled import law_trace
-from batchpid.native.tracing import Segment
+from batchpid.native.compiled import law_with_effort
+from batchpid.native.tracing import Segment, trace_change
 
 BESIDE_P: tuple[dict[str, Any], ...] = (
     {},
@@ -53,9 +53,10 @@ def law_segments() -> Iterator[Segment]:
             derivative_filter_time=time,
         )
         inputs = (NUMBERS, NUMBERS, None, None, feedforward)
-        trees = discretise(params, 1.0), init(params, NUMBERS), inputs
-        trace, _ = law_trace(structure(trees), False, np.dtype(float))
-        yield from trace.segments
+        state = init(params, NUMBERS)
+        trees = map(structure, (discretise(params, 1.0), state, inputs))
+        histories = (False,) * len(leaves(state))
+        yield from trace_change(law_with_effort, histories, *trees).program.segments
 
 
 def header() -> str:

@@ -6,16 +6,22 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import lru_cache
 from itertools import groupby
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, DType, Pytree
-from batchpid.arrays.trees import filled, leaves
+from batchpid.arrays.trees import filled, leaves, structure
 from batchpid.native.extensions import MASKS, MOST_OPERANDS, OPERATIONS, ROW_WISE
 
-_OTHER_NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
+_OTHER_NAMES = {
+    "abs": "absolute",
+    "logical_and": "and",
+    "logical_or": "or",
+    "logical_not": "not",
+}
 """Operations that have another name in NumPy."""
 
 
@@ -238,6 +244,58 @@ def trace_trees(
     return trace(flat, first, sum(rest), dtype)
 
 
+class Change(NamedTuple):
+    """Trace of a function that changes a state."""
+
+    program: Trace
+    after: Pytree
+    """Structure of state, results and others after it."""
+    places: tuple[int, ...]
+    """Index of each of their arrays: inputs first, then results of the program."""
+
+
+@lru_cache(maxsize=256)
+def trace_change(
+    function: Callable[[Any, Any, Any], tuple[Pytree, Pytree, Pytree]],
+    histories: tuple[bool, ...],
+    constants: Pytree,
+    state: Pytree,
+    inputs: Pytree,
+    dtype: DType = np.float64,
+) -> Change:
+    """Return the trace of ``function(constants, state, inputs)``, which returns state, results and
+    others.
+
+    The arguments are structures; ``histories`` says which arrays of the state are histories, which
+    a program changes in place. Of the results each is an array of its own, while an input may be
+    among the others.
+    """
+    count = len(leaves((state, inputs)))
+    parts: list[Any] = []
+
+    def changed(constants: Any, state: Any, inputs: Any) -> list[Any]:
+        numbers = {symbol: number for number, symbol in enumerate(leaves((state, inputs)))}
+        after = function(constants, state, inputs)
+        own = set(map(id, leaves(after[1])))
+        results, places = list[Any](), list[int]()
+        for at, leaf in enumerate(leaves(after)):
+            is_state = at < len(histories)
+            number = numbers.get(leaf)
+            if is_state and (number == at or histories[at]):
+                places.append(at)
+            # A result that is an input is copied, since the next call changes the input.
+            elif number is not None and not is_state and id(leaf) not in own:
+                places.append(number)
+            else:
+                places.append(count + len(results))
+                results.append(leaf)
+        parts[:] = structure(after), tuple(places)
+        return results
+
+    program = trace_trees(changed, constants, state, inputs, dtype=dtype)
+    return Change(program, *parts)
+
+
 def _needed(noted: Iterable[_Operation], results: list[Symbol]) -> list[_Operation]:
     """Return the operations that ``results`` depend on."""
     needed = set(results)
@@ -320,7 +378,15 @@ def _assembled(
     masks = tuple(result.is_mask for result in results)
     segments = tuple(_segments(operations, places, results))
     ends = _packed(places[result] for result in results)
-    return Trace(_packed(rows), ends, segments, masks, registers, literals, prelude)
+    return Trace(
+        _packed(rows),
+        ends,
+        segments,
+        masks,
+        registers,
+        literals,
+        prelude,
+    )
 
 
 def _segments(

@@ -89,7 +89,12 @@ class Matrix(Stage):
 
     def bind(self, program: Any, state: Array, values: Values) -> Values:
         tree, bodies = program.pack.rigid_tree.tables
-        program.place(pose=values.seen.qpos, rate=values.seen.qvel, tree=tree, bodies=bodies)
+        program.place(
+            pose=values.seen.qpos,
+            rate=values.seen.qvel,
+            tree=tree,
+            bodies=bodies,
+        )
         program.place(matrix=state, armature=self.armature, damping=self.damping)
         program.place(**self.coupling.native())
         return values._replace(matrix=state)
@@ -142,7 +147,14 @@ class PID(Stage):
             inputs = setpoint, qpos, values.matrix, *rates, acceleration, forward
             state, terms = advance_with_mass_matrix(k, state, *inputs)
         else:  # accelerations are for gains per mass matrix only
-            state, terms = advance(k, state, setpoint, qpos, *rates, forward)
+            state, terms = advance(
+                k,
+                state,
+                setpoint,
+                qpos,
+                *rates,
+                forward,
+            )
         effort, unsaturated = terms.effort, terms.unsaturated
         return state, values.told(qf=effort, motor=effort, saturated=effort != unsaturated)
 
@@ -194,7 +206,12 @@ class Drive(Stage):
             state, target = advance_drive(self.integral, state, target, qpos, **rates)
         if rate is None:
             rate = namespace(target).zeros_like(target)
-        return state, values.told(qf=forward, motor=forward, target=target, target_rate=rate)
+        return state, values.told(
+            qf=forward,
+            motor=forward,
+            target=target,
+            target_rate=rate,
+        )
 
 
 @dataclass(frozen=True)

@@ -9,18 +9,16 @@ restart of some envs is :func:`started` under a mask, and a native program is a 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Pytree
 from batchpid.arrays.elementwise import namespace, replace_envs
-from batchpid.arrays.trees import filled, leaves, mapped, structure
-from batchpid.native.array_program import ArrayProgram
-from batchpid.native.tracing import Trace, trace_trees
+from batchpid.arrays.trees import mapped
+from batchpid.native.array_program import Bound, TreeProgram
 from batchpid.stages.control import Control
 from batchpid.stages.values import Outputs, Told, Values
 
@@ -47,6 +45,10 @@ class Stage:
     """Whether each tick makes its state anew, so that snapshots do not hold it."""
     starting: ClassVar[tuple[str, ...]] = ()
     """Constants that only ``init`` needs."""
+    due: ClassVar[tuple[str, ...]] = ()
+    """Two fields of the state: the time of an env, and the time from which :meth:`renewed` changes
+    its state; () for never.
+    """
 
     @classmethod
     def of(cls, control: Control) -> Any:
@@ -63,6 +65,10 @@ class Stage:
     def init(self, values: Values) -> Told:
         """Return the state of envs at their start, and the values for the stages after it."""
         return (), values
+
+    def renewed(self, state: Any) -> Any:
+        """Return the state for the next sim step, before ``step``, changed where its time is due."""
+        return state
 
     def step(self, state: Any, values: Values) -> Told:
         """Return the state after a sim step, and the values for the stages after it."""
@@ -84,6 +90,17 @@ def running(stages: Iterable[Any]) -> tuple[Any, ...]:
 
 def stepped(stages: Sequence[Any], states: States, values: Values) -> tuple[States, Values]:
     """Advance stages by a sim step; return their states, and the values after them."""
+    return advanced(stages, renewed(stages, states), values)
+
+
+def renewed(stages: Sequence[Any], states: States) -> States:
+    """Return the states for the next sim step: :meth:`Stage.renewed`."""
+    pairs = zip(stages, states, strict=True)
+    return tuple([stage.renewed(state) if stage.due else state for stage, state in pairs])
+
+
+def advanced(stages: Sequence[Any], states: States, values: Values) -> tuple[States, Values]:
+    """Advance stages by a sim step, from :func:`renewed` states on."""
     new = list[Pytree]()
     values = recalled(stages, states, values)
     for stage, state in zip(stages, states, strict=True):
@@ -166,102 +183,46 @@ class Last(Stage):
         return Outputs(qf=outputs.qf, motor=outputs.motor), values
 
 
-class StageProgram:
-    """Stages, their states, and the values before them, whose arrays it reads.
+def bind_stages(
+    stages: Sequence[Any],
+    states: States,
+    values: Values,
+    shape: tuple[int, int],
+    passes: bool = False,
+    renews: bool = False,
+) -> tuple[Bound, Values]:
+    """Return a program of stages, their states, and the values before them, whose arrays it reads;
+    and the values after them.
 
     It changes the arrays of ``states`` in place. It makes new arrays for the ``values`` that it
-    changes: for the outputs alone, or with ``passes`` for all, which stages after it read.
-
-    Attributes
-    ----------
-    values
-        The values after the stages.
-    program, inputs, outputs
-        The program and its arrays.
-
-    Raises
-    ------
-    AttributeError, AssertionError, TypeError
-        A stage uses an operation that programs do not have.
+    changes: for the outputs alone, or with ``passes`` for all, which stages after it read. With
+    ``renews`` it is :func:`renewed`. Errors as for :class:`.TreeProgram`.
     """
-
-    def __init__(
-        self,
-        stages: Sequence[Any],
-        states: States,
-        values: Values,
-        shape: tuple[int, int],
-        passes: bool = False,
-    ) -> None:
-        constants = mapped(_split, running(stages))
-        # Programs have no keys of noise, counts, or state of a controller.
-        states = mapped(_number, tuple(states))
-        state, self.inputs = leaves(states), leaves((states, values))
-        histories = tuple([array.ndim == 3 for array in state])
-        traced = _trace(histories, passes, *map(structure, (constants, states, values)))
-        masks = traced.program.masks
-        self.outputs = [np.zeros(shape, bool if is_mask else float) for is_mask in masks]
-        for array, place in zip(state, traced.places, strict=False):  # the state comes first
-            if place >= len(self.inputs):
-                self.outputs[place - len(self.inputs)] = array
-        arrays = [*self.inputs, *self.outputs]
-        _, after = filled(traced.changed, iter([arrays[place] for place in traced.places]))
-        self.values = after._replace(noise=None) if passes else values._replace(outputs=after)
-        self.program = ArrayProgram(traced.program, leaves(constants), len(self.inputs), shape)
-
-    def __call__(self) -> None:
-        """Run the program on its arrays."""
-        self.program(*self.inputs, out=self.outputs)
+    constants = mapped(_split, running(stages))
+    # Programs have no keys of noise, counts, or state of a controller.
+    states = mapped(_number, tuple(states))
+    function: Callable[..., tuple[States, Outputs, Any]] = _outputs_after
+    if renews:
+        function = _renewed_states
+    elif passes:
+        function = _values_after
+    bound = TreeProgram(function, constants, states, values, shape).bind(states, values)
+    _, outputs, others = bound.after
+    after = others._replace(noise=None) if passes else values
+    return bound, after._replace(outputs=outputs)
 
 
-class _Traced(NamedTuple):
-    """Program of consecutive stages."""
-
-    program: Trace
-    changed: Pytree
-    """Structure of the states and the values after it."""
-    places: tuple[int, ...]
-    """Index of each of their arrays: inputs first, then results."""
+def _values_after(stages: Any, states: States, values: Values) -> tuple[States, Outputs, Values]:
+    states, values = advanced(stages, states, values)
+    return states, values.outputs, values._replace(outputs=Outputs())
 
 
-@lru_cache(maxsize=64)
-def _trace(
-    histories: tuple[bool, ...],
-    passes: bool,
-    constants: Any,
-    states: Any,
-    values: Any,
-) -> _Traced:
-    """Return the program of stages.
+def _outputs_after(stages: Any, states: States, values: Values) -> tuple[States, Outputs, Any]:
+    return *_values_after(stages, states, values)[:2], ()
 
-    The last three are structures of the stages, their states and the values before them.
-    ``histories`` says which arrays of the states are histories, which a program changes in place.
-    """
-    count = len(leaves((states, values)))
-    parts: list[Any] = []
 
-    def function(stages: Any, states: States, values: Values) -> list[Any]:
-        numbers = {symbol: number for number, symbol in enumerate(leaves((states, values)))}
-        new, after = stepped(stages, states, values)
-        changed = new, after if passes else after.outputs
-        outputs = set(map(id, leaves(after.outputs)))
-        results, places = list[Any](), list[int]()
-        for at, leaf in enumerate(leaves(changed)):
-            is_state = at < len(histories)
-            number = numbers.get(leaf)
-            if is_state and (number == at or histories[at]):
-                places.append(at)
-            # An output that is an input is copied, since the next sim step changes the input.
-            elif number is not None and not is_state and id(leaf) not in outputs:
-                places.append(number)
-            else:
-                places.append(count + len(results))
-                results.append(leaf)
-        parts[:] = structure(changed), tuple(places)
-        return results
-
-    program = trace_trees(function, constants, states, values)
-    return _Traced(program, *parts)
+def _renewed_states(stages: Any, states: States, _: Values) -> tuple[States, Outputs, Any]:
+    return renewed(stages, states), Outputs(), ()
 
 
 def _number(array: Array) -> Any:

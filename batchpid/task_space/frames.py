@@ -19,17 +19,35 @@ from numpy.typing import ArrayLike, NDArray
 from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.arrays.elementwise import namespace
 
-_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+Vector = tuple[Array, Array, Array]
+"""Components x, y and z of vectors, arrays of one shape: XLA makes one loop of operations on them,
+but not of those on slices of one array.
+"""
+
+
+def components(vectors: Array) -> Vector:
+    """Return the components of vectors (..., 3)."""
+    return vectors[..., 0], vectors[..., 1], vectors[..., 2]
+
+
+def added(a: Vector, b: Vector) -> Vector:
+    """Return the sums of vectors."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def scaled(a: Vector, b: Array) -> Vector:
+    """Return vectors times numbers."""
+    return a[0] * b, a[1] * b, a[2] * b
+
+
+def crossed(a: Vector, b: Vector) -> Vector:
+    """Return the cross products of vectors."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def cross(a: Array, b: Array) -> Array:
     """Return the cross product of (..., 3) and (..., 3)."""
-    xp = namespace(a, b)
-    if xp is np:
-        return a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]
-    # A list of indices would be a gather, which XLA does not fuse.
-    (a0, a1, a2), (b0, b1, b2) = ([rows[..., axis] for axis in range(3)] for rows in (a, b))
-    return xp.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
+    return namespace(a, b).stack(crossed(components(a), components(b)), axis=-1)
 
 
 def rotate(turn: Array, vector: Array) -> Array:

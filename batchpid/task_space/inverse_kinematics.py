@@ -29,18 +29,11 @@ from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import array, choice, entries, instance, integer, positive
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
-from batchpid.task_space.frames import pose_error, pose_of
+from batchpid.task_space.frames import pose_error
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.symmetric import gram, product, quiet, whitened
-from batchpid.task_space.tree_kinematics import (
-    Motions,
-    jacobian_at,
-    motions_of,
-    rate_at,
-    read_point,
-    tool_frame,
-    velocities_of,
-)
+from batchpid.task_space.tree_kinematics import read_point
+from batchpid.task_space.tree_quantities import evaluated
 
 ON_FAILURE = ("raise", "return")
 _DAMPING, _DAMPING_PER_ERROR = 1e-8, 0.1
@@ -190,6 +183,11 @@ class _Search(NamedTuple):
     iterations: int
 
     @property
+    def tool(self) -> tuple[str, Float64 | None]:
+        """Link and point of the tool."""
+        return self.tree.links[self.link], self.point
+
+    @property
     def limits(self) -> tuple[Float64, Float64]:
         """Position limits of the joints (dof,)."""
         return np.asarray(self.tree.lower), np.asarray(self.tree.upper)
@@ -218,7 +216,14 @@ class _Search(NamedTuple):
     def solve(self, goal: Float64, qpos: Float64) -> _Found:
         """Return the results of searches that begin at ``qpos`` (n, dof), within the limits."""
         tool = self.tree, self.link, self.point
-        native = native_rows.search(*tool, self.limits, goal, qpos, self.tolerance, self.iterations)
+        native = native_rows.search(
+            *tool,
+            self.limits,
+            goal,
+            qpos,
+            self.tolerance,
+            self.iterations,
+        )
         if native is not None:
             return _Found(*native)
         # The same search in NumPy: the definition of the native one.
@@ -232,30 +237,26 @@ class _Search(NamedTuple):
         going = np.arange(count)
         q = qpos
         for step in range(self.iterations + 1):
-            motions = motions_of(self.tree, self.tree.bodies, q, np)
-            frame = tool_frame(self.tree, self.tree.bodies, motions.frames, *tool[1:])
-            error = pose_error(goal[going], pose_of(frame))
+            present = evaluated(self.tree, ("pose", "jacobian"), q, None, *self.tool)
+            error = pose_error(goal[going], present["pose"])
             lengths = np.sqrt((error * error).reshape(-1, 2, 3).sum(-1))
             nearest = _Found(q, lengths, np.full((len(q), 1), float(step)))
             better = self.size(nearest) < self.size(best.rows(going))
             best.write(going[better], nearest.rows(better))
             stay = ~self.reached(nearest)
             going = going[stay]
-            q = self.tree.positions(self._stepped(motions, frame[..., 3], q, error))[stay]
+            q = self.tree.positions(self._stepped(present["jacobian"], q, error))[stay]
             if not len(going):
                 break
         return best
 
     def _stepped(
         self,
-        motions: Motions,
-        place: Float64,
+        jacobian: Float64,
         qpos: Float64,
         error: Float64,
     ) -> Float64:
-        """Return the positions (n, dof) after a step within the limits, of a tool at ``place`` (n, 3)."""
-        tree = self.tree
-        jacobian = jacobian_at(tree, tree.bodies, motions, self.link, place)
+        """Return the positions (n, dof) after a step within the limits."""
         # Damping grows with the error: far away the steps are short and safe, near by quadratic.
         damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
         # Joints that would pass a limit stop there, and the others take over their share.
@@ -273,8 +274,9 @@ class _Search(NamedTuple):
             if not beyond.any():
                 break
         # Geodesic acceleration: the curvature of the path of the tool.
-        velocities = velocities_of(tree, motions, tree.rates(move), np)
-        acceleration = -_damped(part, damping, rate_at(tree, velocities, self.link, place))
+        names = ("jacobian_rate",)
+        rates = evaluated(self.tree, names, qpos, self.tree.rates(move), *self.tool)
+        acceleration = -_damped(part, damping, rates["jacobian_rate"])
         size = np.sqrt((acceleration * acceleration).sum(-1, keepdims=True))
         most = _LARGEST_ACCELERATION * np.sqrt((move * move).sum(-1, keepdims=True))
         share = np.where(size > most, most / size, 1.0) / 2
@@ -305,7 +307,15 @@ def _goals_and_starts(
     unit = np.abs(length - 1) < 1e-3
     problem = "has a quaternion whose length is not 1"
     remedy = "normalise w, x, y, z"
-    entries("pose", length, unit, problem, ["qw"], kind="entry", remedy=remedy)
+    entries(
+        "pose",
+        length,
+        unit,
+        problem,
+        ["qw"],
+        kind="entry",
+        remedy=remedy,
+    )
     goal[:, 3:] /= length
     return goal, tree.positions(np.clip(rows, tree.lower, tree.upper))
 

@@ -73,7 +73,15 @@ def law(
     if tool is not None:
         fixed, chain = _of_tree(native, tool.tree, tool.link, dynamics_arrays[0], k)
         dynamics_arrays = (*[None] * 5, chain)
-    native_rows.call(native.law, rows, dof, *fixed, *dynamics_arrays, *arrays, *results)
+    native_rows.call(
+        native.law,
+        rows,
+        dof,
+        *fixed,
+        *dynamics_arrays,
+        *arrays,
+        *results,
+    )
     effort, integral, _, *parts, s1, s2, near = results
     # The extension writes columns; the terms are one number for each env.
     shares = [None if entry is None else entry[:, 0] for entry in (s1, s2)]

@@ -150,14 +150,29 @@ def osc(
         a = task_acceleration(k, task)
         a = a if state.integral is None else a + state.integral
         a_n, a_s = posture_acceleration(k, dynamics, state.posture, inputs.qpos, inputs.qvel)
-        p = projections(k, task.dynamics, a, a_n, inputs.wrench, inputs.feedforward, a_s)
+        p = projections(
+            k,
+            task.dynamics,
+            a,
+            a_n,
+            inputs.wrench,
+            inputs.feedforward,
+            a_s,
+        )
         effort, whole, s1, s2 = _saturated(p, k.effort_min, k.effort_max)
         if state.integral is not None:
             held = (p.near_singular | (effort != whole).any(-1))[:, None] & (a * task.near > 0)
             state = state._replace(integral=_integrated(k, state.integral, task, held))
     shares = s1[..., 0], s2[..., 0]
     return state, OSCTerms(
-        task.error, p.force, p.task, p.posture, whole, effort, *shares, p.near_singular
+        task.error,
+        p.force,
+        p.task,
+        p.posture,
+        whole,
+        effort,
+        *shares,
+        p.near_singular,
     )
 
 

@@ -181,12 +181,27 @@ def make_osc_params(
     """
     check_masses(instance("tree", tree, RigidTree, MAKE_TREE))
     joints = tree.joint_names
-    rows = _read(options, {"axis": AXES, "joint": joints, "norm": ("norm",), "s0": ("s0",)})
+    rows = _read(
+        options,
+        {
+            "axis": AXES,
+            "joint": joints,
+            "norm": ("norm",),
+            "s0": ("s0",),
+        },
+    )
     motion = rows["axes"]
     force = rows["force_axes"]
     if force is not None:
         both = force * (1.0 if motion is None else motion)
-        entries("force_axes", both > 0, both == 0, "is an axis of motion, too", AXES, kind="entry")
+        entries(
+            "force_axes",
+            both > 0,
+            both == 0,
+            "is an axis of motion, too",
+            AXES,
+            kind="entry",
+        )
     if rows["damping"] is None:
         rows["damping"] = 2 * rows["damping_ratio"] * np.sqrt(rows["stiffness"])
     # Critical damping and the like follow from the stiffness that is left.

@@ -130,7 +130,14 @@ def task_dynamics(
     names: tuple[str, ...] = ("pose", "jacobian", "jacobian_rate", "mass_matrix")
     if bias is None:
         names = (*names, "bias")
-    results = evaluated(tree, names, qpos, qvel, link, point)
+    results = evaluated(
+        tree,
+        names,
+        qpos,
+        qvel,
+        link,
+        point,
+    )
     xp = namespace(results["pose"])
     chain = xp.asarray(tree.chain(link), dtype=results["pose"].dtype)
     return TaskDynamics(**{"bias": bias, "chain": chain, **results})

@@ -5,21 +5,21 @@ w_j). All bodies that it moves together have the mass m, the first moment c and 
 I. Momenta under s_j and mass matrix are (composite rigid bodies; R. Featherstone, Rigid Body
 Dynamics Algorithms, Springer, 2008, section 6.2)::
 
-    linear  l_j = m v_j + w_j x c        angular  k_j = I w_j + c x v_j
-    M_ij = M_ji = s_i . (l_j, k_j)   for a joint i that moves joint j, or is joint j; else 0;   M_jj += armature
+    linear  p_j = m v_j + w_j x c        angular  k_j = I w_j + c x v_j
+    M_ij = M_ji = s_i . (p_j, k_j)   for a joint i that moves joint j, or is joint j; else 0;   M_jj += armature
 
 The bias h (gravity, Coriolis and centrifugal forces) is the sum of the rates of momentum of the
-bodies at q'' = 0, less their weight (recursive Newton-Euler algorithm, section 5.3). For a body
-with the center of mass r, a is the acceleration of r, I the inertia tensor about r, w the angular
-velocity and w' the angular acceleration::
+bodies at q'' = 0, less their weight (recursive Newton-Euler algorithm, section 5.3). A body with the
+velocity (v, w) and the acceleration (A_o, A_w), as fields about the origin, has momenta (p, k) under
+its velocity, and (p', k') under its acceleration less gravity, (A_o - g, A_w)::
 
-    f = m (a - g)      n = I w' + w x I w + r x f      h_j = s_j . (sum of (f, n) of the bodies that j moves)
+    f = p' + w x p      n = k' + w x k + v x p      h_j = s_j . (sum of (f, n) of the bodies that j moves)
 
 On a floating base (index b; index j for the joints) M and h of the joints are Schur complements::
 
     M = M_jj - M_jb M_bb^-1 M_bj        h = h_j - M_jb M_bb^-1 h_b
 
-where the columns of M_bj are the momenta (l_j, k_j), and M_bb and h_b belong to all bodies
+where the columns of M_bj are the momenta (p_j, k_j), and M_bb and h_b belong to all bodies
 together. Gravity, and the velocity and acceleration of the base's origin, cancel. The rate at which
 the base turns remains in h.
 
@@ -29,17 +29,19 @@ The results for coupled joints are reduced to their leaders, G^T M G and G^T h
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+
+import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space.frames import cross, multiply, rotate
+from batchpid.task_space.frames import Vector, added, components, crossed, scaled
 from batchpid.task_space.rigid_tree import Bodies, RigidTree
-from batchpid.task_space.symmetric import solve
+from batchpid.task_space.symmetric import gram, solve
 from batchpid.task_space.tree_kinematics import (
     Motions,
     Velocities,
-    from_tips,
+    summed,
 )
 
 
@@ -58,77 +60,77 @@ def check_masses(tree: RigidTree) -> None:
             )
 
 
-class _Composite(NamedTuple):
-    """The bodies that each joint moves, as one rigid body, and the momenta under the motions of the
-    joints.
+Inertias = Sequence[Array]
+"""Inertias about the origin of the world, in its axes: mass, first moment x, y, z, and entries xx,
+yy, zz, xy, xz, yz of the inertia tensor; arrays (dof, rows).
+"""
+_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def _inertias(mass: Array, center: Array, tensor: Array, frames: Array) -> Inertias:
+    """Return the inertias of bodies with ``center`` (n, 3, rows) and ``tensor`` (n, 3, 3, rows) in
+    their ``frames`` (n, 3, 4, rows).
     """
-
-    mass: Array
-    """(..., dof, 1)"""
-    moment: Array
-    """First moment about the origin (..., dof, 3)."""
-    tensor: Array
-    """Inertia tensor about the origin (..., dof, 3, 3)."""
-    momenta: Array
-    """Linear and angular (..., dof, 6)."""
-
-
-def _composite(
-    tree: RigidTree,
-    bodies: Bodies,
-    motions: Motions,
-    xp: ArrayModule,
-) -> _Composite:
-    turn = motions.frames[..., :3]
-    center = rotate(turn, bodies.center) + motions.frames[..., 3]
-    moment = bodies.mass * center
-    tensor = _in_world(turn, bodies.tensor, xp) + _about_origin(moment, center, xp)
-    # One pass from the tips for both: sums over everything that a joint moves.
-    packed = xp.concatenate([moment, tensor.reshape(*tensor.shape[:-2], 9)], axis=-1)
-    composite = from_tips(tree, packed, xp)
-    mass = from_tips(tree, bodies.mass, xp)
-    moment = composite[..., :3]
-    tensor = composite[..., 3:].reshape(tensor.shape)
-    v, w = motions.linear, motions.angular
-    linear = mass * v + cross(w, moment)
-    angular = rotate(tensor, w) + cross(moment, v)
-    return _Composite(mass, moment, tensor, xp.concatenate([linear, angular], axis=-1))
+    axes = range(3)
+    turn = [[frames[:, i, k] for k in axes] for i in axes]
+    r = [_products(turn[i], [center[:, k] for k in axes]) + frames[:, i, 3] for i in axes]
+    half = [[_products(row, [tensor[:, k, j] for k in axes]) for j in axes] for row in turn]
+    square = _products(r, r)
+    # R I R^T + m (r.r 1 - r r^T)
+    entries = [
+        _products(half[i], turn[j]) + mass * ((square if i == j else 0.0) - r[i] * r[j])
+        for i, j in _ENTRIES
+    ]
+    return mass + 0.0 * square, *[mass * at for at in r], *entries
 
 
-def _about_origin(moment: Array, center: Array, xp: ArrayModule) -> Array:
-    """Return the inertia tensors (..., 3, 3) about the origin of points with first moments
-    ``moment``.
-    """
-    square = (moment * center).sum(-1)[..., None, None] * xp.eye(3, dtype=center.dtype)
-    return square - moment[..., :, None] * center[..., None, :]
+def _of_bodies(bodies: Bodies, motions: Motions) -> Inertias:
+    return _inertias(bodies.mass, bodies.center, bodies.tensor, motions.frames)
+
+
+def _products(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    """Return the sum of the products of components, in their order."""
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+def _momenta(inertias: Inertias, v: Vector, w: Vector) -> tuple[Vector, Vector]:
+    """Return the momenta p = m v + w x c and k = I w + c x v."""
+    mass, cx, cy, cz, xx, yy, zz, xy, xz, yz = inertias
+    c = cx, cy, cz
+    spin = _products((xx, xy, xz), w), _products((xy, yy, yz), w), _products((xz, yz, zz), w)
+    return added(scaled(v, mass), crossed(w, c)), added(spin, crossed(c, v))
+
+
+def _on_base(tree: RigidTree, part: Array) -> Array:
+    """Return the sum (rows,) over the joints on the base, of numbers (dof, rows)."""
+    return part[np.array(tree.body_parents) < 0].sum(0)
 
 
 def _of_base(
     tree: RigidTree,
     bodies: Bodies,
-    all_: _Composite,
+    whole: Inertias,
     xp: ArrayModule,
-) -> Array:
-    """Return M_bb (..., 6, 6), linear parts first: the momenta of the whole robot under the motions
-    of its base.
+) -> tuple[Inertias, Array]:
+    """Return the inertias of the base (1, rows), and M_bb (rows, 6, 6), linear parts first: the
+    momenta of the whole robot under the motions of its base.
     """
+    center, tensor = bodies.base_center[None], bodies.base_tensor[None]
+    frame = xp.eye(3, 4, dtype=bodies.mass.dtype)[None, ..., None]
+    base = _inertias(bodies.base_mass, center, tensor, frame)
     # Composites of the joints on the base contain all bodies but the base itself.
-    roots = [joint for joint, above in enumerate(tree.body_parents) if above < 0]
-    part = bodies.base_mass * bodies.base_center
-    mass = all_.mass[..., roots, :].sum(-2) + bodies.base_mass
-    moment = all_.moment[..., roots, :].sum(-2) + part
-    tensor = (
-        all_.tensor[..., roots, :, :].sum(-3)
-        + bodies.base_tensor
-        + _about_origin(part, bodies.base_center, xp)
-    )
-    eye = xp.eye(3, dtype=moment.dtype)
-    # The matrix c x.
-    columns = [cross(moment, eye[axis] + xp.zeros_like(moment)) for axis in range(3)]
-    crossed = xp.stack(columns, axis=-1)
-    zero = xp.zeros_like(crossed)
-    upper = xp.concatenate([mass[..., None] * eye + zero, -crossed], axis=-1)
-    return xp.concatenate([upper, xp.concatenate([crossed, tensor + zero], axis=-1)], axis=-2)
+    robot = [_on_base(tree, part)[None] + own for part, own in zip(whole, base, strict=True)]
+    unit = xp.eye(6, dtype=bodies.mass.dtype)[..., None]
+    p, k = _momenta(robot, (unit[0], unit[1], unit[2]), (unit[3], unit[4], unit[5]))
+    return base, _by_row(xp.stack((*p, *k)), xp)
+
+
+def _by_row(table: Array, xp: ArrayModule) -> Array:
+    """Return ``table`` (..., rows) as (rows, ...)."""
+    return xp.moveaxis(table, -1, 0)
 
 
 def mass_matrix_of(
@@ -137,25 +139,20 @@ def mass_matrix_of(
     motions: Motions,
     xp: ArrayModule,
 ) -> Array:
-    """Return the mass matrices (..., dof, dof) at given motions of the joints."""
-    all_ = _composite(tree, bodies, motions, xp)
-    s = xp.concatenate([motions.linear, motions.angular], axis=-1)
-    table = (s[..., :, None, :] * all_.momenta[..., None, :, :]).sum(-1)
-    above = xp.swapaxes(bodies.moves, 0, 1) > 0
+    """Return the mass matrices (rows, dof, dof) at given motions of the joints."""
+    whole = summed(tree, bodies, _of_bodies(bodies, motions), xp, outwards=False)
+    p, k = _momenta(whole, motions.linear, motions.angular)
+    twists = [part[:, None] for part in (*motions.linear, *motions.angular)]
+    table = _products(twists, [part[None] for part in (*p, *k)])
     # Only entries of joints on one branch differ from 0: one of them moves the other.
-    rest = xp.where(
-        bodies.moves > 0,
-        xp.swapaxes(table, -1, -2),
-        xp.zeros_like(table),
-    )
-    matrix = xp.where(above, table, rest)
+    moves = bodies.moves[..., None] > 0
+    rest = xp.where(moves, xp.swapaxes(table, 0, 1), xp.zeros_like(table))
+    matrix = _by_row(xp.where(xp.swapaxes(moves, 0, 1), table, rest), xp)
     if not tree.fixed_base:
         # The free base yields to each joint's momentum.
-        falls = solve(_of_base(tree, bodies, all_, xp), xp.swapaxes(all_.momenta, -1, -2))
-        matrix = matrix - (
-            all_.momenta[..., :, None, :] * xp.swapaxes(falls, -1, -2)[..., None, :, :]
-        ).sum(-1)
-    matrix = matrix + bodies.armature * xp.eye(tree.dof, dtype=matrix.dtype)
+        momenta = _by_row(xp.stack((*p, *k)), xp)
+        matrix = matrix - gram(momenta, solve(_of_base(tree, bodies, whole, xp)[1], momenta))
+    matrix = matrix + bodies.armature[None] * xp.eye(tree.dof, dtype=matrix.dtype)[None]
     return xp.asarray(tree.coupling.mass_matrix(matrix), dtype=matrix.dtype)
 
 
@@ -167,45 +164,33 @@ def effort_of(
     xp: ArrayModule,
     turning: Array = None,
 ) -> Array:
-    """Return the efforts (..., dof) of given velocities and accelerations of the bodies, without
+    """Return the efforts (rows, dof) of given velocities and accelerations of the bodies, without
     armature.
 
-    A floating base turns at ``turning`` (..., 3) [rad/s]; ``rates`` must include this rotation.
+    A floating base turns at ``turning`` (rows, 3) [rad/s]; ``rates`` must include this rotation.
     """
-    turn = motions.frames[..., :3]
-    center = rotate(turn, bodies.center) + motions.frames[..., 3]
-    tensor = _in_world(turn, bodies.tensor, xp)
-    v, w = rates.linear, rates.angular
-    acceleration = (
-        rates.linear_rate + cross(rates.angular_rate, center) + cross(w, v + cross(w, center))
-    )
+    inertias = _of_bodies(bodies, motions)
+    acceleration = rates.linear_rate
     # A free base falls with its joints: gravity cancels there.
-    force = bodies.mass * (acceleration - bodies.gravity if tree.fixed_base else acceleration)
-    spin = rotate(tensor, rates.angular_rate) + cross(w, rotate(tensor, w))
-    wrench = from_tips(
-        tree,
-        xp.concatenate([force, spin + cross(center, force)], axis=-1),
-        xp,
-    )
-    effort = (xp.concatenate([motions.linear, motions.angular], axis=-1) * wrench).sum(-1)
+    if tree.fixed_base:
+        weight = -bodies.gravity[:, None]
+        acceleration = added(acceleration, (weight[0], weight[1], weight[2]))
+    v, w = rates.linear, rates.angular
+    p, k = _momenta(inertias, v, w)
+    p_rate, k_rate = _momenta(inertias, acceleration, rates.angular_rate)
+    force = added(p_rate, crossed(w, p))
+    torque = added(k_rate, added(crossed(w, k), crossed(v, p)))
+    wrench = summed(tree, bodies, (*force, *torque), xp, outwards=False)
+    effort = _products((*motions.linear, *motions.angular), wrench).T
     if not tree.fixed_base:
-        all_ = _composite(tree, bodies, motions, xp)
-        on_base: Array = sum(
-            wrench[..., joint, :] for joint, above in enumerate(tree.body_parents) if above < 0
-        )
+        whole = summed(tree, bodies, inertias, xp, outwards=False)
+        base, matrix = _of_base(tree, bodies, whole, xp)
+        on_base = xp.stack([_on_base(tree, part) for part in wrench], axis=-1)
         if turning is not None:
-            part = bodies.base_mass * cross(
-                turning, cross(turning, bodies.base_center + xp.zeros_like(turning))
-            )
-            torque = cross(turning, rotate(bodies.base_tensor, turning)) + cross(
-                bodies.base_center + xp.zeros_like(part), part
-            )
-            on_base = on_base + xp.concatenate([part, torque], axis=-1)
-        falls = solve(_of_base(tree, bodies, all_, xp), on_base[..., None])[..., 0]
-        effort = effort - (all_.momenta * falls[..., None, :]).sum(-1)
+            turn = components(turning[None])
+            p, k = _momenta(base, scaled(turn, 0.0), turn)
+            on_base = on_base + xp.stack((*crossed(turn, p), *crossed(turn, k)), axis=-1)[0]
+        p, k = _momenta(whole, motions.linear, motions.angular)
+        falls = solve(matrix, on_base[..., None])
+        effort = effort - gram(_by_row(xp.stack((*p, *k)), xp), falls)[..., 0]
     return tree.efforts(effort)
-
-
-def _in_world(turn: Any, tensor: Array, xp: ArrayModule) -> Array:
-    """Return R I R^T."""
-    return multiply(multiply(turn, tensor), xp.swapaxes(turn, -1, -2))

@@ -14,13 +14,16 @@ the joints::
     J' q' = (A_o + A_w x p + w x (v_o + w x p), A_w)
 
 R. Featherstone, Rigid Body Dynamics Algorithms (Springer, 2008), sections 2.11 and 5.3. Twists and
-Jacobians are (linear, angular). Arrays have any leading axes; an env's result does not depend on
-the others, to the last bit.
+Jacobians are (linear, angular). Rows of robots are the last axis, along which processors make
+vectors: positions are (dof, rows), a vector is three arrays of that shape. Constants of the bodies
+have a last axis of 1, or of the rows. A row does not depend on the others, under NumPy to the last
+bit.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,9 +31,15 @@ from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace
 from batchpid.checks.validate import instance, is_traced, read_array
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space.frames import cross, rotate, turned
+from batchpid.task_space.frames import (
+    Vector,
+    added,
+    components,
+    crossed,
+    rotate,
+    scaled,
+)
 from batchpid.task_space.rigid_tree import MAKE_TREE, Bodies, RigidTree
-from batchpid.task_space.symmetric import quiet
 
 
 class Motions(NamedTuple):
@@ -39,24 +48,23 @@ class Motions(NamedTuple):
     """
 
     frames: Array
-    """(..., dof, 3, 4)."""
-    linear: Array
-    """Velocity per rate of the joint, of the body's point that is at the origin of the world (...,
-    dof, 3).
+    """(dof, 3, 4, rows)."""
+    linear: Vector
+    """Velocity per rate of the joint, of the body's point that is at the origin of the world, and
+    its angular velocity; components (dof, rows).
     """
-    angular: Array
-    """Angular velocity per rate of the joint (..., dof, 3)."""
+    angular: Vector
 
 
 class Velocities(NamedTuple):
-    """Velocities of the bodies, and their accelerations at q'' = 0, as fields about the origin
-    (..., dof, 3).
+    """Velocities of the bodies, and their accelerations at q'' = 0, as fields about the origin;
+    components (dof, rows).
     """
 
-    linear: Array
-    angular: Array
-    linear_rate: Array
-    angular_rate: Array
+    linear: Vector
+    angular: Vector
+    linear_rate: Vector
+    angular_rate: Vector
 
 
 def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Array], Bodies, ArrayModule]:
@@ -94,27 +102,18 @@ def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Array], Bodies, Arr
     )
 
 
-def frames_of_bodies(
-    tree: RigidTree,
-    bodies: Bodies,
-    qpos: Array,
-    xp: ArrayModule,
-) -> Array:
-    """Return the frames (..., dof, 3, 4) of the bodies in the world."""
-    with quiet():
-        # Rodrigues' formula with the placement multiplied in: four constant matrices a joint.
-        q = qpos[..., None, None]
-        local = (
-            bodies.at_zero
-            + xp.sin(q) * bodies.sine
-            + (1 - xp.cos(q)) * bodies.cosine
-            + q * bodies.slide
-        )
-        frames: list[Array] = []
-        for joint, above in enumerate(tree.body_parents):
-            part = local[..., joint, :, :]
-            frames.append(part if above < 0 else turned(frames[above], part))
-        return xp.stack(frames, axis=-3)
+_SHIFT = np.array([0.0, 0.0, 0.0, 1.0]).reshape(1, 4, 1)
+"""Share of a frame's columns that shift with the frame above."""
+
+
+def _turned(frame: Array, inner: Array) -> Array:
+    """Return the frames ``inner`` (3, 4, rows), given in ``frame``, where that is given."""
+    return (
+        frame[:, :1] * inner[:1]
+        + frame[:, 1:2] * inner[1:2]
+        + frame[:, 2:3] * inner[2:3]
+        + frame[:, 3:] * _SHIFT.astype(inner.dtype)
+    )
 
 
 def motions_of(
@@ -123,81 +122,109 @@ def motions_of(
     qpos: Array,
     xp: ArrayModule,
 ) -> Motions:
-    """Return the frames of the bodies and the motions of the joints."""
-    frames = frames_of_bodies(tree, bodies, qpos, xp)
-    axis = frames[..., 0]
-    turning = axis * (1 - bodies.slides)
-    return Motions(
-        frames,
-        cross(frames[..., 3], turning) + axis * bodies.slides,
-        turning,
+    """Return the frames of the bodies and the motions of the joints at ``qpos`` (dof, rows)."""
+    # Rodrigues' formula with the placement multiplied in: four constant matrices a joint.
+    q = qpos[:, None, None]
+    local = (
+        bodies.at_zero
+        + xp.sin(q) * bodies.sine
+        + (1 - xp.cos(q)) * bodies.cosine
+        + q * bodies.slide
     )
+    base = xp.broadcast_to(xp.eye(3, 4, dtype=q.dtype)[None, ..., None], local[:1].shape)
+    # The base is the last row, whose index is -1.
+    frames = xp.concatenate([local, base])
+    if xp is np:
+        for joint, above in enumerate(tree.body_parents):
+            frames[joint] = _turned(frames[above], frames[joint])
+    else:
+        from jax import lax
+
+        def placed(frames: Any, at: Any) -> Any:
+            joint, above = at
+            return frames.at[joint].set(_turned(frames[above], frames[joint])), None
+
+        # A loop, since XLA would compute all frames above again for each frame.
+        joints = xp.arange(tree.dof), xp.asarray(tree.body_parents)
+        frames, _ = lax.scan(placed, frames, joints)
+    frames = frames[:-1]
+    axis = frames[:, 0, 0], frames[:, 1, 0], frames[:, 2, 0]
+    origin = frames[:, 0, 3], frames[:, 1, 3], frames[:, 2, 3]
+    turning = scaled(axis, 1 - bodies.slides)
+    moving = added(crossed(origin, turning), scaled(axis, bodies.slides))
+    return Motions(frames, moving, turning)
 
 
 def velocities_of(
     tree: RigidTree,
+    bodies: Bodies,
     motions: Motions,
     qvel: Array,
     xp: ArrayModule,
     turning: Array = None,
 ) -> Velocities:
     """Return the velocities of the bodies, and their accelerations at q'' = 0, on a base that turns
-    at ``turning``.
+    at ``turning`` (rows, 3).
     """
-    linear = motions.linear * qvel[..., None]
-    angular = motions.angular * qvel[..., None]
+    linear = scaled(motions.linear, qvel)
+    angular = scaled(motions.angular, qvel)
     # Velocities about the world's origin add up along the chain without a shift.
-    v = from_base(tree, linear, xp)
-    w = from_base(tree, angular, xp)
+    sums = summed(tree, bodies, (*linear, *angular), xp, outwards=True)
+    v, w = (sums[0], sums[1], sums[2]), (sums[3], sums[4], sums[5])
     if turning is not None:
-        w = w + turning[..., None, :]
-    return Velocities(
-        v,
-        w,
-        from_base(tree, cross(w, linear) + cross(v, angular), xp),
-        from_base(tree, cross(w, angular), xp),
-    )
+        w = added(w, components(turning[None]))
+    rates = *added(crossed(w, linear), crossed(v, angular)), *crossed(w, angular)
+    sums = summed(tree, bodies, rates, xp, outwards=True)
+    return Velocities(v, w, (sums[0], sums[1], sums[2]), (sums[3], sums[4], sums[5]))
 
 
-def from_base(tree: RigidTree, steps: Array, xp: ArrayModule) -> Array:
-    """Return the sums of ``steps`` (..., dof, k) over the joints between the base and each body."""
-    sums: list[Array] = []
-    for joint, above in enumerate(tree.body_parents):
-        sums.append(steps[..., joint, :] if above < 0 else sums[above] + steps[..., joint, :])
-    return xp.stack(sums, axis=-2)
-
-
-def from_tips(tree: RigidTree, parts: Array, xp: ArrayModule) -> Array:
-    """Return the sums of ``parts`` (..., dof, k) over the bodies that each joint moves."""
-    sums = [parts[..., joint, :] for joint in range(tree.dof)]
-    for joint, above in reversed(list(enumerate(tree.body_parents))):
-        if above >= 0:
-            sums[above] = sums[above] + sums[joint]
-    return xp.stack(sums, axis=-2)
+def summed(
+    tree: RigidTree,
+    bodies: Bodies,
+    parts: Sequence[Array],
+    xp: ArrayModule,
+    *,
+    outwards: bool,
+) -> list[Array]:
+    """Return the sums of each of ``parts`` (dof, rows) over the joints between the base and each
+    body, or over the bodies that each joint moves.
+    """
+    table = xp.stack(parts, axis=1)
+    if xp is not np:
+        moves = bodies.moves if outwards else bodies.moves.T
+        table = xp.tensordot(moves, table, 1, precision="highest")
+    else:
+        # A library's product would round by the number of rows.
+        pairs = [(joint, above) for joint, above in enumerate(tree.body_parents) if above >= 0]
+        for joint, above in pairs if outwards else reversed(pairs):
+            if outwards:
+                table[joint] += table[above]
+            else:
+                table[above] += table[joint]
+    return [table[:, k] for k in range(len(parts))]
 
 
 def tool_frame(
     tree: RigidTree,
     bodies: Bodies,
-    frames: Array,
+    motions: Motions,
     index: int,
     point: Array,
 ) -> Array:
-    """Return the frame (..., 3, 4) of a link, from the frames of the bodies, with its origin at
-    ``point`` (..., 3) of the link.
+    """Return the frame (rows, 3, 4) of a link, with its origin at ``point`` (3,) or (rows, 3) of
+    the link.
     """
+    frames = motions.frames
+    xp = namespace(frames)
     body = tree.link_bodies[index]
     frame = bodies.link_frames[index]
     # A link of the base does not move, but has a frame in each row.
-    if body >= 0:
-        frame = turned(frames[..., body, :, :], frame)
-    else:
-        frame = frame + namespace(frames).zeros_like(frames[..., 0, :, :])
+    frame = frame + xp.zeros_like(frames[0]) if body < 0 else _turned(frames[body], frame)
+    frame = xp.moveaxis(frame, -1, 0)
     if point is None:
         return frame
-    xp = namespace(frame, point)
-    at = read_point(frame[..., 0, :], point)
-    place = rotate(frame[..., :3], at + xp.zeros_like(frame[..., 3])) + frame[..., 3]
+    at = xp.broadcast_to(xp.asarray(point, dtype=frame.dtype), frame[..., 3].shape)
+    place = rotate(frame[..., :3], at) + frame[..., 3]
     return xp.concatenate([frame[..., :3], place[..., None]], axis=-1)
 
 
@@ -226,24 +253,16 @@ def jacobian_at(
     index: int,
     place: Array,
 ) -> Array:
-    """Return the Jacobian (..., 6, dof) of a link's point at ``place`` (..., 3) in the world, J G
+    """Return the Jacobian (rows, 6, dof) of a link's point at ``place`` (rows, 3) in the world, J G
     of coupled joints.
     """
     xp = namespace(place)
     body = tree.link_bodies[index]
-    linear = motions.linear + cross(motions.angular, place[..., None, :])
-    columns = xp.concatenate([linear, motions.angular], axis=-1)
-    if body >= 0:
-        moved = bodies.moves[body][:, None] > 0
-    else:
-        moved = xp.asarray(False)
-    return tree.efforts(
-        xp.moveaxis(
-            xp.where(moved, columns, xp.zeros_like(columns)),
-            -1,
-            -2,
-        )
-    )
+    linear = added(motions.linear, crossed(motions.angular, components(place[None])))
+    twists = xp.moveaxis(xp.stack((*linear, *motions.angular)), -1, 0)
+    if body < 0:
+        return xp.zeros_like(twists)
+    return tree.efforts(xp.where(bodies.moves[body][None, None] > 0, twists, 0.0 * twists))
 
 
 def rate_at(
@@ -252,12 +271,12 @@ def rate_at(
     index: int,
     place: Array,
 ) -> Array:
-    """Return J' q' (..., 6) of a link's point at ``place`` (..., 3) in the world."""
+    """Return J' q' (rows, 6) of a link's point at ``place`` (rows, 3) in the world."""
     xp = namespace(place)
     body = tree.link_bodies[index]
     if body < 0:
         return xp.concatenate([xp.zeros_like(place)] * 2, axis=-1)
-    v, w, linear, angular = (leaf[..., body, :] for leaf in velocities)
-    return xp.concatenate(
-        [linear + cross(angular, place) + cross(w, v + cross(w, place)), angular], axis=-1
-    )
+    v, w, linear, angular = ((x[body], y[body], z[body]) for x, y, z in velocities)
+    at = components(place)
+    around = added(crossed(angular, at), crossed(w, added(v, crossed(w, at))))
+    return xp.stack((*added(linear, around), *angular), axis=-1)

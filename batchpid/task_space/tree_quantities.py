@@ -51,31 +51,66 @@ def evaluated(
     index = 0 if link is None else tree.index(link)
     point = read_point(q, point)
     if bodies is None:
-        native = native_rows.kinematics(tree, names, q, v, index, point)
+        native = native_rows.kinematics(
+            tree,
+            names,
+            q,
+            v,
+            index,
+            point,
+        )
         if native is not None:
             return native
     # The definition, for JAX, for varied bodies, and where no extension was built.
-    varied = bodies or nominal
-    quantities: dict[str, Array] = {}
+    leading = q.shape[:-1]
+
+    def by_rows(rows: Array) -> Array:
+        return rows if rows is None or rows.ndim == 1 else rows.reshape(-1, rows.shape[-1])
+
+    # Rows of robots are the last axis, along which NumPy and XLA make vectors.
+    columns = q.reshape(-1, tree.dof).T
+    parts = [
+        xp.moveaxis(leaf, 0, -1) if leaf.ndim > one.ndim else leaf[..., None]
+        for leaf, one in zip(bodies or nominal, nominal, strict=True)
+    ]
+    of_robots = Bodies(*parts)._replace(moves=nominal.moves)
+    of_robots = of_robots._replace(slides=nominal.slides, mass=of_robots.mass[:, 0])
+    place, turning = by_rows(point), by_rows(turning)
+    results: dict[str, Array] = {}
     with quiet():
-        motions = motions_of(tree, nominal, q, xp)
+        motions = motions_of(tree, of_robots, columns, xp)
         if v is None:
             velocities = None
         else:
-            velocities = velocities_of(tree, motions, v, xp, turning)
+            speeds = v.reshape(-1, tree.dof).T
+            velocities = velocities_of(
+                tree,
+                of_robots,
+                motions,
+                speeds,
+                xp,
+                turning,
+            )
         if link is not None:
-            tool = tool_frame(tree, nominal, motions.frames, index, point)
+            tool = tool_frame(tree, of_robots, motions, index, place)
+            results["pose"] = pose_of(tool)
             place = tool[..., 3]
-            quantities["pose"] = pose_of(tool)
             if "jacobian" in names:
-                quantities["jacobian"] = jacobian_at(tree, nominal, motions, index, place)
+                results["jacobian"] = jacobian_at(tree, of_robots, motions, index, place)
             if "jacobian_rate" in names and velocities is not None:
-                quantities["jacobian_rate"] = rate_at(tree, velocities, index, place)
+                results["jacobian_rate"] = rate_at(tree, velocities, index, place)
         if "mass_matrix" in names:
-            quantities["mass_matrix"] = mass_matrix_of(tree, varied, motions, xp)
+            results["mass_matrix"] = mass_matrix_of(tree, of_robots, motions, xp)
         if "bias" in names and velocities is not None:
-            quantities["bias"] = effort_of(tree, varied, motions, velocities, xp, turning)
-    return quantities
+            results["bias"] = effort_of(
+                tree,
+                of_robots,
+                motions,
+                velocities,
+                xp,
+                turning,
+            )
+    return {name: rows.reshape(*leading, *rows.shape[1:]) for name, rows in results.items()}
 
 
 def link_poses(
@@ -92,7 +127,17 @@ def link_poses(
     """
     prepared(tree, qpos=qpos)
     names = tree.links if links is None else links
-    poses = [evaluated(tree, ("pose",), qpos, None, link, point)["pose"] for link in names]
+    poses = [
+        evaluated(
+            tree,
+            ("pose",),
+            qpos,
+            None,
+            link,
+            point,
+        )["pose"]
+        for link in names
+    ]
     return namespace(*poses).stack(poses, axis=-2)
 
 
@@ -108,7 +153,14 @@ def jacobian(
 
     ``point`` is in the link's frame, (3,) or (..., 3) [m]; default its origin.
     """
-    return evaluated(tree, ("jacobian",), qpos, None, link, point)["jacobian"]
+    return evaluated(
+        tree,
+        ("jacobian",),
+        qpos,
+        None,
+        link,
+        point,
+    )["jacobian"]
 
 
 def jacobian_rate(
@@ -124,7 +176,14 @@ def jacobian_rate(
 
     ``qpos`` and ``qvel`` are (..., dof); ``point`` is as in :func:`jacobian`.
     """
-    return evaluated(tree, ("jacobian_rate",), qpos, qvel, link, point)["jacobian_rate"]
+    return evaluated(
+        tree,
+        ("jacobian_rate",),
+        qpos,
+        qvel,
+        link,
+        point,
+    )["jacobian_rate"]
 
 
 def mass_matrix(tree: RigidTree, qpos: Array, bodies: Bodies | None = None) -> Array:
@@ -151,7 +210,14 @@ def bias(
     A floating base turns at ``turning`` (..., 3) [rad/s], in its own axes; default 0. ``bodies``
     are as in :func:`mass_matrix`.
     """
-    return evaluated(tree, ("bias",), qpos, qvel, bodies=bodies, turning=turning)["bias"]
+    return evaluated(
+        tree,
+        ("bias",),
+        qpos,
+        qvel,
+        bodies=bodies,
+        turning=turning,
+    )["bias"]
 
 
 def gravity(tree: RigidTree, qpos: Array) -> Array:

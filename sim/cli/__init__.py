@@ -90,7 +90,12 @@ def parse(arguments: Sequence[str]) -> tuple[str, object]:
     for name, summary in SUMMARIES.items():
         app.command(name=name, help=summary)(_nothing)
     about = "Joint-level PID control for many robots at once, in SAPIEN or MuJoCo."
-    app.cli(prog="batchpid", description=about, args=arguments, config=config)
+    app.cli(
+        prog="batchpid",
+        description=about,
+        args=arguments,
+        config=config,
+    )
     raise SystemExit(0)
 
 

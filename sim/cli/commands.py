@@ -26,8 +26,6 @@ from batchpid.sim.cli.gains import ENDINGS, compare, export, tune
 from batchpid.sim.cli.identify import excite_joints, identify_logs
 from batchpid.sim.cli.inspect import inspect_robot
 from batchpid.sim.cli.rollout import demo, rollout
-from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.tuning.gain_sets import default_gains
 
 PICTURES = (".png", ".svg")
 DOCUMENTS = (".yaml", ".yml", ".json")
@@ -36,6 +34,8 @@ FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
 FIRST_SECONDS, LINE_SECONDS = 1.0, 10.0
 """Time before the first line about the progress of a command, and between lines [s]."""
+SHOWN_FLAGS = ("base", "engine", "control", "gains")
+"""Flags in the first line that a command prints."""
 FIXED: dict[str | None, bool] = {"fixed": True, "free": False}
 """Values of the flag ``--base``."""
 
@@ -200,33 +200,22 @@ def _arguments(command: CommandFunction, values: Document) -> Document:
         )
         arguments["robot"] = robot
         if not is_recorded:
-            print(f"{robot.name}: {', '.join(_settings(robot, values))}", flush=True)
+            print(_settings(robot, values), flush=True)
     if "progress" in accepted:
         arguments["progress"] = bar(command.function.__name__)
     return arguments
 
 
-def _settings(robot: Robot, values: Document) -> Iterator[str]:
-    """Yield the words of the first line: base, joints, engine, gains, rate and number of robots."""
-    if not robot.fixed_base:
-        yield "free base"
-    yield f"{robot.dof} dof"
-    engines = values.get("engine") or ()
-    # A comparison may have two engines.
-    for name in (engines,) if isinstance(engines, str) else engines:
-        yield load_engine(name).title
-    # Drives and tools have other gains.
-    if values.get("control", "pid") != "pid":
-        yield f"control {values['control']}"
-    elif values.get("gains"):
-        gains = values["gains"]
-        yield f"gains {gains if isinstance(gains, str) else ', '.join(gains)}"
-    elif "num_envs" in values:
-        yield f"gains {default_gains(robot)}"
-    if values.get("timestep") is not None:
-        yield f"{1 / values['timestep']:g} Hz"
+def _settings(robot: Robot, values: Document) -> str:
+    """Return the first line: the robot, and the flags that say how it is run."""
+    words = [f"{robot.name}: {robot.dof} dof"]
+    for name in SHOWN_FLAGS:
+        value = values.get(name)
+        if value:
+            words.append(f"{name} {value if isinstance(value, str) else ' '.join(value)}")
     if "num_envs" in values:
-        yield f"{values['num_envs']} robots"
+        words.append(f"{values['num_envs']} robots")
+    return ", ".join(words)
 
 
 def _write(name: str, result: Any, path: Path) -> None:
@@ -277,7 +266,14 @@ def bar(label: str, unit: str = "it") -> Progress[Any]:
         return partial(_lines, label, unit)
     from tqdm import tqdm
 
-    return partial(tqdm, desc=label, unit=unit, delay=1.0, leave=False, dynamic_ncols=True)
+    return partial(
+        tqdm,
+        desc=label,
+        unit=unit,
+        delay=1.0,
+        leave=False,
+        dynamic_ncols=True,
+    )
 
 
 def _lines(label: str, unit: str, items: Collection[T]) -> Iterator[T]:

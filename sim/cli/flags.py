@@ -35,10 +35,6 @@ def _hint(default: str) -> str:
     return f"(default: {default})"
 
 
-OPTIONS_WITH_FLAG = {
-    entry.name: entry.default for entry in fields(RunnerKeywords) if OPTIONS[entry.name].flag
-}
-"""Options of a Runner that have a flag, with their defaults."""
 BOUNDS = declared(RunnerKeywords, Field)
 """Ranges of the options that are numbers."""
 NumEnvs = Annotated[int, BOUNDS["num_envs"], flag("Number of robots, one in each scene.")]
@@ -107,7 +103,7 @@ def record_of(
     for name in options:
         kind = get_args(OPTION_TYPES[name])[0]
         kind = Annotated[kind, BOUNDS.get(name), flag(OPTIONS[name].flag)]
-        rows.append((name, kind, field(default=OPTIONS_WITH_FLAG[name])))
+        rows.append((name, kind, field(default=getattr(RunnerKeywords, name))))
     rows += [(name, LOADING[name], field(default=None)) for name in loading]
     for name, text in (outputs or {}).items():
         rows.append((name, Annotated[Path | None, flag(text, "FILE")], field(default=None)))

@@ -44,7 +44,14 @@ SHORTEST = 1.0
 """Shortest run in which envs should settle [s]."""
 LISTED = 8
 """Envs that a line lists."""
-AXIS_UNITS = {"x": "m", "y": "m", "z": "m", "rx": "rad", "ry": "rad", "rz": "rad"}
+AXIS_UNITS = {
+    "x": "m",
+    "y": "m",
+    "z": "m",
+    "rx": "rad",
+    "ry": "rad",
+    "rz": "rad",
+}
 """Axes of the error of a pose, with their units."""
 COLUMNS = {
     "first_error": ("first error", "{:.2g}"),
@@ -202,7 +209,15 @@ def rollout(
         result = runner.rollout(setpoints, progress=progress, **further)
         wall = time.perf_counter() - began
         backend = runner.backend
-    return RunReport(robot, result, timestep, wall, backend, notes, is_held=trajectory is None)
+    return RunReport(
+        robot,
+        result,
+        timestep,
+        wall,
+        backend,
+        notes,
+        is_held=trajectory is None,
+    )
 
 
 def start_poses(

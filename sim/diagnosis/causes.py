@@ -20,6 +20,7 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
+from batchpid.metrics import SETTLING_SHARE
 from batchpid.sim.diagnosis.preflight import touching_links
 from batchpid.sim.findings import FINDING_KINDS, LIMIT_TOLERANCE, Finding, Findings
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
     from batchpid.sim.rollout import Rollout
 
-SETTLING_SHARE = 0.02  # half width of the settling band, as a share of the move
 EXAMINED = 100  # envs at most
 TAIL = 0.2  # last share of the run, by which joints are judged
 MOST_CAUSES = 3  # of a report
@@ -105,7 +105,16 @@ def _finding(
     numbers = tuple(envs[rows].tolist())
     time = times.min()
     kind = FINDING_KINDS[rule.code]
-    return Finding(kind.code, kind.when, kind.done, name, None, detail, numbers, time)
+    return Finding(
+        kind.code,
+        kind.when,
+        kind.done,
+        name,
+        None,
+        detail,
+        numbers,
+        time,
+    )
 
 
 class _Run:

@@ -167,7 +167,14 @@ class NativeModel:
             for rows in (qpos, qvel, base)
         ]
         out = np.empty(qpos.shape)
-        self._native.forces(self.address, gravity, coriolis, *state, out, len(out))
+        self._native.forces(
+            self.address,
+            gravity,
+            coriolis,
+            *state,
+            out,
+            len(out),
+        )
         return out
 
 
@@ -219,7 +226,11 @@ class NativeRefresh:
         arrays |= coupling.native()
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
         self._structure = structure("Refresh")(
-            model=model.address, timestep=timestep, share=DEADBEAT_SHARE, steps=steps, **addresses
+            model=model.address,
+            timestep=timestep,
+            share=DEADBEAT_SHARE,
+            steps=steps,
+            **addresses,
         )
         self._kept = model, arrays
 
@@ -258,7 +269,12 @@ class NativeStep:
             self._arrays["speed_limit"] = np.broadcast_to(speed_limit, dof).astype(np.float64)
         addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
         self._native = native.extension("_gateway")
-        self._group = structure("Group")(robots=robots, dof=dof, **addresses, **fields)
+        self._group = structure("Group")(
+            robots=robots,
+            dof=dof,
+            **addresses,
+            **fields,
+        )
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension that does a sim

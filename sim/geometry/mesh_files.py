@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -89,15 +89,6 @@ def _ros_packages(package: str) -> Iterator[Path]:
             yield from sorted(root.glob(pattern))
 
 
-class Mesh(NamedTuple):
-    """Content of a mesh file: digest of its bytes, and the reason for which it cannot be used, or
-    None.
-    """
-
-    content: str
-    problem: str | None
-
-
 def read_mesh(path: str | Path, data: bytes | None = None) -> Any:
     """Return the result of ``trimesh`` for a mesh file, or for its bytes ``data``, in metres.
 
@@ -124,18 +115,20 @@ are loaded again.
 """
 
 
-def check_mesh(path: Path) -> Mesh:
-    """Return content and problem of a mesh file."""
+def check_mesh(path: Path) -> tuple[str, str | None]:
+    """Return the digest of the bytes of a mesh file, and the reason for which it cannot be used, or
+    None.
+    """
     try:
         with open(path, "rb") as file:
             data = file.read(MESH_SIZE_LIMIT + 1)
     except OSError as error:
-        return Mesh("", str(error))
+        return "", str(error)
     content = digest(data)
     key = content, path.suffix.lower()
     if key not in _PROBLEMS:
         _PROBLEMS[key] = _problem(path, data)
-    return Mesh(content, _PROBLEMS[key])
+    return content, _PROBLEMS[key]
 
 
 def _problem(path: Path, data: bytes) -> str | None:

@@ -30,7 +30,7 @@ from batchpid.sim.identification.regression import (
     smooth,
 )
 from batchpid.sim.identification.result import Identification
-from batchpid.sim.identification.simulator import Exact, Plant
+from batchpid.sim.identification.simulator import Exact, LogPlant
 from batchpid.sim.identification.trials import fit, with_effects
 from batchpid.sim.identification.unknowns import (
     BASIC,
@@ -129,7 +129,14 @@ def identify(
         places = _payload_links(robot, payload_link)
     read = _read(robot, logs, params, reading)
     moves, still = _moving(robot, read)
-    robot, data = _prepared(robot, read, moves, params, compensate, timestep)
+    robot, data = _prepared(
+        robot,
+        read,
+        moves,
+        params,
+        compensate,
+        timestep,
+    )
     law_unknown = bool({"kd", "gain"}.intersection(kinds))
     data, guesses = _regress(robot, data, law_unknown, progress)
     windows = windows_of(data)
@@ -138,7 +145,14 @@ def identify(
         starts = dict[Any, list[Problem]]()
         for place, share in product(places, SATURATIONS if "saturation" in kinds else (0.7,)):
             for guess in guesses:
-                unknowns = _unknowns(robot, data, guess, kinds, place, share)
+                unknowns = _unknowns(
+                    robot,
+                    data,
+                    guess,
+                    kinds,
+                    place,
+                    share,
+                )
                 starts.setdefault((place, share), []).append(Problem(data, windows, unknowns, run))
         solution = with_effects(fit(starts, evaluations, progress), evaluations, progress)
     # Worker processes end with the fit.
@@ -237,7 +251,7 @@ def _prepared(
         band = np.array([FRICTION_BAND[robot.units[joint]] for joint in joints])
         turns = robot.continuous[joints] / TURN
         modelled = {"modelled": friction, "band": band, "turns": turns}
-    plants = dict[Robot, Plant]()
+    plants = dict[Robot, LogPlant]()
     data = list[LogData]()
     for log in logs:
         law = _law(robot, log, params)
@@ -253,7 +267,7 @@ def _prepared(
         )
         key = log.robot or robot
         if key not in plants:
-            plants[key] = Plant(_resting(key, start), tuple(joints.tolist()), free)
+            plants[key] = LogPlant(_resting(key, start), tuple(joints.tolist()), free)
         part = log.part(joints=moves)
         data.append(LogData(part, smooth(part, dt), plants[key], drive))
     return _resting(robot, start), data

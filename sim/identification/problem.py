@@ -213,7 +213,16 @@ def windows_of(data: Sequence[LogData]) -> list[Stretch]:
             starts = [*range(edge, split - length + 1, length)]
             starts += range(first, total - length + 1, length)
         for start in starts:
-            windows.append(_window(number, part, start, start + length, split, every))
+            windows.append(
+                _window(
+                    number,
+                    part,
+                    start,
+                    start + length,
+                    split,
+                    every,
+                )
+            )
     return windows[:: 1 + len(windows) // MOST_WINDOWS]
 
 

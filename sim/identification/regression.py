@@ -26,8 +26,8 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.identification.log import Log, interpolated
-from batchpid.sim.identification.simulator import Candidates, Plant
-from batchpid.sim.loop.loop_run import LoopRun, Playback
+from batchpid.sim.identification.simulator import Candidates, LogPlant
+from batchpid.sim.loop.loop_run import LoopRun, MotionPlant
 from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control
 from batchpid.task_space.tree_quantities import inverse_dynamics
@@ -88,7 +88,7 @@ class LogData(NamedTuple):
 
     log: Log
     motion: Motion
-    plant: Plant
+    plant: LogPlant
     drive: Control
 
 
@@ -235,12 +235,22 @@ def _commanded(part: LogData) -> Float64:
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
     none = np.zeros(count)
     alone = drive._replace(gravity=False, coriolis=False, further=())
-    loop = plant.loop(alone, Candidates(Actuators(), {}, none, none, {}, {}))
+    loop = plant.loop(
+        alone,
+        Candidates(
+            Actuators(),
+            {},
+            none,
+            none,
+            {},
+            {},
+        ),
+    )
     loop = replace(loop, control=loop.control._replace(friction=Friction()))
     tables = [np.repeat(plant.spread(table)[:, None], count, axis=1) for table in motion[:2]]
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)
     setpoints = motion.command[np.clip(np.arange(steps)[:, None] - late, 0, steps - 1)]
-    moving = loop.changed(plant=Playback(*tables))
+    moving = loop.changed(plant=MotionPlant(*tables))
     run = LoopRun(moving, tables[0][0], tables[1][0], plant.spread(setpoints[0]), steps)
     run.setpoints[...] = plant.spread(setpoints)
     run.run(steps)

@@ -121,7 +121,7 @@ class Exact(Stage):
         return state, values.told(qf=values.outputs.qf + values.seen.passive)
 
 
-class Plant:
+class LogPlant:
     """Logged ``joints`` of ``robot``; those that are ``free`` (joints,) have no limits.
 
     A control and candidates have the logged joints; arrays of the tree have the followers, too.
@@ -216,8 +216,10 @@ class Plant:
         for name, factor in candidates.mass.items():
             body = tree.link_bodies[tree.index(name)]
             for link in np.flatnonzero(np.array(tree.link_bodies) == body).tolist():
-                own = SpatialInertia(float(tree.mass[link]), tree.center[link], tree.inertia[link])
-                added[tree.links[link]] = (factor - 1)[:, None, None] * spatial_matrix(own)
+                spatial = SpatialInertia(
+                    float(tree.mass[link]), tree.center[link], tree.inertia[link]
+                )
+                added[tree.links[link]] = (factor - 1)[:, None, None] * spatial_matrix(spatial)
         for name, mass in candidates.payload.items():
             point = SpatialInertia(1.0, tree.center[tree.index(name)], np.zeros((3, 3)))
             change = mass[:, None, None] * spatial_matrix(point)
@@ -240,7 +242,7 @@ def changed_params(params: bp.PIDParams, law: Mapping[str, Float64]) -> bp.PIDPa
 
 
 def simulate(
-    plant: Plant,
+    plant: LogPlant,
     drive: Control,
     candidates: Candidates,
     states: Float64,

@@ -4,6 +4,7 @@ of controllers in Python; and in programs of JAX.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import groupby
@@ -69,6 +70,16 @@ class NumPyExecutor:
         """Replace the states; they have the arrays of the states before."""
         self._states = states
 
+    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
+        """Change the state of the stage ``name``, between sim steps, to ``function(stage, state)``,
+        which has the same arrays or others in their place.
+        """
+        pairs = zip(self.setup.stages, self._states, strict=True)
+        changed = [
+            function(stage, state) if stage.name == name else state for stage, state in pairs
+        ]
+        self._states = tuple(changed)
+
     def results(self) -> Outputs:
         """Return the results of the last sim step as NumPy arrays."""
         return self.outputs
@@ -96,7 +107,14 @@ class NumPyExecutor:
             step = Step(index, end, control.left(index, end))
             self.before = self.measured.qpos  # where a robot that fails now is suspended
             measured = self.measured
-            values = Values(command, measured, measured, control.timestep, step, setup.model)
+            values = Values(
+                command,
+                measured,
+                measured,
+                control.timestep,
+                step,
+                setup.model,
+            )
             with controller_errors(control.controller, index + 1):
                 self.outputs = outputs = self._stepped(values).outputs
             # Writing the targets of drives costs a call for each joint.

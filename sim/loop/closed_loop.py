@@ -17,14 +17,14 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import added_friction, own_friction
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.group_control import control_of
-from batchpid.sim.loop.tree_plant import TreePlant
+from batchpid.sim.loop.tree_plant import DYNAMICS, TreePlant
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control, stages_of
 from batchpid.stages.stage import States, placed, started, stepped
 from batchpid.stages.values import Command, Measured, Model, Outputs, Step, Values
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.tree_quantities import bias, mass_matrix
+from batchpid.task_space.tree_quantities import bias, evaluated, mass_matrix
 
 
 class Plant(Protocol):
@@ -153,9 +153,15 @@ class ClosedLoop:
         def sim_step(carry: Any, index: Array) -> tuple[Any, Outputs]:
             plant, states = carry
             step = Step(index, substeps, self.control.left(index, substeps))
-            values = self.values(plant, command, step, episode)
+            # The law and the robots have the same dynamics, computed once.
+            shared = evaluated(self.tree, DYNAMICS, *self.plant.read(plant))
+            values = self.values(plant, command, step, episode, shared["bias"])
             states, values = stepped(stages, states, values)
-            return (self.plant.step(plant, values.outputs.qf), states), values.outputs
+            if isinstance(self.plant, TreePlant):
+                plant = self.plant.step(plant, values.outputs.qf, shared)
+            else:
+                plant = self.plant.step(plant, values.outputs.qf)
+            return (plant, states), values.outputs
 
         carry = state.plant, state.stages
         if xp is np:
@@ -189,8 +195,11 @@ class ClosedLoop:
         command: Command,
         step: Step,
         episode: Array,
+        load: Array = None,
     ) -> Values:
-        """Return the values of a sim step before its stages."""
+        """Return the values of a sim step before its stages; ``load`` is the bias at the state, if it
+        is known.
+        """
         control, tree = self.control, self.tree
         qpos, qvel = self.plant.read(plant)
         xp = namespace(qpos)
@@ -221,8 +230,17 @@ class ClosedLoop:
         )
         if xp is not np:
             model = model._replace(when=_when)
-        measured = Measured(qpos, qvel, passive(qpos, qvel))
-        return Values(command, measured, measured, control.timestep, step, model)
+        if load is None or not (control.gravity and control.coriolis):
+            load = passive(qpos, qvel)
+        measured = Measured(qpos, qvel, load)
+        return Values(
+            command,
+            measured,
+            measured,
+            control.timestep,
+            step,
+            model,
+        )
 
 
 def _when(due: Any, function: Callable[[], Any], otherwise: Any) -> Any:
@@ -277,7 +295,7 @@ def closed_loop(
         scene.joints,
         friction,
         slice(0, num_envs),
-        controller and _Traced(controller),
+        controller and _TracedController(controller),
         scene.dissipation == "urdf",
     )
     tree = robot.kinematic_tree(armature=np.zeros(robot.dof)).held
@@ -286,7 +304,7 @@ def closed_loop(
     return ClosedLoop(plant, control, tree, robot.start)
 
 
-class _Traced:
+class _TracedController:
     """The caller's own controller in a program of JAX."""
 
     def __init__(self, controller: OwnController) -> None:

@@ -162,7 +162,7 @@ class FaultContainment:
     def begin_tick(self) -> bool:
         """Forget the failures of the last tick; return whether no env is suspended."""
         self.failed[...] = self.suspended
-        return not np.logical_or.reduce(self.suspended)
+        return not np.count_nonzero(self.suspended)
 
     def clear(self, mask: Bool) -> None:
         """Clear the faults of the envs of ``mask`` (M,), which are reset."""

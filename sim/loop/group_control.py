@@ -31,7 +31,7 @@ from batchpid.sim.robot.tables import Joint
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.stages import Control, Stage, stages_of
 from batchpid.stages.friction import REFRESH_STEPS
-from batchpid.stages.stage import StageProgram, States, started
+from batchpid.stages.stage import States, bind_stages, started
 from batchpid.stages.values import Command, Measured, Model, Outputs, Step, Values
 
 
@@ -161,7 +161,15 @@ def empty_states(
     controller = None if isinstance(options.control, str) else OwnController(options)
     friction = Friction(coulomb=rows if stiction else None)
     envs = slice(0, options.num_envs)
-    control = control_of(options, params, actuators, joints, friction, envs, controller)
+    control = control_of(
+        options,
+        params,
+        actuators,
+        joints,
+        friction,
+        envs,
+        controller,
+    )
     stages = stages_of(control)
     model = Model(
         joint_mass_matrix=lambda qpos: np.eye(len(joints)) + 0.0 * qpos[:, :, None],
@@ -182,14 +190,19 @@ def untraceable(options: RunnerOptions) -> str:
     step = Step(0, 1, np.zeros(()))
     values = Values(Command(*[row] * 4), reading, reading, options.timestep, step)
     values = values._replace(last=Outputs(row, row), forward=row, limits=(row, row))
-    values = values.told(qf=row, motor=row, saturated=row, guarded=row)
+    values = values.told(
+        qf=row,
+        motor=row,
+        saturated=row,
+        guarded=row,
+    )
     for stage in stages:
         if stage.name in names:
             state, _ = stage.init(values)
             if any(leaf.shape != row.shape for leaf in leaves(state)):
                 return f"the state of stage {stage.name!r} is not (envs, joints)"
             try:
-                StageProgram([stage], (state,), values, row.shape)
+                bind_stages([stage], (state,), values, row.shape)
             except (AttributeError, AssertionError, TypeError, ValueError) as error:
                 return f"stage {stage.name!r}: {error}"
     return ""

@@ -24,7 +24,7 @@ from batchpid.stages.stage import by_name, started
 from batchpid.stages.values import Command, Measured, Model, Step, Values
 
 
-class Playback:
+class MotionPlant:
     """Plant that moves as ``qpos`` and ``qvel`` (steps, envs, dof) say, whatever its efforts."""
 
     def __init__(self, qpos: Float64, qvel: Float64) -> None:
@@ -49,7 +49,7 @@ class LoopRun:
     """Run of a closed loop from ``qpos`` and ``qvel`` (envs, dof) on, up to ``steps`` sim steps at
     a time.
 
-    Its plant is a :class:`.TreePlant`, or a :class:`Playback`, which runs once. ``setpoint`` (envs,
+    Its plant is a :class:`.TreePlant`, or a :class:`MotionPlant`, which runs once. ``setpoint`` (envs,
     dof) is that at the start.
 
     Attributes
@@ -75,7 +75,7 @@ class LoopRun:
     ) -> None:
         self._loop = loop
         self.setpoints, self.effort = np.zeros((2, steps, *qpos.shape))
-        if isinstance(loop.plant, Playback):
+        if isinstance(loop.plant, MotionPlant):
             self.qpos, self.qvel = loop.plant.motion
         else:
             self.qpos, self.qvel = np.zeros((2, steps, *qpos.shape))
@@ -96,7 +96,14 @@ class LoopRun:
         if lanes is not None:
             setup: Any = GroupControl(None, lanes, loop.control, stages, values.model)  # type: ignore[arg-type]
             buffers = Buffers(states, command, values.measured, np.zeros_like(qpos))
-            self._program = TickProgram(setup, buffers, self._copies, (), False, False)
+            self._program = TickProgram(
+                setup,
+                buffers,
+                self._copies,
+                (),
+                False,
+                False,
+            )
             lanes.prepare(self._program)
 
     def run(self, steps: int) -> None:
@@ -113,7 +120,7 @@ class LoopRun:
         for at in range(steps):
             state, seen = self._loop.step(state, self.setpoints[at])
             self.effort[at] = seen.effort
-            if not isinstance(self._loop.plant, Playback):
+            if not isinstance(self._loop.plant, MotionPlant):
                 self.qpos[at], self.qvel[at] = seen[:2]
         self._plant, self._states, _ = state
 
@@ -122,7 +129,7 @@ class LoopRun:
         command, measured = program.buffers.command, program.buffers.measured
         copies = [(self.setpoints, command.setpoint)]
         results = [(self.qpos, measured.qpos), (self.qvel, measured.qvel)]
-        if isinstance(self._loop.plant, Playback):
+        if isinstance(self._loop.plant, MotionPlant):
             copies += zip(self._loop.plant.motion, measured[:2], strict=True)
             results = [(self.effort, program.outputs.motor)]
         # Bytes are copied as they are, numbers of observations in single precision.
@@ -131,7 +138,7 @@ class LoopRun:
 
 class Lanes:
     """Robots of a closed loop in lanes of native code, for :class:`.TickProgram`; with a
-    :class:`Playback` there are none.
+    :class:`MotionPlant` there are none.
     """
 
     def __init__(self, loop: ClosedLoop, qpos: Float64, qvel: Float64) -> None:
@@ -190,8 +197,10 @@ class Lanes:
             armature = np.zeros((1, self.dof))
             if control.actuators is not None and control.actuators.armature is not None:
                 armature = control.actuators.armature
-            given = control.friction, control.drive, control.coupling, control.timestep
-            refresh = NativeRefresh(self.joint_model, self.size, armature, *given, REFRESH_STEPS)
+            constants = control.friction, control.drive, control.coupling, control.timestep
+            refresh = NativeRefresh(
+                self.joint_model, self.size, armature, *constants, REFRESH_STEPS
+            )
             model = model._replace(refresh=refresh)
         qpos, qvel = self._start
         measured = Measured(qpos.copy(), qvel.copy(), force(qpos, qvel, *parts))

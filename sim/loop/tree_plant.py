@@ -13,6 +13,7 @@ documentation). Newton steps on the set of active limits find the minimum.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -24,6 +25,7 @@ from batchpid.motors.coupling import Coupling
 from batchpid.task_space.rigid_tree import Bodies, RigidTree
 from batchpid.task_space.tree_quantities import evaluated
 
+DYNAMICS = ("mass_matrix", "bias")
 TURNS = 4
 """Newton steps on the active limits: more sets than a robot changes in a time step."""
 IMPEDANCE = (0.99, 0.999, 1e-4)
@@ -66,11 +68,20 @@ class TreePlant:
         """Return positions and velocities (envs, dof)."""
         return state
 
-    def step(self, state: tuple[Array, Array], effort: Array) -> tuple[Array, Array]:
-        """Return the state after a time step under ``effort`` (envs, dof) [N m or N]."""
+    def step(
+        self,
+        state: tuple[Array, Array],
+        effort: Array,
+        nominal: Mapping[str, Array] | None = None,
+    ) -> tuple[Array, Array]:
+        """Return the state after a time step under ``effort`` (envs, dof) [N m or N].
+
+        ``nominal`` are the mass matrix and the bias of the tree at the state, if they are known.
+        """
         qpos, qvel = state
-        dynamics = evaluated(self.tree, ("mass_matrix", "bias"), qpos, qvel, bodies=self.bodies)
-        matrix, bias = dynamics["mass_matrix"], dynamics["bias"]
+        if nominal is None or self.bodies is not self.tree.bodies:
+            nominal = evaluated(self.tree, DYNAMICS, qpos, qvel, bodies=self.bodies)
+        matrix, bias = nominal["mass_matrix"], nominal["bias"]
         xp = namespace(matrix)
         eye = xp.eye(matrix.shape[-1], dtype=matrix.dtype)
         matrix = matrix + self.inertia[..., None] * eye
@@ -92,40 +103,41 @@ class TreePlant:
         """Return the accelerations (envs, dof) with the active joint limits."""
         below, above = qpos - self.low, self.high - qpos
         sign = (below < 0).astype(qpos.dtype) - (above < 0).astype(qpos.dtype)
-        eye = xp.eye(matrix.shape[-1], dtype=matrix.dtype)
-        least, most, width = IMPEDANCE
-
         if xp is not np:
             from jax import lax
+        least, most, width = IMPEDANCE
+        distance = xp.where(sign > 0, below, xp.where(sign < 0, above, 0.0))
+        x = abs(distance) / width
+        curve = xp.where(x > 0.5, 1.0 - 2.0 * (1.0 - x) ** 2, 2.0 * x * x)
+        impedance = xp.where(x < 1.0, least + curve * (most - least), most)
+        cost = impedance / ((1.0 - impedance) * self.weight)
+        stiffness, rate_gain = (most * self.limit_time) ** -2.0, 2.0 / (most * self.limit_time)
+        push = sign * (-rate_gain * sign * qvel - stiffness * impedance * distance)
+        eye = xp.eye(matrix.shape[-1], dtype=matrix.dtype)
 
-        def limited() -> Array:
-            distance = xp.where(sign > 0, below, xp.where(sign < 0, above, 0.0))
-            x = abs(distance) / width
-            curve = xp.where(x > 0.5, 1.0 - 2.0 * (1.0 - x) ** 2, 2.0 * x * x)
-            impedance = xp.where(x < 1.0, least + curve * (most - least), most)
-            cost = impedance / ((1.0 - impedance) * self.weight)
-            stiffness, rate_gain = (most * self.limit_time) ** -2.0, 2.0 / (most * self.limit_time)
-            push = sign * (-rate_gain * sign * qvel - stiffness * impedance * distance)
-            active = sign * sign
+        def solution(active: Array, given: Any) -> Array:
+            matrix, effort, cost, push = given
+            pulled = xp.where(active, cost, 0.0)
+            return _solved(matrix + pulled[..., None] * eye, effort + pulled * push, xp)
 
-            def turn(active: Array, _: Any) -> tuple[Array, Array]:
-                stiff = matrix + (active * cost)[..., None] * eye
-                a = _solved(stiff, effort + active * cost * push, xp)
-                return (sign * (a - push) < 0).astype(active.dtype), a
+        # The set of limits has no derivative, so a loop of unknown length may find it.
+        given = matrix, effort, cost, push
+        fixed = given if xp is np else lax.stop_gradient(given)
 
-            if xp is np:
-                for _ in range(TURNS):
-                    active, a = turn(active, None)
-                return a
-            return lax.scan(turn, active, length=TURNS)[1][-1]
+        def turn(carry: Any) -> Any:
+            turns, active, _ = carry
+            held = sign * (solution(active, fixed) - fixed[3]) < 0
+            return turns + 1, held, (held != active).any()
 
-        def free() -> Array:
-            return _solved(matrix, effort, xp)
+        def changes(carry: Any) -> Any:
+            return carry[2] & (carry[0] < TURNS)
 
-        if xp is np:
-            return limited() if sign.any() else free()
-        chosen: Array = lax.cond((sign != 0).any(), limited, free)
-        return chosen
+        carry = 0, sign != 0, (sign != 0).any()
+        if xp is not np:
+            carry = lax.while_loop(changes, turn, carry)
+        while xp is np and changes(carry):
+            carry = turn(carry)
+        return solution(carry[1], given)
 
 
 def _solved(matrix: Array, right: Array, xp: Any) -> Array:
@@ -133,8 +145,13 @@ def _solved(matrix: Array, right: Array, xp: Any) -> Array:
     if xp is np:
         solution: Array = np.linalg.solve(matrix, right[..., None])[..., 0]
         return solution
-    from jax.scipy import linalg
+    from jax.lax import linalg
 
-    factor = linalg.cho_factor(matrix)
-    solved: Array = linalg.cho_solve(factor, right[..., None])[..., 0]
-    return solved
+    # The mass matrix is symmetric.
+    factor = linalg.cholesky(matrix, symmetrize_input=False)
+    solved = right[..., None]
+    for transposed in (False, True):
+        solved = linalg.triangular_solve(
+            factor, solved, left_side=True, lower=True, transpose_a=transposed
+        )
+    return solved[..., 0]

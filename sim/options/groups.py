@@ -465,7 +465,12 @@ class ControlOptions(OptionGroup):
             # A copy: the caller may change the array later.
             speeds = array("speed_limit", limit, (1, robot.dof), joints)[0].copy()
             limit = read_only(at_least("speed_limit", speeds, 0.0, joints, above=True))
-        return self.changed(control=control, tool=link, speed_limit=limit, **values)
+        return self.changed(
+            control=control,
+            tool=link,
+            speed_limit=limit,
+            **values,
+        )
 
     @property
     def control_name(self) -> str:

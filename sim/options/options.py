@@ -339,7 +339,10 @@ def default_params(
                 ki=0.0, setpoint_weight=None, derivative_filter_time=None
             )
         return robot.params(
-            kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None
+            kp=settings.drive_stiffness,
+            ki=0.0,
+            kd=settings.drive_damping,
+            effort_limit=None,
         )
     if tuned_file(robot) is not None:
         return robot.tuned()

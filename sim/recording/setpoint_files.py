@@ -183,7 +183,14 @@ def setpoint_csv(robot: Robot, motion: Trajectory) -> str:
     text = io.StringIO()
     # A name may hold separators and quotation marks.
     header = [name if re.fullmatch(r"[\w.:/-]+", name) else _quoted(name) for name in names]
-    np.savetxt(text, rows, "%.9g", ",", header=",".join(["time", *header]), comments="")
+    np.savetxt(
+        text,
+        rows,
+        "%.9g",
+        ",",
+        header=",".join(["time", *header]),
+        comments="",
+    )
     return text.getvalue()
 
 
@@ -216,13 +223,29 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
     acceleration = tables.get("setpoint_acceleration")
     if "setpoint_rate" in tables:
         rate = tables["setpoint_rate"]
-        return Setpoints(start, position, rate, acceleration, substeps, True, 0)
+        return Setpoints(
+            start,
+            position,
+            rate,
+            acceleration,
+            substeps,
+            True,
+            0,
+        )
     if start is None:
         first = robot.start
     else:
         first = start
     rate, steps = _rates(robot, np.vstack([first, position]), substeps * timestep)
-    return Setpoints(start, position, rate, acceleration, substeps, False, steps)
+    return Setpoints(
+        start,
+        position,
+        rate,
+        acceleration,
+        substeps,
+        False,
+        steps,
+    )
 
 
 def _rates(robot: Robot, position: Float64, dt: float) -> tuple[Float64, int]:

@@ -121,7 +121,12 @@ def _with_inertia(body: Body, parts: Sequence[SpatialInertia]) -> Body:
     if sum(part.mass for part in parts) <= LEAST_MASS * len(parts):
         parts = [nothing]
     mass, center, tensor = total(parts)
-    return body._replace(mass=float(mass), center=center, inertia=tensor, inertia_wxyz=NO_TURN)
+    return body._replace(
+        mass=float(mass),
+        center=center,
+        inertia=tensor,
+        inertia_wxyz=NO_TURN,
+    )
 
 
 def _within(at: Placement, position: Float64, wxyz: Float64) -> tuple[Float64, Float64]:
@@ -287,7 +292,12 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     friction, damping = np.zeros((2, len(joints)))
     np.add.at(friction, coupling.leader, share * [joint.friction for joint in joints])
     np.add.at(damping, coupling.leader, share**2 * [joint.damping for joint in joints])
-    columns = {"lower": lower, "upper": upper, "friction": friction, "damping": damping}
+    columns = {
+        "lower": lower,
+        "upper": upper,
+        "friction": friction,
+        "damping": damping,
+    }
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     return tuple(
         replace(joint, **dict(zip(columns, row, strict=True)))

@@ -70,7 +70,14 @@ def read_robot(
         name = root.get("model") or path.stem
         source = read_mjcf(path, name, findings, fixed_base, missing_meshes)
     else:
-        source = read_urdf(root, path, findings, fixed_base, package_dirs, missing_meshes)
+        source = read_urdf(
+            root,
+            path,
+            findings,
+            fixed_base,
+            package_dirs,
+            missing_meshes,
+        )
     joints = [joint.name for joint in source.tables.joints]
     for name in (source.name, *joints, *source.tables.links):
         if not is_name(name):

@@ -374,7 +374,15 @@ class Robot:
             from batchpid.sim.engine.protocol import engine_findings
 
             of_engine = engine_findings(self, engine, timestep)
-        return check(self, params, qpos, setpoint, timestep, control, of_engine)
+        return check(
+            self,
+            params,
+            qpos,
+            setpoint,
+            timestep,
+            control,
+            of_engine,
+        )
 
     def guard(
         self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None

@@ -34,7 +34,12 @@ identified from a log is inexact; friction in the robot's description is exact, 
 simulated with it.
 """
 
-_NO_LIMIT = {"lower": -np.inf, "upper": np.inf, "rate": np.inf, "acceleration": np.inf}
+_NO_LIMIT = {
+    "lower": -np.inf,
+    "upper": np.inf,
+    "rate": np.inf,
+    "acceleration": np.inf,
+}
 
 
 def known_joints(robot: Robot) -> dict[str, Float64]:
@@ -45,12 +50,12 @@ def known_joints(robot: Robot) -> dict[str, Float64]:
     ``armature``: reflected inertia of the motors [kg m^2 or kg]; each (dof,).
     """
     motors = robot.actuators or bp.Actuators()
-    known = {}
+    leaves = {}
     for name in ("coulomb", "viscous", "armature"):
         leaf = getattr(motors, name)
-        known[name] = np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
-    known["coulomb"] *= FRICTION_SHARE
-    return known
+        leaves[name] = np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
+    leaves["coulomb"] *= FRICTION_SHARE
+    return leaves
 
 
 def load_robot_actuators(source: bp.Actuators | str | Path, robot: Robot) -> bp.Actuators:
@@ -102,7 +107,14 @@ def fit_actuators(
             remedy = "give at least minus the friction or damping of the robot's file"
             # Of a float32 the sum may be zero but for its rounding.
             good = motors[name] >= -(1 + 1e-6) * least
-            entries(name, motors[name], good, problem, robot.joint_names, remedy=remedy)
+            entries(
+                name,
+                motors[name],
+                good,
+                problem,
+                robot.joint_names,
+                remedy=remedy,
+            )
     return actuators.replace(**motors, continuous=robot.continuous)
 
 

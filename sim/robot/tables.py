@@ -28,6 +28,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.trees import mapped
 from batchpid.motors import Actuators
 from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.shapes import LEAST_MASS, Shape
@@ -189,6 +190,7 @@ class Tables:
         vars(self).update(
             bodies=tuple(Body._make(map(read_only, body)) for body in self.bodies),
             shapes=tuple(Shape._make(map(read_only, shape)) for shape in self.shapes),
+            visuals={link: mapped(read_only, rows) for link, rows in self.visuals.items()},
         )
 
     def __eq__(self, other: object) -> bool:
@@ -278,7 +280,7 @@ class MjcfFile:
     """MJCF file that MuJoCo simulates itself, with everything in it besides the robot.
 
     ``is_whole`` says whether all of it is compiled
-    (:func:`batchpid.sim.robot.mjcf.model.compile_scene`), and ``content`` is the digest of the
+    (:func:`batchpid.sim.robot.mjcf.reader.compile_scene`), and ``content`` is the digest of the
     model. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
     other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
     links. ``losses`` are findings of what is lost in an engine that does not simulate the file.

@@ -168,7 +168,8 @@ def _after_run(request: Request, state: RunnerState, outcome: Outcome) -> Runner
     motion = state.motion
     work = state.work
     count = outcome.num_ticks
-    if not np.logical_and.reduce(outcome.arrays.observation.ok[:count], axis=None):
+    ok = outcome.arrays.observation.ok[:count]
+    if np.count_nonzero(ok) < ok.size:
         for arrays in outcome.completed:
             faults = faults.with_events(arrays)
     if motion is not None and count:
@@ -275,4 +276,12 @@ def _fault(options: RunnerOptions, env: int, arrays: Arrays) -> Fault:
     if command is not None and cause in COMMAND_CAUSES:
         kind, names = "entry", command.names
     joint = names[arrays.fault.joint[env]]
-    return Fault(env, step, step * options.timestep, joint, cause, options.on_fault, kind)
+    return Fault(
+        env,
+        step,
+        step * options.timestep,
+        joint,
+        cause,
+        options.on_fault,
+        kind,
+    )

@@ -233,7 +233,14 @@ class Runner(SingleOwner):
         options = self.options
         seed = None if options.randomization is None else 0
         base = {"base_pose": None, "base_twist": None}
-        start = reset_request(options, self._state, (None, None), None, seed, base)
+        start = reset_request(
+            options,
+            self._state,
+            (None, None),
+            None,
+            seed,
+            base,
+        )
         self._call.begin()
         try:
             self._call.waits = True
@@ -304,7 +311,14 @@ class Runner(SingleOwner):
         """
         self._ready()
         base = {"base_pose": base_pose, "base_twist": base_twist}
-        start = reset_request(self.options, self._state, (qpos, qvel), mask, seed, base)
+        start = reset_request(
+            self.options,
+            self._state,
+            (qpos, qvel),
+            mask,
+            seed,
+            base,
+        )
         self._execute(start)
         return self.observe()
 
@@ -484,7 +498,15 @@ class Runner(SingleOwner):
         rated = command.setpoint_rate is not None
         info = replace(info, rates=rated, faults=self._state.faults.events)
         times = steps * options.timestep
-        return Rollout(times, command.setpoint, seen, seconds, info, command.feedforward, changes)
+        return Rollout(
+            times,
+            command.setpoint,
+            seen,
+            seconds,
+            info,
+            command.feedforward,
+            changes,
+        )
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""

@@ -24,13 +24,6 @@ class GainSet(NamedTuple):
     control: ControlMode = "pid"
 
 
-def default_gains(robot: Robot) -> str:
-    """Return the name of the gains that a robot has by default."""
-    if tuned_file(robot) is not None:
-        return "tuned"
-    return "designed"
-
-
 def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     """Return the gains of ``robot`` by name; default "tuned" where the robot has them, else
     "designed".
@@ -45,7 +38,8 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     InvalidArgumentError
         There is no such name or file, or the robot lacks these gains.
     """
-    name = name or default_gains(robot)
+    if name is None:
+        name = "designed" if tuned_file(robot) is None else "tuned"
     named = {
         "tuned": robot.tuned,
         "designed": robot.designed,
@@ -64,7 +58,12 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
             problem = "is no drive of finite stiffness and damping, 0 or more"
             remedy = "write drive:STIFFNESS,DAMPING, e.g. drive:20,5"
             raise InvalidArgumentError("gains", problem, value=name, remedy=remedy)
-        params = robot.params(kp=stiffness, ki=0.0, kd=damping, effort_limit=None)
+        params = robot.params(
+            kp=stiffness,
+            ki=0.0,
+            kd=damping,
+            effort_limit=None,
+        )
         return GainSet(f"drive ({stiffness:g}, {damping:g})", params, "drive")
     path = Path(name)
     if not path.is_file():

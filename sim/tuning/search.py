@@ -34,7 +34,7 @@ from batchpid.sim.options.groups import DEFAULT_ENGINE, EngineName
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.reading import describe
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tuning.candidates import FACTORS, Candidates
+from batchpid.sim.tuning.candidates import FACTORS, GainCandidates
 from batchpid.sim.tuning.evaluation import EVALUATION_SUBSTEPS, Comparison, compare, reseeded
 from batchpid.sim.tuning.gain_sets import GainSet, gain_table
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
@@ -199,8 +199,8 @@ def tune(
         if robot.fixed_base and build is None:
             fast = SEARCH_SCENE
 
-    def candidates(moves: Moves, headroom: float) -> Candidates:
-        return Candidates(
+    def candidates(moves: Moves, headroom: float) -> GainCandidates:
+        return GainCandidates(
             robot,
             gain_units,
             moves,
@@ -220,7 +220,14 @@ def tune(
     options["randomization"] = reseeded(randomization, seed)
     with searched.runner(population, options | fast) as runner:
         evaluate = partial(searched.costs, runner)
-        points, history = _evolve(evaluate, first, generations, population, seed, progress)
+        points, history = _evolve(
+            evaluate,
+            first,
+            generations,
+            population,
+            seed,
+            progress,
+        )
 
     # Final round, on other moves: the designed gains against the candidates that beat them.
     costs = np.concatenate(history)

@@ -33,7 +33,12 @@ HOST = "127.0.0.1"
 CHART_FRAMES = 5
 """Frames between two updates of chart and status."""
 CURVE = {"label": "qpos", "stroke": "#15803d", "width": 2}
-SETPOINT_CURVE = {"label": "setpoint", "stroke": "#4a82ff", "width": 1, "dash": [6, 4]}
+SETPOINT_CURVE = {
+    "label": "setpoint",
+    "stroke": "#4a82ff",
+    "width": 1,
+    "dash": [6, 4],
+}
 SCALES = {
     # Without a fixed range the axis drifts in viser 1.1.
     "x": {"time": False, "range": (-HISTORY_SECONDS, 0.0)},
@@ -73,7 +78,11 @@ class View(AbstractContextManager["View"]):
         """Address of the page, with the token that opens it."""
         self._stopped = False
         make = partial(
-            viser.ViserServer, host=HOST, port=gate.port, verbose=False, label="batchpid"
+            viser.ViserServer,
+            host=HOST,
+            port=gate.port,
+            verbose=False,
+            label="batchpid",
         )
         with redirect_stdout(io.StringIO()):  # viser's banner
             self._server = gate.start(make)

@@ -156,7 +156,9 @@ def surfaces(
                     findings.append(finding)
                 continue
             for rgba in dict.fromkeys(colours):
-                parts = [mesh for mesh, own in zip(meshes, colours, strict=True) if own == rgba]
+                parts = [
+                    mesh for mesh, colour in zip(meshes, colours, strict=True) if colour == rgba
+                ]
                 joined: Any = imported("trimesh.util").concatenate(parts)
                 vertices = np.asarray(joined.vertices)
                 result.append(Surface(name, rgba, vertices, np.asarray(joined.faces)))

@@ -121,7 +121,7 @@ class Replay:
                 self._waiting = self._waiting & ~request.arguments[0]
             if not self._waiting.any():
                 self.requests = [BUILD, *self._next]
-                self._ticks = sum(max(1, each.ticks) for each in self._next)
+                self._ticks = sum(max(1, request.ticks) for request in self._next)
                 self._next = []
         if self._ticks > self._most_ticks:
             self.requests = []

@@ -99,7 +99,7 @@ def generated_options(
                 rng.random(shape) < 0.3, off, on * rng.uniform(0.1, 1.0, shape)
             )
     strategies = ["none", "conditional"]
-    if "effort_max" in options:
+    if np.isfinite(options.get("effort_max", np.inf)).any():
         strategies.append("clamp")
     if units == "effort":
         options["non_finite"] = rng.choice(["propagate", "zero", "hold"]).item()

@@ -158,7 +158,16 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         joint = model.joint(model.body(parts.root).jntadr[0])
         base = int(joint.qposadr[0]), int(joint.dofadr[0])
     bodies = {link: model.body(name).id for link, name in parts.names.items()}
-    return RobotMj(model, spec.joints, qpos, qvel, bodies, parts.terms, parts.frames, base)
+    return RobotMj(
+        model,
+        spec.joints,
+        qpos,
+        qvel,
+        bodies,
+        parts.terms,
+        parts.frames,
+        base,
+    )
 
 
 def robot_spec(spec: SceneSpec) -> tuple[MjSpec, dict[str, str]]:

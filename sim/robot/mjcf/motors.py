@@ -5,7 +5,7 @@ An actuator with force F and moment arm g on a joint (the gear, times the joint'
 fixed tendon) applies the effort g F; a follower q' = m q adds m g' to the arm on its leader. A
 servo F = k u - kp g q - kv g q' has the gains g^2 kp and g^2 kv of a PID whose setpoint is its
 target in units of the joint. (MuJoCo's documentation, "Computation", actuation model.) MuJoCo's PID
-and its DC motor have the laws that :mod:`batchpid.sim.engine.mujoco.actuator_export` describes.
+and its DC motor have the laws that :mod:`batchpid.sim.engine.mujoco.mjcf_export` describes.
 
 Motors, servos, PIDs and DC motors of one joint are read. A finding names every other actuator.
 """
@@ -21,8 +21,8 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import MjModel
-from batchpid.sim.findings import Finding, Notes
-from batchpid.sim.robot.mjcf.model import RobotInFile, label
+from batchpid.sim.findings import Finding
+from batchpid.sim.robot.mjcf.bodies import RobotInFile, label
 
 Couplings = dict[str, tuple[str, float, float]]
 """Leader, multiplier and offset of each follower, as in ``<mimic>``."""
@@ -43,7 +43,7 @@ _OF_TENDONS = (
 """Effects of a tendon by itself."""
 
 
-class Law(NamedTuple):
+class ActuatorLaw(NamedTuple):
     """Law and motor of an actuator, in units of its transmission. Without gains it is a motor."""
 
     kp: float = 0.0
@@ -69,11 +69,11 @@ class Law(NamedTuple):
     @property
     def adds(self) -> bool:
         """Whether several actuators of one joint with such laws are one with the sum of gains."""
-        return self == Law(self.kp, kv=self.kv, input_gain=self.input_gain)
+        return self == ActuatorLaw(self.kp, kv=self.kv, input_gain=self.input_gain)
 
 
 @dataclass(frozen=True)
-class Motors:
+class JointMotors:
     """Motors of the joints by name, in N m or N; joints without an entry have none, or no limit."""
 
     effort_limit: dict[str, float] = field(default_factory=dict)
@@ -95,10 +95,11 @@ class Motors:
     lag: dict[str, float] = field(default_factory=dict)
 
 
-def read_couplings(model: MjModel, robot: RobotInFile, notes: Notes) -> Couplings:
+def read_couplings(robot: RobotInFile) -> Couplings:
     """Return the joints that linear equalities couple: y - y0 = c0 + c1 (x - x0), with y0, x0 the
     reference pose.
     """
+    model = robot.model
     couplings: Couplings = {}
     others: list[str] = []
     for equality in np.flatnonzero(model.eq_active0).tolist():
@@ -112,26 +113,22 @@ def read_couplings(model: MjModel, robot: RobotInFile, notes: Notes) -> Coupling
         is_linear = leader in robot.joints and multiplier and not any(higher)
         if not is_linear or name in couplings:
             text = "without the joint's equality, which is not linear in one other joint"
-            notes.lose(text, name)
+            robot.lose(text, name)
             continue
         rest, rest_of_leader = model.qpos0[model.jnt_qposadr[[follower, leader]]].tolist()
         offset += rest - multiplier * rest_of_leader
         couplings[name] = robot.joints[leader], multiplier, offset
     if others:
         text = "closed loops are open, without the equality constraints other than between the"
-        notes.lose(f"{text} robot's joints: {', '.join(others)}")
+        robot.lose(f"{text} robot's joints: {', '.join(others)}")
     return couplings
 
 
-def read_motors(
-    model: MjModel,
-    robot: RobotInFile,
-    couplings: Couplings,
-    notes: Notes,
-) -> Motors:
+def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
     """Return the motors of the joints, with findings for effects that are not simulated."""
-    motors = Motors()
-    findings = notes.repairs
+    model = robot.model
+    motors = JointMotors()
+    findings = robot.repairs
     # A follower has no motor: its leader moves its armature, too.
     for joint, name in robot.joints.items():
         for leader, arm in _on_leaders({name: 1.0}, couplings).items():
@@ -148,7 +145,7 @@ def read_motors(
             text += ": only motors and servos of one joint are"
             remedy = "check gains and limits of the joint"
             findings += [Finding("actuator", text, remedy, name) for name in arms or [None]]
-            law = Law(law.kp, kv=law.kv) if len(arms) == 1 else Law()
+            law = ActuatorLaw(law.kp, kv=law.kv) if len(arms) == 1 else ActuatorLaw()
         for name, arm in arms.items():
             _add_limits(model, actuator, name, arm, motors, findings)
             _add_law(law, name, arm, motors)
@@ -175,11 +172,11 @@ def read_motors(
     ]
     if tendons:
         text = "joints move freely, without springs, damping, friction, armature and limits of tendons: "
-        notes.lose(text + ", ".join(tendons))
+        robot.lose(text + ", ".join(tendons))
     return motors
 
 
-def _is_plain(model: MjModel, actuator: int, law: Law) -> bool:
+def _is_plain(model: MjModel, actuator: int, law: ActuatorLaw) -> bool:
     """Return whether an actuator is a motor, or has this ``law``, without further effects."""
     effects = ("delay", "damping", "dampingpoly")
     if model.actuator_plugin[actuator] >= 0:
@@ -212,31 +209,31 @@ def _is_plain(model: MjModel, actuator: int, law: Law) -> bool:
     return bool(is_motor or (is_law and (stiffness < 0 or damping == 0)))
 
 
-def _law(model: MjModel, actuator: int) -> Law:
+def _law(model: MjModel, actuator: int) -> ActuatorLaw:
     """Return the law of an actuator; that of a motor for unknown laws."""
     # A plugin's parameters have other meanings.
     if model.actuator_plugin[actuator] >= 0:
-        return Law()
+        return ActuatorLaw()
     kind = int(model.actuator_gaintype[actuator])
     gain = model.actuator_gainprm[actuator].tolist()
     dynamics = model.actuator_dynprm[actuator].tolist()
     if kind == _GAIN.mjGAIN_DCMOTOR:
         resistance, constant, _, _, kp, ki, kv, supply, *_ = gain
-        law = Law(kp, ki, kv, error_limit=dynamics[8], slew=dynamics[7], lag=dynamics[0])
+        law = ActuatorLaw(kp, ki, kv, error_limit=dynamics[8], slew=dynamics[7], lag=dynamics[0])
         if supply:
             law = law._replace(stall=constant * supply / resistance, speed=supply / constant)
         return law
     if model.actuator_biastype[actuator] != _BIAS.mjBIAS_AFFINE:
-        return Law()
+        return ActuatorLaw()
     kp, kv = np.maximum(-model.actuator_biasprm[actuator, 1:3], 0.0).tolist()
     if kind == _GAIN.mjGAIN_PID:
-        return Law(kp, gain[0], kv, error_limit=dynamics[0], slew=dynamics[1])
+        return ActuatorLaw(kp, gain[0], kv, error_limit=dynamics[0], slew=dynamics[1])
     if kind == _GAIN.mjGAIN_FIXED and kp:
-        return Law(kp, kv=kv, input_gain=gain[0] / kp)
-    return Law(kp, kv=kv)
+        return ActuatorLaw(kp, kv=kv, input_gain=gain[0] / kp)
+    return ActuatorLaw(kp, kv=kv)
 
 
-def _add_law(law: Law, name: str, arm: float, motors: Motors) -> None:
+def _add_law(law: ActuatorLaw, name: str, arm: float, motors: JointMotors) -> None:
     """Add gains and motor of an actuator to a joint."""
     motors.kp[name] += arm**2 * law.kp
     motors.ki[name] += arm**2 * law.ki
@@ -255,9 +252,9 @@ def _add_law(law: Law, name: str, arm: float, motors: Motors) -> None:
 def _add_setpoints(
     model: MjModel,
     actuator: int,
-    law: Law,
+    law: ActuatorLaw,
     robot: RobotInFile,
-    motors: Motors,
+    motors: JointMotors,
 ) -> None:
     """Add the range of a servo's setpoints, where its transmission moves with one joint alone."""
     arms = _arms(model, actuator, robot)
@@ -273,7 +270,7 @@ def _add_limits(
     actuator: int,
     name: str,
     arm: float,
-    motors: Motors,
+    motors: JointMotors,
     findings: list[Finding],
 ) -> None:
     """Add armature and effort limit of an actuator to a joint."""

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 import tyro
-from commands_that_write import WORDS, output, output_flags
+from commands_that_write import WORDS
 
 from batchpid.sim.cli.commands import COMMANDS, bar
 
@@ -68,23 +68,6 @@ def test_a_wrong_flag_is_answered_with_the_help_of_its_command(command, batchpid
     assert not [
         other for other in COMMANDS if other != command and f"batchpid {other} " in complaint
     ]
-
-
-@pytest.mark.parametrize(("command", "flag"), output_flags())
-def test_an_output_without_a_folder_is_refused_before_the_run(
-    command,
-    flag,
-    files,
-    batchpid,
-    tmp_path,
-    monkeypatch,
-):
-    monkeypatch.chdir(files)
-    path = tmp_path / "missing" / output(command, flag)
-    status, said, complaint = batchpid(*WORDS[command], f"--{flag}", path)
-    assert (status, said) == (2, "")
-    assert complaint.splitlines()[-1].endswith(f"mkdir -p {path.parent}")
-    assert not path.parent.exists()
 
 
 BAD = {

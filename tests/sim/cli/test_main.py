@@ -101,7 +101,7 @@ def test_the_help_has_the_docstring_and_every_flag_with_its_help(name, batchpid)
 
 
 def test_a_base_is_free_or_fixed_by_a_flag(batchpid):
-    assert "quadruped: free base, " in batchpid("inspect", "quadruped", "--base", "free")[1]
+    assert "quadruped: 12 dof, base free" in batchpid("inspect", "quadruped", "--base", "free")[1]
 
 
 def test_flags_reach_the_command_and_its_status_is_returned(batchpid, stub):

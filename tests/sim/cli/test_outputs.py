@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 
 import pytest
 from commands_that_write import SHORT, WORDS, output, output_flags
@@ -22,42 +23,24 @@ def empty_pictures(monkeypatch):
     )
 
 
+@pytest.mark.parametrize("folder", ["", "missing/"])
 @pytest.mark.parametrize(("name", "flag"), output_flags())
-def test_an_existing_output_is_refused_before_the_run(
-    name, flag, files, batchpid, tmp_path, monkeypatch
+def test_an_output_that_exists_or_has_no_folder_is_refused_before_the_run(
+    name, flag, folder, files, batchpid, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(files)
-    (path := tmp_path / output(name, flag, "kept")).write_text("kept")
-    others = [
-        word
-        for command, each in output_flags()
-        if command == name and each not in (flag, "out")
-        for word in (f"--{each}", tmp_path / output(name, each))
-    ]
-    status, said, complaint = batchpid(*WORDS[name], *others, f"--{flag}", path)
+    path = tmp_path / f"{folder}{output(name, flag)}"
+    if not folder:
+        path.write_text("kept")
+    status, said, complaint = batchpid(*WORDS[name], f"--{flag}", path)
     assert (status, said) == (2, "")
-    assert complaint.splitlines()[-1].startswith(f"batchpid: {flag}: exists already (got '{path}')")
-    assert "--force" in complaint
-    assert "another name" in complaint
-    assert [each.name for each in tmp_path.iterdir()] == [path.name]
-    assert path.read_text() == "kept"
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("empty_pictures")
-def test_default_names_say_what_they_show(files, batchpid, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "run.h5").write_bytes((files / "run.h5").read_bytes())
-    (tmp_path / "run.png").write_text("kept")
-    for words in ((), ("--kind", "efforts")):
-        status, _, complaint = batchpid("plot", "run.h5", *words)
-        assert status == 0, complaint
-        status, _, complaint = batchpid("plot", "run.h5", *words)
-        assert "exists already" in complaint
-        assert batchpid("plot", "run.h5", *words, "--force")[0] == 0
-    names = {"run.h5", "run.png", "run-responses.png", "run-efforts.png"}
-    assert {path.name for path in tmp_path.iterdir()} == names
-    assert (tmp_path / "run.png").read_text() == "kept"
+    problem = "has no folder" if folder else "exists already"
+    remedy = (
+        f"mkdir -p {path.parent}" if folder else "add --force to replace it, or .* another name"
+    )
+    assert re.search(rf"^batchpid: {flag}: {problem} .*{remedy}\n", complaint, re.MULTILINE)
+    assert [each.name for each in tmp_path.iterdir()] == ([] if folder else [path.name])
+    assert folder or path.read_text() == "kept"
 
 
 @pytest.mark.usefixtures("empty_pictures")

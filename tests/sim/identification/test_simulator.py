@@ -8,7 +8,7 @@ from arms import DT, FALLING, STEPS, TRUTH, gains, load, motion, run
 
 import batchpid as bp
 from batchpid.motors.coupling import Coupling
-from batchpid.sim.identification.simulator import Candidates, Plant, Stretch, simulate
+from batchpid.sim.identification.simulator import Candidates, LogPlant, Stretch, simulate
 from batchpid.stages import Control
 
 MOTORS = {
@@ -49,7 +49,7 @@ def stretch_of(commands, start) -> Stretch:
 
 
 def simulated(robot, commands, drive, made, start) -> np.ndarray:
-    plant, states = Plant(robot, (0, 1)), np.zeros((1, 2, 2))
+    plant, states = LogPlant(robot, (0, 1)), np.zeros((1, 2, 2))
     return simulate(plant, drive, made, states, [stretch_of(commands, start)])[0][0]
 
 
@@ -113,13 +113,13 @@ def test_followers_move_with_their_leader(tmp_path):
     stretch = stretch_of(setpoints, setpoints[0])
     one = stretch._replace(qpos=setpoints[0, :1], qvel=none, command=stretch.command[:, :1])
     candidate = Candidates(made, {}, none, none, {}, {})
-    (table,) = simulate(Plant(robot, (0,)), drive, candidate, np.zeros((1, 2, 1)), [one])
+    (table,) = simulate(LogPlant(robot, (0,)), drive, candidate, np.zeros((1, 2, 1)), [one])
     np.testing.assert_allclose(table[0, :, 0], rollout.qpos[:, 0, 0], atol=1e-4)
 
 
 def test_candidates_and_stretches_do_not_affect_each_other(tmp_path):
     robot, setpoints = load(tmp_path), motion(0.5)
-    plant, drive = Plant(robot, (0, 1)), control(gains(), "gravity+coriolis")
+    plant, drive = LogPlant(robot, (0, 1)), control(gains(), "gravity+coriolis")
     stretches = [stretch_of(setpoints, setpoints[0]), stretch_of(setpoints[20:60], setpoints[20])]
     # Each candidate comes once for each stretch.
     strengths = np.array([[1.0, 1.0], [0.9, 0.9], [0.5, 1.2]])

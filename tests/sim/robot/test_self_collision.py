@@ -4,7 +4,6 @@ poses.
 
 from __future__ import annotations
 
-import pickle
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -119,13 +118,6 @@ def test_an_srdf_disables_and_enables_pairs_whatever_their_reason(tmp_path):
     assert [finding.code for finding in loaded.check() if finding.severity == "warning"].count(
         "self-collision"
     ) == 2
-
-
-def test_the_pairs_of_a_robot_travel_with_it(tmp_path):
-    loaded = Robot.load(write(tmp_path, sliders(0.0, 0.1)))
-    pairs = loaded.self_contact
-    assert loaded.self_contact is pairs
-    assert vars(pickle.loads(pickle.dumps(loaded)))["self_contact"] == pairs
 
 
 def test_pairs_that_physx_cannot_hold_collide_in_sapien_alone(tmp_path):

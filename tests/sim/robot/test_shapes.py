@@ -7,13 +7,11 @@ import re
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
 from robots import load_bundled
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.sim import Robot
-from batchpid.sim.view.scene import FEWEST, MOST, segments_of, surfaces
+from batchpid.sim.view.scene import surfaces
 
 RED = '<material name="red"><color rgba="1 0 0 0.5"/></material>'
 BOX = '<box size="0.1 0.2 0.4"/>'
@@ -85,15 +83,6 @@ def test_no_vertex_is_shared_across_a_sharp_edge(geometry, angle, tmp_path):
     for vertex in range(len(surface.vertices)):
         around = normals[(surface.faces == vertex).any(1)]
         assert (around @ around.T > np.cos(np.radians(angle))).all()
-
-
-@given(radius=st.floats(1e-3, 10), deviation=st.floats(1e-4, 1e-2))
-def test_chords_stay_within_the_deviation_asked_for(radius, deviation):
-    segments = segments_of(radius, deviation)
-    if FEWEST < segments < MOST:
-        assert radius * (1 - np.cos(np.pi / segments)) <= deviation * (1 + 1e-9)
-        assert radius * (1 - np.cos(np.pi / (segments - 1))) > deviation
-    assert FEWEST <= segments <= MOST
 
 
 @pytest.mark.parametrize("name", Robot.bundled())

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from batchpid.sim.tuning.candidates import DESIGNS, Candidates
+from batchpid.sim.tuning.candidates import DESIGNS, GainCandidates
 from batchpid.sim.tuning.moves import random_moves
 
 
 def test_designs_have_their_poles(panda):
     options = {"headroom": 1.0, "drawn": False}
     moves = random_moves(panda, 1, 0)
-    search = Candidates(panda, "mass_matrix", moves, 0.2, **options)
+    search = GainCandidates(panda, "mass_matrix", moves, 0.2, **options)
     params = search.params(search.designs())
     for row, (p, w) in enumerate(DESIGNS):
         for ki, kp, kd in zip(params.ki[row], params.kp[row], params.kd[row], strict=True):
