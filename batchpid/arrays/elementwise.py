@@ -124,10 +124,15 @@ def push_history(history: Array, value: Array) -> Array:
 @_recorded("take_row")
 def take_rows(table: Array, rows: Array) -> Array:
     """Return the numbers of ``table`` (..., rows, joints) in row ``rows`` (..., joints) of each
-    joint; the numbers of the rows are floats.
+    joint, or in several (..., n, joints); the numbers of the rows are floats.
     """
     xp = namespace(table, rows)
-    return xp.take_along_axis(table, rows[..., None, :].astype(int), -2)[..., 0, :]
+    count, joints = table.shape[-2:]
+    # By places in the whole table: NumPy's take_along_axis takes three times as long.
+    axes = (*table.shape[:-2], *[1] * (rows.ndim - table.ndim + 2))
+    begin = xp.arange(0, table.size, count * joints).reshape(axes)
+    column = xp.arange(joints).reshape(*[1] * (rows.ndim - 1), joints)
+    return table.reshape(-1)[begin + rows.astype(int) * joints + column]
 
 
 def replace_envs(state: T, fresh: T, mask: Array) -> T:

@@ -4,7 +4,7 @@ of controllers in Python; and in programs of JAX.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from functools import lru_cache, partial
 from itertools import groupby
 from typing import Any
@@ -68,6 +68,16 @@ class NumPyExecutor:
     def write_state(self, states: States) -> None:
         """Replace the states; they have the arrays of the states before."""
         self._states = states
+
+    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
+        """Change the state of the stage ``name``, between sim steps, to ``function(stage, state)``,
+        which has the same arrays or others in their place.
+        """
+        pairs = zip(self.setup.stages, self._states, strict=True)
+        changed = [
+            function(stage, state) if stage.name == name else state for stage, state in pairs
+        ]
+        self._states = tuple(changed)
 
     def results(self) -> Outputs:
         """Return the results of the last sim step as NumPy arrays."""
@@ -207,7 +217,7 @@ class JAXExecutor(NumPyExecutor):
         super().__init__(setup, states)
         self._parts = list[tuple[slice, Any]]()
         first = 0
-        for calls_model, group in groupby(map(_traceable, setup.stages), _calls_model):
+        for calls_model, group in groupby(setup.stages, _calls_model):
             part = running(group)
             program = None
             if not calls_model:
@@ -263,12 +273,6 @@ def _without(values: Values, *names: str) -> Values:
 def _calls_model(stage: Any) -> bool:
     calls_model: bool = stage.calls_model
     return calls_model
-
-
-def _traceable(stage: Any) -> Any:
-    """Return a stage with the function of the caller's controller for programs."""
-    controller = getattr(stage, "controller", None)
-    return stage if controller is None else replace(stage, controller=controller.traced)
 
 
 @lru_cache(maxsize=8)

@@ -138,11 +138,7 @@ class EnvGroup:
 
     def add_chunk(self, chunk: Float64, latency: Float64) -> None:
         """Add a chunk (M, rows, dof) that is ``latency`` (M,) [s] old to the plan."""
-        executor = self._executor
-        stages, states = executor.setup.stages, list(executor.read_state())
-        place = [stage.name for stage in stages].index("plan")
-        states[place] = stages[place].add(states[place], chunk, latency)
-        executor.write_state(tuple(states))
+        self._executor.change("plan", lambda stage, state: stage.add(state, chunk, latency))
 
     def _put_actuators(self, actuators: bp.Actuators | None, rows: list[int] | None = None) -> None:
         """Put actuators into effect, for the robots ``rows`` or all."""

@@ -165,6 +165,10 @@ class TickProgram:
     def _add_stages(self, values: Values, moves: bool) -> Outputs:
         """Add the stages; return the results after them."""
         setup = self._setup
+        for stage, state in zip(setup.stages, self.buffers.states, strict=True):
+            if stage.due:
+                clock, due = [self._address(getattr(state, name), np.float64) for name in stage.due]
+                self._add_program([(stage, state)], values, renews=True, clock=clock, due=due)
         waiting = list[tuple[Any, Pytree]]()
         for stage, state in zip(setup.stages, self.buffers.states, strict=True):
             if not stage.native:
@@ -186,23 +190,31 @@ class TickProgram:
         return outputs
 
     def _add_program(
-        self, pairs: list[tuple[Any, Pytree]], values: Values, passes: bool = False
+        self,
+        pairs: list[tuple[Any, Pytree]],
+        values: Values,
+        passes: bool = False,
+        renews: bool = False,
+        **fields: Any,
     ) -> Values:
         """Add a program of stages and their states; return the values after it, which it
-        ``passes`` on to further stages.
+        ``passes`` on to further stages. ``renews`` as for :func:`bind_stages`; ``fields`` are of
+        the program's stage in native code.
         """
         if not pairs:
             return values
         stages, states = zip(*pairs, strict=True)
         # Native code sets the addresses of the noise, which is another in each sim step.
         drawn = [id(block) for block in leaves(values.noise)]
-        made, values = bind_stages(stages, states, values, self.buffers.before.shape, passes)
+        shape = self.buffers.before.shape
+        made, values = bind_stages(stages, states, values, shape, passes, renews)
         if made.outputs:
             noise = [at for at, array in enumerate(made.inputs) if id(array) in drawn]
             self._add_stage(
                 "PROGRAM",
                 program=len(self._programs),
                 noise=(*noise, -1, -1)[:2],
+                **fields,
             )
             rows = tuple([(array, _row_size(array)) for array in made.inputs])
             arguments = made.program.arguments
@@ -302,6 +314,16 @@ class NativeExecutor:
         if sensors is not None:  # the noise is drawn anew for another object as the key
             key = states[self._places["sensors"]].key
             self._replace("sensors", sensors._replace(key=key))
+
+    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
+        """Change the state of a stage:
+        :meth:`batchpid.sim.loop.array_executors.NumPyExecutor.change`.
+        """
+        before = self._buffers.states[self._places[name]]
+        after = function(self.setup.stage(name), before)
+        for array, rows in zip(leaves(before), leaves(after), strict=True):
+            if rows is not array:
+                array[...] = rows
 
     def _sensors(self) -> ActuatorState | None:
         """Return the state of the sensors, if there are some."""
@@ -410,7 +432,7 @@ class NativeExecutor:
         tick = self._program.tick
         # The address changes when the engine's robots are built again.
         tick.group = self._engine.compiled().prepare()
-        noise = leaves(self._noise())
+        noise = leaves(self._noise()) if "sensors" in self._places else []
         tick.drawn = min(map(len, noise), default=-1)
         for place, block in enumerate(noise):
             tick.noise[place] = block.ctypes.data
@@ -421,7 +443,9 @@ class NativeExecutor:
         assert self._program is not None
         tick = self._program.tick
         sensors = self._sensors()
-        if sensors is not None and sensors.step is not None:
+        if sensors is None:
+            return False
+        if sensors.step is not None:
             sensors.step[...] += tick.ran
         return bool(tick.status & number("Status", "NO_NOISE"))
 

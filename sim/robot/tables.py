@@ -280,7 +280,7 @@ class MjcfFile:
     """MJCF file that MuJoCo simulates itself, with everything in it besides the robot.
 
     ``is_whole`` says whether all of it is compiled
-    (:func:`batchpid.sim.robot.mjcf.model.compile_scene`), and ``content`` is the digest of the
+    (:func:`batchpid.sim.robot.mjcf.reader.compile_scene`), and ``content`` is the digest of the
     model. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
     other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
     links. ``losses`` are findings of what is lost in an engine that does not simulate the file.

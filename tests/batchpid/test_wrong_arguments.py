@@ -180,7 +180,6 @@ COMBINATIONS = {
         {"measurement": np.zeros((1, 1, 2))},
         {"setpoint": np.zeros(3)},
         {"saturated": np.zeros((9, 1, 2))},
-        {"band": 0.0},
     ],
     bp.design_gains: [
         {"bandwidth_hz": 0.0},

@@ -205,7 +205,7 @@ FEATURES: dict[str, Feature] = {
     "own controller": Feature({"control": Damped()}, exact=True),
     "a command of its own": Feature({"control": Polar()}, exact=True),
     "guard": Feature({"guard": GUARD}),
-    "plan": Feature({"plan": PLAN}),
+    "plan": Feature({"plan": PLAN, "randomization": Randomization(latency=Uniform(0, 0.03))}),
     "plan of a drive": Feature({"control": "drive", "plan": PLAN, "guard": GUARD}, exact=True),
     "guarded drive": Feature({"control": "drive", "guard": GUARD}, exact=True),
     "a thermal limit": Feature({"stages": [Thermal(2.0, 0.02)]}),
@@ -440,8 +440,8 @@ def in_python(case: tuple[str, str]) -> None:
             assert "native calls into" not in runner.backend
             result = program(runner, case)
     feature = FEATURES[case[0]]
-    rounds = case[1] == "mujoco" and feature.options.get("control") != "drive"
-    if feature.exact and not rounds:
+    # Vectors of native code step robots that touch nothing in MuJoCo's place.
+    if feature.exact and case[1] != "mujoco":
         check_equal(reference(case), result)
     else:
         check_close(reference(case), result, 1e-7 if feature.exact else 1e-6)

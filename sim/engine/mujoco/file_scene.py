@@ -19,8 +19,8 @@ from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.merging import coupling_of
-from batchpid.sim.robot.mjcf.model import RobotInFile, compile_scene
-from batchpid.sim.robot.mjcf.reader import home
+from batchpid.sim.robot.mjcf.bodies import RobotInFile
+from batchpid.sim.robot.mjcf.reader import compile_scene, home
 from batchpid.sim.robot.tables import MjcfFile
 from batchpid.task_space.frames import inverse, matrix_of, rotate
 

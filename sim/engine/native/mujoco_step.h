@@ -139,6 +139,7 @@ inline void write_to_mujoco(Mujoco const &mujoco, std::int64_t row) {
     mujoco.qpos[row][mujoco.qpos_at[j]] = free.qpos[at + j].of[k];
     mujoco.qvel[row][mujoco.qvel_at[j]] = free.qvel[at + j].of[k];
     mujoco.warm[row][mujoco.qvel_at[j]] = free.acceleration[at + j].of[k];
+    if (free.ctrl != nullptr) mujoco.ctrl[row][j] = free.ctrl[row * dof + j];
   }
 }
 inline void read_from_mujoco(Mujoco const &mujoco, std::int64_t row) {

@@ -304,7 +304,8 @@ inline void write_targets(Group const &group, double const *target, double const
       continue;
     }
     Mujoco const &mujoco = *group.mujoco;
-    mujoco.ctrl[at / dof][at % dof] = mujoco.stiffness[at] * target[at] + mujoco.rate_gain[at] * speed;
+    double &ctrl = mujoco.free != nullptr ? mujoco.free->ctrl[at] : mujoco.ctrl[at / dof][at % dof];
+    ctrl = mujoco.stiffness[at] * target[at] + mujoco.rate_gain[at] * speed;
   }
 }
 

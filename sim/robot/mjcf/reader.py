@@ -1,33 +1,58 @@
 """Reader of MJCF files: MuJoCo compiles them, and the model becomes tables, motors and a start
 pose.
+
+Geoms that add neither shape nor mass are not compiled, so their meshes and textures may be missing.
+A collision mesh may be missing if the mass of its body does not depend on it.
 """
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Document, Float64, MjModel
+from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
+from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
 from batchpid.errors import RobotError
 from batchpid.motors import make_actuators
 from batchpid.sim.findings import Finding
-from batchpid.sim.robot.mjcf.bodies import TableReader, excluded_pairs
-from batchpid.sim.robot.mjcf.model import (
+from batchpid.sim.robot.mjcf.bodies import (
     PLANE,
-    Compiled,
     RobotInFile,
+    TableReader,
     can_collide,
-    compile_file,
+    excluded_pairs,
     label,
 )
 from batchpid.sim.robot.mjcf.motors import read_couplings, read_motors
 from batchpid.sim.robot.tables import MjcfFile, Source
 from batchpid.task_space.rigid_tree import GRAVITY
 
+_PREFIXES = (
+    "body_",
+    "jnt_",
+    "dof_",
+    "geom_",
+    "pair_",
+    "exclude_",
+    "eq_",
+    "tendon_",
+    "hfield_",
+    "qpos",
+    "key_",
+    "site_",
+    "wrap_",
+    "mesh_vert",
+    "flex",
+    "plugin_",
+)
+"""Beginnings of the names of the model's arrays that the simulation depends on."""
 _KEYFRAME = "home"
 """Keyframe with the start pose."""
 _SWITCHES = (
@@ -39,6 +64,10 @@ _SWITCHES = (
     "CONSTRAINT",
 )
 """Parts of MuJoCo's physics that a file can disable."""
+
+# Without a handler MuJoCo appends warnings to a file in the working folder, too.
+if mujoco.get_mju_user_warning() is None:
+    mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))
 
 
 def read_mjcf(
@@ -212,3 +241,124 @@ def _report_unused(robot: RobotInFile) -> None:
             text = "gravity compensation of this body (gravcomp) is not simulated"
             remedy = "let the controller compensate"
             robot.repair("option", text, remedy, link=robot.bodies[body])
+
+
+class Compiled(NamedTuple):
+    """Model of a file, and the ``mujoco.MjSpec`` that was compiled.
+
+    ``is_whole`` says whether it has the geoms that are only drawn, ``missing`` are the files of
+    collision meshes that it is without.
+    """
+
+    scene: MjSpec
+    model: MjModel
+    is_whole: bool
+    missing: tuple[str, ...]
+
+    @property
+    def content(self) -> str:
+        """Digest of the elements that move, collide or act."""
+        model = self.model
+        names = [name for name in dir(model) if name.startswith(_PREFIXES)]
+        arrays = {name: _rounded(np.asarray(getattr(model, name), float)) for name in names}
+        return digest(arrays, model.names, str(model.opt))
+
+
+def _rounded(values: Float64) -> Float64:
+    """Return ``values`` to nine digits: the last bits may differ between kinds of processors."""
+    # What cancels out leaves a rest of rounding.
+    shares, exponents = np.frexp(np.where(np.abs(values) < 1e-12, 0.0, values))
+    rounded: Float64 = np.ldexp(np.round(shares, 9), exponents)
+    return rounded
+
+
+def compile_file(path: Path, missing_meshes: str, findings: list[Finding]) -> Compiled:
+    """Return the compiled model of a file.
+
+    Raises RobotError if MuJoCo refuses the file, or missing meshes are refused.
+    """
+    lean = None
+    try:
+        lean = compile_scene(path, is_whole=False)
+        if not lean.missing:
+            return lean
+        return compile_scene(path, is_whole=True)
+    except RobotError:
+        # Something may refer to a geom that is only drawn.
+        if lean is None:
+            return compile_scene(path, is_whole=True)
+        if missing_meshes == "error":
+            raise
+    text = f"collision meshes not found, simulated without: {', '.join(lean.missing)}"
+    remedy = "put the files where the MJCF names them"
+    findings.append(Finding("missing-mesh", text, remedy))
+    return lean
+
+
+def compile_scene(path: Path, is_whole: bool) -> Compiled:
+    """Return the compilation of the whole file, or of its collision shapes and masses.
+
+    Raises RobotError if MuJoCo refuses it.
+    """
+    missing: tuple[str, ...] = ()
+    # MuJoCo takes a file of the same name, size and second for the one that it has read.
+    mujoco.mj_clearCache(mujoco.mj_getCache())
+    try:
+        scene = mujoco.MjSpec.from_file(str(path))
+        if not is_whole:
+            missing = _strip(scene, path)
+        return Compiled(scene, scene.compile(), is_whole, missing)
+    except (ValueError, mujoco.FatalError) as error:
+        problem = " ".join(str(error).split())
+        raise RobotError(
+            f"{path}: MuJoCo cannot compile the file: {problem}; correct it, or restore the file"
+            " that it names, e.g. by git lfs pull"
+        ) from error
+
+
+def _strip(spec: Any, path: Path) -> tuple[str, ...]:
+    """Remove materials, geoms that add neither shape nor mass, and collision shapes of missing
+    meshes; return the files of the latter.
+    """
+    # A <pair> makes geoms collide whatever their masks say.
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    absent = {}
+    for mesh in spec.meshes:
+        folder = path.parent / (mesh.compiler.meshdir or "")
+        file = Path(mesh.file).name if spec.strippath else mesh.file
+        if mesh.file and not (folder / file).is_file():
+            absent[mesh.name] = mesh.file
+    missing: dict[str, None] = {}
+    used: set[str] = set()
+    for geom in list(spec.geoms):
+        # A texture that is missing would stop the compilation.
+        geom.material = ""
+        is_solid = geom.contype or geom.conaffinity or geom.name in paired
+        # A missing mesh that weighs stays, and MuJoCo refuses it.
+        if _weighs(spec, geom) or (is_solid and geom.meshname not in absent):
+            used.add(geom.meshname)
+            continue
+        if is_solid:
+            missing[absent[geom.meshname]] = None
+        for pair in list(spec.pairs):
+            if geom.name in (pair.geomname1, pair.geomname2):
+                spec.delete(pair)
+        spec.delete(geom)
+    for site in spec.sites:
+        site.material = ""
+    unused = [mesh for mesh in spec.meshes if mesh.name not in used]
+    for element in [*spec.materials, *spec.textures, *unused]:
+        spec.delete(element)
+    return tuple(missing)
+
+
+def _weighs(spec: Any, geom: Any) -> bool:
+    """Return whether the mass of a geom's body depends on the geom."""
+    body = geom.parent
+    always = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    if body.explicitinertial and spec.compiler.inertiafromgeom != always:
+        return False
+    if geom.mass == 0 or (math.isnan(geom.mass) and geom.density == 0):
+        return False
+    low, high = spec.compiler.inertiagrouprange
+    return bool(low <= geom.group <= high) and body.parent is not None
