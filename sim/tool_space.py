@@ -327,7 +327,8 @@ class OperationalSpace:
         ahead = error if twist is None else error + LOOKAHEAD * twist
         rows = namespace(j).swapaxes(j, -1, -2)
         eye = 1e-4 * namespace(j).eye(6)
-        motion = gram(j, solve(gram(rows, rows) + eye.astype(j.dtype), ahead[..., None]))[..., 0]
+        damped = gram(rows, rows) + eye.astype(j.dtype)
+        motion = gram(j, solve(damped, ahead[..., None]))[..., 0]
         chain = dynamics.chain
         return compensation(
             coulomb,

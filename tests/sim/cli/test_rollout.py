@@ -193,15 +193,6 @@ def test_files_of_other_programs_read_as_those_of_this_one(saved, tmp_path, pand
         np.testing.assert_array_equal(rows, runs[1][name])
 
 
-def test_the_motion_of_excite_is_followed(batchpid, tmp_path):
-    path = tmp_path / "x.csv"
-    assert batchpid("excite", "panda", "--seconds", 2, "--out", path)[0] == 0
-    status, said, error = batchpid("rollout", "--trajectory", path, *ONE)
-    assert status == 0, error
-    assert "real-time" in said
-    assert following_errors(said).max() < 5e-3
-
-
 def test_changes_beyond_the_velocity_limits_are_steps(batchpid, tmp_path, panda):
     path = tmp_path / "step.csv"
     poses = [panda.start, panda.start, panda.settings.target, panda.settings.target]
