@@ -432,7 +432,7 @@ class NativeExecutor:
         tick = self._program.tick
         # The address changes when the engine's robots are built again.
         tick.group = self._engine.compiled().prepare()
-        noise = leaves(self._noise())
+        noise = leaves(self._noise()) if "sensors" in self._places else []
         tick.drawn = min(map(len, noise), default=-1)
         for place, block in enumerate(noise):
             tick.noise[place] = block.ctypes.data
@@ -443,7 +443,9 @@ class NativeExecutor:
         assert self._program is not None
         tick = self._program.tick
         sensors = self._sensors()
-        if sensors is not None and sensors.step is not None:
+        if sensors is None:
+            return False
+        if sensors.step is not None:
             sensors.step[...] += tick.ran
         return bool(tick.status & number("Status", "NO_NOISE"))
 
