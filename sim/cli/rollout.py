@@ -42,8 +42,6 @@ NOT_SETTLED = 3
 """Exit status of `batchpid rollout` and `batchpid demo` where no env settles."""
 SHORTEST = 1.0
 """Shortest run in which envs should settle [s]."""
-LISTED = 8
-"""Envs that a line lists."""
 AXIS_UNITS = {
     "x": "m",
     "y": "m",
@@ -90,7 +88,13 @@ def demo(
     PID and passive force are computed at each of the 2000 sim steps of a second. Env 0 starts where
     SAPIEN's tutorial does, the others at seeded poses near it.
     """
-    return rollout(robot, num_envs, seconds=seconds, progress=progress, **options)
+    return rollout(
+        robot,
+        num_envs,
+        seconds=seconds,
+        progress=progress,
+        **options,
+    )
 
 
 def rollout(
@@ -337,24 +341,16 @@ class RunReport:
         return "\n".join(lines)
 
     def _unsettled_lines(self) -> list[str]:
-        """Return lines about envs that failed, joints that did not settle, and the causes."""
+        """Return lines about joints that did not settle, and the causes."""
         rollout = self.rollout
-        lines = []
-        # Failed envs first: their joints are not counted as unsettled.
-        failed = np.flatnonzero(~rollout.ok.all(0))
-        if failed.size:
-            first = rollout.tick * (1 + np.argmin(rollout.ok.all(1)))
-            envs = ", ".join(map(str, failed[:LISTED]))
-            lines.append(
-                f"FAILED: {failed.size} of {rollout.num_envs} envs, the first after {first:.3g} s:"
-                f" env {envs}{', ...' if failed.size > LISTED else ''}."
-            )
+        causes = rollout.findings(self.robot)
         # A trajectory ends where it ends: its last setpoint need not be reached.
         if not self.is_held:
-            return lines
+            return list(cause_lines([cause for cause in causes if cause.code == "failed"]))
+        lines = []
         settling = self.columns[2].get("settling_time")
         if settling is not None:
-            # Followers do what their leaders do.
+            # Joints of failed envs are not counted; followers do what their leaders do.
             counts = np.isinf(settling[rollout.ok.all(0)]).sum(0) * self.robot.independent
             named = zip(self.robot.joint_names, counts, strict=True)
             joints = [f"{name} ({count})" for name, count in named if count]
@@ -363,9 +359,9 @@ class RunReport:
                 lines.append(
                     f"NOT SETTLED {within} the move, with the number of envs: {', '.join(joints)}."
                 )
-            elif not failed.size:
+            elif rollout.ok.all():
                 lines.append(f"Every joint of every env settled {within} its move.")
-        return lines + list(cause_lines(rollout.findings(self.robot)))
+        return [*lines, *cause_lines(causes)]
 
     def save(self, path: Path) -> None:
         """Write the recording."""

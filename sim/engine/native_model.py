@@ -45,7 +45,7 @@ def passive_force(
     bodies = None
     if base is not None:
         turning = base[:, 3:]
-        bodies = tree.bodies._replace(gravity=base[:, None, :3])
+        bodies = tree.bodies._replace(gravity=base[:, :3])
     force = zero
     if coriolis or gravity:
         force = ts.bias(
@@ -293,7 +293,7 @@ class NativeStep:
         """Return whether an env may have failed in a sim step with this status; RuntimeError if the
         engine has.
         """
-        if status & number("Status", "FAILED"):
+        if status and status & number("Status", "FAILED"):
             raise RuntimeError(self._group.message.decode(errors="replace"))
         return bool(status)
 

@@ -5,7 +5,6 @@ of controllers in Python; and in programs of JAX.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import groupby
 from typing import Any
@@ -218,7 +217,7 @@ class JAXExecutor(NumPyExecutor):
         super().__init__(setup, states)
         self._parts = list[tuple[slice, Any]]()
         first = 0
-        for calls_model, group in groupby(map(_traceable, setup.stages), _calls_model):
+        for calls_model, group in groupby(setup.stages, _calls_model):
             part = running(group)
             program = None
             if not calls_model:
@@ -274,12 +273,6 @@ def _without(values: Values, *names: str) -> Values:
 def _calls_model(stage: Any) -> bool:
     calls_model: bool = stage.calls_model
     return calls_model
-
-
-def _traceable(stage: Any) -> Any:
-    """Return a stage with the function of the caller's controller for programs."""
-    controller = getattr(stage, "controller", None)
-    return stage if controller is None else replace(stage, controller=controller.traced)
 
 
 @lru_cache(maxsize=8)
