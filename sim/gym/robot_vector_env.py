@@ -78,8 +78,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         ``"rgb_array"``: :meth:`render` returns pictures.
     chunk
         Rows of a chunk: an action of one env is then (chunk, size), ``rate_hz`` rows a second, which
-        a plan executes (``plan=`` of the runner; default :func:`batchpid.make_plan`). None: no
-        plan.
+        a plan executes (``plan=`` of the runner; default :func:`batchpid.make_plan` with a fade of
+        one step). None: no plan.
     execute
         Rows of a chunk that a step executes; default all.
     latency
@@ -157,7 +157,13 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             self._rows = integer("chunk", chunk, 1, 999)
             self._ticks = integer("execute", chunk if execute is None else execute, 1, chunk)
             self.step_seconds = self._ticks * self._period
-            plan = make_plan(self.robot.dof, period=self._period, horizon=self._rows + 1)
+            # The rows that passed during the latency are made up for within a step.
+            plan = make_plan(
+                self.robot.dof,
+                period=self._period,
+                horizon=self._rows + 1,
+                fade=self.step_seconds,
+            )
             options = {"plan": plan, **options}
             box = self.single_action_space
             low, high = (np.tile(end, (self._rows, 1)) for end in (box.low, box.high))

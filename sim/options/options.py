@@ -145,6 +145,9 @@ class RunnerOptions(RunnerKeywords):
     def _checked_plan(self) -> bp.Plan | None:
         """Return the plan, as a read-only copy, if it fits the robot and the control."""
         if self.plan is None:
+            if self.randomization is not None and self.randomization.latency is not None:
+                problem = "is that of a plan's chunks, and the runner has no plan"
+                raise InvalidArgumentError("latency", problem, remedy="give plan=, or leave it out")
             return None
         if not self.sets_positions:
             problem = "makes positions of joints, which this control does not take"

@@ -17,7 +17,7 @@ from batchpid.sim.randomization.randomization import EVENTS, RANDOMIZED_FIELDS, 
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.tables import MjcfFile
 
-_ZERO = ("payload", "center_of_mass", *EVENTS)
+_ZERO = ("payload", "center_of_mass", "latency", *EVENTS)
 """Fields whose nominal value is 0, which no draw can scale."""
 
 

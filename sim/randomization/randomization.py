@@ -106,6 +106,8 @@ class Randomization:
     """
     push_interval: Annotated[Distribution | None, Bounds("s", above=True, group="event")] = None
     """Time from the reset to the first push, and from each to the next [s]."""
+    latency: Annotated[Distribution | None, Bounds("s", group="policy")] = None
+    """Age that is added to the latency of each chunk of a plan [s]; nominal 0."""
     params: Mapping[str, Field] = field(default_factory=dict)
     """Fields of :class:`batchpid.PIDParams` that the runner's params have, e.g. ``{"kp": ...}``."""
     actuators: Mapping[str, Field] = field(default_factory=dict)

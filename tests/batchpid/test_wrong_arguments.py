@@ -175,6 +175,7 @@ COMBINATIONS = {
         {"duration": 1.0, "max_velocity": 1.0},
     ],
     trajectories.trapezoidal: [{"max_velocity": [1.0, -1.0]}, {"max_acceleration": math.inf}],
+    trajectories.sine: [{"frequency": frequency} for frequency in (50.0, 99.0, 100.0)],
     metrics.step_metrics: [
         {"measurement": np.zeros((1, 1, 2))},
         {"setpoint": np.zeros(3)},

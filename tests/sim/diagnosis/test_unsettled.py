@@ -124,7 +124,8 @@ CASES = {
         options={"randomization": Randomization(payload=Uniform(4.0, 4.1), payload_link="bar3")},
     ),
     "a setpoint that still moves": Case(
-        "slow", "elbow", (0.0, 1.0, 0.0), gains={"kp": 100.0, "kd": [20.0, 12.0, 2.0]}, moves=True
+        "slow", "ms behind the moving setpoint", (0.0, 1.0, 0.0),
+        gains={"kp": 100.0, "kd": [20.0, 12.0, 2.0]}, moves=True,
     ),
     "a delay of the motors": Case("oscillates", "shoulder", (0.3, 0.0, 0.0), options={"actuators": LAGGING}),
     "a joint without gains": Case("gains", "elbow", (0.0, 0.5, 0.0), gains={"kp": [200.0, 0, 200], "kd": 12.0}),
