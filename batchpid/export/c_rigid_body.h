@@ -1,8 +1,7 @@
 /* Rigid-body functions of a robot. A header of batchpid.to_c has them with the prefix and the type of its numbers, and
  * tables in place of the comments in brackets. Efforts come from the recursive Newton-Euler algorithm about the world's
- * origin, so that sums over bodies need no shift (R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section
- * 5.3): without acceleration the bias, for a unit acceleration at rest a row of the mass matrix (section 6.1).
- */
+ * origin (R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section 5.3), those of a unit acceleration at
+ * rest are a row of the mass matrix (section 6.1). */
 
 /* Bodies at a pose, in the axes of the world. */
 typedef struct {

@@ -82,8 +82,6 @@ class StoppedClock {
     std::lock_guard const lock(mutex_);
     if (--threads_ == 0) *clock_ = before_;
   }
-  StoppedClock(StoppedClock const &) = delete;
-  StoppedClock &operator=(StoppedClock const &) = delete;
 
  private:
   Clock *clock_;

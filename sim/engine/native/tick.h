@@ -157,7 +157,7 @@ inline std::int32_t run_stage(Stage const &stage, BoundProgram *const *programs,
       return 0;
     case StageKind::ENGINE: {
       std::memcpy(tick.before, tick.qpos, static_cast<std::size_t>(robots * tick.dof) * sizeof(double));
-      std::int32_t const status = try_sim_step(group, robots, tick.qf, tick.qpos, tick.qvel, tick.passive);
+      std::int32_t const status = try_sim_step(group, tick.qf, tick.qpos, tick.qvel, tick.passive);
       if (tick.read_force != nullptr) write_force(group, *tick.read_force, parts, tick.qpos, tick.qvel, tick.passive);
       return status;
     }
