@@ -215,7 +215,9 @@ class BatchPID:
         r = self._array("setpoint", setpoint)
         y = self._array("measurement", measurement, exact=True)
         rest = self._optional(
-            measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward
+            measurement_rate=measurement_rate,
+            setpoint_rate=setpoint_rate,
+            feedforward=feedforward,
         )
         if out is not None:
             self._check_out(out)
@@ -258,7 +260,9 @@ class BatchPID:
         y = self._array("measurement", measurement, exact=True)
         u = self._array("effort", effort)
         rest = self._optional(
-            measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward
+            measurement_rate=measurement_rate,
+            setpoint_rate=setpoint_rate,
+            feedforward=feedforward,
         )
         self._fast = declined
         self._state = self._engine.call(

@@ -276,7 +276,7 @@ def trace_change(
     def changed(constants: Any, state: Any, inputs: Any) -> list[Any]:
         numbers = {symbol: number for number, symbol in enumerate(leaves((state, inputs)))}
         after = function(constants, state, inputs)
-        own = set(map(id, leaves(after[1])))
+        result_ids = set(map(id, leaves(after[1])))
         results, places = list[Any](), list[int]()
         for at, leaf in enumerate(leaves(after)):
             is_state = at < len(histories)
@@ -284,7 +284,7 @@ def trace_change(
             if is_state and (number == at or histories[at]):
                 places.append(at)
             # A result that is an input is copied, since the next call changes the input.
-            elif number is not None and not is_state and id(leaf) not in own:
+            elif number is not None and not is_state and id(leaf) not in result_ids:
                 places.append(number)
             else:
                 places.append(count + len(results))

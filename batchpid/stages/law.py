@@ -95,7 +95,11 @@ class Matrix(Stage):
             tree=tree,
             bodies=bodies,
         )
-        program.place(matrix=state, armature=self.armature, damping=self.damping)
+        program.place(
+            matrix=state,
+            armature=self.armature,
+            damping=self.damping,
+        )
         program.place(**self.coupling.native())
         return values._replace(matrix=state)
 
@@ -156,7 +160,11 @@ class PID(Stage):
                 forward,
             )
         effort, unsaturated = terms.effort, terms.unsaturated
-        return state, values.told(qf=effort, motor=effort, saturated=effort != unsaturated)
+        return state, values.told(
+            qf=effort,
+            motor=effort,
+            saturated=effort != unsaturated,
+        )
 
     def adopt(self, before: Self, state: PIDState, values: Values) -> PIDState:
         # The integral in the unit of the new gains, by the params that have them per mass matrix.
@@ -272,4 +280,8 @@ class Effort(Stage):
         saturated = effort != total
         if values.limited is not None:
             saturated = saturated | (values.limited > 0)
-        return state, values.told(qf=effort, motor=effort, saturated=saturated)
+        return state, values.told(
+            qf=effort,
+            motor=effort,
+            saturated=saturated,
+        )

@@ -88,7 +88,13 @@ def demo(
     PID and passive force are computed at each of the 2000 sim steps of a second. Env 0 starts where
     SAPIEN's tutorial does, the others at seeded poses near it.
     """
-    return rollout(robot, num_envs, seconds=seconds, progress=progress, **options)
+    return rollout(
+        robot,
+        num_envs,
+        seconds=seconds,
+        progress=progress,
+        **options,
+    )
 
 
 def rollout(

@@ -176,4 +176,13 @@ class Contacts:
 
     def _distance(self, first: int, second: int, farthest: float) -> float:
         """Return the distance [m] of two shapes as placed, at most ``farthest``."""
-        return float(mujoco.mj_geomDistance(self._model, self._data, first, second, farthest, None))
+        return float(
+            mujoco.mj_geomDistance(
+                self._model,
+                self._data,
+                first,
+                second,
+                farthest,
+                None,
+            )
+        )

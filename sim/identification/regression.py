@@ -234,7 +234,11 @@ def _commanded(part: LogData) -> Float64:
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
     none = np.zeros(count)
-    alone = drive._replace(gravity=False, coriolis=False, further=())
+    alone = drive._replace(
+        gravity=False,
+        coriolis=False,
+        further=(),
+    )
     loop = plant.loop(
         alone,
         Candidates(

@@ -119,6 +119,10 @@ DESCRIBED = {"damping": "damping", "friction": "friction"}
 """Kinds that add to a value of the robot's description, and the name there."""
 
 
+LEAST_MASS_FACTOR = 1e-3
+"""Least factor of a mass: a body without any has no center."""
+
+
 def kinds_of(effect: str) -> list[str]:
     """Return the kinds of unknowns of an effect that a fit has on request."""
     return ["static", effect] if effect == "stribeck" else [effect]
@@ -186,15 +190,7 @@ class Unknowns:
             kind = UNKNOWN_KINDS[name]
             if kind.per == "link":
                 entries += [
-                    Unknown(
-                        name,
-                        None,
-                        1.0,
-                        1.0,
-                        0.0,
-                        link,
-                    )
-                    for link in self.links
+                    Unknown(name, None, 1.0, 1.0, LEAST_MASS_FACTOR, link) for link in self.links
                 ]
                 continue
             for joint in range(len(self.joints)) if kind.per == "joint" else (None,):

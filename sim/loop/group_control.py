@@ -189,7 +189,11 @@ def untraceable(options: RunnerOptions) -> str:
     reading = Measured(row, row, row)
     step = Step(0, 1, np.zeros(()))
     values = Values(Command(*[row] * 4), reading, reading, options.timestep, step)
-    values = values._replace(last=Outputs(row, row), forward=row, limits=(row, row))
+    values = values._replace(
+        last=Outputs(row, row),
+        forward=row,
+        limits=(row, row),
+    )
     values = values.told(
         qf=row,
         motor=row,

@@ -8,11 +8,10 @@ have a native function: see tick.h.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import DType, Float64, Pytree, Rows
 from batchpid.arrays.trees import flatten, leaves, mapped, rebuilt_as
@@ -244,31 +243,27 @@ def _row_size(array: Rows) -> int:
     return size
 
 
-class Table(NamedTuple):
-    """Commands and observations of the ticks of a run, and arrays of its last observation."""
-
-    arrays: Arrays
-    """(ticks, envs, ...), the same in every run."""
-    effort: NDArray[np.float32]
-    """Effort of the last tick (envs, dof), as are the next two."""
-    saturated: NDArray[np.bool_]
-    guarded: NDArray[np.bool_]
-    fault: FaultArrays
-    """Last fault of each env (envs,)."""
-
-
 class NativeExecutor:
     """Executor of the sim steps of the robots of ``setup`` in native code.
 
     It has the methods of :class:`batchpid.sim.loop.array_executors.NumPyExecutor`. With
-    :func:`run_ticks` it also runs whole ticks, with their commands and observations in ``table``.
+    :func:`run_ticks` it also runs whole ticks, with their commands and observations in ``arrays``
+    (ticks, envs, ...); it writes the results of the last one to ``last`` (envs, dof), by name, and
+    reads the ``faults`` of the envs.
     """
 
-    def __init__(self, setup: GroupControl, states: States, table: Table) -> None:
+    def __init__(
+        self,
+        setup: GroupControl,
+        states: States,
+        arrays: Arrays,
+        last: Mapping[str, Rows],
+        faults: FaultArrays,
+    ) -> None:
         self.setup = setup
-        self._table = table
+        self._tables = arrays, last, faults
         self._engine = EngineSteps(setup)
-        shape = table.effort.shape
+        shape = setup.pack.size, setup.pack.dof
         command = Command(*np.zeros((4, *shape)))
         if setup.control.mode == "custom":  # it has its own copy of setpoints, of any size
             command = Command(None, feedforward=command.feedforward)
@@ -385,26 +380,21 @@ class NativeExecutor:
 
     def _copies(self, program: TickProgram) -> list[tuple[Rows, Rows]]:
         """Return the copies between the tables of the ticks and the arrays of a sim step."""
-        table = self._table
-        command, seen, fault = table.arrays
+        (command, seen, fault), last, faults = self._tables
         outputs = program.outputs
         measured = self._buffers.measured
         none = np.zeros(measured.qpos.shape, bool)
         copies: list[tuple[Rows, Rows]] = [
             (seen.qpos, measured.qpos),
             (seen.qvel, measured.qvel),
-            (seen.effort, outputs.motor),
             (seen.ok, np.ones(len(none), bool)),
-            # One row, which each tick overwrites.
-            (table.effort[None], outputs.motor),
-            *zip(fault, table.fault, strict=True),
+            *zip(fault, faults, strict=True),
         ]
-        for name in ("saturated", "guarded"):
-            mask = getattr(outputs, name)
-            if mask is None:
-                mask = none
-            copies.append((getattr(seen, name), mask))
-            copies.append((getattr(table, name)[None], mask))
+        results = outputs.motor, outputs.saturated, outputs.guarded
+        for (name, row), rows in zip(last.items(), results, strict=True):
+            rows = none if rows is None else rows
+            # Each tick overwrites the one row of the last.
+            copies += (getattr(seen, name), rows), (row[None], rows)
         if seen.base_pose is not None and seen.base_twist is not None:
             pose = np.zeros((len(none), 7))
             twist = np.zeros((len(none), 6))

@@ -196,14 +196,32 @@ def fit_errors(
     held_out = np.concatenate([time[~fitted] for time, fitted, *_ in fits])
     for joint, (axes,) in enumerate(blocks):
         axes.set_ylabel(units[joint], fontsize=SMALL)
-        axes.semilogy(time, before[:, joint], color=SECOND, lw=0.8, label="before")
-        axes.semilogy(time, after[:, joint], color=ENV, lw=0.8, label="after")
+        axes.semilogy(
+            time,
+            before[:, joint],
+            color=SECOND,
+            lw=0.8,
+            label="before",
+        )
+        axes.semilogy(
+            time,
+            after[:, joint],
+            color=ENV,
+            lw=0.8,
+            label="after",
+        )
         # Minor ticks and exponents as formulas take most of a second to lay out.
         axes.yaxis.set_major_locator(LogLocator(numticks=5))
         axes.yaxis.set_minor_locator(NullLocator())
         axes.yaxis.set_major_formatter("{x:.0e}")
         if len(held_out):
-            axes.axvspan(held_out[0], held_out[-1], color=SETPOINT, alpha=0.15, lw=0)
+            axes.axvspan(
+                held_out[0],
+                held_out[-1],
+                color=SETPOINT,
+                alpha=0.15,
+                lw=0,
+            )
     _add_legend(figure)
     return figure
 
@@ -266,7 +284,11 @@ def _grid(
         line, column = divmod(place, columns)
         block = [figure.add_subplot(grid[line * rows + row, column]) for row in range(rows)]
         for axes in block:
-            axes.tick_params(labelsize=SMALL, length=2, labelbottom=axes is block[-1])
+            axes.tick_params(
+                labelsize=SMALL,
+                length=2,
+                labelbottom=axes is block[-1],
+            )
             axes.spines[["top", "right"]].set_visible(False)
             axes.set_xlim(0, end)
             axes.yaxis.set_major_locator(MaxNLocator(4))
@@ -319,7 +341,13 @@ def _draw_fan(axes: Axes, time: Rows, values: Rows) -> None:
     )
     axes.add_collection(fan, autolim=False)
     (median,) = _quantiles(values, 0.5)
-    axes.plot(time, median, color=MEDIAN, lw=1.5, label="median")
+    axes.plot(
+        time,
+        median,
+        color=MEDIAN,
+        lw=1.5,
+        label="median",
+    )
 
 
 def _draw_band(
@@ -339,7 +367,13 @@ def _draw_band(
         alpha=0.2,
         lw=0,
     )
-    axes.plot(time, median, color=colour, lw=1.4, label=f"{label}: median, 10 to 90 %")
+    axes.plot(
+        time,
+        median,
+        color=colour,
+        lw=1.4,
+        label=f"{label}: median, 10 to 90 %",
+    )
 
 
 def _draw_line(axes: Axes, time: Rows, values: Rows) -> None:

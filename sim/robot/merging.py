@@ -57,7 +57,11 @@ def merge_links(tables: Tables, separate: Separate = ()) -> Tables:
             at = links[body.joint.parent_link]
             position, wxyz = _within(at, body.position, body.wxyz)
             joint = replace(body.joint, parent_link=at.link)
-            body = body._replace(joint=joint, position=position, wxyz=wxyz)
+            body = body._replace(
+                joint=joint,
+                position=position,
+                wxyz=wxyz,
+            )
         # A link alone keeps the axes of its tensor, by which SAPIEN orders the principal ones.
         if members[body.name] > 1 or body.mass <= LEAST_MASS:
             body = _with_inertia(body, parts[body.name])
@@ -66,7 +70,13 @@ def merge_links(tables: Tables, separate: Separate = ()) -> Tables:
     for shape in tables.shapes:
         at = links[shape.owner]
         position, wxyz = _within(at, shape.position, shape.wxyz)
-        shapes.append(shape._replace(body=at.link, position=position, wxyz=wxyz))
+        shapes.append(
+            shape._replace(
+                body=at.link,
+                position=position,
+                wxyz=wxyz,
+            )
+        )
     row = {body.name: index for index, body in enumerate(bodies)}
     # Engines number shapes by body, and SAPIEN builds mirrored ones last.
     shapes.sort(key=lambda shape: (row[shape.body], shape.is_mirrored))

@@ -77,7 +77,11 @@ class CommandSpec:
             raise InvalidArgumentError("units", problem, value=self.units, remedy=remedy)
         neutral = array("neutral", self.neutral, (1, len(names)), names, kind="entry")[0]
         # The class is frozen; its __dict__ is not.
-        vars(self).update(names=names, units=units, neutral=tuple(neutral.tolist()))
+        vars(self).update(
+            names=names,
+            units=units,
+            neutral=tuple(neutral.tolist()),
+        )
 
     @property
     def size(self) -> int:

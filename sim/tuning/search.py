@@ -284,7 +284,12 @@ def _evolve(
     """
     from cmaes import CMA
 
-    make = partial(CMA, sigma=INITIAL_SPREAD, seed=seed, population_size=population)
+    make = partial(
+        CMA,
+        sigma=INITIAL_SPREAD,
+        seed=seed,
+        population_size=population,
+    )
     optimizer = make(mean=first[0])
     points = []
     history = []

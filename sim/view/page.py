@@ -89,7 +89,11 @@ class View(AbstractContextManager["View"]):
 
         # Controls on the right, a chart on the left, the scene between them.
         gui = self._server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(43, 92, 199))
+        gui.configure_theme(
+            show_logo=False,
+            show_share_button=False,
+            brand_color=(43, 92, 199),
+        )
         self.panel = Panel(gui, data)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
@@ -278,7 +282,12 @@ class Gate:
                 return response
 
             handlers.append(handler)
-            return serve(handler, sock=self.socket, process_request=process, **options)
+            return serve(
+                handler,
+                sock=self.socket,
+                process_request=process,
+                **options,
+            )
 
         websocket_server.serve = guarded  # type: ignore[assignment, misc]
         try:

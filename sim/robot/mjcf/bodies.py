@@ -118,7 +118,16 @@ class RobotInFile:
         detail: str = "",
     ) -> None:
         """Report what is simulated otherwise in every engine."""
-        self.repairs.append(Finding(code, text, remedy, joint, link, detail))
+        self.repairs.append(
+            Finding(
+                code,
+                text,
+                remedy,
+                joint,
+                link,
+                detail,
+            )
+        )
 
     def lose(self, text: str, joint: str | None = None, link: str | None = None) -> None:
         """Report what an engine loses that does not simulate the file."""
@@ -319,7 +328,12 @@ class TableReader:
                 remedy = "correct <inertia>"
                 self._robot.repair("inertia", text, remedy, link=row.name, detail=detail)
             axes = model.body_iquat[body].copy()
-            row = row._replace(mass=mass, center=center, inertia=inertia, inertia_wxyz=axes)
+            row = row._replace(
+                mass=mass,
+                center=center,
+                inertia=inertia,
+                inertia_wxyz=axes,
+            )
         self._bodies.append(row)
 
     def _geoms(self, body: int) -> list[int]:
@@ -337,14 +351,29 @@ class TableReader:
         if shape_type in _SHAPE_KINDS:
             kind, count = _SHAPE_KINDS[shape_type]
             size = tuple(model.geom_size[geom, :count].tolist())
-            return Shape(link, link, kind, size, place, turn)
+            return Shape(
+                link,
+                link,
+                kind,
+                size,
+                place,
+                turn,
+            )
         if shape_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID:  # which PhysX does not have
             vertices = _ellipsoid(model.geom_size[geom])
         elif shape_type in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF):
             vertices = _hull(model, int(model.geom_dataid[geom]))
         else:
             return None
-        return Shape(link, link, "mesh", (), place, turn, vertices=vertices)
+        return Shape(
+            link,
+            link,
+            "mesh",
+            (),
+            place,
+            turn,
+            vertices=vertices,
+        )
 
     def _report_absent(self, rows: set[int]) -> None:
         """Report the shapes of the robot and of the world that are no shapes of the tables. A level
