@@ -170,7 +170,7 @@ class ReachVectorEnv(RobotVectorEnv):
     def success(self, observation: Float32) -> Bool:
         """Return whether every joint is within the tolerance."""
         self._error = self._distance(observation)
-        success: Bool = (self._error <= self.tolerance).all(1)
+        success: Bool = np.all(self._error <= self.tolerance, axis=1)
         return success
 
     def reward(self, observation: Float32, success: Bool) -> Float64:

@@ -58,6 +58,8 @@ class Setpoints(NamedTuple):
     """False if the rates are central differences."""
     steps: int
     """Number of changes that count as steps of the setpoint, with rate 0."""
+    period: float
+    """Time from row to row [s]."""
 
 
 def _quoted(name: str) -> str:
@@ -194,8 +196,9 @@ def setpoint_csv(robot: Robot, motion: Trajectory) -> str:
     return text.getvalue()
 
 
-def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) -> Setpoints:
-    """Return the setpoints in a file, for sim steps of ``timestep`` [s].
+def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float | None) -> Setpoints:
+    """Return the setpoints in a file, for sim steps of ``timestep`` [s]; with None, rows may be at
+    any distance, one each "sim step".
 
     Rates that the file does not give are central differences, the short way round on continuous
     joints, and 0 where the setpoint makes a step. Without a row at time 0, the robot's start pose
@@ -214,7 +217,10 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
     columns, lines = read_csv(path)
     tables = _tables(robot, source, columns, lines)
     tables["setpoint"] = robot.coupling.positions(tables["setpoint"])
-    substeps, at_zero = _substeps(source, columns["time"], lines, timestep)
+    times = columns["time"]
+    if timestep is None:
+        timestep = float(times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else times[0]
+    substeps, at_zero = _substeps(source, times, lines, timestep)
     start = None
     if at_zero:
         start = tables["setpoint"][0]
@@ -231,6 +237,7 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
             substeps,
             True,
             0,
+            substeps * timestep,
         )
     if start is None:
         first = robot.start
@@ -245,6 +252,7 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
         substeps,
         False,
         steps,
+        substeps * timestep,
     )
 
 
@@ -332,7 +340,7 @@ def _substeps(
             if len(time) > 1 and period > 0:
                 # Times are rounded: over all rows the period is closer than between two.
                 period = (time[-1] - time[0]) / np.round(np.diff(time) / period).sum()
-            remedy += f", or use --timestep {period / substeps:.9g} (timestep=)"
+            remedy += f", or use --timestep {period / substeps:.9g} (timestep=), or --plan"
         raise error(source, problem, remedy)
     if first + len(time) == 1:
         problem = f"line {lines[0]}: the only row is at 0 s"
