@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document
-from batchpid.arrays.jax_settings import precision, require_jax
+from batchpid.arrays.elementwise import precision, require_jax
 from batchpid.law import pid
 from batchpid.law.coefficients import discretise
 from batchpid.law.params import PIDParams

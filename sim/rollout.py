@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Document, Float64, Rows
-from batchpid.arrays.digest import digest
+from batchpid.arrays.trees import digest
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.records import frozen, summary
+from batchpid.arrays.trees import digest
 from batchpid.checks.validate import array, choice, flag, instance, names
 from batchpid.errors import InvalidArgumentError, warn
 from batchpid.motors.friction import LOOKAHEAD, compensation

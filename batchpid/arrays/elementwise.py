@@ -1,20 +1,22 @@
-"""Operations on rows of the law, for NumPy and JAX arrays and for the symbols of a trace; and
-read-only views.
+"""Operations on rows of the law, for NumPy and JAX arrays and for the symbols of a trace; read-only
+views; and the precision of JAX in programs of batchpid. All other settings of JAX are the caller's.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache, wraps
+from importlib.util import find_spec
 from types import NoneType
 from typing import Any, TypeVar
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, ArrayModule, DType
-from batchpid.arrays.choices import CHOICE_TYPES
+from batchpid.arrays.array_types import CHOICE_TYPES, Array, ArrayModule, DType
 from batchpid.arrays.trees import parts, rebuilt_as
+from batchpid.errors import MissingDependencyError
 
 T = TypeVar("T")
 V = TypeVar("V")
@@ -205,3 +207,26 @@ def read_only(array: V) -> V:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+def require_jax() -> None:
+    """Raise MissingDependencyError if JAX is not installed. It is not imported."""
+    if find_spec("jax") is None:
+        raise MissingDependencyError("jax", "backend='jax'", "jax")
+
+
+def precision(dtype: DType) -> AbstractContextManager[None]:
+    """Return a context in which JAX has arrays of ``dtype``, "float64" or "float32"; None: as the
+    caller has set it.
+    """
+    import jax
+
+    config: Any = jax.config
+    is_wide = dtype == "float64"
+    # To enter a context takes longer than a small program.
+    if dtype is None or config.jax_enable_x64 == is_wide:
+        return nullcontext()
+    # Before JAX 0.8 it is in another module.
+    home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental
+    context: AbstractContextManager[None] = home.enable_x64(is_wide)
+    return context

@@ -16,8 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Document
-from batchpid.arrays.choices import MeasuredRate
+from batchpid.arrays.array_types import Array, Document, MeasuredRate
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.trees import is_leaf, leaves, parts, structure
 from batchpid.checks.validate import choice, instance, names, time_step

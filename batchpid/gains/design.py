@@ -25,8 +25,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Float64
-from batchpid.arrays.choices import CHOICES
+from batchpid.arrays.array_types import CHOICES, Float64
 from batchpid.checks.validate import at_least, broadcast, choice, number, positive, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.gains.stability import stability_bound

@@ -22,8 +22,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from batchpid.arrays.array_types import Document, Rows
-from batchpid.arrays.choices import CHOICES
+from batchpid.arrays.array_types import CHOICES, Document, Rows
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.records import Record
 from batchpid.checks.validate import choice, file_path, instance, names

@@ -49,8 +49,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from batchpid.arrays.array_types import Array
-from batchpid.arrays.choices import NamedChoice
+from batchpid.arrays.array_types import Array, NamedChoice
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
 from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import instance

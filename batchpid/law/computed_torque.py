@@ -34,8 +34,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from batchpid.arrays.array_types import Array, ArrayModule
-from batchpid.arrays.choices import Everywhere, PerMassMatrix
+from batchpid.arrays.array_types import Array, ArrayModule, Everywhere, PerMassMatrix
 from batchpid.arrays.elementwise import clip, in_dtype_of, matrix_vector, namespace, row_minimum
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import Coefficients

@@ -2,7 +2,7 @@
 
 An option that is off is ``None``, which is not a leaf: NumPy skips it and ``jax.jit`` compiles a
 law without it. Choices without a number, such as the unit of the gains, are tuples without fields
-(:mod:`batchpid.arrays.choices`): part of the tree's structure, and so static under every JAX
+(:mod:`batchpid.arrays.array_types`): part of the tree's structure, and so static under every JAX
 transform.
 """
 
@@ -14,8 +14,17 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Bool, Document, DType, Rows
-from batchpid.arrays.choices import CHOICES, Everywhere, NamedChoice, PerMassMatrix
+from batchpid.arrays.array_types import (
+    CHOICES,
+    Array,
+    Bool,
+    Document,
+    DType,
+    Everywhere,
+    NamedChoice,
+    PerMassMatrix,
+    Rows,
+)
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.records import Ends, LeafBuilder, Record, is_everywhere, with_fields

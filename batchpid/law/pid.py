@@ -29,8 +29,7 @@ b) / ki.
 
 from __future__ import annotations
 
-from batchpid.arrays.array_types import Array, ArrayModule
-from batchpid.arrays.choices import Everywhere, HoldEffort
+from batchpid.arrays.array_types import Array, ArrayModule, Everywhere, HoldEffort
 from batchpid.arrays.elementwise import (
     clip,
     flush,

@@ -15,8 +15,14 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.native.extensions import LAW
 from batchpid.task_space import native_rows
-from batchpid.task_space.osc_coefficients import OSCCoefficients
-from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDynamics, Tool
+from batchpid.task_space.osc_state import (
+    OSCCoefficients,
+    OSCInputs,
+    OSCState,
+    OSCTerms,
+    TaskDynamics,
+    Tool,
+)
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_kinematics import prepared, read_point
 

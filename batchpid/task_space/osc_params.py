@@ -9,8 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Array, Document
-from batchpid.arrays.choices import CHOICES, NamedChoice
+from batchpid.arrays.array_types import CHOICES, Array, Document, NamedChoice
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.records import (
@@ -24,7 +23,7 @@ from batchpid.arrays.records import (
 from batchpid.checks.validate import AxisKind, choice, entries, instance, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
-from batchpid.task_space.tree_dynamics import check_masses
+from batchpid.task_space.tree_quantities import check_masses
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Names of the axes of a task."""
@@ -172,7 +171,7 @@ def make_osc_params(
         "world" or "tool": the axes of gains, selections and wrenches. Setpoints are in the world.
     discretization
         "explicit", or "implicit": stable at any time step
-        (:mod:`batchpid.task_space.osc_coefficients`).
+        (:mod:`batchpid.task_space.osc_state`).
 
     Raises
     ------

@@ -131,7 +131,7 @@ class RigidTree:
     """
     fixed_base: bool = True
     """False if the base floats. Mass matrices and biases of the joints are then Schur complements
-    (:mod:`batchpid.task_space.tree_dynamics`); poses and Jacobians are still in the frame of the
+    (:mod:`batchpid.task_space.tree_quantities`); poses and Jacobians are still in the frame of the
     base.
     """
 

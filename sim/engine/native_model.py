@@ -1,7 +1,7 @@
 r"""Robots in native code: mass matrices and passive forces, also within the sim steps of a tick,
 and the step itself.
 
-The equations are those of :mod:`batchpid.task_space.tree_dynamics`, on a base that is held or
+The equations are those of :mod:`batchpid.task_space.tree_quantities`, on a base that is held or
 floats.
 """
 

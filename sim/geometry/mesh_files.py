@@ -17,7 +17,7 @@ from urllib.parse import unquote
 import numpy as np
 from lxml import etree
 
-from batchpid.arrays.digest import digest
+from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
 from batchpid.io.files import imported
 

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Document, Float64, MjModel, MjsBody, MjSpec, Rows
-from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.geometry.mesh_files import mesh_bytes, read_mesh

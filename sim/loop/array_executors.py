@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Float64, Pytree, Rows
-from batchpid.arrays.jax_settings import precision
+from batchpid.arrays.elementwise import precision
 from batchpid.arrays.trees import filled, leaves, structure
 from batchpid.sim.engine.native_model import NativeStep
 from batchpid.sim.engine.protocol import EnginePack

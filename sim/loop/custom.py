@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document, Rows
-from batchpid.arrays.elementwise import namespace, read_only
-from batchpid.arrays.jax_settings import precision
+from batchpid.arrays.elementwise import namespace, precision, read_only
 from batchpid.arrays.trees import flatten, unflatten
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions

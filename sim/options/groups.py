@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike
 
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Rows
-from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.elementwise import read_only, require_jax
 from batchpid.arrays.field_tables import Field, plain
-from batchpid.arrays.jax_settings import require_jax
 from batchpid.checks.validate import array, at_least, choice, instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.physics import MujocoSolver, Physics

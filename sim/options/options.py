@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Kind, Rows
-from batchpid.arrays.choices import PerMassMatrix
-from batchpid.arrays.digest import digest
+from batchpid.arrays.array_types import Document, Kind, PerMassMatrix, Rows
 from batchpid.arrays.field_tables import Field, declared, plain
 from batchpid.arrays.records import frozen
+from batchpid.arrays.trees import digest
 from batchpid.checks.validate import AxisKind, instance
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.law.computed_torque import check_gain_units

@@ -14,8 +14,8 @@ from lxml import etree
 
 from batchpid import assets
 from batchpid.arrays.array_types import Document
-from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.trees import digest
 from batchpid.checks.validate import file_path, is_name
 from batchpid.errors import RobotError, RobotNotFoundError
 from batchpid.sim.findings import Finding

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import batchpid as bp
-from batchpid.arrays.array_types import Bool, Document, Float64
-from batchpid.arrays.choices import CHOICES
+from batchpid.arrays.array_types import CHOICES, Bool, Document, Float64
 from batchpid.arrays.elementwise import read_only
 from batchpid.checks.validate import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError

@@ -26,9 +26,8 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
-from batchpid.arrays.trees import mapped
+from batchpid.arrays.trees import digest, mapped
 from batchpid.motors import Actuators
 from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.shapes import LEAST_MASS, Shape

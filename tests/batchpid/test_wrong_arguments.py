@@ -18,7 +18,7 @@ import batchpid as bp
 import batchpid.export
 import batchpid.task_space as ts
 from batchpid import metrics, motors, trajectories
-from batchpid.arrays.choices import CHOICES
+from batchpid.arrays.array_types import CHOICES
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import LAW_FIELDS
 from batchpid.motors import friction, guard

@@ -304,6 +304,14 @@ def test_an_aligned_plan_is_near_and_smooth(run):
     assert change <= 4 < figures["cubic"][2]
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_process")
+def test_gains_by_gradient_beat_the_designed_ones(run):
+    lines = run("gradient_gains.py", "--moves", "2", "--generations", "1").splitlines()
+    losses = {name: float(value) for name, value, _ in map(str.split, lines)}
+    assert losses["gradient"] < 0.8 * losses["designed"]
+
+
 @pytest.mark.usefixtures("one_process")
 def test_chunks_that_have_a_file_are_not_run_again(run, tmp_path):
     flags = (

@@ -17,8 +17,8 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
-from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
 from batchpid.motors import make_actuators
 from batchpid.sim.findings import Finding
