@@ -16,7 +16,8 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
-from batchpid.sim.engine.protocol import SceneSpec
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.geometry.distances import Contacts
 
 BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
 SLIDE = '<limit lower="-0.5" upper="0.5" effort="10" velocity="2"/>'
@@ -176,7 +177,10 @@ def test_contacts_are_of_all_pairs_but_the_disabled_and_the_neighbours(seed):
         lines = (f'<disable_collisions link1="{a}" link2="{b}"/>' for a, b in disabled)
         write(Path(folder), robot(*lines), "test.srdf")
         loaded = Robot.load(path, self_collision="urdf")
-        near = spec_of(loaded).contact_model(False).near(loaded.start)
+        spec = spec_of(loaded)
+        ignored = {frozenset(pair) for pair in spec.ignored}
+        contacts = Contacts(spec.rigid_tree, spec.simulated.shapes, ignored, False)
+        near = contacts.near(loaded.start)
         seen = {frozenset((first, second)) for first, second, _ in near}
     far = {pair for pair in map(frozenset, pairs) if len({body[name] for name in pair}) == 2}
     neighbours = {frozenset((a, b)) for a, b in pairs if {body[a], body[b]} == {"arm0", "arm4"}}
