@@ -129,7 +129,10 @@ class JAXBackend:
             return function(self.jax.tree.unflatten(tree, leaves), *inputs, **named)
 
         return self.jax.jit(
-            packed, static_argnums=0, static_argnames=("dt", "keep_integral"), **options
+            packed,
+            static_argnums=0,
+            static_argnames=("dt", "keep_integral"),
+            **options,
         )
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:

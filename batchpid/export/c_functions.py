@@ -44,7 +44,12 @@ def rigid_body(c: Dialect, tree: RigidTree) -> str:
     masses = above + coupling + c.table("k_mass", bodies.mass[:, 0])
     masses += c.table("k_armature", np.asarray(tree.armature))
     masses += f"  static const {c.type} gravity[3] = {{{fall}}};\n"
-    return c.translated("c_rigid_body.h", poses=poses, masses=masses, coupling=coupling)
+    return c.translated(
+        "c_rigid_body.h",
+        poses=poses,
+        masses=masses,
+        coupling=coupling,
+    )
 
 
 def _integers(c: Dialect, name: str, values: object) -> str:
@@ -82,7 +87,15 @@ def plan_functions(c: Dialect, plan: Plan, functions: str) -> str:
         return position, row[0] * 0.0 if weight is None else weight
 
     def body(step: Callable[..., Pytree], inputs: list[str], *places: str) -> str:
-        return _body(c, step, plan, like, [*names, *inputs], len(inputs), places)
+        return _body(
+            c,
+            step,
+            plan,
+            like,
+            [*names, *inputs],
+            len(inputs),
+            places,
+        )
 
     row = [f"chunk[k * {n} + j]", "begin", "offset[j]", "slope[j]", "first", "step", "rows"]
     knots = ["length", "position[j]", "blended[f][j]", "speed[j]", "state->rates[j][f]"]

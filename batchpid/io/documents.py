@@ -296,7 +296,12 @@ def render(document: Document, format: str) -> str:
         return json.dumps(standard, indent=2) + "\n"
     import yaml
 
-    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
+    return yaml.safe_dump(
+        document,
+        sort_keys=False,
+        default_flow_style=None,
+        width=10_000,
+    )
 
 
 def is_number(entry: object) -> bool:

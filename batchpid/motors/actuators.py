@@ -396,7 +396,11 @@ def envelope(actuators: Actuators) -> Envelope:
     # A motor without a stall effort has no line, so its slope is 0.
     finite = xp.isfinite(stall)
     slope = xp.where(finite, xp.where(finite, stall, 0.0) / actuators.no_load_speed, 0.0)
-    return k._replace(stall=stall, reverse=-stall, slope=slope)
+    return k._replace(
+        stall=stall,
+        reverse=-stall,
+        slope=slope,
+    )
 
 
 def command_envelope(actuators: Actuators) -> Envelope:

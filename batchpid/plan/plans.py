@@ -35,7 +35,12 @@ SPARE_ROWS = 2
 """Knots behind the rows of a chunk, at rest."""
 INTERPOLATIONS = {"cubic": 3.0, "linear": 1.0, "hold": 0.0}
 """Interpolations, with the degree of the curve between two rows."""
-BLENDS = {"align": "fade", "newest": "", "ensemble": "weight", "average": "share"}
+BLENDS = {
+    "align": "fade",
+    "newest": "",
+    "ensemble": "weight",
+    "average": "share",
+}
 """Blends, with the option that each of them has."""
 
 
@@ -49,10 +54,26 @@ class _PlanFields(NamedTuple):
     blended: Array
     """1.0 on the joints whose chunks are blended, 0.0 on those that take the newest value."""
     fade: Annotated[Array, Field("s", above=True, default=1.0)] = None
-    weight: Annotated[Array, Field("1", low=-9.0, high=9.0, default=0.01)] = None
+    weight: Annotated[
+        Array,
+        Field(
+            "1",
+            low=-9.0,
+            high=9.0,
+            default=0.01,
+        ),
+    ] = None
     forgotten: Array = None
     """1 - exp(-m) of an ensemble."""
-    share: Annotated[Array, Field("1", above=True, high=0.999, default=0.7)] = None
+    share: Annotated[
+        Array,
+        Field(
+            "1",
+            above=True,
+            high=0.999,
+            default=0.7,
+        ),
+    ] = None
     taper: Annotated[Array, Field("s")] = None
     rate: Annotated[Array, GUARD_FIELDS["rate"]] = None
     """V [rad/s or m/s]."""

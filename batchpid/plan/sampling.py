@@ -104,7 +104,18 @@ def init(plan: Plan, qpos: Array, time: Array = 0.0) -> PlanState:
     rest = start, zeros, zeros, zeros
     limits = _guard(plan)
     guard = None if limits is None else guard_model.init(limits, start)
-    return PlanState(knots, empty, weights, at, at, rest, at, at, zeros, guard)
+    return PlanState(
+        knots,
+        empty,
+        weights,
+        at,
+        at,
+        rest,
+        at,
+        at,
+        zeros,
+        guard,
+    )
 
 
 def add(
@@ -129,8 +140,21 @@ def add(
         raise InvalidArgumentError("chunk", problem, remedy="give rows of all joints, in order")
     chunk = xp.broadcast_to(chunk, (*state.now.shape[:-1], rows, joints))
     # All rows at once: plan and state have an axis more.
-    options, wide = _wide(plan), _wide(state._replace(knots=None, rates=None, weights=None))
-    wide = wide._replace(knots=state.knots, rates=state.rates, weights=state.weights)
+    options, wide = (
+        _wide(plan),
+        _wide(
+            state._replace(
+                knots=None,
+                rates=None,
+                weights=None,
+            )
+        ),
+    )
+    wide = wide._replace(
+        knots=state.knots,
+        rates=state.rates,
+        weights=state.weights,
+    )
     period, now = options.period, wide.now
     begin = xp.zeros_like(now) + _column(_column(time))
     # Rows that have passed are dropped; if all have, the last one is still the newest wish.
@@ -141,7 +165,17 @@ def add(
     position, rate, _ = evaluate(wide.segment, now - wide.end)
     offset, slope = gap(options, wide, chunk, joined, first)
     step = xp.arange(rows, dtype=chunk.dtype).reshape(*[1] * (chunk.ndim - 2), rows, 1)
-    blended, weights = blend(options, wide, chunk, begin, offset, slope, first, step, rows)
+    blended, weights = blend(
+        options,
+        wide,
+        chunk,
+        begin,
+        offset,
+        slope,
+        first,
+        step,
+        rows,
+    )
     # Central differences, one-sided at the ends of the chunk.
     rise = xp.diff(blended if rows > 1 else xp.concatenate((position, blended), -2), axis=-2)
     inner = 0.5 * (rise[..., 1:, :] + rise[..., :-1, :])
@@ -149,7 +183,14 @@ def add(
     rates = xp.concatenate(rises, -2) / period
     behind, rest = [xp.zeros_like(now)] * (count - rows), [blended[..., -1:, :]] * (count - rows)
     high, slope = take_rows(blended, first), take_rows(rates, first)
-    segment = cubic(options, joined - now, position, high, rate, slope)
+    segment = cubic(
+        options,
+        joined - now,
+        position,
+        high,
+        rate,
+        slope,
+    )
     return state._replace(
         knots=xp.concatenate((blended, *rest), -2),
         rates=xp.concatenate((rates, *behind), -2),

@@ -355,7 +355,14 @@ def projections(
 
     ``springs`` (envs, dof) is the part a_s of a_n, all of it if None.
     """
-    xp = namespace(*k, *d, a, a_n, wrench, feedforward)
+    xp = namespace(
+        *k,
+        *d,
+        a,
+        a_n,
+        wrench,
+        feedforward,
+    )
     j = d.jacobian
     m = d.mass_matrix
     chain = d.chain
@@ -393,7 +400,15 @@ def projections(
         moved = chain * gram(inverse_root, product(inverse_root, effort)[..., None])[..., 0]
         return (1 - chain) * product(m, moved)
 
-    return Projections(f, task, null, base, of_others(task), of_others(null), singular)
+    return Projections(
+        f,
+        task,
+        null,
+        base,
+        of_others(task),
+        of_others(null),
+        singular,
+    )
 
 
 def _inertias(

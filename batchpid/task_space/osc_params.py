@@ -52,15 +52,35 @@ class _OSCParamsFields(NamedTuple):
     posture_damping: Array
     """(1 | envs, dof) [1/s]."""
     position_error_limit: Annotated[
-        Array, Field("m", math.inf, above=True, group="norm", default=0.1)
+        Array,
+        Field(
+            "m",
+            math.inf,
+            above=True,
+            group="norm",
+            default=0.1,
+        ),
     ]
     """(1 | envs, 1) [m]."""
     rotation_error_limit: Annotated[
-        Array, Field("rad", math.inf, above=True, group="norm", default=0.5)
+        Array,
+        Field(
+            "rad",
+            math.inf,
+            above=True,
+            group="norm",
+            default=0.5,
+        ),
     ]
     """(1 | envs, 1) [rad]."""
     smallest_eigenvalue: Annotated[
-        Array, Field("1/kg or 1/(kg m^2)", above=True, group="s0", default=0.02)
+        Array,
+        Field(
+            "1/kg or 1/(kg m^2)",
+            above=True,
+            group="s0",
+            default=0.02,
+        ),
     ]
     """s0 (1 | envs, 1) [1/kg, 1/(kg m^2)]."""
     axes: Annotated[Array, Field(neutral=True, group="axis")] = None

@@ -76,7 +76,11 @@ class Bodies(NamedTuple):
     base_tensor: Array
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(
+    frozen=True,
+    eq=False,
+    repr=False,
+)
 class RigidTree:
     """Rigid tree of a robot. Arrays are copied and read-only; the degrees of freedom are the joints
     that move, in the order of their links.

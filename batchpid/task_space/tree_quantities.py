@@ -136,7 +136,9 @@ def _of_base(
     frame = xp.eye(3, 4, dtype=bodies.mass.dtype)[None, ..., None]
     base = _inertias(bodies.base_mass, center, tensor, frame)
     # Composites of the joints on the base contain all bodies but the base itself.
-    robot = [_on_base(tree, part)[None] + own for part, own in zip(whole, base, strict=True)]
+    robot = [
+        _on_base(tree, part)[None] + of_base for part, of_base in zip(whole, base, strict=True)
+    ]
     unit = xp.eye(6, dtype=bodies.mass.dtype)[..., None]
     p, k = _momenta(robot, (unit[0], unit[1], unit[2]), (unit[3], unit[4], unit[5]))
     return base, _by_row(xp.stack((*p, *k)), xp)
@@ -419,7 +421,12 @@ def inverse_dynamics(
     """Return the efforts (..., dof) [N m or N] of the accelerations ``qacc`` (..., dof): M q'' +
     h.
     """
-    *_, a = prepared(tree, qpos=qpos, qvel=qvel, qacc=qacc)[0]
+    *_, a = prepared(
+        tree,
+        qpos=qpos,
+        qvel=qvel,
+        qacc=qacc,
+    )[0]
     results = evaluated(tree, ("mass_matrix", "bias"), qpos, qvel)
     with quiet():
         return product(results["mass_matrix"], tree.coupling.of_independent(a)) + results["bias"]
@@ -439,7 +446,12 @@ def forward_dynamics(
     InvalidArgumentError
         Also if a joint moves no mass and has no armature.
     """
-    *_, u = prepared(tree, qpos=qpos, qvel=qvel, effort=effort)[0]
+    *_, u = prepared(
+        tree,
+        qpos=qpos,
+        qvel=qvel,
+        effort=effort,
+    )[0]
     check_masses(tree)
     results = evaluated(tree, ("mass_matrix", "bias"), qpos, qvel)
     with quiet():

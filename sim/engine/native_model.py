@@ -116,7 +116,11 @@ class NativeModel:
             "base": number("Base", self._base.upper()),
         }
         gravity = tuple(self._pack.rigid_tree.bodies.gravity)
-        return structure("Model")(gravity=gravity, **numbers, **addresses), arrays
+        return structure("Model")(
+            gravity=gravity,
+            **numbers,
+            **addresses,
+        ), arrays
 
     @property
     def address(self) -> int:

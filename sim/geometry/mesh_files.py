@@ -99,7 +99,11 @@ def read_mesh(path: str | Path, data: bytes | None = None) -> Any:
     # Materials are textures to decode, of which nothing here needs any.
     load = imported("trimesh").load
     mesh: Any = load(
-        BytesIO(data), file_type=kind, force="mesh", process=False, skip_materials=True
+        BytesIO(data),
+        file_type=kind,
+        force="mesh",
+        process=False,
+        skip_materials=True,
     )
     # Of COLLADA: "0.01 * meters".
     factor, _, unit = str(mesh.metadata.get("units", "")).partition(" * ")

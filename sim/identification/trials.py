@@ -40,7 +40,12 @@ KEPT = 0.95
 """Share of the held-out error that an unknown has to leave for it to be kept."""
 COLORED = 0.2
 """Correlation of the residuals from which further effects are tried."""
-EFFECTS = {"stribeck": KEPT, "mass": 0.8, "offset": 0.8, "load_friction": 0.8}
+EFFECTS = {
+    "stribeck": KEPT,
+    "mass": 0.8,
+    "offset": 0.8,
+    "load_friction": 0.8,
+}
 """Effects that are tried, and the share of the held-out error that each has to leave: every motor
 has more friction at rest, but a few percent may be an error of the model that looks like a mass.
 """
@@ -57,7 +62,14 @@ def fit(
     problem, point = _best_start(starts, progress)
     coarse = problem.coarse()
     if coarse is not problem:
-        point = solve(coarse, point, None, evaluations, progress, ROUGH_TOLERANCE).point
+        point = solve(
+            coarse,
+            point,
+            None,
+            evaluations,
+            progress,
+            ROUGH_TOLERANCE,
+        ).point
     result = with_certainty(solve(problem, point, None, evaluations, progress))
     return _without_sender(result, evaluations, progress)
 
@@ -93,7 +105,14 @@ def _best_start(
         if len(starts) == 1:
             return problem, point
         coarse = problem.coarse()
-        point = solve(coarse, point, None, TRIAL, progress, ROUGH_TOLERANCE).point
+        point = solve(
+            coarse,
+            point,
+            None,
+            TRIAL,
+            progress,
+            ROUGH_TOLERANCE,
+        ).point
         tried.append((error(coarse, point), len(tried), problem, point))
     return min(tried)[2:]
 
@@ -119,7 +138,9 @@ def _without_sender(
         fitted = solve(problem, point, size, evaluations, progress)
         if _left(fitted) * KEPT <= error:
             return smaller._replace(
-                point=fitted.point, size=fitted.size, converged=fitted.converged
+                point=fitted.point,
+                size=fitted.size,
+                converged=fitted.converged,
             )
     return result
 
@@ -185,7 +206,14 @@ def _with_effect(
     is_used = np.isin(names, [*present, *kinds_of(effects[best])])
     trial = replace(wide, unknowns=wider.only(is_used))
     start = (point + steps[best])[is_used]
-    further = solve(trial, start, None, evaluations, progress, ROUGH_TOLERANCE)
+    further = solve(
+        trial,
+        start,
+        None,
+        evaluations,
+        progress,
+        ROUGH_TOLERANCE,
+    )
     share = _left(further._replace(size=result.size)) / before
     if share > EFFECTS[effects[best]]:
         return result

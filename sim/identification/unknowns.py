@@ -190,7 +190,15 @@ class Unknowns:
             kind = UNKNOWN_KINDS[name]
             if kind.per == "link":
                 entries += [
-                    Unknown(name, None, 1.0, 1.0, LEAST_MASS_FACTOR, link) for link in self.links
+                    Unknown(
+                        name,
+                        None,
+                        1.0,
+                        1.0,
+                        LEAST_MASS_FACTOR,
+                        link,
+                    )
+                    for link in self.links
                 ]
                 continue
             for joint in range(len(self.joints)) if kind.per == "joint" else (None,):

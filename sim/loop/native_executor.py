@@ -83,7 +83,11 @@ class TickProgram:
             coriolis=control.coriolis,
         )
         self._left = np.zeros(())
-        self.place(**buffers.measured._asdict(), before=buffers.before, left=self._left)
+        self.place(
+            **buffers.measured._asdict(),
+            before=buffers.before,
+            left=self._left,
+        )
         # SAPIEN knows neither measured states nor the model of varied robots.
         if control.gravity and (control.measures or not reads_force):
             if control.measures:
@@ -116,7 +120,9 @@ class TickProgram:
         """Let fields of the structure of native code point to these arrays."""
         for name, array in arrays.items():
             if array is not None:
-                setattr(self.tick, name, self._address(array, _TYPES.get(name, np.float64)))
+                setattr(
+                    self.tick, name, self._address(array, _CONSTANT_TYPES.get(name, np.float64))
+                )
 
     def use(self, **owners: Any) -> None:
         """Let fields of the structure of native code point to the structures of these objects."""
@@ -167,7 +173,13 @@ class TickProgram:
         for stage, state in zip(setup.stages, self.buffers.states, strict=True):
             if stage.due:
                 clock, due = [self._address(getattr(state, name), np.float64) for name in stage.due]
-                self._add_program([(stage, state)], values, renews=True, clock=clock, due=due)
+                self._add_program(
+                    [(stage, state)],
+                    values,
+                    renews=True,
+                    clock=clock,
+                    due=due,
+                )
         waiting = list[tuple[Any, Pytree]]()
         for stage, state in zip(setup.stages, self.buffers.states, strict=True):
             if not stage.native:
@@ -206,7 +218,14 @@ class TickProgram:
         # Native code sets the addresses of the noise, which is another in each sim step.
         drawn = [id(block) for block in leaves(values.noise)]
         shape = self.buffers.before.shape
-        made, values = bind_stages(stages, states, values, shape, passes, renews)
+        made, values = bind_stages(
+            stages,
+            states,
+            values,
+            shape,
+            passes,
+            renews,
+        )
         if made.outputs:
             noise = [at for at, array in enumerate(made.inputs) if id(array) in drawn]
             self._add_stage(
@@ -223,11 +242,15 @@ class TickProgram:
 
     def _add_stage(self, kind: str, every: int = 1, **fields: Any) -> None:
         self._stages.append(
-            structure("Stage")(kind=number("StageKind", kind), every=every, **fields)
+            structure("Stage")(
+                kind=number("StageKind", kind),
+                every=every,
+                **fields,
+            )
         )
 
 
-_TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
+_CONSTANT_TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
 """Dtypes of arrays that are not float64."""
 
 

@@ -83,7 +83,11 @@ def check_plain(record: object) -> None:
         vars(record)[name] = plain(name, kinds[name], value)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(
+    frozen=True,
+    eq=False,
+    kw_only=True,
+)
 class OptionGroup:
     """Base of the groups of options."""
 
@@ -105,7 +109,11 @@ class OptionGroup:
         return made
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(
+    frozen=True,
+    eq=False,
+    kw_only=True,
+)
 class SceneOptions(OptionGroup):
     """Engine, ground, contacts, and content of the scenes."""
 
@@ -228,7 +236,11 @@ class SceneOptions(OptionGroup):
             ground = robot.has_ground or (file is not None and file.has_floor)
         contacts = self._sensed_links("contacts", self.contacts, robot)
         wrenches = self._sensed_links("wrenches", self.wrenches, robot)
-        return self.changed(ground=ground, contacts=contacts, wrenches=wrenches)
+        return self.changed(
+            ground=ground,
+            contacts=contacts,
+            wrenches=wrenches,
+        )
 
     def _check_randomization(self, robot: Robot) -> None:
         """Raise InvalidArgumentError for draws that robot or scenes do not take."""
@@ -333,7 +345,11 @@ class Controller(Protocol):
         """
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(
+    frozen=True,
+    eq=False,
+    kw_only=True,
+)
 class ControlOptions(OptionGroup):
     """Time step, law, gains, motors and guard; what makes an env fail, and what happens then."""
 
@@ -527,7 +543,11 @@ class Ray:
             raise InvalidArgumentError("address", "has a protocol", value=address, remedy=remedy)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(
+    frozen=True,
+    eq=False,
+    kw_only=True,
+)
 class WorkerOptions(OptionGroup):
     """Processes and machines that run the envs."""
 

@@ -58,7 +58,11 @@ IDEAL = bp.Actuators()
 OPTION_GROUPS = (SceneOptions, ControlOptions, WorkerOptions)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(
+    frozen=True,
+    eq=False,
+    kw_only=True,
+)
 class RunnerKeywords(SceneOptions, ControlOptions, WorkerOptions):
     """Arguments of a :class:`batchpid.sim.Runner`, as they are passed; all but the first two may be
     left out.
@@ -333,12 +337,18 @@ def default_params(
     """
     # Other controls need the effort limits alone.
     if control not in ("pid", "drive"):
-        return robot.params(kp=0.0, ki=0.0, kd=0.0)
+        return robot.params(
+            kp=0.0,
+            ki=0.0,
+            kd=0.0,
+        )
     settings = robot.settings
     if control == "drive":
         if settings is None:
             return robot.designed("effort").replace(
-                ki=0.0, setpoint_weight=None, derivative_filter_time=None
+                ki=0.0,
+                setpoint_weight=None,
+                derivative_filter_time=None,
             )
         return robot.params(
             kp=settings.drive_stiffness,

@@ -42,7 +42,7 @@ from batchpid.sim.robot.robot_model import link_tree
 
 Drawn = TypeVar("Drawn", bp.PIDParams, bp.Actuators | None)
 LARGEST_SEED = 2**63 - 1
-OF_JOINTS = ("bias", *JOINT_SIDE)
+LEADER_FIELDS = ("bias", *JOINT_SIDE)
 """Fields of the actuators that followers do not have."""
 
 
@@ -268,7 +268,7 @@ class Randomization:
         for name in getattr(self, group):
             rows = self.apply(f"{group}.{name}", getattr(record, name), draws, robot)
             # Followers have no motor.
-            if name in OF_JOINTS:
+            if name in LEADER_FIELDS:
                 values[name] = rows * robot.independent
             else:
                 values[name] = rows

@@ -118,7 +118,9 @@ def with_srdf(source: Source) -> Source:
         else:
             disabled.append(DisabledPair(*pair, element.get("reason") or "User"))
     return source._replace(
-        disabled=tuple(disabled), enabled=frozenset(enabled), repairs=tuple(findings)
+        disabled=tuple(disabled),
+        enabled=frozenset(enabled),
+        repairs=tuple(findings),
     )
 
 

@@ -44,7 +44,11 @@ STANDING_HZ)^2.
 """
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(
+    frozen=True,
+    eq=False,
+    repr=False,
+)
 class Robot:
     """Robot as its file describes it; every array is in the order of ``joint_names``. Load one with
     :meth:`load`.
@@ -452,4 +456,8 @@ class Robot:
             problem = f"{self.name!r} has no servos of an MJCF file"
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
         # MuJoCo's integral grows during saturation, up to its limit.
-        return self.params(**gains, anti_windup="none", measurement_rate="measured")
+        return self.params(
+            **gains,
+            anti_windup="none",
+            measurement_rate="measured",
+        )

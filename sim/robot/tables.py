@@ -227,7 +227,12 @@ def unique(name: str, names: set[str]) -> str:
 def without_mass(body: Body) -> Body:
     """Return ``body`` with next to no mass, in place of that of its shapes."""
     tensor = 1e-3 * LEAST_MASS * np.eye(3)
-    return body._replace(mass=LEAST_MASS, center=ORIGIN, inertia=tensor, inertia_wxyz=NO_TURN)
+    return body._replace(
+        mass=LEAST_MASS,
+        center=ORIGIN,
+        inertia=tensor,
+        inertia_wxyz=NO_TURN,
+    )
 
 
 def breadth_first(

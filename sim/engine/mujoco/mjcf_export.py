@@ -84,7 +84,11 @@ class _Actuators:
         if low >= high:
             problem = "must be below effort_max for MuJoCo"
             raise InvalidArgumentError(
-                "effort_min", problem, joint=name, value=low, remedy="widen the limits"
+                "effort_min",
+                problem,
+                joint=name,
+                value=low,
+                remedy="widen the limits",
             )
         element = {"name": name, "joint": name}
         if delay := law.column("command_delay")[joint]:
@@ -119,7 +123,13 @@ class _Actuators:
         imax = limit / ki if ki and math.isfinite(limit) else 0.0
         rate = float(self._rate[joint])
         slewmax = rate if math.isfinite(rate) else 0.0
-        return {"kp": kp, "ki": ki, "kv": kd, "slewmax": slewmax, "imax": imax}
+        return {
+            "kp": kp,
+            "ki": ki,
+            "kv": kd,
+            "slewmax": slewmax,
+            "imax": imax,
+        }
 
     def _pid(self, joint: int) -> dict[str, str]:
         element = {
@@ -210,7 +220,15 @@ def to_mjcf(
             )
     if params is None:
         params = make_params(robot.dof, 0.0, measurement_rate="measured")
-    law = export_law(params, robot.joint_names, dt, inertia, actuators, guard, has_law)
+    law = export_law(
+        params,
+        robot.joint_names,
+        dt,
+        inertia,
+        actuators,
+        guard,
+        has_law,
+    )
     sentences = differences(law, "mjcf", robot.independent)
     spec = SceneSpec.of(robot, law.dt, SOLVERS["accurate"], ground=robot.has_ground)
     # The bodies are those that the engine simulates; inertias and efforts are then written with all
@@ -333,14 +351,33 @@ def _exact(scene: MjSpec) -> Any:
         body = scene.body(element.get("name"))
         _write(element, body, pos="pos", quat="quat")
         inertial = element.find("inertial")
-        _write(inertial, body, pos="ipos", quat="iquat", mass="mass", diaginertia="inertia")
+        _write(
+            inertial,
+            body,
+            pos="ipos",
+            quat="iquat",
+            mass="mass",
+            diaginertia="inertia",
+        )
     for element in root.iterfind("worldbody//joint[@name]"):
         joint = scene.joint(element.get("name"))
         if joint.actfrclimited == mujoco.mjtLimited.mjLIMITED_TRUE:
             # MuJoCo leaves out a range that is nearly 0, and then refuses to read the joint.
             element.set("actuatorfrcrange", "0 0")
-        _write(element, joint, axis="axis", range="range", actuatorfrcrange="actfrcrange")
-        _write(element, joint, armature="armature", damping="damping", frictionloss="frictionloss")
+        _write(
+            element,
+            joint,
+            axis="axis",
+            range="range",
+            actuatorfrcrange="actfrcrange",
+        )
+        _write(
+            element,
+            joint,
+            armature="armature",
+            damping="damping",
+            frictionloss="frictionloss",
+        )
     for element, tie in zip(root.findall("equality/joint"), scene.equalities, strict=True):
         _write(element, tie, polycoef="data")
     return root

@@ -147,7 +147,14 @@ def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
             findings += [Finding("actuator", text, remedy, name) for name in arms or [None]]
             law = ActuatorLaw(law.kp, kv=law.kv) if len(arms) == 1 else ActuatorLaw()
         for name, arm in arms.items():
-            _add_limits(model, actuator, name, arm, motors, findings)
+            _add_limits(
+                model,
+                actuator,
+                name,
+                arm,
+                motors,
+                findings,
+            )
             _add_law(law, name, arm, motors)
         if law.is_servo:
             _add_setpoints(model, actuator, law, robot, motors)
@@ -219,7 +226,14 @@ def _law(model: MjModel, actuator: int) -> ActuatorLaw:
     dynamics = model.actuator_dynprm[actuator].tolist()
     if kind == _GAIN.mjGAIN_DCMOTOR:
         resistance, constant, _, _, kp, ki, kv, supply, *_ = gain
-        law = ActuatorLaw(kp, ki, kv, error_limit=dynamics[8], slew=dynamics[7], lag=dynamics[0])
+        law = ActuatorLaw(
+            kp,
+            ki,
+            kv,
+            error_limit=dynamics[8],
+            slew=dynamics[7],
+            lag=dynamics[0],
+        )
         if supply:
             law = law._replace(stall=constant * supply / resistance, speed=supply / constant)
         return law
