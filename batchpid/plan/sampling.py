@@ -180,8 +180,8 @@ def add(
     rise = xp.diff(blended if rows > 1 else xp.concatenate((position, blended), -2), axis=-2)
     inner = 0.5 * (rise[..., 1:, :] + rise[..., :-1, :])
     rises = (rise[..., :1, :], inner, rise[..., -1:, :]) if rows > 1 else (rise,)
-    rates = xp.concatenate(rises, -2) / period
     behind, rest = [xp.zeros_like(now)] * (count - rows), [blended[..., -1:, :]] * (count - rows)
+    rates = xp.concatenate((*rises, *behind), -2) / period
     high, slope = take_rows(blended, first), take_rows(rates, first)
     segment = cubic(
         options,
@@ -193,7 +193,7 @@ def add(
     )
     return state._replace(
         knots=xp.concatenate((blended, *rest), -2),
-        rates=xp.concatenate((rates, *behind), -2),
+        rates=rates,
         weights=None if weights is None else xp.concatenate((weights, *behind), -2),
         begin=begin[..., 0, :],
         last=(begin + (rows - 1.0) * period)[..., 0, :],
@@ -244,7 +244,8 @@ def blend(
     if plan.fade is not None:
         s = (step - first) * (plan.period / plan.fade)
         u = xp.minimum(s / EASE, 1.0)
-        eased = u * ((1.0 - u) * (1.0 - u)) * (EASE * (offset + plan.fade * slope))
+        rest = 1.0 - u
+        eased = u * (rest * rest) * (EASE * (offset + plan.fade * slope))
         return chunk + plan.blended * (xp.maximum(1.0 - s, 0.0) * offset + eased), None
     if not plan.is_mean:
         return chunk, None
