@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document
-from batchpid.arrays.jax_settings import precision, require_jax
+from batchpid.arrays.elementwise import precision, require_jax
 from batchpid.law import pid
 from batchpid.law.coefficients import discretise
 from batchpid.law.params import PIDParams
@@ -129,7 +129,10 @@ class JAXBackend:
             return function(self.jax.tree.unflatten(tree, leaves), *inputs, **named)
 
         return self.jax.jit(
-            packed, static_argnums=0, static_argnames=("dt", "keep_integral"), **options
+            packed,
+            static_argnums=0,
+            static_argnames=("dt", "keep_integral"),
+            **options,
         )
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
@@ -148,11 +151,10 @@ class JAXBackend:
 
     def array(self, value: Array) -> Array:
         """Return ``value`` as an array of this backend."""
-        if isinstance(value, np.ndarray) or not isinstance(value, self.jax.Array):
-            return np.asarray(value, dtype=self.dtype)
-        if value.dtype == self.dtype:
+        if isinstance(value, self.jax.Array) and value.dtype == self.dtype:
             return value
-        return np.asarray(value, dtype=self.dtype)
+        # A copy: JAX may read it when the call has returned, and the caller writes to it.
+        return np.array(value, dtype=self.dtype)
 
     def call(self, function: Callable[..., PIDState], *inputs: Array, **named: Array) -> PIDState:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""

@@ -202,7 +202,12 @@ class BatchPID:
         if measurement_rate is None:
             check_alone(self._params, None)
         effort = self._fast(
-            out, setpoint, measurement, measurement_rate, setpoint_rate, feedforward
+            out,
+            setpoint,
+            measurement,
+            measurement_rate,
+            setpoint_rate,
+            feedforward,
         )
         if effort is not NotImplemented:
             return effort
@@ -210,7 +215,9 @@ class BatchPID:
         r = self._array("setpoint", setpoint)
         y = self._array("measurement", measurement, exact=True)
         rest = self._optional(
-            measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward
+            measurement_rate=measurement_rate,
+            setpoint_rate=setpoint_rate,
+            feedforward=feedforward,
         )
         if out is not None:
             self._check_out(out)
@@ -253,11 +260,19 @@ class BatchPID:
         y = self._array("measurement", measurement, exact=True)
         u = self._array("effort", effort)
         rest = self._optional(
-            measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward
+            measurement_rate=measurement_rate,
+            setpoint_rate=setpoint_rate,
+            feedforward=feedforward,
         )
         self._fast = declined
         self._state = self._engine.call(
-            bumpless.track, self._started(y), r, y, u, dt=self._dt, **rest
+            bumpless.track,
+            self._started(y),
+            r,
+            y,
+            u,
+            dt=self._dt,
+            **rest,
         )
 
     def _started(self, y: Array) -> PIDState:

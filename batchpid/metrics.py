@@ -4,8 +4,8 @@ With setpoint r, start y0, move A = r - y0 and error e = r - y, per env and join
 
     rise time            from the first 10 % of the move to the first 90 %
     overshoot            max((y - r) sign A) / |A|, at least 0
-    settling time        from which on |e| <= max(band |A|, absolute band)
-    steady-state error   max |e| over the last part of the record
+    settling time        from which on |e| <= max(2 % |A|, absolute band)
+    steady-state error   max |e| over the last tenth of the record
     IAE, ITAE            int |e| dt, int t |e| dt
     effort peak          max |u|
     effort variation     sum |u_k - u_{k-1}|: chatter of the actuator
@@ -27,8 +27,13 @@ from numpy.typing import ArrayLike, NDArray
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.records import array_summary
-from batchpid.checks.validate import broadcast, number, read_array, time_step
+from batchpid.checks.validate import broadcast, read_array, time_step
 from batchpid.errors import InvalidArgumentError
+
+SETTLING_SHARE = 0.02
+"""Half width of the settling band, as a share of the move."""
+FINAL_SHARE = 0.1
+"""Last share of the record, over which the steady-state error is taken."""
 
 
 class StepMetrics(NamedTuple):
@@ -46,7 +51,7 @@ class StepMetrics(NamedTuple):
     settling_time: Float64
     """Time after which the error stays within the band [s]."""
     steady_state_error: Float64
-    """Largest absolute error over the last part of the record [rad or m]."""
+    """Largest absolute error over the last tenth of the record [rad or m]."""
     peak_deviation: Float64
     """Largest distance beyond the setpoint, defined without a move too [rad or m]."""
     iae: Float64
@@ -79,9 +84,7 @@ def step_metrics(
     start: ArrayLike | None = None,
     effort: ArrayLike | None = None,
     saturated: ArrayLike | None = None,
-    band: float = 0.02,
     absolute_band: ArrayLike = 1e-3,
-    tail: float = 0.1,
     continuous: ArrayLike | None = None,
 ) -> StepMetrics:
     """Return the figures of merit of step responses.
@@ -100,28 +103,22 @@ def step_metrics(
         (envs, joints) or (joints,): start of the move; default the first row of ``measurement``.
     effort, saturated
         (ticks, envs, joints): applied efforts [N m or N], and whether they were limited.
-    band
-        Half width of the settling band, as a fraction of the move.
     absolute_band
-        Its least half width [rad or m], a number or (joints,). Rise time and overshoot are
-        undefined for moves smaller than absolute_band / band, where they would compare noise with
-        noise.
-    tail
-        Last share of the record, over which the steady-state error is taken.
+        Least half width of the settling band [rad or m], a number or (joints,). Rise time and
+        overshoot are undefined for moves smaller than 50 times that, where they would compare noise
+        with noise.
     continuous
         (joints,) bool: positions that are angles modulo 2 pi; the move is the short way round.
 
     Raises
     ------
     InvalidArgumentError
-        Shapes that do not fit, fewer than two samples, or a dt, band or tail out of range.
+        Shapes that do not fit, fewer than two samples, or a dt out of range.
     """
     y = read_array("measurement", measurement).astype(np.float64)
     if y.ndim != 3 or len(y) < 2:
         problem = f"has shape {y.shape}, needs (ticks, envs, joints) with at least 2 ticks"
         raise InvalidArgumentError("measurement", problem, remedy="pass a rollout's qpos")
-    number("band", band, 1e-9, 1.0, "fraction of the move")
-    number("tail", tail, 1e-9, 1.0, "share of the record")
     # Everything takes the shape of the measurement.
     r = broadcast("setpoint", setpoint, y.shape)
     floor = broadcast("absolute_band", absolute_band, y.shape[1:])
@@ -150,10 +147,10 @@ def step_metrics(
     direction = np.where(move < 0, -1.0, 1.0)
     error = r - y
     final_error = r[-1] - y
-    tolerance: Float64 = np.maximum(band * size, floor)
+    tolerance: Float64 = np.maximum(SETTLING_SHARE * size, floor)
     # For a joint that hardly moves, rise and overshoot would measure noise; its deviation is still
     # reported.
-    moves = size >= floor / band
+    moves = size >= floor / SETTLING_SHARE
     beyond = np.where(
         moves,
         np.max(-final_error * direction, 0),
@@ -165,7 +162,7 @@ def step_metrics(
     high = _first_crossing(t, progress, 0.9)
     low = _first_crossing(t, progress, 0.1)
     rise = high - np.where(np.isfinite(high), low, 0.0)
-    tail_rows = max(1, round(tail * len(t)))
+    tail_rows = max(1, round(FINAL_SHARE * len(t)))
 
     def judged(figure: ArrayLike) -> Float64:
         return np.where(finite, figure, np.inf)

@@ -126,7 +126,15 @@ def minimum_jerk(
     s = tau**3 * (10 + tau * (6 * tau - 15))
     rate = 30 * tau**2 * (1 - tau) ** 2 / safe
     acceleration = 60 * tau * (1 - tau) * (1 - 2 * tau) / safe**2
-    return _trajectory(time, x0, move, s, rate, acceleration, done=tau >= 1 - _ROUNDING)
+    return _trajectory(
+        time,
+        x0,
+        move,
+        s,
+        rate,
+        acceleration,
+        done=tau >= 1 - _ROUNDING,
+    )
 
 
 def straight_line(
@@ -156,7 +164,8 @@ def straight_line(
     """
     first, last = (broadcast(name, x, (7,)) for name, x in (("start", start), ("target", target)))
     q0, q1 = (pose[3:] / np.linalg.norm(pose[3:]) for pose in (first, last))
-    turn = compose(q1, q0 * np.array([1, -1, -1, -1]))
+    conjugate = q0 * np.array([1, -1, -1, -1])
+    turn = compose(q1, conjugate)
     # q and -q are the same rotation; the one with w >= 0 turns less.
     turn = turn if turn[0] >= 0 else -turn
     sine = np.linalg.norm(turn[1:])
@@ -166,7 +175,8 @@ def straight_line(
     s = minimum_jerk([0.0], [1.0], dt, duration=duration)
     half = s.position * angle / 2
     q = compose(np.concatenate([np.cos(half), np.sin(half) * axis], 1), q0)
-    position = np.concatenate([first[:3] + s.position * move[:3], q], 1)
+    place = first[:3] + s.position * move[:3]
+    position = np.concatenate([place, q], 1)
     return Trajectory(s.time, position, s.velocity * move, s.acceleration * move)
 
 
@@ -212,9 +222,12 @@ def sine(
     sin = np.sin(w * time)
     cos = np.cos(w * time)
     # Products of the growth and the wave, and their derivatives.
-    rows = (a * sin, rate * sin + w * a * cos, (change - w**2 * a) * sin + 2 * w * rate * cos)
+    wave = a * sin
+    wave_rate = rate * sin + w * a * cos
+    wave_acceleration = (change - w**2 * a) * sin + 2 * w * rate * cos
     # One wave for all joints, scaled by the amplitude of each.
-    shares = [row[(...,) + (None,) * move.ndim] for row in rows]
+    axes = (...,) + (None,) * move.ndim
+    shares = [row[axes] for row in (wave, wave_rate, wave_acceleration)]
     return Trajectory(
         time,
         low + shares[0] * move,
@@ -278,7 +291,15 @@ def trapezoidal(
         as_,
         np.where(left < ramp, -as_, 0.0),
     )
-    return _trajectory(time, x0, move, s, rate, acceleration, done=left <= _ROUNDING * total)
+    return _trajectory(
+        time,
+        x0,
+        move,
+        s,
+        rate,
+        acceleration,
+        done=left <= _ROUNDING * total,
+    )
 
 
 def _trajectory(

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import batchpid as bp
-from batchpid.arrays.choices import CHOICES
+from batchpid.arrays.array_types import CHOICES
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.law.params import LAW_FIELDS
 from batchpid.motors.actuators import ACTUATOR_FIELDS

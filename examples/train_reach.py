@@ -29,6 +29,8 @@ class Config(ppo.Config):
     robot: str = "panda"  # Bundled robot, or path of a URDF.
     episode: int = 150  # Steps of an episode, 50 a second.
     shaping: float = 10.0  # Weight of the potential that shapes the reward.
+    chunk: int | None = None  # Increments of an action, which a plan executes; None: no plan.
+    latency: tuple[float, float] = (0.0, 0.0)  # Range of the chunks' latency [s].
     picture: Path | None = None  # Learning curve to draw: .png or .svg.
     out: Path | None = None  # Policy to write: .npz.
     policy: Path | None = None  # Policy to evaluate in place of a training: .npz.
@@ -43,9 +45,19 @@ def make_envs(config):
         kp=900.0, kd=60.0, ki=0.0, gain_units="mass_matrix", measurement_rate="measured"
     )
     options = {"params": params, "workers": config.workers, "collisions": False}
-    task = {"robot": robot, "actions": "increment", "max_episode_steps": config.episode}
-    return gymnasium.make_vec(
+    steps = config.episode // (config.chunk or 1)
+    task = {"robot": robot, "actions": "increment", "max_episode_steps": steps}
+    if config.chunk is not None:
+        task |= {"chunk": config.chunk, "latency": config.latency}
+    envs = gymnasium.make_vec(
         "batchpid.sim.gym:batchpid/Reach-v0", config.num_envs, **task, **options
+    )
+    if config.chunk is None:
+        return envs
+    # The agent gives one increment, which each row of the chunk repeats.
+    single = gymnasium.spaces.Box(-1.0, 1.0, envs.single_action_space.shape[1:])
+    return gymnasium.wrappers.vector.TransformAction(
+        envs, lambda action: np.repeat(action[:, None], config.chunk, 1), None, single
     )
 
 
@@ -75,13 +87,15 @@ def shaping(envs, config):
 
 
 def evaluate(envs, act, config):
-    """Return success and error (envs,) at the end of one episode in each env, without
-    exploration.
+    """Return success and error (envs,) at the end of one episode in each env, and the mean reward
+    of its steps, without exploration.
     """
     raw, _ = envs.reset(seed=config.seed + 1_000_000)  # other goals than in the training
-    for _ in range(config.episode):
-        raw, *_, info = envs.step(act(raw))
-    return info["success"], info["error"]
+    rewards = []
+    for _ in range(config.episode // (config.chunk or 1)):
+        raw, reward, *_, info = envs.step(act(raw))
+        rewards.append(reward)
+    return info["success"], info["error"], np.mean(rewards)
 
 
 def draw(curve, config):
@@ -106,13 +120,13 @@ def main(config: Config):
         act, curve = ppo.train(envs, config, SCORES, features, shaping(envs, config))
     else:
         act, curve = ppo.Policy.load(config.policy, features), None
-    success, error = evaluate(envs, act, config)
+    success, error, reward = evaluate(envs, act, config)
     envs.close()
     print(
         f"without exploration {success.mean():.1%} of {len(success)} episodes end at the goal,",
         end=" ",
     )
-    print(f"the worst joint within {np.median(error):.4f} rad (median)")
+    print(f"the worst joint within {np.median(error):.4f} rad (median); mean reward {reward:.3f}")
     if config.out is not None:
         act.save(config.out)
     if config.picture is not None and curve is not None:

@@ -236,20 +236,6 @@ def _sentence(same: Sequence[Finding]) -> str:
     )
 
 
-class Notes(NamedTuple):
-    """Findings of a file that is read: ``repairs`` are what is simulated otherwise than the file
-    says, ``losses`` what is lost where MuJoCo does not simulate an MJCF file itself.
-    """
-
-    repairs: list[Finding]
-    losses: list[Finding]
-
-    def lose(self, text: str, joint: str | None = None, link: str | None = None) -> None:
-        """Add a loss."""
-        remedy = "use the engine 'mujoco', which simulates the file itself"
-        self.losses.append(Finding("engine", text, remedy, joint, link))
-
-
 class RepairWarning(UserWarning):
     """A robot's file was read with repairs."""
 

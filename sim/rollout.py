@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Document, Float64, Rows
-from batchpid.arrays.digest import digest
+from batchpid.arrays.trees import digest
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
@@ -163,7 +163,12 @@ class RunInfo:
 
         values = {name: getattr(robot, name) for name in _OF_ROBOT}
         values |= {"digest": content(robot), "dissipation": robot.source.dissipation}
-        return cls(robot=robot.name, description=robot, **values, **options)
+        return cls(
+            robot=robot.name,
+            description=robot,
+            **values,
+            **options,
+        )
 
     @property
     def command(self) -> CommandSpec:
@@ -223,7 +228,12 @@ class RunInfo:
         if draws is not None:
             draws = {name: rows(table) for name, table in draws.items()}
         tables = {name: rows(getattr(self, name)) for name in _OF_ENVS}
-        return replace(self, draws=draws, faults=tuple(faults), **tables)
+        return replace(
+            self,
+            draws=draws,
+            faults=tuple(faults),
+            **tables,
+        )
 
     def __repr__(self) -> str:
         if self.control:
@@ -320,7 +330,12 @@ class Rollout:
                     unknown[name] = None
             info = replace(info, **unknown)
         tick = self.tick * (ticks.step or 1)
-        part = self._mapped(itemgetter(ticks), time=time, tick=tick, info=info)
+        part = self._mapped(
+            itemgetter(ticks),
+            time=time,
+            tick=tick,
+            info=info,
+        )
         return replace(part, changes=changes)
 
     def _mapped(self, function: Callable[[Rows], Rows], **others: Any) -> Rollout:
@@ -332,7 +347,12 @@ class Rollout:
             others[name] = None if rows is None else function(rows)
         setpoint = function(self.setpoint)
         seen = self.observation.map(function)
-        return replace(self, setpoint=setpoint, observation=seen, **others)
+        return replace(
+            self,
+            setpoint=setpoint,
+            observation=seen,
+            **others,
+        )
 
     @staticmethod
     def join(parts: Sequence[Rollout]) -> Rollout:

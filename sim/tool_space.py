@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.records import frozen, summary
+from batchpid.arrays.trees import digest
 from batchpid.checks.validate import array, choice, flag, instance, names
 from batchpid.errors import InvalidArgumentError, warn
 from batchpid.motors.friction import LOOKAHEAD, compensation
@@ -166,7 +166,12 @@ class OperationalSpace:
     def version(self) -> str:
         """Digest of all that the law depends on, besides the robot."""
         return digest(
-            self.link, self.point, self._posture, self._params, self.tree, self.command.names
+            self.link,
+            self.point,
+            self._posture,
+            self._params,
+            self.tree,
+            self.command.names,
         )
 
     def __repr__(self) -> str:
@@ -228,7 +233,12 @@ class OperationalSpace:
         if self._columns.any():
             posture = xp.where(self._columns > 0, setpoint[:, self._columns], posture)
         dynamics = ts.task_dynamics(
-            self.tree, qpos, qvel, self.link, point=self.point, bias=passive
+            self.tree,
+            qpos,
+            qvel,
+            self.link,
+            point=self.point,
+            bias=passive,
         )
         parts = {name: setpoint[:, part] for name, part in self._parts.items()}
         feedforward = None
@@ -240,7 +250,12 @@ class OperationalSpace:
             dynamics = dynamics._replace(mass_matrix=mass_matrix)
         if self._friction is not None:
             friction = self._friction_to(
-                setpoint, parts.get("twist"), posture, qpos, dynamics, *self._friction
+                setpoint,
+                parts.get("twist"),
+                posture,
+                qpos,
+                dynamics,
+                *self._friction,
             )
             feedforward = friction if feedforward is None else feedforward + friction
         inputs = ts.OSCInputs(setpoint[:, :7], qpos, qvel, **parts, feedforward=feedforward)
@@ -312,7 +327,8 @@ class OperationalSpace:
         ahead = error if twist is None else error + LOOKAHEAD * twist
         rows = namespace(j).swapaxes(j, -1, -2)
         eye = 1e-4 * namespace(j).eye(6)
-        motion = gram(j, solve(gram(rows, rows) + eye.astype(j.dtype), ahead[..., None]))[..., 0]
+        damped = gram(rows, rows) + eye.astype(j.dtype)
+        motion = gram(j, solve(damped, ahead[..., None]))[..., 0]
         chain = dynamics.chain
         return compensation(
             coulomb,

@@ -89,6 +89,35 @@ def test_what_a_program_prints_it_also_states():
             assert claims, f"{page.name}: {match['code'][-200:]}"
 
 
+SOURCES = [
+    *("batchpid/**/*.[phc]*", "sim/**/*.[phc]*", "bench/*.py", "examples/*.py", "tests/**/*.py"),
+    *("assets/*", "Makefile", "pyproject.toml", "setup.py", ".ci/*"),
+]
+FOREIGN = """
+ActuatorCfg DCMotorCfg PDJointPosControllerConfig max_effort mj_initCtrlHistory mjDSBL_CONSTRAINT
+first_robot zero_qpos pid_qf get_joints viewer sim_freq control_freq pd_joint_pos pd_joint_delta_pos
+_load_scene balance_passive_force proportional_on_measurement error_map set_auto_mode last_output
+gym_env_vectorize_mode impratio noslip_iterations auth verifies ulimit jax_numpy_rank_promotion
+batchpid_reset BATCHPID_SOAK_
+"""
+"""Names of other programs, and parts of names."""
+
+
+def test_names_in_the_text_are_those_of_the_code():
+    """What is gone is named nowhere."""
+    known = {*FOREIGN.split()}
+    for path in (path for pattern in SOURCES for path in ROOT.glob(pattern) if path.is_file()):
+        known |= {path.stem, *re.findall(r"[A-Za-z_]\w+", path.read_text(errors="ignore"))}
+    for page in {*TEXTS} - {ROOT / "CHANGELOG.md"}:
+        text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+        named = {
+            word
+            for span in re.findall(r"`([^`\n]+)`", text)
+            for word in re.findall(r"[A-Za-z_]\w{3,}", span)
+        }
+        assert named - known == set(), page
+
+
 @pytest.mark.parametrize("page", TEXTS, ids=name)
 def test_every_link_has_a_target(page):
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)

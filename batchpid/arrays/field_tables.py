@@ -74,7 +74,13 @@ class Field(NamedTuple):
         if not is_traced(values):
             infinite = infinite or math.isinf(self.neutral)
             at_least(
-                name, values, self.low, joint_names, above=self.above, infinite=infinite, kind=kind
+                name,
+                values,
+                self.low,
+                joint_names,
+                above=self.above,
+                infinite=infinite,
+                kind=kind,
             )
             remedy = f"use a number from {self.low:g} to {self.high:g} ({self.unit})"
             entries(

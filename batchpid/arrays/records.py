@@ -3,7 +3,7 @@ representations.
 
 A record inherits from a ``NamedTuple``: ``class Guard(Record, GuardFields)``. So it is a pytree
 that JAX knows without registration. A leaf is an array (1 | envs, joints), None (off), or a choice
-without a number (:mod:`batchpid.arrays.choices`). Unit, bounds and neutral value of a field stand
+without a number (:mod:`batchpid.arrays.array_types`). Unit, bounds and neutral value of a field stand
 in its annotation, a :class:`batchpid.arrays.field_tables.Field`; checks, files, randomizations and
 the tables of the guides come from there.
 

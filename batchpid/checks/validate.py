@@ -272,7 +272,13 @@ def array(
     is_sound = flat.size < 10_000 and math.isfinite(flat.dot(flat))
     if finite and not is_sound and not (good := np.isfinite(result)).all():
         entries(
-            argument, result, good, "is not finite", names, kind=kind, remedy="pass finite numbers"
+            argument,
+            result,
+            good,
+            "is not finite",
+            names,
+            kind=kind,
+            remedy="pass finite numbers",
         )
     return result
 
@@ -328,7 +334,14 @@ def at_least(
         low
     )
     problem = f"must be {' and '.join(bounds) or 'a number'}"
-    entries(argument, values, good, problem, joint_names, kind=kind)
+    entries(
+        argument,
+        values,
+        good,
+        problem,
+        joint_names,
+        kind=kind,
+    )
     return values
 
 

@@ -16,8 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Document
-from batchpid.arrays.choices import MeasuredRate
+from batchpid.arrays.array_types import Array, Document, MeasuredRate
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.trees import is_leaf, leaves, parts, structure
 from batchpid.checks.validate import choice, instance, names, time_step
@@ -86,7 +85,18 @@ def to_c(
         Params for several envs, options that exclude each other, names that C does not allow, or a
         tree with other joints.
     """
-    return Exported(Header(params, dt, joint_names, guard, inputs, prefix, tree, plan).text())
+    return Exported(
+        Header(
+            params,
+            dt,
+            joint_names,
+            guard,
+            inputs,
+            prefix,
+            tree,
+            plan,
+        ).text()
+    )
 
 
 class Header:

@@ -1,11 +1,7 @@
-/* Rigid-body functions of a robot: mass matrix, bias and gravity. A header of batchpid.to_c has them with the prefix and
- * the type of its numbers, and the tables of its robot in place of the comments in brackets.
- *
- * The efforts of velocities and accelerations are computed by the recursive Newton-Euler algorithm, in the axes of the
- * world and about its origin, so that sums over bodies need no shift from one to the next (R. Featherstone, Rigid Body
- * Dynamics Algorithms, Springer, 2008, section 5.3). Without acceleration they are the bias. For a unit acceleration of
- * one joint, at rest and without gravity, they are a row of the mass matrix (section 6.1).
- */
+/* Rigid-body functions of a robot. A header of batchpid.to_c has them with the prefix and the type of its numbers, and
+ * tables in place of the comments in brackets. Efforts come from the recursive Newton-Euler algorithm about the world's
+ * origin (R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section 5.3), those of a unit acceleration at
+ * rest are a row of the mass matrix (section 6.1). */
 
 /* Bodies at a pose, in the axes of the world. */
 typedef struct {

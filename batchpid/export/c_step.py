@@ -150,7 +150,12 @@ def statements(
     inputs, for joint ``j``. The results are written to ``places``.
     """
     operations, ends = _unrolled(traced, constants, len(names) - constants)
-    symbols = {"p": c.prefix, "f": c.suffix, "one": c.number(1.0), "zero": c.number(0.0)}
+    symbols = {
+        "p": c.prefix,
+        "f": c.suffix,
+        "one": c.number(1.0),
+        "zero": c.number(0.0),
+    }
     arrays = ", ".join(f"t{out}[{c.size}]" for _, out, _ in operations)
     lines = [f"  {c.type} {arrays};\n"] if arrays else []
 

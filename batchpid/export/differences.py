@@ -189,7 +189,15 @@ def export_law(
                 scaled[name] = (leaf * inertia).astype(explicit.dtype)
         explicit = explicit._replace(**scaled)
     guard = Guard() if guard is None else guard
-    return Law(joints, dt, explicit, motors, guard, tuple(conversions), is_law)
+    return Law(
+        joints,
+        dt,
+        explicit,
+        motors,
+        guard,
+        tuple(conversions),
+        is_law,
+    )
 
 
 def differences(

@@ -112,7 +112,11 @@ def _gains(law: Law, at: int) -> Document:
         problem = "must be below effort_max for control_toolbox"
         value = gains["u_clamp_min"]
         raise InvalidArgumentError(
-            "effort_min", problem, joint=law.joints[at], value=value, remedy="widen the limits"
+            "effort_min",
+            problem,
+            joint=law.joints[at],
+            value=value,
+            remedy="widen the limits",
         )
     # control_toolbox refuses limits that exclude 0.
     gains["i_clamp_min"] = min(gains["i_clamp_min"], 0.0)

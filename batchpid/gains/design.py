@@ -25,8 +25,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Float64
-from batchpid.arrays.choices import CHOICES
+from batchpid.arrays.array_types import CHOICES, Float64
 from batchpid.checks.validate import at_least, broadcast, choice, number, positive, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.gains.stability import stability_bound
@@ -192,7 +191,14 @@ def design_gains(
             inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping
         )
         if is_explicit:
-            filter_time = _filter_time(mass, gains, dt, viscous, gain_units, margin)
+            filter_time = _filter_time(
+                mass,
+                gains,
+                dt,
+                viscous,
+                gain_units,
+                margin,
+            )
         else:
             filter_time = 0.0
         if (
@@ -233,7 +239,12 @@ def _filter_time(
 
     def ratios(filter_time: float) -> Float64:
         return stability_bound(
-            mass, gains["kp"], gains["kd"], dt, filter_time=filter_time, damping=damping
+            mass,
+            gains["kp"],
+            gains["kd"],
+            dt,
+            filter_time=filter_time,
+            damping=damping,
         ).ratio
 
     low = FILTER_STEPS * dt

@@ -125,7 +125,8 @@ def stability_bound(
         return _late_bound(m, unit, [p, c, tau, b, late, slow], dt)
     passed = dt / (dt + 2 * tau)
     weight = np.sqrt(passed * dt * c + 0.5 * dt**2 * p)
-    inverse = np.linalg.inv(m + 0.5 * dt * b[..., None] * np.eye(m.shape[-1]))
+    implicit = 0.5 * dt * b[..., None] * np.eye(m.shape[-1])
+    inverse = np.linalg.inv(m + implicit)
     values, vectors = np.linalg.eigh(weight[..., :, None] * inverse * weight[..., None, :])
     return StabilityBound(ratio=0.5 * values[..., -1], participation=vectors[..., -1] ** 2)
 
@@ -146,9 +147,11 @@ def _late_bound(
         # With later efforts z would round to 1 at the lowest frequency.
         local[-2:] = [np.minimum(late, _LATEST_STEPS * dt) for late in local[-2:]]
         # Frequencies are spaced by ratio where loci bend, and evenly up to the highest.
-        slowest = _SLOWEST / (1 + float(np.max(local[-2] + local[-1])) / dt)
+        latest = float(np.max(local[-2] + local[-1]))
+        slowest = _SLOWEST / (1 + latest / dt)
         slow = np.geomspace(slowest, np.pi / 4, _FREQUENCIES)
-        z = np.exp(1j * np.append(slow, np.linspace(np.pi / 4, np.pi, _FREQUENCIES)[1:]))
+        fast = np.linspace(np.pi / 4, np.pi, _FREQUENCIES)[1:]
+        z = np.exp(1j * np.append(slow, fast))
         loop = _loop(z, m[at], unit[at], local, dt)
         ratio[at], row = _crossing(z, np.linalg.eigvals(loop))
         # Kinetic energy of the mode that passes -180 degrees at the ratio.
@@ -177,9 +180,13 @@ def _loop(
     whole = np.floor(delay / dt)
     part = delay / dt - whole
     intake = -np.expm1(-dt / np.maximum(lag, 1e-3 * dt))
-    late = entry**-whole * (1 - part + part / entry) * intake / (1 - (1 - intake) / entry)
-    plant = (z - 1)[:, None, None] * m + dt * z[:, None, None] * (b * np.eye(len(b)))
-    moved: Rows = np.linalg.solve(plant, late[..., None] * unit * law[:, None, :])
+    # Efforts are late by whole steps, by a part of one, and by the lag.
+    delayed = entry**-whole * (1 - part + part / entry)
+    late = delayed * intake / (1 - (1 - intake) / entry)
+    implicit = b * np.eye(len(b))
+    plant = (z - 1)[:, None, None] * m + dt * z[:, None, None] * implicit
+    effort = late[..., None] * unit * law[:, None, :]
+    moved: Rows = np.linalg.solve(plant, effort)
     response: Rows = moved * (dt**2 * z / (z - 1))[:, None, None]
     return response
 
@@ -196,13 +203,15 @@ def _crossing(z: Rows, values: Rows) -> tuple[float, int]:
     # Each eigenvalue goes on from the nearest one at the frequency before, apart from the fall of
     # all with frequency.
     local = values * np.abs(z - 1)[:, None] ** 2
-    nearest = np.abs(local[1:, :, None] - local[:-1, None, :]).argmin(2)
+    distance = np.abs(local[1:, :, None] - local[:-1, None, :])
+    nearest = distance.argmin(2)
     now = np.take_along_axis(values[:-1], nearest, 1)
     then = values[1:]
     first = values[0]
     if ((first.real < 0) & (first.imag > 0)).any():
         return np.inf, 0
-    falls = (now.real < 0) & (then.real < 0) & (now.imag < 0) & (then.imag >= 0)
+    is_negative = (now.real < 0) & (then.real < 0)
+    falls = is_negative & (now.imag < 0) & (then.imag >= 0)
     # Between two frequencies the loci are straight.
     share = now.imag / np.where(falls, now.imag - then.imag, 1.0)
     crossed = np.where(

@@ -22,8 +22,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from batchpid.arrays.array_types import Document, Rows
-from batchpid.arrays.choices import CHOICES
+from batchpid.arrays.array_types import CHOICES, Document, Rows
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.records import Record
 from batchpid.checks.validate import choice, file_path, instance, names
@@ -297,7 +296,12 @@ def render(document: Document, format: str) -> str:
         return json.dumps(standard, indent=2) + "\n"
     import yaml
 
-    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
+    return yaml.safe_dump(
+        document,
+        sort_keys=False,
+        default_flow_style=None,
+        width=10_000,
+    )
 
 
 def is_number(entry: object) -> bool:

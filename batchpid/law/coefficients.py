@@ -49,8 +49,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from batchpid.arrays.array_types import Array
-from batchpid.arrays.choices import NamedChoice
+from batchpid.arrays.array_types import Array, NamedChoice
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
 from batchpid.arrays.records import array_summary
 from batchpid.checks.validate import instance
@@ -176,7 +175,14 @@ def implicit_gains(params: PIDParams, dt: Array) -> tuple[Array, ...]:
     kd = params.kd
     b = params.setpoint_weight
     c = params.setpoint_weight_derivative
-    xp = namespace(kp, ki, kd, b, c, dt)
+    xp = namespace(
+        kp,
+        ki,
+        kd,
+        b,
+        c,
+        dt,
+    )
     ki_dt = 0.0 if ki is None else ki * dt
     # The symbols of the equations above: numerators first, then 1 / D.
     stiffness = kp + 2 * ki_dt
@@ -210,5 +216,10 @@ def as_explicit(params: PIDParams, dt: Array) -> PIDParams:
         return params
     kp, ki, kd, b, _, c, _ = implicit_gains(params, dt)
     return params._replace(
-        kp=kp, ki=ki, kd=kd, setpoint_weight=b, setpoint_weight_derivative=c, discretization=None
+        kp=kp,
+        ki=ki,
+        kd=kd,
+        setpoint_weight=b,
+        setpoint_weight_derivative=c,
+        discretization=None,
     )

@@ -34,8 +34,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from batchpid.arrays.array_types import Array, ArrayModule
-from batchpid.arrays.choices import Everywhere, PerMassMatrix
+from batchpid.arrays.array_types import Array, ArrayModule, Everywhere, PerMassMatrix
 from batchpid.arrays.elementwise import clip, in_dtype_of, matrix_vector, namespace, row_minimum
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import Coefficients
@@ -71,13 +70,27 @@ def advance_with_mass_matrix(
     )
     rates = measurement_rate, setpoint_rate, given_acceleration(k, setpoint_acceleration)
     new, terms = advance(_unlimited(k), state, setpoint, measurement, *rates)
-    new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
+    new, effort, unsaturated = _to_effort(
+        k,
+        state,
+        new,
+        terms.effort,
+        mass_matrix,
+        feedforward,
+    )
     p, i, d, arguments = (
         x if isinstance(x, float) else matrix_vector(mass_matrix, x) for x in terms[:4]
     )
     if feedforward is not None:
         arguments = arguments + feedforward
-    return new, Terms(p, i, d, arguments, unsaturated, effort)
+    return new, Terms(
+        p,
+        i,
+        d,
+        arguments,
+        unsaturated,
+        effort,
+    )
 
 
 def given_acceleration(k: Coefficients, setpoint_acceleration: Array) -> Array:
@@ -136,7 +149,12 @@ def convert_integral(
 
 
 def _unlimited(k: Coefficients) -> Coefficients:
-    return k._replace(effort_min=None, effort_max=None, effort_step=None, gain_units=None)
+    return k._replace(
+        effort_min=None,
+        effort_max=None,
+        effort_step=None,
+        gain_units=None,
+    )
 
 
 def _to_effort(

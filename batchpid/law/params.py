@@ -2,7 +2,7 @@
 
 An option that is off is ``None``, which is not a leaf: NumPy skips it and ``jax.jit`` compiles a
 law without it. Choices without a number, such as the unit of the gains, are tuples without fields
-(:mod:`batchpid.arrays.choices`): part of the tree's structure, and so static under every JAX
+(:mod:`batchpid.arrays.array_types`): part of the tree's structure, and so static under every JAX
 transform.
 """
 
@@ -14,8 +14,17 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Bool, Document, DType, Rows
-from batchpid.arrays.choices import CHOICES, Everywhere, NamedChoice, PerMassMatrix
+from batchpid.arrays.array_types import (
+    CHOICES,
+    Array,
+    Bool,
+    Document,
+    DType,
+    Everywhere,
+    NamedChoice,
+    PerMassMatrix,
+    Rows,
+)
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.records import Ends, LeafBuilder, Record, is_everywhere, with_fields
@@ -303,7 +312,14 @@ def _masks(build: LeafBuilder, names: str | Sequence[object]) -> list[Bool | Non
     array = build.rows("anti_windup", array)
     good = np.array([isinstance(name, str) and name in ANTI_WINDUP for name in array.flat], bool)
     good = good.reshape(array.shape)
-    entries("anti_windup", array, good, "unknown option", build.names, remedy=remedy)
+    entries(
+        "anti_windup",
+        array,
+        good,
+        "unknown option",
+        build.names,
+        remedy=remedy,
+    )
     # "none" needs no mask: it is where the others are not.
     joints = [array == strategy for strategy in ANTI_WINDUP[1:]]
     return [mask if mask.any() else None for mask in joints]

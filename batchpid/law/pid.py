@@ -29,8 +29,7 @@ b) / ki.
 
 from __future__ import annotations
 
-from batchpid.arrays.array_types import Array, ArrayModule
-from batchpid.arrays.choices import Everywhere, HoldEffort
+from batchpid.arrays.array_types import Array, ArrayModule, Everywhere, HoldEffort
 from batchpid.arrays.elementwise import (
     clip,
     flush,
@@ -125,7 +124,14 @@ def step(
         "setpoint_rate": setpoint_rate,
         "feedforward": feedforward,
     }
-    state, terms = _step(params, state, setpoint, measurement, dt, **inputs)
+    state, terms = _step(
+        params,
+        state,
+        setpoint,
+        measurement,
+        dt,
+        **inputs,
+    )
     return state, terms.effort
 
 
@@ -140,7 +146,14 @@ def step_terms(
     """Advance the law as :func:`step`, with the same arguments; return the state and all terms,
     effort included.
     """
-    state, terms = _step(params, state, setpoint, measurement, dt, **inputs)
+    state, terms = _step(
+        params,
+        state,
+        setpoint,
+        measurement,
+        dt,
+        **inputs,
+    )
     return state, terms.filled()
 
 
@@ -191,9 +204,22 @@ def advance(
     measured rate that is not given. Gains per mass matrix: :mod:`batchpid.law.computed_torque`.
     """
     check_alone(k, measurement_rate)
-    xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
+    xp = namespace(
+        *k,
+        *state,
+        setpoint,
+        measurement,
+        measurement_rate,
+        setpoint_rate,
+        feedforward,
+    )
     r, y, r_rate, y_rate, ff = in_dtype_of(
-        k, setpoint, measurement, setpoint_rate, measurement_rate, feedforward
+        k,
+        setpoint,
+        measurement,
+        setpoint_rate,
+        measurement_rate,
+        feedforward,
     )
     finite = None
     if k.non_finite is not None:
@@ -283,7 +309,15 @@ def advance(
             finite, effort, state.effort if isinstance(k.non_finite, HoldEffort) else 0
         )
         u = xp.where(finite, u, effort)  # no limit has changed that
-    return new, Terms(p, i, d, 0.0 if ff is None else ff, u, effort, finite=finite)
+    return new, Terms(
+        p,
+        i,
+        d,
+        0.0 if ff is None else ff,
+        u,
+        effort,
+        finite=finite,
+    )
 
 
 def reset(

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array
-from batchpid.arrays.choices import HoldEffort
+from batchpid.arrays.array_types import Array, HoldEffort
 from batchpid.arrays.elementwise import in_dtype_of, namespace
 from batchpid.arrays.records import Record, array_summary
 from batchpid.checks.validate import instance, read_array, time_step

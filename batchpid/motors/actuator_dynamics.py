@@ -11,7 +11,7 @@ velocity v, and the effort u that the controller asks for::
     y      = r rint((y + o + sigma z) / r)                 offset, noise, resolution; of v_y likewise
 
     m      = s u(t - d_c) + b                              command delay, strength, bias
-    e      = min(max(m, low(v)), high(v))                  envelope: batchpid.motors.envelope
+    e      = min(max(m, low(v)), high(v))                  envelope: batchpid.motors.actuators
     e      = e' + (1 - exp(-dt / T)) (e - e')              lag, again within the envelope; exact for a constant e
 
 A command u is delivered unclipped, where nothing is late, if (low - b) / s <= u <= (high - b) / s:
@@ -51,8 +51,14 @@ from batchpid.arrays.trees import mapped
 from batchpid.checks.validate import check_time_step
 from batchpid.motors import delay
 from batchpid.motors import sensor_noise as noise
-from batchpid.motors.actuators import Actuators, ActuatorState
-from batchpid.motors.envelope import Envelope, command_envelope, envelope, limits
+from batchpid.motors.actuators import (
+    Actuators,
+    ActuatorState,
+    Envelope,
+    command_envelope,
+    envelope,
+    limits,
+)
 
 _ONE = np.uint32(1)
 
@@ -143,7 +149,15 @@ def init(
         episodes = xp.broadcast_to(xp.asarray(episode), leading)
         key = noise.keys(actuators.seed, numbers, episodes, xp)
         step = xp.zeros(leading, xp.uint32)
-    state = ActuatorState(command, None, positions, velocities, encoder, key, step)
+    state = ActuatorState(
+        command,
+        None,
+        positions,
+        velocities,
+        encoder,
+        key,
+        step,
+    )
     if actuators.lag is None:
         return state
     k = discretise(actuators, state, dt)
@@ -362,7 +376,19 @@ def advance_measurement(
             drawn = measurement_noise(k, key, step, qpos, xp)
         step = step + _ONE
     qpos, qvel = _encode(k, qpos, qvel, *(drawn or (None, None)))
-    return ActuatorState(command, effort, positions, velocities, encoder, key, step), qpos, qvel
+    return (
+        ActuatorState(
+            command,
+            effort,
+            positions,
+            velocities,
+            encoder,
+            key,
+            step,
+        ),
+        qpos,
+        qvel,
+    )
 
 
 def measurement_noise(

@@ -120,7 +120,15 @@ def init(
     if friction.coulomb is None:
         return FrictionState()
     return with_sliding(
-        friction, refresh(friction, started(velocity, load), mass_matrix, dt, damping, stiffness)
+        friction,
+        refresh(
+            friction,
+            started(velocity, load),
+            mass_matrix,
+            dt,
+            damping,
+            stiffness,
+        ),
     )
 
 

@@ -188,7 +188,14 @@ class TreeProgram:
         self._change = trace_change(function, histories, *trees, dtype=np.dtype(dtype))
         count = len(leaves((state, inputs)))
         trace = self._change.program
-        self.program = ArrayProgram(trace, leaves(constants), count, shape, dtype, threads)
+        self.program = ArrayProgram(
+            trace,
+            leaves(constants),
+            count,
+            shape,
+            dtype,
+            threads,
+        )
 
     def bind(self, state: Pytree, inputs: Pytree, last: Rows | None = None) -> Bound:
         """Return arrays for the program: it changes those of the state in place, and makes its

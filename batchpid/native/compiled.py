@@ -76,7 +76,13 @@ class CompiledLaw:
         key = tuple([leaf is None for leaf in (*state, *inputs)])
         if key not in self._programs:
             self._programs[key] = TreeProgram(
-                self._law, self._k, state, inputs, self._shape, self._k.kp.dtype, self._threads
+                self._law,
+                self._k,
+                state,
+                inputs,
+                self._shape,
+                self._k.kp.dtype,
+                self._threads,
             )
         tree = self._programs[key]
         bound = tree.bind(state, inputs, out)
@@ -86,9 +92,9 @@ class CompiledLaw:
         if self._terms:
             terms, effort = result
             return state, effort, terms._replace(effort=effort), None
-        given = sum((entry is not None) << at for at, entry in enumerate(inputs))
+        inputs_mask = sum((entry is not None) << at for at, entry in enumerate(inputs))
         written = bound.outputs[:-1]
-        fast = tree.program.bind(leaves(state), written, given, 1 << _MEASUREMENT)
+        fast = tree.program.bind(leaves(state), written, inputs_mask, 1 << _MEASUREMENT)
         return state, result, None, fast
 
     def _whole(self, leaf: Rows) -> Rows:

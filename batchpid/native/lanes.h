@@ -9,14 +9,21 @@
 
 namespace batchpid {
 
-// Compile a function twice, for processors with AVX2 and without; the results are the same, since no operation is fused.
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define FOR_EACH_PROCESSOR __attribute__((target_clones("default", "avx2"), flatten))
-#else
-#define FOR_EACH_PROCESSOR
+#ifndef BATCHPID_WIDTH  // defined before this file is included
+#define BATCHPID_WIDTH 4
 #endif
+constexpr int WIDTH = BATCHPID_WIDTH;
 
-constexpr int WIDTH = 4;
+// Compile a function for processors with AVX-512, where vectors are as wide, with AVX2, and without; the results are the
+// same, since no operation is fused.
+#if defined(FOR_EACH_PROCESSOR)  // a test compiles for one of them
+#elif !defined(__x86_64__) || !defined(__GLIBC__) || !defined(__GNUC__) || defined(__clang__)
+#define FOR_EACH_PROCESSOR
+#elif BATCHPID_WIDTH > 4
+#define FOR_EACH_PROCESSOR __attribute__((target_clones("default", "avx2", "avx512f"), flatten))
+#else
+#define FOR_EACH_PROCESSOR __attribute__((target_clones("default", "avx2"), flatten))
+#endif
 
 // Numbers of WIDTH robots. Each is rounded as a double is, so that results do not depend on a robot's company.
 struct alignas(WIDTH * sizeof(double)) Lanes {  // GCC aligns its vectors otherwise with AVX2 than without
@@ -42,8 +49,16 @@ struct alignas(WIDTH * sizeof(double)) Lanes {  // GCC aligns its vectors otherw
   friend Lanes at_least(Lanes a, Lanes low) { return a.of < low.of ? low.of : a.of; }
   friend Lanes at_most(Lanes a, Lanes high) { return a.of > high.of ? high.of : a.of; }
   friend Lanes where_positive(Lanes mask, Lanes a, Lanes b) { return mask.of > 0.0 ? a.of : b.of; }
-  friend double largest(Lanes a) { return std::max(std::max(a.of[0], a.of[1]), std::max(a.of[2], a.of[3])); }
-  friend bool any_positive(Lanes a) { return (a.of[0] > 0) | (a.of[1] > 0) | (a.of[2] > 0) | (a.of[3] > 0); }
+  friend double largest(Lanes a) {
+    double most = a.of[0];
+    for (int k = 1; k < WIDTH; ++k) most = std::max(most, a.of[k]);
+    return most;
+  }
+  friend bool any_positive(Lanes a) {
+    bool any = false;
+    for (int k = 0; k < WIDTH; ++k) any |= a.of[k] > 0;
+    return any;
+  }
   // 1.0 where a >= b, else 0.0, also for nan.
   friend Lanes at_least_mask(Lanes a, Lanes b) { return a.of >= b.of ? Packed{} + 1.0 : Packed{}; }
   // 1.0 where a < b, else 0.0, also for nan.

@@ -1,5 +1,5 @@
 // Bounded inverses of the mobilities of tools, symmetric matrices of AXES rows. The equations stand in
-// batchpid/task_space: symmetric.py and projections.py.
+// batchpid/task_space: symmetric.py and operational_space.py.
 
 #pragma once
 
@@ -8,7 +8,7 @@
 namespace batchpid {
 
 constexpr int SWEEPS = 12;
-constexpr double SPRING_BOUND = 0.2;  // as in projections.py
+constexpr double SPRING_BOUND = 0.2;  // as in operational_space.py
 constexpr double CLEAR = 1e-17;  // least entry off the diagonal that is turned away, as a share of the trace: below
                                  // the rounding of the matrix itself
 constexpr int PAIRS = AXES / 2;

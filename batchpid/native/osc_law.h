@@ -1,5 +1,5 @@
 // Law of operational-space control for WIDTH robots, and its compensation of friction. The equations stand in
-// batchpid/task_space: operational_space.py and projections.py; and in sim/tool_space.py.
+// batchpid/task_space: operational_space.py; and in sim/tool_space.py.
 
 #pragma once
 

@@ -1,5 +1,5 @@
 // Rigid-body dynamics of a tree on a fixed base: mass matrix by the composite-rigid-body algorithm, passive forces by
-// the recursive Newton-Euler algorithm. The equations stand in batchpid/task_space/tree_dynamics.py.
+// the recursive Newton-Euler algorithm. The equations stand in batchpid/task_space/tree_quantities.py.
 //
 // A number N is a double, or a vector of them: one for each of several robots.
 

@@ -1,5 +1,5 @@
 // A kinematic tree with a tool, a frame on one of its bodies: its pose, and the dynamics at it. The equations stand in
-// batchpid/task_space: tree_kinematics.py, tree_dynamics.py and frames.py.
+// batchpid/task_space: tree_kinematics.py, tree_quantities.py and frames.py.
 
 #pragma once
 

@@ -16,7 +16,12 @@ from batchpid.arrays.array_types import Array, DType, Pytree
 from batchpid.arrays.trees import filled, leaves, structure
 from batchpid.native.extensions import MASKS, MOST_OPERANDS, OPERATIONS, ROW_WISE
 
-_OTHER_NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
+_OTHER_NAMES = {
+    "abs": "absolute",
+    "logical_and": "and",
+    "logical_or": "or",
+    "logical_not": "not",
+}
 """Operations that have another name in NumPy."""
 
 
@@ -271,7 +276,7 @@ def trace_change(
     def changed(constants: Any, state: Any, inputs: Any) -> list[Any]:
         numbers = {symbol: number for number, symbol in enumerate(leaves((state, inputs)))}
         after = function(constants, state, inputs)
-        own = set(map(id, leaves(after[1])))
+        result_ids = set(map(id, leaves(after[1])))
         results, places = list[Any](), list[int]()
         for at, leaf in enumerate(leaves(after)):
             is_state = at < len(histories)
@@ -279,7 +284,7 @@ def trace_change(
             if is_state and (number == at or histories[at]):
                 places.append(at)
             # A result that is an input is copied, since the next call changes the input.
-            elif number is not None and not is_state and id(leaf) not in own:
+            elif number is not None and not is_state and id(leaf) not in result_ids:
                 places.append(number)
             else:
                 places.append(count + len(results))
@@ -373,7 +378,15 @@ def _assembled(
     masks = tuple(result.is_mask for result in results)
     segments = tuple(_segments(operations, places, results))
     ends = _packed(places[result] for result in results)
-    return Trace(_packed(rows), ends, segments, masks, registers, literals, prelude)
+    return Trace(
+        _packed(rows),
+        ends,
+        segments,
+        masks,
+        registers,
+        literals,
+        prelude,
+    )
 
 
 def _segments(

@@ -22,7 +22,6 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document, DType
-from batchpid.arrays.choices import NamedChoice
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.records import LeafBuilder, Record, with_fields
 from batchpid.checks.validate import choice, integer, positive
@@ -32,42 +31,54 @@ from batchpid.motors.guard import GUARD_FIELDS
 
 LONGEST_HORIZON = 1000
 """Most rows of a chunk."""
-SPARE_ROWS = 3
-"""Knots besides the rows of a chunk: the point where it was joined, and two at rest behind it."""
-
-
-class Linear(NamedChoice):
-    """Straight lines between the knots."""
-
-
-class Held(NamedChoice):
-    """Each knot is held until the next one."""
-
-
-INTERPOLATIONS = {"cubic": None, "linear": Linear(), "hold": Held()}
-BLENDS = {"align": "fade", "newest": "", "ensemble": "weight", "average": "share"}
+SPARE_ROWS = 2
+"""Knots behind the rows of a chunk, at rest."""
+INTERPOLATIONS = {"cubic": 3.0, "linear": 1.0, "hold": 0.0}
+"""Interpolations, with the degree of the curve between two rows."""
+BLENDS = {
+    "align": "fade",
+    "newest": "",
+    "ensemble": "weight",
+    "average": "share",
+}
 """Blends, with the option that each of them has."""
 
 
 class _PlanFields(NamedTuple):
     period: Array
     """P [s]."""
-    last: Array
-    """Number of the last knot that has a next one, horizon + 1."""
+    rows: Array
+    """Number of the last knot of the tables, horizon + 1."""
+    degree: Array
+    """Degree of the curve between two rows."""
     blended: Array
     """1.0 on the joints whose chunks are blended, 0.0 on those that take the newest value."""
     fade: Annotated[Array, Field("s", above=True, default=1.0)] = None
-    weight: Annotated[Array, Field("1", low=-9.0, high=9.0, default=0.01)] = None
+    weight: Annotated[
+        Array,
+        Field(
+            "1",
+            low=-9.0,
+            high=9.0,
+            default=0.01,
+        ),
+    ] = None
     forgotten: Array = None
     """1 - exp(-m) of an ensemble."""
-    share: Annotated[Array, Field("1", above=True, high=0.999, default=0.7)] = None
+    share: Annotated[
+        Array,
+        Field(
+            "1",
+            above=True,
+            high=0.999,
+            default=0.7,
+        ),
+    ] = None
     taper: Annotated[Array, Field("s")] = None
     rate: Annotated[Array, GUARD_FIELDS["rate"]] = None
     """V [rad/s or m/s]."""
     acceleration: Annotated[Array, GUARD_FIELDS["acceleration"]] = None
     """A [rad/s^2 or m/s^2]."""
-    interpolation: NamedChoice | None = None
-    """Linear() or Held(); off: cubic."""
 
 
 PLAN_FIELDS = declared(_PlanFields, Field)
@@ -86,7 +97,12 @@ class Plan(Record, _PlanFields):
     @property
     def horizon(self) -> int:
         """Most rows of a chunk."""
-        return int(self.last[0, 0]) + 2 - SPARE_ROWS
+        return int(self.rows[0, 0]) + 1 - SPARE_ROWS
+
+    @property
+    def is_mean(self) -> bool:
+        """Whether chunks are averaged, with weights."""
+        return self.forgotten is not None or self.share is not None
 
     def options(self) -> Document:
         """Return the options that are on, as arguments of :func:`make_plan` that build this plan
@@ -94,12 +110,12 @@ class Plan(Record, _PlanFields):
         """
         leaves = self.leaves()
         blends = [blend for blend, option in BLENDS.items() if option in leaves]
-        kind = type(self.interpolation)
+        degrees = {degree: name for name, degree in INTERPOLATIONS.items()}
         return {
             "period": float(self.period[0, 0]),
             "horizon": self.horizon,
             "blend": blends[0] if blends else "newest",
-            "interpolation": next(n for n, one in INTERPOLATIONS.items() if type(one) is kind),
+            "interpolation": degrees[float(self.degree[0, 0])],
             "latest": np.flatnonzero(self.blended[0] == 0).tolist(),
             "dtype": np.dtype(self.dtype),
             **{name: leaf for name, leaf in leaves.items() if name in PLAN_FIELDS},
@@ -184,15 +200,14 @@ def make_plan(
         leaves["forgotten"] = 1.0 - np.exp(-leaves["weight"])
     horizon = integer("horizon", horizon, 1, LONGEST_HORIZON)
     newest = [integer("latest", joint, 0, build.joints - 1) for joint in latest]
+    degree = INTERPOLATIONS[choice("interpolation", interpolation, INTERPOLATIONS)]
     leaves |= {
         "period": build.rows("period", np.array(positive("period", period, "s"))),
-        "last": build.rows("horizon", np.array(horizon + SPARE_ROWS - 2.0)),
+        "rows": build.rows("horizon", np.array(horizon + SPARE_ROWS - 1.0)),
+        "degree": build.rows("interpolation", np.array(degree)),
         "blended": 1.0 - np.isin(np.arange(build.joints), newest)[None],
     }
-    return Plan(
-        interpolation=INTERPOLATIONS[choice("interpolation", interpolation, INTERPOLATIONS)],
-        **{name: build.freeze(leaf) for name, leaf in leaves.items()},
-    )
+    return Plan(**{name: build.freeze(leaf) for name, leaf in leaves.items()})
 
 
 PLANS = RecordFile(

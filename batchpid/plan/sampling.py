@@ -21,11 +21,14 @@ The knots of the new plan are x(t) at t, where the plan has its rate too, and b_
 with the rates (b_{k+1} - b_{k-1}) / (2 P), one-sided at the ends of the chunk. Behind the last row
 the plan comes to rest there within P, and stays. So position and rate are continuous, whenever a
 chunk comes. Between two knots of distance D, with r, v at the first and q, w at the second one, the
-cubic of u = (t - T) / D is::
+cubic of the time s <= 0 to the second one is::
 
-    x   = r + u (D v + u (c + u d)),    c = 3 (q - r) - D (2 v + w),    d = D (v + w) - 2 (q - r)
-    x'  = v + u (2 c + 3 u d) / D
-    x'' = (2 c + 6 u d) / D^2
+    x   = q + s (w + s (c + s d)),    c = (3 (r - q) + D (v + 2 w)) / D^2
+    x'  = w + s (2 c + 3 s d),        d = (2 (r - q) + D (v + w)) / D^3
+    x'' = 2 c + 6 s d
+
+The state has q, w, c, d of the present segment, which change where it ends (:func:`renewed`); a
+sample is this polynomial (:func:`advance`).
 
 Limits of the plan are those of :mod:`batchpid.motors.guard` on x. The alignment is after the policy
 runner of axol, the ensemble after ACT (T. Z. Zhao et al., Learning Fine-Grained Bimanual
@@ -34,44 +37,52 @@ Manipulation with Low-Cost Hardware, RSS 2023), the average after LeRobot.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
-from batchpid.arrays.array_types import Array, ArrayModule
+import numpy as np
+
+from batchpid.arrays.array_types import Array, Pytree
 from batchpid.arrays.elementwise import in_dtype_of, namespace, take_rows
 from batchpid.arrays.trees import mapped
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import guard as guard_model
 from batchpid.motors.guard import Guard, GuardState
-from batchpid.plan.plans import SPARE_ROWS, Held, Linear, Plan
+from batchpid.plan.plans import SPARE_ROWS, Plan
 
 EASE = 0.2
 """Share of the fading in which its rate is reached."""
 LEAST_STEP = 1e-9
 """Least time between two samples [s]: the limits divide by it."""
 
+Segment = tuple[Array, Array, Array, Array]
+"""Polynomial between two knots: position and rate at its end, coefficients of the square and the
+cube of the time to it.
+"""
+
 
 class PlanState(NamedTuple):
-    """State of a plan. Arrays are (envs, joints), knots and their likes (envs, horizon + 3,
-    joints).
-    """
+    """State of a plan. Arrays are (envs, joints), tables (envs, horizon + 2, joints)."""
 
     knots: Array
-    """Positions [rad or m]; the first one is the point where the plan was joined."""
+    """Positions in the rows of the last chunk, and behind them the last one [rad or m]."""
     rates: Array
-    """Rates of the knots [rad/s or m/s]."""
+    """Rates in these rows, 0 behind them [rad/s or m/s]."""
     weights: Array
-    """Weights W of the knots in an ensemble or average, else 0."""
-    join: Array
-    """Time of the first knot [s]."""
-    time: Array
-    """Time of the second knot [s]; the others follow in steps of the period."""
+    """Weights W of these rows, 0 behind them; None but for an ensemble or average."""
+    begin: Array
+    """Time of the first row [s]."""
+    last: Array
+    """Time of the last row [s]."""
+    segment: Segment
+    """Present segment."""
     end: Array
-    """Time of the last row of the last chunk [s]."""
+    """Its end [s]."""
     now: Array
     """Time of the last sample [s]."""
     starved: Array
-    """Number of samples so far that were later than the end."""
+    """Number of samples so far that were later than the last row."""
     guard: GuardState | None
     """State of the limits; None without limits."""
 
@@ -89,9 +100,22 @@ def init(plan: Plan, qpos: Array, time: Array = 0.0) -> PlanState:
     start, at = zeros + qpos, zeros + _column(time)
     knots = xp.repeat(start[..., None, :], plan.horizon + SPARE_ROWS, axis=-2)
     empty = xp.zeros_like(knots)
+    weights = empty if plan.is_mean else None
+    rest = start, zeros, zeros, zeros
     limits = _guard(plan)
     guard = None if limits is None else guard_model.init(limits, start)
-    return PlanState(knots, empty, empty, at, at, at, at, zeros, guard)
+    return PlanState(
+        knots,
+        empty,
+        weights,
+        at,
+        at,
+        rest,
+        at,
+        at,
+        zeros,
+        guard,
+    )
 
 
 def add(
@@ -114,66 +138,89 @@ def add(
     if width != joints or not 0 < rows <= count - SPARE_ROWS:
         problem = f"has shape {chunk.shape}, not (envs, 1 to {count - SPARE_ROWS}, {joints})"
         raise InvalidArgumentError("chunk", problem, remedy="give rows of all joints, in order")
-    period, now = plan.period, state.now
-    chunk = chunk + xp.zeros_like(now)[..., None, :]
-    begin = xp.zeros_like(now) + _column(time)
+    chunk = xp.broadcast_to(chunk, (*state.now.shape[:-1], rows, joints))
+    # All rows at once: plan and state have an axis more.
+    options, wide = (
+        _wide(plan),
+        _wide(
+            state._replace(
+                knots=None,
+                rates=None,
+                weights=None,
+            )
+        ),
+    )
+    wide = wide._replace(
+        knots=state.knots,
+        rates=state.rates,
+        weights=state.weights,
+    )
+    period, now = options.period, wide.now
+    begin = xp.zeros_like(now) + _column(_column(time))
     # Rows that have passed are dropped; if all have, the last one is still the newest wish.
     ahead = xp.maximum(xp.ceil((now - begin) / period + 0.5), 0.0)
     first = xp.minimum(ahead, rows - 1.0)
-    joined = xp.where(ahead > first, now + period, begin + first * period)
-    position, rate, _ = curve(plan, state, now)
-    # A single row tells no motion that could be aligned.
-    present, slope, _ = curve(plan, state, begin + first * period)
-    offset = xp.where(rows > 1, present - take_rows(chunk, first), 0.0)
-    low, high = xp.maximum(first - 1.0, 0.0), xp.minimum(first + 1.0, rows - 1.0)
-    rise = take_rows(chunk, high) - take_rows(chunk, low)
-    slope = xp.where(rows > 1, slope - rise / (xp.maximum(high - low, 1.0) * period), 0.0)
-    # All rows at once: plan and state have an axis more.
-    steps = xp.cumsum(xp.ones_like(chunk), axis=-2) - 1.0
-    wide = state._replace(
-        knots=state.knots[..., None, :, :],
-        rates=state.rates[..., None, :, :],
-        weights=state.weights[..., None, :, :],
-        join=state.join[..., None, :],
-        time=state.time[..., None, :],
-    )
-    options = mapped(lambda leaf: leaf[..., None, :], plan)
+    begin = xp.where(ahead > first, now + (1.0 - first) * period, begin)
+    joined = begin + first * period
+    position, rate, _ = evaluate(wide.segment, now - wide.end)
+    offset, slope = gap(options, wide, chunk, joined, first)
+    step = xp.arange(rows, dtype=chunk.dtype).reshape(*[1] * (chunk.ndim - 2), rows, 1)
     blended, weights = blend(
         options,
         wide,
         chunk,
-        begin[..., None, :],
-        offset[..., None, :],
-        slope[..., None, :],
-        first[..., None, :],
-        steps,
+        begin,
+        offset,
+        slope,
+        first,
+        step,
         rows,
     )
     # Central differences, one-sided at the ends of the chunk.
-    path = blended
-    if rows == 1:
-        path = xp.concatenate((position[..., None, :], blended), -2)
-    rise = path[..., 1:, :] - path[..., :-1, :]
+    rise = xp.diff(blended if rows > 1 else xp.concatenate((position, blended), -2), axis=-2)
     inner = 0.5 * (rise[..., 1:, :] + rise[..., :-1, :])
-    rates = xp.concatenate((rise[..., :1, :], inner, rise[..., -1:, :]), -2)[..., -rows:, :]
-    # The knots begin with the join; behind the last row they repeat it, at rest.
-    following = xp.cumsum(xp.ones_like(state.knots[..., 1:, :]), axis=-2) - 1.0
-    index = xp.minimum(first[..., None, :] + following, rows).astype(int)
-
-    def knots(start: Array, values: Array, end: Array) -> Array:
-        values = xp.concatenate((values, end[..., None, :]), -2)
-        shifted = xp.take_along_axis(values, index, -2)
-        return xp.concatenate((start[..., None, :], shifted), -2)
-
-    zero = xp.zeros_like(now)
-    return state._replace(
-        knots=knots(position, blended, blended[..., -1, :]),
-        rates=knots(rate, rates / period[..., None, :], zero),
-        weights=knots(zero, weights, zero),
-        join=now,
-        time=joined,
-        end=joined + (rows - 1.0 - first) * period,
+    rises = (rise[..., :1, :], inner, rise[..., -1:, :]) if rows > 1 else (rise,)
+    behind, rest = [xp.zeros_like(now)] * (count - rows), [blended[..., -1:, :]] * (count - rows)
+    rates = xp.concatenate((*rises, *behind), -2) / period
+    high, slope = take_rows(blended, first), take_rows(rates, first)
+    segment = cubic(
+        options,
+        joined - now,
+        position,
+        high,
+        rate,
+        slope,
     )
+    return state._replace(
+        knots=xp.concatenate((blended, *rest), -2),
+        rates=rates,
+        weights=None if weights is None else xp.concatenate((weights, *behind), -2),
+        begin=begin[..., 0, :],
+        last=(begin + (rows - 1.0) * period)[..., 0, :],
+        segment=mapped(lambda leaf: leaf[..., 0, :], segment),
+        end=joined[..., 0, :],
+    )
+
+
+def gap(
+    plan: Plan,
+    state: PlanState,
+    chunk: Array,
+    time: Array,
+    first: Array,
+) -> tuple[Array, Array]:
+    """Return how far the plan is from the row ``first`` of a chunk (envs, rows, joints) at ``time``
+    [s], and at which rate it goes away from it; 0 for a chunk of one row, which tells no motion.
+    """
+    xp = namespace(*plan, chunk)
+    rows = chunk.shape[-2]
+    if rows == 1 or plan.fade is None:
+        return 0.0, 0.0
+    present, slope = curve(plan, state, time)
+    low, high = xp.maximum(first - 1.0, 0.0), xp.minimum(first + 1.0, rows - 1.0)
+    rise = take_rows(chunk, high) - take_rows(chunk, low)
+    offset = present - take_rows(chunk, first)
+    return offset, slope - rise / ((high - low) * plan.period)
 
 
 def blend(
@@ -188,24 +235,24 @@ def blend(
     rows: Array,
 ) -> tuple[Array, Array]:
     """Return row number ``step`` of a chunk that begins at ``begin`` [s], blended with the plan,
-    and its weight.
+    and its weight, None without weights.
 
     ``offset`` is that of the alignment, in row ``first``, and ``slope`` its rate; ``rows`` is the
-    number of rows. All have the shape of the times of ``state``, or one that broadcasts with it.
+    number of rows. Arrays have the shape of the times of ``state``, or one that broadcasts with it.
     """
     xp = namespace(*plan, state.knots, chunk, begin, step)
     if plan.fade is not None:
-        s = (step - first) * plan.period / plan.fade
+        s = (step - first) * (plan.period / plan.fade)
         u = xp.minimum(s / EASE, 1.0)
-        eased = EASE * u * ((1.0 - u) * (1.0 - u))
-        left = xp.maximum(1.0 - s, 0.0) * offset + eased * (offset + plan.fade * slope)
-        return chunk + plan.blended * left, xp.zeros_like(chunk)
-    if plan.forgotten is None and plan.share is None:
-        return chunk, xp.zeros_like(chunk)
+        rest = 1.0 - u
+        eased = u * (rest * rest) * (EASE * (offset + plan.fade * slope))
+        return chunk + plan.blended * (xp.maximum(1.0 - s, 0.0) * offset + eased), None
+    if not plan.is_mean:
+        return chunk, None
     time = begin + step * plan.period
-    present, _, _ = curve(plan, state, time)
-    near = _row(plan, xp.rint((time - state.time) / plan.period) + 1.0, xp)
-    old = plan.blended * take_rows(state.weights, near)
+    present, _ = curve(plan, state, time)
+    near = xp.rint((time - state.begin) / plan.period)
+    old = xp.where(near >= 0, take_rows(state.weights, _row(plan, near)), 0.0) * plan.blended
     if plan.share is None:
         new = 1.0 - old * plan.forgotten
     else:
@@ -225,7 +272,22 @@ def sample(
     """
     xp = namespace(*plan, state.knots, t)
     at = xp.zeros_like(state.now) + _column(t)
-    return advance(plan, state, at, xp.maximum(at - state.now, LEAST_STEP))
+    return advance(plan, renewed(plan, state, at), at, xp.maximum(at - state.now, LEAST_STEP))
+
+
+def renewed(plan: Plan, state: PlanState, t: Array) -> PlanState:
+    """Return the state with the segment at ``t`` (envs, joints) [s], where the present one has
+    ended.
+    """
+    xp = namespace(*plan, state.knots, t)
+    due = t >= state.end
+    # Most samples are within a segment, which NumPy can see.
+    if xp is np and not due.any():
+        return state
+    end, segment = segment_at(plan, state, t)
+    present = state.segment
+    chosen = tuple([xp.where(due, new, old) for new, old in zip(segment, present, strict=True)])
+    return state._replace(segment=chosen, end=xp.where(due, end, state.end))
 
 
 def advance(
@@ -234,12 +296,12 @@ def advance(
     t: Array,
     dt: Array,
 ) -> tuple[PlanState, Array, Array, Array]:
-    """Sample the plan at ``t`` (envs, joints) [s], ``dt`` [s] after the last sample, for loops of
-    one time step; else as :func:`sample`.
+    """Sample the plan at ``t`` (envs, joints) [s] in its present segment, ``dt`` [s] after the last
+    sample, for loops of one time step; else as :func:`sample`.
     """
-    setpoint, rate, acceleration = curve(plan, state, t)
+    setpoint, rate, acceleration = evaluate(state.segment, t - state.end)
     xp = namespace(*plan, state.knots, t)
-    starved = state.starved + xp.where(t > state.end, 1.0, 0.0)
+    starved = state.starved + xp.where(t > state.last, 1.0, 0.0)
     state = state._replace(now=t, starved=starved)
     limits, before = _guard(plan), state.guard
     if limits is None or before is None:
@@ -254,43 +316,75 @@ def curve(
     plan: Plan,
     state: PlanState,
     t: Array,
-) -> tuple[Array, Array, Array]:
-    """Return position, rate and acceleration of a plan without its limits, at ``t`` (envs, joints)
-    [s].
+) -> tuple[Array, Array]:
+    """Return position and rate of a plan without its limits at ``t`` (envs, joints) [s], not before
+    the last sample.
     """
     xp = namespace(*plan, state.knots, t)
-    row = _row(plan, xp.floor((t - state.time) / plan.period) + 1.0, xp)
-    is_joining = row < 1
-    begin = xp.where(is_joining, state.join, state.time + (row - 1.0) * plan.period)
-    length = xp.where(is_joining, state.time - state.join, plan.period)
-    # A new plan, and an old one, are at rest.
-    length = xp.where(length > 0, length, plan.period)
-    start = take_rows(state.knots, row)
-    zero = xp.zeros_like(start)
-    if isinstance(plan.interpolation, Held):
-        return start, zero, zero
-    frequency = 1.0 / length
-    u = xp.minimum(xp.maximum((t - begin) * frequency, 0.0), 1.0)
-    rise = take_rows(state.knots, row + 1.0) - start
-    if isinstance(plan.interpolation, Linear):
-        return start + u * rise, rise * frequency, zero
-    # The rates as distances in the time of this segment.
-    v = length * take_rows(state.rates, row)
-    w = length * take_rows(state.rates, row + 1.0)
-    c = 3.0 * rise - (2.0 * v + w)
-    bend, twist = 2.0 * c, u * (v + w - 2.0 * rise)
-    position = start + u * (v + u * (c + twist))
-    rate = (v + u * (bend + 3.0 * twist)) * frequency
-    return position, rate, (bend + 6.0 * twist) * (frequency * frequency)
+    end, later = segment_at(plan, state, t)
+    within = t < state.end
+    end = xp.where(within, state.end, end)
+    parts = zip(state.segment, later, strict=True)
+    segment = [xp.where(within, present, then) for present, then in parts]
+    return evaluate(segment, t - end)[:2]
 
 
-def _row(plan: Plan, row: Array, xp: ArrayModule) -> Array:
-    """Return a number of a knot within the knots that have a next one; 0 for NaN."""
-    return xp.minimum(xp.where(row > 0, row, 0.0), plan.last)
+def evaluate(segment: Sequence[Array], s: Array) -> tuple[Array, Array, Array]:
+    """Return position, rate and acceleration of a segment at the time ``s`` after its end [s]."""
+    q, w, c, d = segment
+    twist = s * d
+    bend = c + twist
+    position = q + s * (w + s * bend)
+    twice = bend + twist
+    return position, w + s * (bend + twice), 2.0 * (twice + twist)
+
+
+def cubic(
+    plan: Plan,
+    length: Array,
+    low: Array,
+    high: Array,
+    slope_low: Array,
+    slope_high: Array,
+) -> Segment:
+    """Return the segment of ``length`` [s] between two knots, of these positions and rates."""
+    xp = namespace(*plan, length, low, high)
+    # A line has the rate of its rise, and a held knot has none.
+    high = xp.where(plan.degree > 0, high, low)
+    frequency, rise = 1.0 / length, high - low
+    v = xp.where(plan.degree > 1, length * slope_low, rise)
+    w = xp.where(plan.degree > 1, length * slope_high, rise)
+    c = (v + 2.0 * w) - 3.0 * rise
+    d = (v + w) - 2.0 * rise
+    square = frequency * frequency
+    return high, w * frequency, c * square, d * (square * frequency)
+
+
+def segment_at(plan: Plan, state: PlanState, t: Array) -> tuple[Array, Segment]:
+    """Return end and polynomial of the segment of the last chunk at ``t`` [s]."""
+    xp = namespace(*plan, state.knots, t)
+    number = xp.floor((t - state.begin) / plan.period)
+    low, high = _row(plan, number), _row(plan, number + 1.0)
+    # A chunk that begins later than its first row is needed has a segment before that.
+    end = state.begin + (xp.maximum(number, 0.0) + 1.0) * plan.period
+    positions = take_rows(state.knots, low), take_rows(state.knots, high)
+    slopes = take_rows(state.rates, low), take_rows(state.rates, high)
+    return end, cubic(plan, plan.period, *positions, *slopes)
+
+
+def _row(plan: Plan, row: Array) -> Array:
+    """Return a number of a knot within the knots of a plan; 0 for NaN."""
+    xp = namespace(*plan, row)
+    return xp.minimum(xp.where(row > 0, row, 0.0), plan.rows)
+
+
+def _wide(tree: Pytree) -> Any:
+    """Return a tree with an axis of rows before that of the joints."""
+    return mapped(lambda leaf: leaf[..., None, :], tree)
 
 
 def _column(time: Array) -> Array:
-    """Return a time, a number or (envs,), for all joints."""
+    """Return a time, a number or (envs, ...), with a further axis."""
     if getattr(time, "ndim", 0):
         return time[..., None]
     return time

@@ -95,7 +95,11 @@ class Inertia(Stage):
 
     def bind(self, program: Any, state: InertiaState, values: Values) -> Values:
         program.use(refresh=program.model.refresh)
-        program.place(age=state.age, gain=state.gain, memory=state.memory)
+        program.place(
+            age=state.age,
+            gain=state.gain,
+            memory=state.memory,
+        )
         return values._replace(inertia=(state.gain, state.memory))
 
 

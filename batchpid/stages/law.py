@@ -89,8 +89,17 @@ class Matrix(Stage):
 
     def bind(self, program: Any, state: Array, values: Values) -> Values:
         tree, bodies = program.pack.rigid_tree.tables
-        program.place(pose=values.seen.qpos, rate=values.seen.qvel, tree=tree, bodies=bodies)
-        program.place(matrix=state, armature=self.armature, damping=self.damping)
+        program.place(
+            pose=values.seen.qpos,
+            rate=values.seen.qvel,
+            tree=tree,
+            bodies=bodies,
+        )
+        program.place(
+            matrix=state,
+            armature=self.armature,
+            damping=self.damping,
+        )
         program.place(**self.coupling.native())
         return values._replace(matrix=state)
 
@@ -142,9 +151,20 @@ class PID(Stage):
             inputs = setpoint, qpos, values.matrix, *rates, acceleration, forward
             state, terms = advance_with_mass_matrix(k, state, *inputs)
         else:  # accelerations are for gains per mass matrix only
-            state, terms = advance(k, state, setpoint, qpos, *rates, forward)
+            state, terms = advance(
+                k,
+                state,
+                setpoint,
+                qpos,
+                *rates,
+                forward,
+            )
         effort, unsaturated = terms.effort, terms.unsaturated
-        return state, values.told(qf=effort, motor=effort, saturated=effort != unsaturated)
+        return state, values.told(
+            qf=effort,
+            motor=effort,
+            saturated=effort != unsaturated,
+        )
 
     def adopt(self, before: Self, state: PIDState, values: Values) -> PIDState:
         # The integral in the unit of the new gains, by the params that have them per mass matrix.
@@ -194,7 +214,12 @@ class Drive(Stage):
             state, target = advance_drive(self.integral, state, target, qpos, **rates)
         if rate is None:
             rate = namespace(target).zeros_like(target)
-        return state, values.told(qf=forward, motor=forward, target=target, target_rate=rate)
+        return state, values.told(
+            qf=forward,
+            motor=forward,
+            target=target,
+            target_rate=rate,
+        )
 
 
 @dataclass(frozen=True)
@@ -255,4 +280,8 @@ class Effort(Stage):
         saturated = effort != total
         if values.limited is not None:
             saturated = saturated | (values.limited > 0)
-        return state, values.told(qf=effort, motor=effort, saturated=saturated)
+        return state, values.told(
+            qf=effort,
+            motor=effort,
+            saturated=saturated,
+        )

@@ -30,6 +30,7 @@ class Plan(Stage):
 
     name = "plan"
     starting = ("lag",)
+    due = ("now", "end")
 
     @classmethod
     def of(cls, control: Control) -> Self | None:
@@ -40,6 +41,9 @@ class Plan(Stage):
 
     def init(self, values: Values) -> Told:
         return model.init(self.options, values.measured.qpos, -self.lag), values
+
+    def renewed(self, state: model.PlanState) -> model.PlanState:
+        return model.renewed(self.options, state, state.now + self.timestep)
 
     def step(self, state: model.PlanState, values: Values) -> Told:
         time = state.now + self.timestep
@@ -58,6 +62,8 @@ class Plan(Stage):
         """
         xp = namespace(chunk, latency)
         mask = xp.isfinite(chunk).all((1, 2)) & xp.isfinite(latency)
+        if mask.all():
+            return model.add(self.options, state, chunk, state.now[:, 0] + self.lag - latency)
         chunk = xp.where(mask[:, None, None], chunk, 0.0)
         time = state.now[:, 0] + self.lag - xp.where(mask, latency, 0.0)
         return replace_envs(state, model.add(self.options, state, chunk, time), mask)

@@ -33,7 +33,12 @@ class Sensors(Stage):
         qpos, qvel, _ = values.measured
         envs, episode = values.model.envs, values.model.episode
         state = model.init(
-            self.actuators, qpos, self.timestep, qvel=qvel, envs=envs, episode=episode
+            self.actuators,
+            qpos,
+            self.timestep,
+            qvel=qvel,
+            envs=envs,
+            episode=episode,
         )
         # The law starts from what the sensors show.
         return state, self.step(state, values)[1]

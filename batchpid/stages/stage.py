@@ -9,7 +9,7 @@ restart of some envs is :func:`started` under a mask, and a native program is a 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -45,6 +45,10 @@ class Stage:
     """Whether each tick makes its state anew, so that snapshots do not hold it."""
     starting: ClassVar[tuple[str, ...]] = ()
     """Constants that only ``init`` needs."""
+    due: ClassVar[tuple[str, ...]] = ()
+    """Two fields of the state: the time of an env, and the time from which :meth:`renewed` changes
+    its state; () for never.
+    """
 
     @classmethod
     def of(cls, control: Control) -> Any:
@@ -61,6 +65,10 @@ class Stage:
     def init(self, values: Values) -> Told:
         """Return the state of envs at their start, and the values for the stages after it."""
         return (), values
+
+    def renewed(self, state: Any) -> Any:
+        """Return the state for the next sim step, before ``step``, changed where its time is due."""
+        return state
 
     def step(self, state: Any, values: Values) -> Told:
         """Return the state after a sim step, and the values for the stages after it."""
@@ -82,6 +90,17 @@ def running(stages: Iterable[Any]) -> tuple[Any, ...]:
 
 def stepped(stages: Sequence[Any], states: States, values: Values) -> tuple[States, Values]:
     """Advance stages by a sim step; return their states, and the values after them."""
+    return advanced(stages, renewed(stages, states), values)
+
+
+def renewed(stages: Sequence[Any], states: States) -> States:
+    """Return the states for the next sim step: :meth:`Stage.renewed`."""
+    pairs = zip(stages, states, strict=True)
+    return tuple([stage.renewed(state) if stage.due else state for stage, state in pairs])
+
+
+def advanced(stages: Sequence[Any], states: States, values: Values) -> tuple[States, Values]:
+    """Advance stages by a sim step, from :func:`renewed` states on."""
     new = list[Pytree]()
     values = recalled(stages, states, values)
     for stage, state in zip(stages, states, strict=True):
@@ -170,18 +189,23 @@ def bind_stages(
     values: Values,
     shape: tuple[int, int],
     passes: bool = False,
+    renews: bool = False,
 ) -> tuple[Bound, Values]:
     """Return a program of stages, their states, and the values before them, whose arrays it reads;
     and the values after them.
 
     It changes the arrays of ``states`` in place. It makes new arrays for the ``values`` that it
-    changes: for the outputs alone, or with ``passes`` for all, which stages after it read. Errors
-    as for :class:`.TreeProgram`.
+    changes: for the outputs alone, or with ``passes`` for all, which stages after it read. With
+    ``renews`` it is :func:`renewed`. Errors as for :class:`.TreeProgram`.
     """
     constants = mapped(_split, running(stages))
     # Programs have no keys of noise, counts, or state of a controller.
     states = mapped(_number, tuple(states))
-    function = _values_after if passes else _outputs_after
+    function: Callable[..., tuple[States, Outputs, Any]] = _outputs_after
+    if renews:
+        function = _renewed_states
+    elif passes:
+        function = _values_after
     bound = TreeProgram(function, constants, states, values, shape).bind(states, values)
     _, outputs, others = bound.after
     after = others._replace(noise=None) if passes else values
@@ -189,12 +213,16 @@ def bind_stages(
 
 
 def _values_after(stages: Any, states: States, values: Values) -> tuple[States, Outputs, Values]:
-    states, values = stepped(stages, states, values)
+    states, values = advanced(stages, states, values)
     return states, values.outputs, values._replace(outputs=Outputs())
 
 
 def _outputs_after(stages: Any, states: States, values: Values) -> tuple[States, Outputs, Any]:
     return *_values_after(stages, states, values)[:2], ()
+
+
+def _renewed_states(stages: Any, states: States, _: Values) -> tuple[States, Outputs, Any]:
+    return renewed(stages, states), Outputs(), ()
 
 
 def _number(array: Array) -> Any:

@@ -10,14 +10,15 @@ from batchpid.task_space.inverse_kinematics import (
     inverse_kinematics,
 )
 from batchpid.task_space.operational_space import init, osc, reset
-from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
 from batchpid.task_space.osc_state import (
+    OSCCoefficients,
     OSCInputs,
     OSCState,
     OSCTerms,
     TaskDynamics,
     Tool,
+    discretise,
     task_dynamics,
 )
 from batchpid.task_space.rigid_tree import RigidTree

@@ -105,7 +105,7 @@ def inverse_kinematics(
         "raise", a pose was not reached.
     """
     # Every argument is checked before the first search.
-    index = instance("tree", tree, RigidTree, MAKE_TREE).index(link)
+    instance("tree", tree, RigidTree, MAKE_TREE).index(link)
     choice("on_failure", on_failure, ON_FAILURE)
     integer("starts", starts, 1, 10_000)
     integer("iterations", iterations, 1, 100_000)
@@ -115,7 +115,7 @@ def inverse_kinematics(
     goal, rows = _goals_and_starts(tree, pose, start)
     if point is not None:
         point = array("point", read_point(goal[0], point), (3,), "xyz", kind="entry")
-    search = _Search(tree, index, point, np.array([position, rotation]), iterations)
+    search = _Search(tree, link, point, np.array([position, rotation]), iterations)
     # The draws are shares of the range, the same for every env, whatever the others do.
     shares = np.random.default_rng(seed).uniform(size=(starts - 1, tree.dof))
     number = np.zeros(len(goal), np.intp)
@@ -176,16 +176,11 @@ class _Search(NamedTuple):
     """Searches for the poses of one tool."""
 
     tree: RigidTree
-    link: int
+    link: str
     point: Float64 | None
     tolerance: Float64
     """Of position and rotation (2,) [m, rad]."""
     iterations: int
-
-    @property
-    def tool(self) -> tuple[str, Float64 | None]:
-        """Link and point of the tool."""
-        return self.tree.links[self.link], self.point
 
     @property
     def limits(self) -> tuple[Float64, Float64]:
@@ -210,13 +205,20 @@ class _Search(NamedTuple):
         low = np.where(np.isfinite(low), low, rows - np.pi)
         high = np.where(np.isfinite(high), high, rows + np.pi)
         # Joints outside of the chain stay where they are.
-        chain = self.tree.chain(self.tree.links[self.link])
+        chain = self.tree.chain(self.link)
         return self.tree.positions(np.where(chain, low + share * (high - low), rows))
 
     def solve(self, goal: Float64, qpos: Float64) -> _Found:
         """Return the results of searches that begin at ``qpos`` (n, dof), within the limits."""
-        tool = self.tree, self.link, self.point
-        native = native_rows.search(*tool, self.limits, goal, qpos, self.tolerance, self.iterations)
+        tool = self.tree, self.tree.index(self.link), self.point
+        native = native_rows.search(
+            *tool,
+            self.limits,
+            goal,
+            qpos,
+            self.tolerance,
+            self.iterations,
+        )
         if native is not None:
             return _Found(*native)
         # The same search in NumPy: the definition of the native one.
@@ -230,7 +232,7 @@ class _Search(NamedTuple):
         going = np.arange(count)
         q = qpos
         for step in range(self.iterations + 1):
-            present = evaluated(self.tree, ("pose", "jacobian"), q, None, *self.tool)
+            present = evaluated(self.tree, ("pose", "jacobian"), q, None, self.link, self.point)
             error = pose_error(goal[going], present["pose"])
             lengths = np.sqrt((error * error).reshape(-1, 2, 3).sum(-1))
             nearest = _Found(q, lengths, np.full((len(q), 1), float(step)))
@@ -268,7 +270,7 @@ class _Search(NamedTuple):
                 break
         # Geodesic acceleration: the curvature of the path of the tool.
         names = ("jacobian_rate",)
-        rates = evaluated(self.tree, names, qpos, self.tree.rates(move), *self.tool)
+        rates = evaluated(self.tree, names, qpos, self.tree.rates(move), self.link, self.point)
         acceleration = -_damped(part, damping, rates["jacobian_rate"])
         size = np.sqrt((acceleration * acceleration).sum(-1, keepdims=True))
         most = _LARGEST_ACCELERATION * np.sqrt((move * move).sum(-1, keepdims=True))
@@ -300,7 +302,15 @@ def _goals_and_starts(
     unit = np.abs(length - 1) < 1e-3
     problem = "has a quaternion whose length is not 1"
     remedy = "normalise w, x, y, z"
-    entries("pose", length, unit, problem, ["qw"], kind="entry", remedy=remedy)
+    entries(
+        "pose",
+        length,
+        unit,
+        problem,
+        ["qw"],
+        kind="entry",
+        remedy=remedy,
+    )
     goal[:, 3:] /= length
     return goal, tree.positions(np.clip(rows, tree.lower, tree.upper))
 

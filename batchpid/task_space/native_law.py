@@ -15,8 +15,14 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.native.extensions import LAW
 from batchpid.task_space import native_rows
-from batchpid.task_space.osc_coefficients import OSCCoefficients
-from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDynamics, Tool
+from batchpid.task_space.osc_state import (
+    OSCCoefficients,
+    OSCInputs,
+    OSCState,
+    OSCTerms,
+    TaskDynamics,
+    Tool,
+)
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_kinematics import prepared, read_point
 
@@ -73,7 +79,15 @@ def law(
     if tool is not None:
         fixed, chain = _of_tree(native, tool.tree, tool.link, dynamics_arrays[0], k)
         dynamics_arrays = (*[None] * 5, chain)
-    native_rows.call(native.law, rows, dof, *fixed, *dynamics_arrays, *arrays, *results)
+    native_rows.call(
+        native.law,
+        rows,
+        dof,
+        *fixed,
+        *dynamics_arrays,
+        *arrays,
+        *results,
+    )
     effort, integral, _, *parts, s1, s2, near = results
     # The extension writes columns; the terms are one number for each env.
     shares = [None if entry is None else entry[:, 0] for entry in (s1, s2)]

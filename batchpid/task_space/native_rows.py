@@ -80,7 +80,17 @@ def kinematics(
     # The extension writes into arrays that it is given, by rows.
     outputs = empty(wanted, leading, dof)
     inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
-    call(native.kinematics, *_arguments(native, tree, outputs, inputs, index, point))
+    call(
+        native.kinematics,
+        *_arguments(
+            native,
+            tree,
+            outputs,
+            inputs,
+            index,
+            point,
+        ),
+    )
     return outputs
 
 

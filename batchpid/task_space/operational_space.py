@@ -19,7 +19,7 @@ the gains kp, kd, ki of the task and kp_n, kd_n of the posture::
     u_o   = h + M_oo a_o + M_oc M_cc^-1 (s1 task + s2 null) + feedforward
     I    <- I + ki dt e, within its limit, unless s1 < 1, u is clipped or L is bounded, and a e > 0
 
-These are the gains of the explicit law; :mod:`batchpid.task_space.osc_coefficients` has the
+These are the gains of the explicit law; :mod:`batchpid.task_space.osc_state` has the
 implicit one. Springs of stiffness kp_l push joints of the chain away from their limits; x is the
 depth of q in the margin.
 
@@ -46,7 +46,7 @@ space formulation", IEEE Journal on Robotics and Automation 3 (1987).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -56,9 +56,9 @@ from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_law
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
-from batchpid.task_space.osc_coefficients import OSCCoefficients
 from batchpid.task_space.osc_params import MAKE_PARAMS, OSCParams
 from batchpid.task_space.osc_state import (
+    OSCCoefficients,
     OSCInputs,
     OSCState,
     OSCTerms,
@@ -67,8 +67,7 @@ from batchpid.task_space.osc_state import (
     in_tool_axes,
     task_dynamics,
 )
-from batchpid.task_space.projections import Projections, projections
-from batchpid.task_space.symmetric import product, quiet
+from batchpid.task_space.symmetric import bounded_inverse, gram, product, quiet, whitened
 
 
 def init(params: OSCParams, qpos: Array) -> OSCState:
@@ -150,14 +149,29 @@ def osc(
         a = task_acceleration(k, task)
         a = a if state.integral is None else a + state.integral
         a_n, a_s = posture_acceleration(k, dynamics, state.posture, inputs.qpos, inputs.qvel)
-        p = projections(k, task.dynamics, a, a_n, inputs.wrench, inputs.feedforward, a_s)
+        p = projections(
+            k,
+            task.dynamics,
+            a,
+            a_n,
+            inputs.wrench,
+            inputs.feedforward,
+            a_s,
+        )
         effort, whole, s1, s2 = _saturated(p, k.effort_min, k.effort_max)
         if state.integral is not None:
             held = (p.near_singular | (effort != whole).any(-1))[:, None] & (a * task.near > 0)
             state = state._replace(integral=_integrated(k, state.integral, task, held))
     shares = s1[..., 0], s2[..., 0]
     return state, OSCTerms(
-        task.error, p.force, p.task, p.posture, whole, effort, *shares, p.near_singular
+        task.error,
+        p.force,
+        p.task,
+        p.posture,
+        whole,
+        effort,
+        *shares,
+        p.near_singular,
     )
 
 
@@ -302,3 +316,132 @@ def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
         xp,
     )
     return effort, base + task + null + others, s1, s2
+
+
+SPRING_BOUND = 0.2
+"""Bound s1 of L_s, as a share of the bound s0 of L_n."""
+
+
+class Projections(NamedTuple):
+    """Efforts before saturation, arrays (envs, dof)."""
+
+    force: Array
+    """Wrench F of the task (envs, 6)."""
+    task: Array
+    """J^T F."""
+    posture: Array
+    """N^T M_cc a_n of the chain: M_cc a_n - J^T (L_n J a_n + (L_s - L_n) J a_s)."""
+    base: Array
+    """h + M a_o + feedforward."""
+    task_of_others: Array
+    """M_oc M_cc^-1 task."""
+    posture_of_others: Array
+    """M_oc M_cc^-1 posture."""
+    near_singular: Array
+    """Whether L or L_n is bounded (envs,)."""
+
+
+def projections(
+    k: OSCCoefficients,
+    d: TaskDynamics,
+    a: Array,
+    a_n: Array,
+    wrench: Array = None,
+    feedforward: Array = None,
+    springs: Array = None,
+) -> Projections:
+    """Return the efforts of the accelerations ``a`` (envs, 6) of the task and ``a_n`` (envs, dof)
+    of the posture.
+
+    ``springs`` (envs, dof) is the part a_s of a_n, all of it if None.
+    """
+    xp = namespace(
+        *k,
+        *d,
+        a,
+        a_n,
+        wrench,
+        feedforward,
+    )
+    j = d.jacobian
+    m = d.mass_matrix
+    chain = d.chain
+    eye = xp.eye(m.shape[-1], dtype=m.dtype)
+    # The other joints apart, with unit inertia.
+    m_cc = xp.where((chain[:, None] * chain) > 0, m, eye)
+    y = whitened(m_cc, xp.concatenate([xp.swapaxes(j, -1, -2), eye + xp.zeros_like(m)], axis=-1))
+    task_inertia, null_inertia, spring_inertia, singular = _inertias(
+        k, gram(y[..., :6], y[..., :6]), xp
+    )
+    # The wrench that accelerates the tool's inertia, less the acceleration of the motion itself.
+    f = product(task_inertia, a - d.jacobian_rate)
+    f = f if wrench is None else f + wrench
+    task = gram(j, f[..., None])[..., 0]
+
+    # Joints outside the chain, such as fingers, are controlled by computed torque.
+    a_c = a_n * chain
+    a_o = a_n * (1 - chain)
+    # The difference is 0 to the bit where neither inertia is bounded.
+    held = product(
+        spring_inertia - null_inertia, product(j, (a_n if springs is None else springs) * chain)
+    )
+    null = (
+        product(m, a_c)
+        - gram(j, (product(null_inertia, product(j, a_c)) + held)[..., None])[..., 0]
+    )
+    null = null * chain
+    base = d.bias + product(m, a_o)
+    base = base if feedforward is None else base + feedforward
+
+    # L^-1 of M_cc, from the same factor: two products replace a solution.
+    inverse_root = y[..., 6:]
+
+    def of_others(effort: Array) -> Array:
+        moved = chain * gram(inverse_root, product(inverse_root, effort)[..., None])[..., 0]
+        return (1 - chain) * product(m, moved)
+
+    return Projections(
+        f,
+        task,
+        null,
+        base,
+        of_others(task),
+        of_others(null),
+        singular,
+    )
+
+
+def _inertias(
+    k: OSCCoefficients, mobility: Array, xp: ArrayModule
+) -> tuple[Array, Array, Array, Array]:
+    """Return L, L_n and L_s of the mobility A (envs, 6, 6), and where any is bounded."""
+    # Without axes of force, task and null space need the same inverse, computed once.
+    s0 = k.smallest_eigenvalue[..., 0]
+    both = k.axes
+    if k.axes is not None and k.force_axes is not None:
+        both = xp.maximum(k.axes, k.force_axes)
+    null, springs, near = _selected_inverse(mobility, both, xp, s0, SPRING_BOUND * s0)
+    if both is k.axes:
+        return null, null, springs, near
+    task, bounded = _selected_inverse(mobility, k.axes, xp, s0)
+    return task, null, springs, near | bounded
+
+
+def _selected_inverse(
+    mobility: Array,
+    axes: Any,
+    xp: ArrayModule,
+    smallest: Array,
+    *smooth: Array,
+) -> tuple[Array, ...]:
+    """Return S^T (S A S^T)^-1 S, for each bound, with the selected ``axes`` (1 | envs, 6), and
+    where it is bounded.
+    """
+    if axes is None:
+        return bounded_inverse(mobility, smallest, *smooth)
+    both = axes[..., :, None] * axes[..., None, :] > 0
+    free = (1 - axes)[..., None] * xp.eye(6, dtype=mobility.dtype)
+    # The other axes get an eigenvalue apart from the selected ones, at or above the bound.
+    alone = free * xp.maximum(smallest, 1.0)[..., None, None]
+    *inverses, near = bounded_inverse(xp.where(both, mobility, alone), smallest, *smooth)
+    return *[xp.where(both, inverse, xp.zeros_like(inverse)) for inverse in inverses], near

@@ -9,8 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Array, Document
-from batchpid.arrays.choices import CHOICES, NamedChoice
+from batchpid.arrays.array_types import CHOICES, Array, Document, NamedChoice
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.records import (
@@ -24,7 +23,7 @@ from batchpid.arrays.records import (
 from batchpid.checks.validate import AxisKind, choice, entries, instance, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
-from batchpid.task_space.tree_dynamics import check_masses
+from batchpid.task_space.tree_quantities import check_masses
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Names of the axes of a task."""
@@ -53,15 +52,35 @@ class _OSCParamsFields(NamedTuple):
     posture_damping: Array
     """(1 | envs, dof) [1/s]."""
     position_error_limit: Annotated[
-        Array, Field("m", math.inf, above=True, group="norm", default=0.1)
+        Array,
+        Field(
+            "m",
+            math.inf,
+            above=True,
+            group="norm",
+            default=0.1,
+        ),
     ]
     """(1 | envs, 1) [m]."""
     rotation_error_limit: Annotated[
-        Array, Field("rad", math.inf, above=True, group="norm", default=0.5)
+        Array,
+        Field(
+            "rad",
+            math.inf,
+            above=True,
+            group="norm",
+            default=0.5,
+        ),
     ]
     """(1 | envs, 1) [rad]."""
     smallest_eigenvalue: Annotated[
-        Array, Field("1/kg or 1/(kg m^2)", above=True, group="s0", default=0.02)
+        Array,
+        Field(
+            "1/kg or 1/(kg m^2)",
+            above=True,
+            group="s0",
+            default=0.02,
+        ),
     ]
     """s0 (1 | envs, 1) [1/kg, 1/(kg m^2)]."""
     axes: Annotated[Array, Field(neutral=True, group="axis")] = None
@@ -172,7 +191,7 @@ def make_osc_params(
         "world" or "tool": the axes of gains, selections and wrenches. Setpoints are in the world.
     discretization
         "explicit", or "implicit": stable at any time step
-        (:mod:`batchpid.task_space.osc_coefficients`).
+        (:mod:`batchpid.task_space.osc_state`).
 
     Raises
     ------
@@ -181,12 +200,27 @@ def make_osc_params(
     """
     check_masses(instance("tree", tree, RigidTree, MAKE_TREE))
     joints = tree.joint_names
-    rows = _read(options, {"axis": AXES, "joint": joints, "norm": ("norm",), "s0": ("s0",)})
+    rows = _read(
+        options,
+        {
+            "axis": AXES,
+            "joint": joints,
+            "norm": ("norm",),
+            "s0": ("s0",),
+        },
+    )
     motion = rows["axes"]
     force = rows["force_axes"]
     if force is not None:
         both = force * (1.0 if motion is None else motion)
-        entries("force_axes", both > 0, both == 0, "is an axis of motion, too", AXES, kind="entry")
+        entries(
+            "force_axes",
+            both > 0,
+            both == 0,
+            "is an axis of motion, too",
+            AXES,
+            kind="entry",
+        )
     if rows["damping"] is None:
         rows["damping"] = 2 * rows["damping_ratio"] * np.sqrt(rows["stiffness"])
     # Critical damping and the like follow from the stiffness that is left.

@@ -76,7 +76,11 @@ class Bodies(NamedTuple):
     base_tensor: Array
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(
+    frozen=True,
+    eq=False,
+    repr=False,
+)
 class RigidTree:
     """Rigid tree of a robot. Arrays are copied and read-only; the degrees of freedom are the joints
     that move, in the order of their links.
@@ -131,7 +135,7 @@ class RigidTree:
     """
     fixed_base: bool = True
     """False if the base floats. Mass matrices and biases of the joints are then Schur complements
-    (:mod:`batchpid.task_space.tree_dynamics`); poses and Jacobians are still in the frame of the
+    (:mod:`batchpid.task_space.tree_quantities`); poses and Jacobians are still in the frame of the
     base.
     """
 

@@ -18,7 +18,12 @@ def quiet() -> np.errstate:
     """Return a context in which rows that are not finite, or not positive definite, cause no
     warnings.
     """
-    return np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore")
+    return np.errstate(
+        invalid="ignore",
+        divide="ignore",
+        over="ignore",
+        under="ignore",
+    )
 
 
 def whitened(matrix: Array, right: Array) -> Array:

@@ -1,31 +1,215 @@
-"""Poses, Jacobians, mass matrices and forces of a kinematic tree: natively where that is possible,
-else as :mod:`batchpid.task_space.tree_kinematics` and :mod:`batchpid.task_space.tree_dynamics`
-define them.
+r"""Poses, Jacobians, mass matrices and forces of a kinematic tree: natively where that is possible,
+else by the equations below and those of :mod:`batchpid.task_space.tree_kinematics`.
 
 Arrays have any leading axes. Every function raises InvalidArgumentError for an unknown link, or an
 array of a wrong shape.
+
+The dynamics are M(q) q'' + h(q, q') = tau, without friction and damping. All quantities are in the
+axes of the world and about its origin. Joint j has the motion s_j = (v_j, w_j). All bodies that it
+moves together have the mass m, the first moment c and the inertia tensor I. Momenta under s_j and
+mass matrix are (composite rigid bodies; R. Featherstone, Rigid Body Dynamics Algorithms, Springer,
+2008, section 6.2)::
+
+    linear  p_j = m v_j + w_j x c        angular  k_j = I w_j + c x v_j
+    M_ij = M_ji = s_i . (p_j, k_j)   for a joint i that moves joint j, or is joint j; else 0;   M_jj += armature
+
+The bias h (gravity, Coriolis and centrifugal forces) is the sum of the rates of momentum of the
+bodies at q'' = 0, less their weight (recursive Newton-Euler algorithm, section 5.3). A body with the
+velocity (v, w) and the acceleration (A_o, A_w), as fields about the origin, has momenta (p, k) under
+its velocity, and (p', k') under its acceleration less gravity, (A_o - g, A_w)::
+
+    f = p' + w x p      n = k' + w x k + v x p      h_j = s_j . (sum of (f, n) of the bodies that j moves)
+
+On a floating base (index b; index j for the joints) M and h of the joints are Schur complements::
+
+    M = M_jj - M_jb M_bb^-1 M_bj        h = h_j - M_jb M_bb^-1 h_b
+
+where the columns of M_bj are the momenta (p_j, k_j), and M_bb and h_b belong to all bodies
+together. Gravity, and the velocity and acceleration of the base's origin, cancel. The rate at which
+the base turns remains in h.
+
+The results for coupled joints are reduced to their leaders, G^T M G and G^T h
+(:mod:`batchpid.motors.coupling`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from batchpid.arrays.array_types import Array
+import numpy as np
+
+from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace
+from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
-from batchpid.task_space.frames import pose_of
+from batchpid.task_space.frames import Vector, added, components, crossed, pose_of, scaled
 from batchpid.task_space.rigid_tree import Bodies, RigidTree
-from batchpid.task_space.symmetric import product, quiet, solve
-from batchpid.task_space.tree_dynamics import check_masses, effort_of, mass_matrix_of
+from batchpid.task_space.symmetric import gram, product, quiet, solve
 from batchpid.task_space.tree_kinematics import (
+    Motions,
+    Velocities,
     jacobian_at,
     motions_of,
     prepared,
     rate_at,
     read_point,
+    summed,
     tool_frame,
     velocities_of,
 )
+
+
+def check_masses(tree: RigidTree) -> None:
+    """Raise InvalidArgumentError for a joint that moves no mass and has no armature: its mass
+    matrix is singular.
+    """
+    # A leader moves the masses of its followers, too.
+    moved = tree.bodies.moves.T @ tree.bodies.mass[:, 0] + tree.bodies.armature
+    moved = tree.coupling.of_all(tree.coupling.reduced_damping(moved))
+    for joint, kg in zip(tree.joint_names, moved, strict=True):
+        if not kg > 0:
+            problem = "has a joint that moves no mass and has no armature"
+            raise InvalidArgumentError(
+                "tree", problem, joint=joint, remedy="give one of its links a mass"
+            )
+
+
+Inertias = Sequence[Array]
+"""Inertias about the origin of the world, in its axes: mass, first moment x, y, z, and entries xx,
+yy, zz, xy, xz, yz of the inertia tensor; arrays (dof, rows).
+"""
+_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def _inertias(mass: Array, center: Array, tensor: Array, frames: Array) -> Inertias:
+    """Return the inertias of bodies with ``center`` (n, 3, rows) and ``tensor`` (n, 3, 3, rows) in
+    their ``frames`` (n, 3, 4, rows).
+    """
+    axes = range(3)
+    turn = [[frames[:, i, k] for k in axes] for i in axes]
+    r = [_products(turn[i], [center[:, k] for k in axes]) + frames[:, i, 3] for i in axes]
+    half = [[_products(row, [tensor[:, k, j] for k in axes]) for j in axes] for row in turn]
+    square = _products(r, r)
+    # R I R^T + m (r.r 1 - r r^T)
+    entries = [
+        _products(half[i], turn[j]) + mass * ((square if i == j else 0.0) - r[i] * r[j])
+        for i, j in _ENTRIES
+    ]
+    return mass + 0.0 * square, *[mass * at for at in r], *entries
+
+
+def _of_bodies(bodies: Bodies, motions: Motions) -> Inertias:
+    return _inertias(bodies.mass, bodies.center, bodies.tensor, motions.frames)
+
+
+def _products(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    """Return the sum of the products of components, in their order."""
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+def _momenta(inertias: Inertias, v: Vector, w: Vector) -> tuple[Vector, Vector]:
+    """Return the momenta p = m v + w x c and k = I w + c x v."""
+    mass, cx, cy, cz, xx, yy, zz, xy, xz, yz = inertias
+    c = cx, cy, cz
+    spin = _products((xx, xy, xz), w), _products((xy, yy, yz), w), _products((xz, yz, zz), w)
+    return added(scaled(v, mass), crossed(w, c)), added(spin, crossed(c, v))
+
+
+def _on_base(tree: RigidTree, part: Array) -> Array:
+    """Return the sum (rows,) over the joints on the base, of numbers (dof, rows)."""
+    return part[np.array(tree.body_parents) < 0].sum(0)
+
+
+def _of_base(
+    tree: RigidTree,
+    bodies: Bodies,
+    whole: Inertias,
+    xp: ArrayModule,
+) -> tuple[Inertias, Array]:
+    """Return the inertias of the base (1, rows), and M_bb (rows, 6, 6), linear parts first: the
+    momenta of the whole robot under the motions of its base.
+    """
+    center, tensor = bodies.base_center[None], bodies.base_tensor[None]
+    frame = xp.eye(3, 4, dtype=bodies.mass.dtype)[None, ..., None]
+    base = _inertias(bodies.base_mass, center, tensor, frame)
+    # Composites of the joints on the base contain all bodies but the base itself.
+    robot = [
+        _on_base(tree, part)[None] + of_base for part, of_base in zip(whole, base, strict=True)
+    ]
+    unit = xp.eye(6, dtype=bodies.mass.dtype)[..., None]
+    p, k = _momenta(robot, (unit[0], unit[1], unit[2]), (unit[3], unit[4], unit[5]))
+    return base, _by_row(xp.stack((*p, *k)), xp)
+
+
+def _by_row(table: Array, xp: ArrayModule) -> Array:
+    """Return ``table`` (..., rows) as (rows, ...)."""
+    return xp.moveaxis(table, -1, 0)
+
+
+def mass_matrix_of(
+    tree: RigidTree,
+    bodies: Bodies,
+    motions: Motions,
+    xp: ArrayModule,
+) -> Array:
+    """Return the mass matrices (rows, dof, dof) at given motions of the joints."""
+    whole = summed(tree, bodies, _of_bodies(bodies, motions), xp, outwards=False)
+    p, k = _momenta(whole, motions.linear, motions.angular)
+    twists = [part[:, None] for part in (*motions.linear, *motions.angular)]
+    table = _products(twists, [part[None] for part in (*p, *k)])
+    # Only entries of joints on one branch differ from 0: one of them moves the other.
+    moves = bodies.moves[..., None] > 0
+    rest = xp.where(moves, xp.swapaxes(table, 0, 1), xp.zeros_like(table))
+    matrix = _by_row(xp.where(xp.swapaxes(moves, 0, 1), table, rest), xp)
+    if not tree.fixed_base:
+        # The free base yields to each joint's momentum.
+        momenta = _by_row(xp.stack((*p, *k)), xp)
+        matrix = matrix - gram(momenta, solve(_of_base(tree, bodies, whole, xp)[1], momenta))
+    matrix = matrix + bodies.armature[None] * xp.eye(tree.dof, dtype=matrix.dtype)[None]
+    return xp.asarray(tree.coupling.mass_matrix(matrix), dtype=matrix.dtype)
+
+
+def effort_of(
+    tree: RigidTree,
+    bodies: Bodies,
+    motions: Motions,
+    rates: Velocities,
+    xp: ArrayModule,
+    turning: Array = None,
+) -> Array:
+    """Return the efforts (rows, dof) of given velocities and accelerations of the bodies, without
+    armature.
+
+    A floating base turns at ``turning`` (rows, 3) [rad/s]; ``rates`` must include this rotation.
+    """
+    inertias = _of_bodies(bodies, motions)
+    acceleration = rates.linear_rate
+    # A free base falls with its joints: gravity cancels there.
+    if tree.fixed_base:
+        weight = -bodies.gravity[:, None]
+        acceleration = added(acceleration, (weight[0], weight[1], weight[2]))
+    v, w = rates.linear, rates.angular
+    p, k = _momenta(inertias, v, w)
+    p_rate, k_rate = _momenta(inertias, acceleration, rates.angular_rate)
+    force = added(p_rate, crossed(w, p))
+    torque = added(k_rate, added(crossed(w, k), crossed(v, p)))
+    wrench = summed(tree, bodies, (*force, *torque), xp, outwards=False)
+    effort = _products((*motions.linear, *motions.angular), wrench).T
+    if not tree.fixed_base:
+        whole = summed(tree, bodies, inertias, xp, outwards=False)
+        base, matrix = _of_base(tree, bodies, whole, xp)
+        on_base = xp.stack([_on_base(tree, part) for part in wrench], axis=-1)
+        if turning is not None:
+            turn = components(turning[None])
+            p, k = _momenta(base, scaled(turn, 0.0), turn)
+            on_base = on_base + xp.stack((*crossed(turn, p), *crossed(turn, k)), axis=-1)[0]
+        p, k = _momenta(whole, motions.linear, motions.angular)
+        falls = solve(matrix, on_base[..., None])
+        effort = effort - gram(_by_row(xp.stack((*p, *k)), xp), falls)[..., 0]
+    return tree.efforts(effort)
 
 
 def evaluated(
@@ -51,7 +235,14 @@ def evaluated(
     index = 0 if link is None else tree.index(link)
     point = read_point(q, point)
     if bodies is None:
-        native = native_rows.kinematics(tree, names, q, v, index, point)
+        native = native_rows.kinematics(
+            tree,
+            names,
+            q,
+            v,
+            index,
+            point,
+        )
         if native is not None:
             return native
     # The definition, for JAX, for varied bodies, and where no extension was built.
@@ -76,7 +267,14 @@ def evaluated(
             velocities = None
         else:
             speeds = v.reshape(-1, tree.dof).T
-            velocities = velocities_of(tree, of_robots, motions, speeds, xp, turning)
+            velocities = velocities_of(
+                tree,
+                of_robots,
+                motions,
+                speeds,
+                xp,
+                turning,
+            )
         if link is not None:
             tool = tool_frame(tree, of_robots, motions, index, place)
             results["pose"] = pose_of(tool)
@@ -88,7 +286,14 @@ def evaluated(
         if "mass_matrix" in names:
             results["mass_matrix"] = mass_matrix_of(tree, of_robots, motions, xp)
         if "bias" in names and velocities is not None:
-            results["bias"] = effort_of(tree, of_robots, motions, velocities, xp, turning)
+            results["bias"] = effort_of(
+                tree,
+                of_robots,
+                motions,
+                velocities,
+                xp,
+                turning,
+            )
     return {name: rows.reshape(*leading, *rows.shape[1:]) for name, rows in results.items()}
 
 
@@ -106,7 +311,17 @@ def link_poses(
     """
     prepared(tree, qpos=qpos)
     names = tree.links if links is None else links
-    poses = [evaluated(tree, ("pose",), qpos, None, link, point)["pose"] for link in names]
+    poses = [
+        evaluated(
+            tree,
+            ("pose",),
+            qpos,
+            None,
+            link,
+            point,
+        )["pose"]
+        for link in names
+    ]
     return namespace(*poses).stack(poses, axis=-2)
 
 
@@ -122,7 +337,14 @@ def jacobian(
 
     ``point`` is in the link's frame, (3,) or (..., 3) [m]; default its origin.
     """
-    return evaluated(tree, ("jacobian",), qpos, None, link, point)["jacobian"]
+    return evaluated(
+        tree,
+        ("jacobian",),
+        qpos,
+        None,
+        link,
+        point,
+    )["jacobian"]
 
 
 def jacobian_rate(
@@ -138,7 +360,14 @@ def jacobian_rate(
 
     ``qpos`` and ``qvel`` are (..., dof); ``point`` is as in :func:`jacobian`.
     """
-    return evaluated(tree, ("jacobian_rate",), qpos, qvel, link, point)["jacobian_rate"]
+    return evaluated(
+        tree,
+        ("jacobian_rate",),
+        qpos,
+        qvel,
+        link,
+        point,
+    )["jacobian_rate"]
 
 
 def mass_matrix(tree: RigidTree, qpos: Array, bodies: Bodies | None = None) -> Array:
@@ -165,7 +394,14 @@ def bias(
     A floating base turns at ``turning`` (..., 3) [rad/s], in its own axes; default 0. ``bodies``
     are as in :func:`mass_matrix`.
     """
-    return evaluated(tree, ("bias",), qpos, qvel, bodies=bodies, turning=turning)["bias"]
+    return evaluated(
+        tree,
+        ("bias",),
+        qpos,
+        qvel,
+        bodies=bodies,
+        turning=turning,
+    )["bias"]
 
 
 def gravity(tree: RigidTree, qpos: Array) -> Array:
@@ -185,7 +421,12 @@ def inverse_dynamics(
     """Return the efforts (..., dof) [N m or N] of the accelerations ``qacc`` (..., dof): M q'' +
     h.
     """
-    *_, a = prepared(tree, qpos=qpos, qvel=qvel, qacc=qacc)[0]
+    *_, a = prepared(
+        tree,
+        qpos=qpos,
+        qvel=qvel,
+        qacc=qacc,
+    )[0]
     results = evaluated(tree, ("mass_matrix", "bias"), qpos, qvel)
     with quiet():
         return product(results["mass_matrix"], tree.coupling.of_independent(a)) + results["bias"]
@@ -205,7 +446,12 @@ def forward_dynamics(
     InvalidArgumentError
         Also if a joint moves no mass and has no armature.
     """
-    *_, u = prepared(tree, qpos=qpos, qvel=qvel, effort=effort)[0]
+    *_, u = prepared(
+        tree,
+        qpos=qpos,
+        qvel=qvel,
+        effort=effort,
+    )[0]
     check_masses(tree)
     results = evaluated(tree, ("mass_matrix", "bias"), qpos, qvel)
     with quiet():

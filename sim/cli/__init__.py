@@ -85,12 +85,22 @@ def parse(arguments: Sequence[str]) -> tuple[str, object]:
         from batchpid.sim.cli.commands import COMMANDS
 
         record = COMMANDS[name].record()
-        return name, tyro.cli(record, prog=f"batchpid {name}", args=words, config=config)
+        return name, tyro.cli(
+            record,
+            prog=f"batchpid {name}",
+            args=words,
+            config=config,
+        )
     app = tyro.extras.SubcommandApp()
     for name, summary in SUMMARIES.items():
         app.command(name=name, help=summary)(_nothing)
     about = "Joint-level PID control for many robots at once, in SAPIEN or MuJoCo."
-    app.cli(prog="batchpid", description=about, args=arguments, config=config)
+    app.cli(
+        prog="batchpid",
+        description=about,
+        args=arguments,
+        config=config,
+    )
     raise SystemExit(0)
 
 

@@ -266,7 +266,14 @@ def bar(label: str, unit: str = "it") -> Progress[Any]:
         return partial(_lines, label, unit)
     from tqdm import tqdm
 
-    return partial(tqdm, desc=label, unit=unit, delay=1.0, leave=False, dynamic_ncols=True)
+    return partial(
+        tqdm,
+        desc=label,
+        unit=unit,
+        delay=1.0,
+        leave=False,
+        dynamic_ncols=True,
+    )
 
 
 def _lines(label: str, unit: str, items: Collection[T]) -> Iterator[T]:

@@ -25,7 +25,11 @@ def flag(text: str, metavar: str | None = None) -> Any:
     """Return the part of an annotation that makes a parameter a flag: its help, and a word for its
     values where the type gives none.
     """
-    return tyro.conf.arg(help=text, metavar=metavar, help_behavior_hint=_hint)
+    return tyro.conf.arg(
+        help=text,
+        metavar=metavar,
+        help_behavior_hint=_hint,
+    )
 
 
 def _hint(default: str) -> str:

@@ -165,7 +165,12 @@ def export(
     batchpid's law or the robot's file are printed, one line each.
     """
     # A flag without effect is refused by name.
-    chosen = {"gains": gains, "limits": limits, "dynamics": dynamics, "plan": plan}
+    chosen = {
+        "gains": gains,
+        "limits": limits,
+        "dynamics": dynamics,
+        "plan": plan,
+    }
     unused = [name for name, value in chosen.items() if value and name not in USED[to]]
     if unused:
         raise InvalidArgumentError(
@@ -180,7 +185,15 @@ def export(
     if to == "mjcf":
         exported = _mjcf(robot, params, timestep, limits)
     elif to == "c":
-        exported = _c_header(robot, params, timestep, limits, prefix, dynamics, plan)
+        exported = _c_header(
+            robot,
+            params,
+            timestep,
+            limits,
+            prefix,
+            dynamics,
+            plan,
+        )
     else:
         exported = _controllers(robot, params, timestep, limits, prefix)
     return ExportedFile(to, lambda folder: exported)

@@ -125,7 +125,11 @@ def inspect_robot(
         # Designed gains keep the stability bound.
         return Inspection(robot, findings, None, [], all)
     chosen = gain_set(robot, gains)
-    checked = robot.check(params=chosen.params, setpoint=robot.target, control=chosen.control)
+    checked = robot.check(
+        params=chosen.params,
+        setpoint=robot.target,
+        control=chosen.control,
+    )
     of_gains = [finding for finding in checked if finding not in findings]
     return Inspection(robot, findings, chosen, of_gains, all)
 
@@ -163,6 +167,9 @@ def sentences(findings: Iterable[Finding]) -> list[str]:
 def _fill(text: str) -> str:
     # A unit stays with its other half on a line.
     wrapper = textwrap.TextWrapper(
-        120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+        120,
+        subsequent_indent="  ",
+        break_long_words=False,
+        break_on_hyphens=False,
     )
     return wrapper.fill(text.replace("N m", "N\xa0m")).replace("\xa0", " ")

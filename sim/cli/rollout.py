@@ -4,9 +4,10 @@ the same in one call. Their report: figures as a table and as a picture, and wha
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -18,6 +19,7 @@ from batchpid.arrays.array_types import Document, Float64, Progress, Rows
 from batchpid.arrays.field_tables import Field
 from batchpid.checks.validate import array
 from batchpid.errors import InvalidArgumentError
+from batchpid.plan import make_plan
 from batchpid.sim import OperationalSpace, Robot, Rollout, write_recording
 from batchpid.sim.cli.flags import BOUNDS, Gains, NumEnvs, Randomize, flag
 from batchpid.sim.diagnosis.causes import (
@@ -42,9 +44,14 @@ NOT_SETTLED = 3
 """Exit status of `batchpid rollout` and `batchpid demo` where no env settles."""
 SHORTEST = 1.0
 """Shortest run in which envs should settle [s]."""
-LISTED = 8
-"""Envs that a line lists."""
-AXIS_UNITS = {"x": "m", "y": "m", "z": "m", "rx": "rad", "ry": "rad", "rz": "rad"}
+AXIS_UNITS = {
+    "x": "m",
+    "y": "m",
+    "z": "m",
+    "rx": "rad",
+    "ry": "rad",
+    "rz": "rad",
+}
 """Axes of the error of a pose, with their units."""
 COLUMNS = {
     "first_error": ("first error", "{:.2g}"),
@@ -62,6 +69,8 @@ ticks; settled: within 2 % of the move for good; overshoot: of joints that settl
 """
 SETPOINT_SUBSTEPS = 20
 """Sim steps of a tick, from one sample to the next, to a setpoint."""
+CHUNK_ROWS = 16
+"""Rows of a trajectory that enter a plan at once."""
 START_SPREAD = 0.3
 """Largest distance of a start pose from the first one [rad or m]."""
 Seconds = Annotated[
@@ -83,7 +92,13 @@ def demo(
     PID and passive force are computed at each of the 2000 sim steps of a second. Env 0 starts where
     SAPIEN's tutorial does, the others at seeded poses near it.
     """
-    return rollout(robot, num_envs, seconds=seconds, progress=progress, **options)
+    return rollout(
+        robot,
+        num_envs,
+        seconds=seconds,
+        progress=progress,
+        **options,
+    )
 
 
 def rollout(
@@ -114,6 +129,10 @@ def rollout(
             "FILE",
         ),
     ] = None,
+    plan: Annotated[
+        bool,
+        flag("Execute the rows of the trajectory by a plan: they may be slow, as 30 a second."),
+    ] = False,
     rates: Annotated[
         bool,
         flag(
@@ -163,7 +182,28 @@ def rollout(
     # Setpoints: of a file, or one that is held.
     notes: list[str] = []
     further = Document()
-    if trajectory is not None:
+    meant: Rows | None = None
+    if trajectory is None and plan:
+        raise InvalidArgumentError("plan", "is for a trajectory", remedy="give --trajectory FILE")
+    if plan and not rates:
+        raise InvalidArgumentError("plan", "makes the rates", remedy="leave --no-rates out")
+    if trajectory is not None and plan:
+        from batchpid.sim.recording.setpoint_files import read_setpoints
+
+        _refuse("setpoint", setpoint, "is given by the trajectory")
+        _refuse("seconds", seconds, "is given by the trajectory")
+        motion = read_setpoints(robot, trajectory, None)
+        center = center if motion.start is None else motion.start
+        options["substeps"] = SETPOINT_SUBSTEPS
+        options["plan"] = make_plan(
+            robot.dof, period=motion.period, horizon=CHUNK_ROWS, blend="newest"
+        )
+        knots = np.vstack([center, motion.position])
+        tick = timestep * SETPOINT_SUBSTEPS
+        setpoints, ages, meant = _chunks(knots, motion.period, tick, num_envs)
+        further = {"latency": ages}
+        notes.append(f"Rows every {1000 * motion.period:.4g} ms, executed by a plan.")
+    elif trajectory is not None:
         from batchpid.sim.recording.setpoint_files import read_setpoints
 
         _refuse("setpoint", setpoint, "is given by the trajectory")
@@ -202,7 +242,34 @@ def rollout(
         result = runner.rollout(setpoints, progress=progress, **further)
         wall = time.perf_counter() - began
         backend = runner.backend
-    return RunReport(robot, result, timestep, wall, backend, notes, is_held=trajectory is None)
+    if meant is not None:
+        result = replace(result, setpoint=np.repeat(meant[:, None], num_envs, 1))
+    return RunReport(
+        robot,
+        result,
+        timestep,
+        wall,
+        backend,
+        notes,
+        is_held=trajectory is None,
+    )
+
+
+def _chunks(knots: Rows, period: float, tick: float, num_envs: int) -> tuple[Rows, Float64, Rows]:
+    """Return the chunks (ticks, 1, rows, dof) of ``knots`` (n + 1, dof), the first one at time 0, their
+    ages (ticks, envs) [s], infinite without a chunk, and the setpoints at the ends of ticks.
+    """
+    count = len(knots) - 1
+    times = tick * np.arange(max(2, math.ceil(count * period / tick)))
+    # The half of a chunk is executed before the next one comes.
+    step = CHUNK_ROWS // 2
+    numbers = np.floor(times / (step * period)).astype(int)
+    rows = np.minimum(step * numbers[:, None] + np.arange(CHUNK_ROWS), count)
+    is_new = np.diff(numbers, prepend=-1) > 0
+    ages = np.where(is_new, times - step * numbers * period, np.inf)
+    places = period * np.arange(count + 1)
+    meant = np.stack([np.interp(times + tick, places, column) for column in knots.T], 1)
+    return knots[rows][:, None], np.repeat(ages[:, None], num_envs, 1), meant
 
 
 def start_poses(
@@ -322,24 +389,16 @@ class RunReport:
         return "\n".join(lines)
 
     def _unsettled_lines(self) -> list[str]:
-        """Return lines about envs that failed, joints that did not settle, and the causes."""
+        """Return lines about joints that did not settle, and the causes."""
         rollout = self.rollout
-        lines = []
-        # Failed envs first: their joints are not counted as unsettled.
-        failed = np.flatnonzero(~rollout.ok.all(0))
-        if failed.size:
-            first = rollout.tick * (1 + np.argmin(rollout.ok.all(1)))
-            envs = ", ".join(map(str, failed[:LISTED]))
-            lines.append(
-                f"FAILED: {failed.size} of {rollout.num_envs} envs, the first after {first:.3g} s:"
-                f" env {envs}{', ...' if failed.size > LISTED else ''}."
-            )
+        causes = rollout.findings(self.robot)
         # A trajectory ends where it ends: its last setpoint need not be reached.
         if not self.is_held:
-            return lines
+            return list(cause_lines([cause for cause in causes if cause.code == "failed"]))
+        lines = []
         settling = self.columns[2].get("settling_time")
         if settling is not None:
-            # Followers do what their leaders do.
+            # Joints of failed envs are not counted; followers do what their leaders do.
             counts = np.isinf(settling[rollout.ok.all(0)]).sum(0) * self.robot.independent
             named = zip(self.robot.joint_names, counts, strict=True)
             joints = [f"{name} ({count})" for name, count in named if count]
@@ -348,9 +407,9 @@ class RunReport:
                 lines.append(
                     f"NOT SETTLED {within} the move, with the number of envs: {', '.join(joints)}."
                 )
-            elif not failed.size:
+            elif rollout.ok.all():
                 lines.append(f"Every joint of every env settled {within} its move.")
-        return lines + list(cause_lines(rollout.findings(self.robot)))
+        return [*lines, *cause_lines(causes)]
 
     def save(self, path: Path) -> None:
         """Write the recording."""

@@ -18,8 +18,9 @@ from tabulate import tabulate
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64, Rows
-from batchpid.arrays.elementwise import TURN
+from batchpid.arrays.elementwise import TURN, wrap
 from batchpid.errors import InvalidArgumentError
+from batchpid.metrics import SETTLING_SHARE
 from batchpid.sim.diagnosis.preflight import touching_links
 from batchpid.sim.findings import FINDING_KINDS, LIMIT_TOLERANCE, Finding, Findings
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
     from batchpid.sim.rollout import Rollout
 
-SETTLING_SHARE = 0.02  # half width of the settling band, as a share of the move
 EXAMINED = 100  # envs at most
 TAIL = 0.2  # last share of the run, by which joints are judged
 MOST_CAUSES = 3  # of a report
@@ -99,13 +99,24 @@ def _finding(
     if rule.names_joint:
         name = run.robot.joint_names[joint]
         detail = f"{run.error[-1, first, joint]:.2g} {run.robot.units[joint]} remain"
+        if rule.code == "slow" and run.lag[first, joint] > 0:
+            detail += f", {1000 * run.lag[first, joint]:.0f} ms behind the moving setpoint"
     for fault in run.info.faults:
         if run.failed[first] and fault.env == first:
             detail = f"{fault.joint}: {fault.cause}"
     numbers = tuple(envs[rows].tolist())
     time = times.min()
     kind = FINDING_KINDS[rule.code]
-    return Finding(kind.code, kind.when, kind.done, name, None, detail, numbers, time)
+    return Finding(
+        kind.code,
+        kind.when,
+        kind.done,
+        name,
+        None,
+        detail,
+        numbers,
+        time,
+    )
 
 
 class _Run:
@@ -136,6 +147,22 @@ class _Run:
         """Joints that end outside their band, and all joints of envs that failed or cannot reach
         the pose.
         """
+
+    @cached_property
+    def lag(self) -> Float64:
+        """Time by which the joints follow setpoints that move until the end (envs, dof) [s], the mean
+        error by the mean speed; 0 for others.
+        """
+        lag = np.zeros(self.goal.shape)
+        setpoint = self.rollout.setpoint
+        if setpoint.shape != self.qpos.shape or self.info.control == "effort":
+            return lag
+        period = np.where(self.robot.continuous, 1 / TURN, 0.0)
+        change = wrap(np.diff(setpoint, axis=0), period, np) / self.rollout.tick
+        error = wrap(setpoint - self.qpos, period, np)[1:]
+        moves = change[self.tail].any(0)
+        np.divide(np.abs(error).sum(0), np.abs(change).sum(0), out=lag, where=moves)
+        return lag
 
     def _find_goal(self) -> Float64:
         command = self.info.own_command

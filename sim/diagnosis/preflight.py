@@ -101,7 +101,14 @@ def _found(
 ) -> Finding:
     """Return a finding; text and remedy are those of the kind where they are not given."""
     kind = FINDING_KINDS[code]
-    return Finding(code, text or kind.when, remedy or kind.done, joint, link, detail)
+    return Finding(
+        code,
+        text or kind.when,
+        remedy or kind.done,
+        joint,
+        link,
+        detail,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +228,12 @@ def _changed_meshes(plan: _Plan) -> Iterator[Finding]:
             text = "a collision mesh is not convex, and collides as its convex hull"
             detail = f"{share:.3g} times its volume"
             yield _found(
-                "collision", None, shape.owner, detail, text, "divide the mesh into convex parts"
+                "collision",
+                None,
+                shape.owner,
+                detail,
+                text,
+                "divide the mesh into convex parts",
             )
 
 
@@ -259,7 +271,14 @@ def _without_range(plan: _Plan) -> Iterator[Finding]:
             text = "lower and upper limit are equal: no motion"
             limits = f"[{joint.lower:g}, {joint.upper:g}]"
             remedy = "give <limit lower= upper=>, or make it fixed"
-            yield _found("limits", joint.name, None, limits, text, remedy)
+            yield _found(
+                "limits",
+                joint.name,
+                None,
+                limits,
+                text,
+                remedy,
+            )
 
 
 def _weak(plan: _Plan) -> Iterator[Finding]:

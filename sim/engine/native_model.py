@@ -1,7 +1,7 @@
 r"""Robots in native code: mass matrices and passive forces, also within the sim steps of a tick,
 and the step itself.
 
-The equations are those of :mod:`batchpid.task_space.tree_dynamics`, on a base that is held or
+The equations are those of :mod:`batchpid.task_space.tree_quantities`, on a base that is held or
 floats.
 """
 
@@ -45,7 +45,7 @@ def passive_force(
     bodies = None
     if base is not None:
         turning = base[:, 3:]
-        bodies = tree.bodies._replace(gravity=base[:, None, :3])
+        bodies = tree.bodies._replace(gravity=base[:, :3])
     force = zero
     if coriolis or gravity:
         force = ts.bias(
@@ -116,7 +116,11 @@ class NativeModel:
             "base": number("Base", self._base.upper()),
         }
         gravity = tuple(self._pack.rigid_tree.bodies.gravity)
-        return structure("Model")(gravity=gravity, **numbers, **addresses), arrays
+        return structure("Model")(
+            gravity=gravity,
+            **numbers,
+            **addresses,
+        ), arrays
 
     @property
     def address(self) -> int:
@@ -167,7 +171,14 @@ class NativeModel:
             for rows in (qpos, qvel, base)
         ]
         out = np.empty(qpos.shape)
-        self._native.forces(self.address, gravity, coriolis, *state, out, len(out))
+        self._native.forces(
+            self.address,
+            gravity,
+            coriolis,
+            *state,
+            out,
+            len(out),
+        )
         return out
 
 
@@ -219,7 +230,11 @@ class NativeRefresh:
         arrays |= coupling.native()
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
         self._structure = structure("Refresh")(
-            model=model.address, timestep=timestep, share=DEADBEAT_SHARE, steps=steps, **addresses
+            model=model.address,
+            timestep=timestep,
+            share=DEADBEAT_SHARE,
+            steps=steps,
+            **addresses,
         )
         self._kept = model, arrays
 
@@ -258,7 +273,12 @@ class NativeStep:
             self._arrays["speed_limit"] = np.broadcast_to(speed_limit, dof).astype(np.float64)
         addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
         self._native = native.extension("_gateway")
-        self._group = structure("Group")(robots=robots, dof=dof, **addresses, **fields)
+        self._group = structure("Group")(
+            robots=robots,
+            dof=dof,
+            **addresses,
+            **fields,
+        )
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension that does a sim
@@ -277,7 +297,7 @@ class NativeStep:
         """Return whether an env may have failed in a sim step with this status; RuntimeError if the
         engine has.
         """
-        if status & number("Status", "FAILED"):
+        if status and status & number("Status", "FAILED"):
             raise RuntimeError(self._group.message.decode(errors="replace"))
         return bool(status)
 

@@ -49,6 +49,10 @@ class MujocoSolver:
 
 SOLVERS = {
     "accurate": MujocoSolver(),
-    "fast": MujocoSolver(iterations=20, tolerance=1e-6, elliptic=False),
+    "fast": MujocoSolver(
+        iterations=20,
+        tolerance=1e-6,
+        elliptic=False,
+    ),
 }
 """Presets, by the names of the option ``physics``."""

@@ -17,7 +17,6 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
-from batchpid.sim.geometry.distances import Contacts
 from batchpid.sim.robot.merging import (
     Part,
     body_tree,
@@ -115,13 +114,6 @@ class SceneSpec:
             if owners[places[link].link] - {link}:
                 divided += [link, *sorted(owners[places[link].link])]
         return tuple(dict.fromkeys((*wrenches, *divided)))
-
-    def contact_model(self, ground: bool) -> Contacts:
-        """Return distances of the robot's links, even of one simulated without shapes; ``ground``
-        is at height 0.
-        """
-        ignored = {frozenset(pair) for pair in self.ignored}
-        return Contacts(self.rigid_tree, self.simulated.shapes, ignored, ground)
 
     @property
     def is_alone(self) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from itertools import combinations
 from threading import RLock
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -29,14 +28,6 @@ _ANY = 1e6
 """Distance [m] beyond that of all bodies."""
 _FARTHEST_PAIR = 1.0
 """Largest distance [m] between shapes that is computed."""
-
-
-class Near(NamedTuple):
-    """Two shapes near each other: their links in the URDF, or GROUND, and their distance [m]."""
-
-    first: str
-    second: str
-    distance: float
 
 
 class Contacts:
@@ -101,11 +92,13 @@ class Contacts:
         names = [*(shape.owner for shape in self._shapes), GROUND]
         self._owners = [(names[a], names[b]) for a, b in pairs]
 
-    def near(self, qpos: Rows, within: float = NEAR_DISTANCE) -> Iterator[Near]:
-        """Yield the pairs of shapes that are closer than ``within`` [m], at one pose (dof,)."""
+    def near(self, qpos: Rows, within: float = NEAR_DISTANCE) -> Iterator[tuple[str, str, float]]:
+        """Yield the links, or GROUND, of the shapes that are closer than ``within`` [m] at one pose
+        (dof,), and their distance [m].
+        """
         gaps = self._gaps(np.asarray(qpos)[None], max(within, NEAR_DISTANCE))[0]
         for row in np.flatnonzero(gaps < within).tolist():
-            yield Near(*self._owners[row], float(gaps[row]))
+            yield *self._owners[row], float(gaps[row])
 
     def in_contact(self, qpos: Rows, clearance: float = 0.0) -> NDArray[np.bool_]:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground
@@ -183,4 +176,13 @@ class Contacts:
 
     def _distance(self, first: int, second: int, farthest: float) -> float:
         """Return the distance [m] of two shapes as placed, at most ``farthest``."""
-        return float(mujoco.mj_geomDistance(self._model, self._data, first, second, farthest, None))
+        return float(
+            mujoco.mj_geomDistance(
+                self._model,
+                self._data,
+                first,
+                second,
+                farthest,
+                None,
+            )
+        )

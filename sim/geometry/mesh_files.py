@@ -11,13 +11,13 @@ import re
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
 from lxml import etree
 
-from batchpid.arrays.digest import digest
+from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
 from batchpid.io.files import imported
 
@@ -89,15 +89,6 @@ def _ros_packages(package: str) -> Iterator[Path]:
             yield from sorted(root.glob(pattern))
 
 
-class Mesh(NamedTuple):
-    """Content of a mesh file: digest of its bytes, and the reason for which it cannot be used, or
-    None.
-    """
-
-    content: str
-    problem: str | None
-
-
 def read_mesh(path: str | Path, data: bytes | None = None) -> Any:
     """Return the result of ``trimesh`` for a mesh file, or for its bytes ``data``, in metres.
 
@@ -108,7 +99,11 @@ def read_mesh(path: str | Path, data: bytes | None = None) -> Any:
     # Materials are textures to decode, of which nothing here needs any.
     load = imported("trimesh").load
     mesh: Any = load(
-        BytesIO(data), file_type=kind, force="mesh", process=False, skip_materials=True
+        BytesIO(data),
+        file_type=kind,
+        force="mesh",
+        process=False,
+        skip_materials=True,
     )
     # Of COLLADA: "0.01 * meters".
     factor, _, unit = str(mesh.metadata.get("units", "")).partition(" * ")
@@ -124,18 +119,20 @@ are loaded again.
 """
 
 
-def check_mesh(path: Path) -> Mesh:
-    """Return content and problem of a mesh file."""
+def check_mesh(path: Path) -> tuple[str, str | None]:
+    """Return the digest of the bytes of a mesh file, and the reason for which it cannot be used, or
+    None.
+    """
     try:
         with open(path, "rb") as file:
             data = file.read(MESH_SIZE_LIMIT + 1)
     except OSError as error:
-        return Mesh("", str(error))
+        return "", str(error)
     content = digest(data)
     key = content, path.suffix.lower()
     if key not in _PROBLEMS:
         _PROBLEMS[key] = _problem(path, data)
-    return Mesh(content, _PROBLEMS[key])
+    return content, _PROBLEMS[key]
 
 
 def _problem(path: Path, data: bytes) -> str | None:

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Document, Float64, MjModel, MjsBody, MjSpec, Rows
-from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.geometry.mesh_files import mesh_bytes, read_mesh
@@ -206,7 +206,11 @@ def convex_hull(points: Float64) -> Triangles:
 
     spec = mujoco.MjSpec()
     shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    spec.add_mesh(name="mesh", uservert=points.ravel(), inertia=shell)
+    spec.add_mesh(
+        name="mesh",
+        uservert=points.ravel(),
+        inertia=shell,
+    )
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
     model = spec.compile()
     # The hull's graph has two counts, the addresses and numbers of the vertices, edges, triangles.
@@ -275,7 +279,11 @@ def add_geom(
                 mesh = {"inertia": inertias.mjMESH_INERTIA_EXACT, "userface": faces.ravel()}
         options["meshname"] = name = f"mesh {digest(vertices)}"
         if spec.mesh(name) is None:
-            spec.add_mesh(name=name, uservert=vertices.ravel(), **mesh)
+            spec.add_mesh(
+                name=name,
+                uservert=vertices.ravel(),
+                **mesh,
+            )
     else:
         options["size"] = np.pad(shape.size, (0, 3 - len(shape.size)))
     body.add_geom(

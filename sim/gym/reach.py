@@ -100,6 +100,7 @@ class ReachVectorEnv(RobotVectorEnv):
             continuous = np.asarray(self.runner.params.continuous, np.float64).min(0)
             self._setpoint_turns = np.minimum(self._turns, continuous[self._index] / TURN)
         self._goal = np.zeros((self.num_envs, len(self.joint_names)))
+        self._error = np.zeros_like(self._goal)  # of the last observation: success comes first
 
     def spaces(self) -> tuple[spaces.Box, spaces.Box]:
         """Return the spaces for the joint limits."""
@@ -168,19 +169,20 @@ class ReachVectorEnv(RobotVectorEnv):
 
     def success(self, observation: Float32) -> Bool:
         """Return whether every joint is within the tolerance."""
-        success: Bool = np.all(self._error(observation) <= self.tolerance, axis=1)
+        self._error = self._distance(observation)
+        success: Bool = np.all(self._error <= self.tolerance, axis=1)
         return success
 
     def reward(self, observation: Float32, success: Bool) -> Float64:
         """Return minus the mean error as a share of the ranges, plus 1 at the goal."""
-        reward: Float64 = 1.0 * success - (self._error(observation) / self._span).mean(1)
+        reward: Float64 = 1.0 * success - (self._error / self._span).mean(1)
         return reward
 
     def info(self, observation: Float32) -> Mapping[str, Rows]:
         """Return the largest error."""
-        return {"error": self._error(observation).max(1)}
+        return {"error": self._error.max(1)}
 
-    def _error(self, observation: Float32) -> Float64:
+    def _distance(self, observation: Float32) -> Float64:
         """Return |goal - qpos| (envs, joints) [rad or m], the short way round."""
         error = self._goal - observation[:, : len(self.joint_names)]
         return np.abs(wrap(error, self._turns, np))

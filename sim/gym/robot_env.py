@@ -41,7 +41,11 @@ class RobotEnv(SingleOwner, gymnasium.Env):
             "autoreset_mode": AutoresetMode.DISABLED,
         }
         check_free(self, options, chosen)
-        self._envs = self.task(render_mode=render_mode, **chosen, **options)
+        self._envs = self.task(
+            render_mode=render_mode,
+            **chosen,
+            **options,
+        )
         self.runner = self._envs.runner
         self.render_mode = render_mode
         self.metadata = self._envs.metadata  # type: ignore[misc]

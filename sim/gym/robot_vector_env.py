@@ -78,8 +78,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         ``"rgb_array"``: :meth:`render` returns pictures.
     chunk
         Rows of a chunk: an action of one env is then (chunk, size), ``rate_hz`` rows a second, which
-        a plan executes (``plan=`` of the runner; default :func:`batchpid.make_plan`). None: no
-        plan.
+        a plan executes (``plan=`` of the runner; default :func:`batchpid.make_plan` with a fade of
+        half a step). None: no plan.
     execute
         Rows of a chunk that a step executes; default all.
     latency
@@ -154,10 +154,17 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._action_shape = (self.num_envs, *(self.single_action_space.shape or ()))
         self._period, self._rows, self._ticks = self.step_seconds, chunk, 1
         if chunk is not None:
-            self._rows = integer("chunk", chunk, 1, 999)
+            self._rows = integer("chunk", chunk, 1, 499)
             self._ticks = integer("execute", chunk if execute is None else execute, 1, chunk)
             self.step_seconds = self._ticks * self._period
-            plan = make_plan(self.robot.dof, period=self._period, horizon=self._rows + 1)
+            # Rows that passed during the latency are made up for in half a step, if need be behind
+            # the last row, which is repeated.
+            plan = make_plan(
+                self.robot.dof,
+                period=self._period,
+                horizon=2 * self._rows + 1,
+                fade=self.step_seconds / 2,
+            )
             options = {"plan": plan, **options}
             box = self.single_action_space
             low, high = (np.tile(end, (self._rows, 1)) for end in (box.low, box.high))
@@ -336,10 +343,11 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             self._send_chunk(action, last, begins)
             return
         setpoint = self._returned("command", self.command(action, last), last.shape)
-        setpoint = np.where(begins[:, None], last, setpoint)
+        setpoint[begins] = last[begins]
         rate = self.rate(setpoint, last)
         if rate is not None:
-            rate = np.where(begins[:, None], 0.0, self._returned("rate", rate, last.shape))
+            rate = self._returned("rate", rate, last.shape)
+            rate[begins] = 0.0
         self.runner.send(setpoint, setpoint_rate=rate)
         self.action = action
         self._setpoint = setpoint
@@ -350,7 +358,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         rows = [last]
         for row in action.swapaxes(0, 1):
             rows.append(self._returned("command", self.command(row, rows[-1]), last.shape))
-        chunk = np.stack(rows, 1)
+        assert self.runner.options.plan is not None
+        held = self.runner.options.plan.horizon - len(rows)
+        chunk = np.stack(rows + held * rows[-1:], 1)
         for tick in range(self._ticks):
             enters = (self._waits == tick) & ~begins
             age = np.where(enters, tick * self._period, np.inf)
@@ -519,6 +529,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         values = {"success": self._success, **self.info(self._observation)}
         for key, value in (values | {"diverged": self._diverged}).items():
             self._returned("info", value, mask.shape)
-            info[key] = np.where(mask, value, np.zeros_like(value))
+            info[key] = value * mask
             info[f"_{key}"] = mask.copy()
         return info

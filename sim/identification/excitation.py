@@ -96,7 +96,15 @@ def excite(
         # The motion shrinks about a center until nothing is in its way.
         share = movable.astype(np.float64)
         while most < _ENOUGH and share[movable].min() >= _LEAST:
-            motion = _chirp(robot, center, share, time, lowest, highest, phase)
+            motion = _chirp(
+                robot,
+                center,
+                share,
+                time,
+                lowest,
+                highest,
+                phase,
+            )
             problem, joints = _obstacle(robot, motion)
             obstacle = obstacle or problem
             # Followers move with their leaders.

@@ -30,7 +30,7 @@ from batchpid.sim.identification.regression import (
     smooth,
 )
 from batchpid.sim.identification.result import Identification
-from batchpid.sim.identification.simulator import Apart, Exact, LogPlant
+from batchpid.sim.identification.simulator import Exact, LogPlant
 from batchpid.sim.identification.trials import fit, with_effects
 from batchpid.sim.identification.unknowns import (
     BASIC,
@@ -63,10 +63,6 @@ DETOUR = 0.1
 """Decrease of the regression's cost from which the compensation counts as exact, not through the
 motors.
 """
-
-
-EXACT = (Apart(), Exact())
-"""Stages of a compensation that does not pass through the motors."""
 
 
 def identify(
@@ -133,7 +129,14 @@ def identify(
         places = _payload_links(robot, payload_link)
     read = _read(robot, logs, params, reading)
     moves, still = _moving(robot, read)
-    robot, data = _prepared(robot, read, moves, params, compensate, timestep)
+    robot, data = _prepared(
+        robot,
+        read,
+        moves,
+        params,
+        compensate,
+        timestep,
+    )
     law_unknown = bool({"kd", "gain"}.intersection(kinds))
     data, guesses = _regress(robot, data, law_unknown, progress)
     windows = windows_of(data)
@@ -142,7 +145,14 @@ def identify(
         starts = dict[Any, list[Problem]]()
         for place, share in product(places, SATURATIONS if "saturation" in kinds else (0.7,)):
             for guess in guesses:
-                unknowns = _unknowns(robot, data, guess, kinds, place, share)
+                unknowns = _unknowns(
+                    robot,
+                    data,
+                    guess,
+                    kinds,
+                    place,
+                    share,
+                )
                 starts.setdefault((place, share), []).append(Problem(data, windows, unknowns, run))
         solution = with_effects(fit(starts, evaluations, progress), evaluations, progress)
     # Worker processes end with the fit.
@@ -340,7 +350,11 @@ def _regress(
     guesses = regress(_fitted(data))
     if data[0].drive.gravity:
         # A robot that adds the compensation by itself may do so exactly, whatever its motors.
-        exact = [part._replace(drive=part.drive._replace(further=EXACT)) for part in data]
+        none = np.zeros(data[0].plant.joints)
+        exact = []
+        for part in data:
+            drive = part.drive._replace(powered=none, further=(Exact(),))
+            exact.append(part._replace(drive=drive))
         others = regress(_fitted(exact))
         if others[0].cost < guesses[0].cost - DETOUR:
             data = exact

@@ -239,4 +239,9 @@ def _unwrapped(robot: Robot, log: Log) -> Log:
     if log.kind == "setpoint":
         measured = interpolated(log.command_time, log.time, qpos)
         command = command - TURN * free * np.rint((command - measured) / TURN)
-    return replace(log, qpos=qpos, command=command, is_checked=True)
+    return replace(
+        log,
+        qpos=qpos,
+        command=command,
+        is_checked=True,
+    )

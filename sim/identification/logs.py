@@ -128,7 +128,14 @@ def _read(
     if path.exists() and (suffix in BAGS or path.is_dir()):
         remarks = list[str]()
         columns, commands, cuts = _read_bag(robot, path, reading, remarks)
-        log = _build(robot, str(path), columns, commands, kind, reading)
+        log = _build(
+            robot,
+            str(path),
+            columns,
+            commands,
+            kind,
+            reading,
+        )
         for remark in remarks:
             log = log.with_remark(remark)
         return checked(robot, log, cuts)
@@ -136,7 +143,14 @@ def _read(
     columns, numbers = read_csv(path, (*LOG_QUANTITIES, "time"))
     sources = _sources(robot, str(path), columns, reading.columns)
     columns = {name: scale * columns[column] for name, (column, scale) in sources.items()}
-    log = _build(robot, str(path), columns, columns, kind, reading)
+    log = _build(
+        robot,
+        str(path),
+        columns,
+        columns,
+        kind,
+        reading,
+    )
     return checked(robot, replace(log, lines=np.array(numbers)))
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -51,36 +51,12 @@ RESOLUTION = 1e-5
 """Least size of residuals [rad or m]: encoders show no less."""
 
 
-class Window(NamedTuple):
-    """Stretch of a log to simulate, and the rows of the log that it is compared with."""
-
-    log: int
-    stretch: Stretch
-    measured: Float64
-    """Positions (rows, joints)."""
-    time: Float64
-    """Times (rows,) [s]."""
-    fitted: Any
-    """Fitted rows; the others are held out (rows,) bool."""
-
-    def until(self, step: int) -> Window:
-        """Return the rows that end before a sim step."""
-        stretch = self.stretch
-        rows = stretch.step < step
-        command = stretch.command[: stretch.past + step]
-        part = stretch._replace(
-            command=command, step=stretch.step[rows], before=stretch.before[rows]
-        )
-        columns = self.measured[rows], self.time[rows], self.fitted[rows]
-        return Window(self.log, part, *columns)
-
-
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Windows of logs, the simulation of each log, and the unknowns."""
 
     data: Sequence[LogData]
-    windows: Sequence[Window]
+    windows: Sequence[Stretch]
     unknowns: Unknowns
     run: Callable[..., Any] = map
     """Map over groups of windows: ``map``, or that of worker processes."""
@@ -94,7 +70,7 @@ class Problem:
         windows = self.windows[::FEWER]
         if self.data[0].drive.mode == "pid":
             most = round(BEGINNING / self.data[0].drive.timestep)
-            longest = max(len(window.stretch.command) for window in self.windows)
+            longest = max(len(window.command) for window in self.windows)
             if judged or longest < 2 * most:
                 return self
             return replace(self, windows=[window.until(most) for window in self.windows])
@@ -146,7 +122,7 @@ class Problem:
     def _task(self, group: list[int], points: Float64, states: Float64) -> Any:
         """Return the arguments of :func:`simulate` for a group of windows, each at all points."""
         parts = [self.data[self.windows[number].log] for number in group]
-        stretches = [self.windows[number].stretch for number in group]
+        stretches = [self.windows[number] for number in group]
         drive = parts[0].drive
         if drive.mode == "pid":
             # A column of rows: other options are equal in all logs of a group.
@@ -216,11 +192,11 @@ def _projected(table: Float64, count: int) -> Float64:
     return rest.reshape(*table.shape[:2], count)
 
 
-def windows_of(data: Sequence[LogData]) -> list[Window]:
+def windows_of(data: Sequence[LogData]) -> list[Stretch]:
     """Return the windows of logs, one for each log of setpoints. A window begins where the held-out
     part begins.
     """
-    windows = list[Window]()
+    windows = list[Stretch]()
     every = 1 + sum(len(part.log.time) for part in data) // MOST_ROWS
     for number, part in enumerate(data):
         dt = part.drive.timestep
@@ -237,7 +213,16 @@ def windows_of(data: Sequence[LogData]) -> list[Window]:
             starts = [*range(edge, split - length + 1, length)]
             starts += range(first, total - length + 1, length)
         for start in starts:
-            windows.append(_window(number, part, start, start + length, split, every))
+            windows.append(
+                _window(
+                    number,
+                    part,
+                    start,
+                    start + length,
+                    split,
+                    every,
+                )
+            )
     return windows[:: 1 + len(windows) // MOST_WINDOWS]
 
 
@@ -248,7 +233,7 @@ def _window(
     last: int,
     split: int,
     every: int,
-) -> Window:
+) -> Stretch:
     """Return the window between two sim steps of a log's grid, of one row of ``every``; rows are
     held out from the step ``split`` on.
     """
@@ -265,11 +250,14 @@ def _window(
     before = np.maximum(step - place, 0.0) * dt
     past = round(PAST / dt)
     command = motion.command[np.maximum(np.arange(first - past, last), 0)]
-    begin = motion.qpos[first], motion.qvel[first]
-    stretch = Stretch(*begin, command, past, step - first - 1, before)
-    return Window(
+    return Stretch(
+        motion.qpos[first],
+        motion.qvel[first],
+        command,
+        past,
+        step - first - 1,
+        before,
         number,
-        stretch,
         log.qpos[rows],
         log.time[rows],
         place <= split + 1e-6,

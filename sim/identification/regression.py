@@ -234,8 +234,22 @@ def _commanded(part: LogData) -> Float64:
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
     none = np.zeros(count)
-    alone = drive._replace(gravity=False, coriolis=False, further=())
-    loop = plant.loop(alone, Candidates(Actuators(), {}, none, none, {}, {}))
+    alone = drive._replace(
+        gravity=False,
+        coriolis=False,
+        further=(),
+    )
+    loop = plant.loop(
+        alone,
+        Candidates(
+            Actuators(),
+            {},
+            none,
+            none,
+            {},
+            {},
+        ),
+    )
     loop = replace(loop, control=loop.control._replace(friction=Friction()))
     tables = [np.repeat(plant.spread(table)[:, None], count, axis=1) for table in motion[:2]]
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)

@@ -18,10 +18,9 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.sim.identification.intervals import INTERVAL
+from batchpid.sim.identification.fit import INTERVAL, Fit
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.simulator import changed_params
-from batchpid.sim.identification.trials import Fit
 from batchpid.sim.identification.unknowns import UNKNOWN_KINDS, Unknown, Unknowns, least_value
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import load_robot_actuators
@@ -76,7 +75,7 @@ class Identification:
 
     @property
     def _point(self) -> Float64:
-        return self.fit.solution.point
+        return self.fit.point
 
     @property
     def robot(self) -> Robot:
@@ -113,7 +112,7 @@ class Identification:
     @property
     def converged(self) -> bool:
         """False if the fit has stopped at the largest number of evaluations."""
-        return self.fit.solution.converged
+        return self.fit.converged
 
     @property
     def effects(self) -> dict[str, float]:

@@ -35,6 +35,10 @@ TABLE_ROWS = 2**16
 """Robots times sim steps of a table of commands, which stays in the cache."""
 
 
+OF_JOINTS = ("powered", "modelled", "band", "turns")
+"""Constants (joints,) of a control."""
+
+
 class Candidates(NamedTuple):
     """Motors, laws and robots of n simulations."""
 
@@ -55,7 +59,7 @@ class Candidates(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """Stretch of a log to simulate."""
+    """Stretch of a log to simulate, and the rows that it is compared with."""
 
     qpos: Float64
     """Position at its start (joints,) [rad or m]."""
@@ -70,6 +74,21 @@ class Stretch(NamedTuple):
     """First sim step that ends at or after each row (rows,)."""
     before: Float64
     """Time from the row to that end [s] (rows,)."""
+    log: int = 0
+    """Number of its log."""
+    measured: Any = None
+    """Positions (rows, joints)."""
+    time: Any = None
+    """Times (rows,) [s]."""
+    fitted: Any = None
+    """Fitted rows; the others are held out (rows,) bool."""
+
+    def until(self, step: int) -> Stretch:
+        """Return the rows that end before a sim step."""
+        rows = self.step < step
+        names = ("step", "before", "measured", "time", "fitted")
+        parts = {name: getattr(self, name)[rows] for name in names}
+        return self._replace(command=self.command[: self.past + step], **parts)
 
 
 @dataclass(frozen=True)
@@ -91,20 +110,8 @@ class Lag(Stage):
 
 
 @dataclass(frozen=True)
-class Apart(Stage):
-    """f <- f - p: the compensation does not pass through the motors, but acts by :class:`Exact`."""
-
-    name = "apart"
-    after = "feedforward"
-
-    def step(self, state: tuple[()], values: Values) -> Told:
-        """Advance by a sim step."""
-        return state, values._replace(forward=values.forward - values.seen.passive)
-
-
-@dataclass(frozen=True)
 class Exact(Stage):
-    """qf <- qf + p."""
+    """qf <- qf + p: the compensation does not pass through the motors."""
 
     name = "exact"
     after = "friction"
@@ -166,11 +173,14 @@ class LogPlant:
 
     def loop(self, drive: Control, candidates: Candidates) -> ClosedLoop:
         """Return the closed loop of candidates under the control of a log."""
-        tree = self.tree
-        coupling = tree.coupling
+        # The plant and the stages couple joints.
+        tree = self.tree.held
+        coupling = self.tree.coupling
         envs = len(candidates.setpoint_lag)
         dt = drive.timestep
         actuators = mapped(self.spread, candidates.actuators)
+        # One number of all joints.
+        actuators = actuators._replace(max_delay=candidates.actuators.max_delay)
         for name in JOINT_SIDE:
             figures = getattr(actuators, name)
             if figures is not None:
@@ -190,7 +200,7 @@ class LogPlant:
             guard=None if slew is None else Guard(rate=self.spread(slew)),
             friction=added_friction(described, actuators),
             further=further,
-            **{name: self.spread(getattr(drive, name)) for name in ("modelled", "band", "turns")},
+            **{name: self.spread(getattr(drive, name)) for name in OF_JOINTS},
         )
         inertia = dt * np.zeros((envs, tree.dof)) + dt * control.friction.viscous
         if actuators.armature is not None:

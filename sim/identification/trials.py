@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,16 +22,17 @@ from batchpid.sim.identification.fit import (
     DAMPING,
     FIRST_CHANGE,
     ROUGH_TOLERANCE,
-    Solution,
+    Fit,
     axes_of,
     bounded_step,
+    inverse,
     iterate,
     solve,
     triangle_of,
+    with_certainty,
 )
-from batchpid.sim.identification.intervals import Certainty, certainty, inverse
 from batchpid.sim.identification.problem import Problem
-from batchpid.sim.identification.unknowns import SENDER, Unknown, kinds_of
+from batchpid.sim.identification.unknowns import SENDER, kinds_of
 
 TRIAL = 5
 """Evaluations of a short fit."""
@@ -40,24 +40,17 @@ KEPT = 0.95
 """Share of the held-out error that an unknown has to leave for it to be kept."""
 COLORED = 0.2
 """Correlation of the residuals from which further effects are tried."""
-EFFECTS = {"stribeck": KEPT, "mass": 0.8, "offset": 0.8, "load_friction": 0.8}
+EFFECTS = {
+    "stribeck": KEPT,
+    "mass": 0.8,
+    "offset": 0.8,
+    "load_friction": 0.8,
+}
 """Effects that are tried, and the share of the held-out error that each has to leave: every motor
 has more friction at rest, but a few percent may be an error of the model that looks like a mass.
 """
 
 Progress = Callable[[], object] | None
-
-
-class Fit(NamedTuple):
-    """A fit, and what was left out of it or added to it."""
-
-    problem: Problem
-    solution: Solution
-    certainty: Certainty
-    dropped: tuple[Unknown, ...] = ()
-    """Delay and lag of setpoints that the logs do not need."""
-    effects: Mapping[str, float] = {}
-    """Effects that were added, with the share of the held-out error that each left."""
 
 
 def fit(
@@ -69,9 +62,15 @@ def fit(
     problem, point = _best_start(starts, progress)
     coarse = problem.coarse()
     if coarse is not problem:
-        point = solve(coarse, point, None, evaluations, progress, ROUGH_TOLERANCE).point
-    solution = solve(problem, point, None, evaluations, progress)
-    result = Fit(problem, solution, certainty(problem, solution))
+        point = solve(
+            coarse,
+            point,
+            None,
+            evaluations,
+            progress,
+            ROUGH_TOLERANCE,
+        ).point
+    result = with_certainty(solve(problem, point, None, evaluations, progress))
     return _without_sender(result, evaluations, progress)
 
 
@@ -106,7 +105,14 @@ def _best_start(
         if len(starts) == 1:
             return problem, point
         coarse = problem.coarse()
-        point = solve(coarse, point, None, TRIAL, progress, ROUGH_TOLERANCE).point
+        point = solve(
+            coarse,
+            point,
+            None,
+            TRIAL,
+            progress,
+            ROUGH_TOLERANCE,
+        ).point
         tried.append((error(coarse, point), len(tried), problem, point))
     return min(tried)[2:]
 
@@ -121,23 +127,27 @@ def _without_sender(
 
     Intervals stay as wide as with them: the motor's delay may be theirs in part.
     """
-    error = _left(result.problem, result.solution)
+    error = _left(result)
     # A value at its bound of zero is left out as it is.
     result = _without(result, [kind for kind in SENDER if _value(result, kind) == 0.0])
     for kinds in (SENDER, SENDER[1:], SENDER[:1]):
         smaller = _without(result, kinds)
         if smaller is result:
             continue
-        point, size, _ = smaller.solution
-        solution = solve(smaller.problem, point, size, evaluations, progress)
-        if _left(smaller.problem, solution) * KEPT <= error:
-            return smaller._replace(solution=solution)
+        problem, point, size, *_ = smaller
+        fitted = solve(problem, point, size, evaluations, progress)
+        if _left(fitted) * KEPT <= error:
+            return smaller._replace(
+                point=fitted.point,
+                size=fitted.size,
+                converged=fitted.converged,
+            )
     return result
 
 
 def _value(result: Fit, kind: str) -> float:
     """Return the value of the unknown of a kind; NaN if there is none."""
-    pairs = zip(result.problem.unknowns.entries, result.solution.point.tolist(), strict=True)
+    pairs = zip(result.problem.unknowns.entries, result.point.tolist(), strict=True)
     return next((value for entry, value in pairs if entry.kind == kind), np.nan)
 
 
@@ -149,7 +159,7 @@ def _without(result: Fit, kinds: Sequence[str]) -> Fit:
         return result
     return result._replace(
         problem=replace(result.problem, unknowns=unknowns.only(is_kept)),
-        solution=result.solution._replace(point=result.solution.point[is_kept]),
+        point=result.point[is_kept],
         certainty=result.certainty.only(is_kept),
         dropped=(*result.dropped, *unknowns.only(~is_kept).entries),
     )
@@ -163,7 +173,7 @@ def _with_effect(
     """Return a fit with the effect whose linear step leaves the least held-out error, or the fit
     itself.
     """
-    problem, solution = result.problem, result.solution
+    problem = result.problem
     unknowns = problem.unknowns
     present = [entry.kind for entry in unknowns.entries]
     effects = [effect for effect in EFFECTS if effect not in present]
@@ -175,12 +185,12 @@ def _with_effect(
     wider = unknowns.adding(kinds, {"load_friction": zero, "static": zero})
     wide = replace(problem.coarse(judged=True), unknowns=wider)
     count = len(present)
-    point = np.append(solution.point, wider.start[count:])
+    point = np.append(result.point, wider.start[count:])
     changes = FIRST_CHANGE * np.eye(len(point))
     changes[:count, :count] = _axes(result)
     if progress is not None:
         progress()
-    triangle = triangle_of(wide, iterate(wide, point, changes), solution.size)
+    triangle = triangle_of(wide, iterate(wide, point, changes), result.size)
     low, high = wider.bounds - point
     names = np.array([entry.kind for entry in wider.entries])
     steps = np.zeros((len(effects), len(point)))
@@ -188,7 +198,7 @@ def _with_effect(
         is_free = np.isin(names, [*present, *kinds_of(effect)])
         columns = triangle[:, np.append(True, is_free)]
         step[is_free], _ = bounded_step(columns, DAMPING, low[is_free], high[is_free])
-    before, *after = np.linalg.norm(wide.errors(point, steps) / solution.size, axis=1).tolist()
+    before, *after = np.linalg.norm(wide.errors(point, steps) / result.size, axis=1).tolist()
     best = int(np.argmin(after))
     # A linear step is no fit: half of the decrease will do.
     if after[best] > 0.5 * (1 + EFFECTS[effects[best]]) * before:
@@ -196,24 +206,31 @@ def _with_effect(
     is_used = np.isin(names, [*present, *kinds_of(effects[best])])
     trial = replace(wide, unknowns=wider.only(is_used))
     start = (point + steps[best])[is_used]
-    further = solve(trial, start, None, evaluations, progress, ROUGH_TOLERANCE)
-    share = _left(trial, further._replace(size=solution.size)) / before
+    further = solve(
+        trial,
+        start,
+        None,
+        evaluations,
+        progress,
+        ROUGH_TOLERANCE,
+    )
+    share = _left(further._replace(size=result.size)) / before
     if share > EFFECTS[effects[best]]:
         return result
     trial = replace(trial, windows=problem.windows)
     further = solve(trial, further.point, None, evaluations, progress)
     added = {**result.effects, effects[best]: share}
-    return Fit(trial, further, certainty(trial, further), result.dropped, added)
+    return with_certainty(further._replace(dropped=result.dropped, effects=added))
 
 
 def _axes(result: Fit) -> Float64:
     """Return changes (unknowns, unknowns) along the axes of the covariance."""
     root = result.certainty.root / result.problem.unknowns.sizes[:, None]
-    scale = np.maximum(np.abs(result.solution.point), 1.0)
+    scale = np.maximum(np.abs(result.point), 1.0)
     axes, _ = axes_of(inverse(root @ root.T), scale)
     return axes
 
 
-def _left(problem: Problem, solution: Solution) -> float:
+def _left(fit: Fit) -> float:
     """Return the held-out error over the size of the residuals, with free initial states."""
-    return float(np.linalg.norm(problem.errors(solution.point)[0] / solution.size))
+    return float(np.linalg.norm(fit.problem.errors(fit.point)[0] / fit.size))

@@ -44,17 +44,59 @@ UNKNOWN_KINDS = {
     "armature": Kind("motor", "joint", "inertia", 4.0, field="armature"),
     "damping": Kind("motor", "joint", "damping", 4.0, field="viscous"),
     "friction": Kind("motor", "joint", "effort", 4.0, field="coulomb"),
-    "strength": Kind("motor", "joint", 1.0, 0.3, 1.0, "strength"),
-    "effort_scale": Kind("sensor", "joint", 1.0, 0.3, 1.0, "strength"),
-    "bias": Kind("motor", "joint", "effort", 10.0, field="bias", positive=False),
-    "delay": Kind("motor", "robot", 2e-3, 3.0, field="command_delay", most=0.1),
+    "strength": Kind(
+        "motor",
+        "joint",
+        1.0,
+        0.3,
+        1.0,
+        "strength",
+    ),
+    "effort_scale": Kind(
+        "sensor",
+        "joint",
+        1.0,
+        0.3,
+        1.0,
+        "strength",
+    ),
+    "bias": Kind(
+        "motor",
+        "joint",
+        "effort",
+        10.0,
+        field="bias",
+        positive=False,
+    ),
+    "delay": Kind(
+        "motor",
+        "robot",
+        2e-3,
+        3.0,
+        field="command_delay",
+        most=0.1,
+    ),
     "setpoint_delay": Kind("setpoint", "robot", 5e-3, 10.0, most=0.2),
     "setpoint_lag": Kind("setpoint", "robot", 5e-3, 10.0, most=0.5),
     "payload": Kind("robot", "robot", 0.1, 10.0),
-    "load_friction": Kind("motor", "joint", 0.05, 2.0, field="load_friction", most=0.9),
+    "load_friction": Kind(
+        "motor",
+        "joint",
+        0.05,
+        2.0,
+        field="load_friction",
+        most=0.9,
+    ),
     "static": Kind("motor", "joint", "friction", 2.0, field="static"),
     "stribeck": Kind("motor", "joint", "speed", 2.0, field="stribeck"),
-    "offset": Kind("motor", "joint", 0.01, 20.0, field="position_offset", positive=False),
+    "offset": Kind(
+        "motor",
+        "joint",
+        0.01,
+        20.0,
+        field="position_offset",
+        positive=False,
+    ),
     "gain": Kind("law", "joint", 1.0, 3.0, 1.0),
     "kd": Kind("law", "joint", 1.0, 2.0, 1.0),
     "saturation": Kind("law", "joint", "error", 2.0, np.inf),
@@ -75,6 +117,10 @@ SENDER = ("setpoint_delay", "setpoint_lag")
 """Kinds that every fit of setpoints has in addition."""
 DESCRIBED = {"damping": "damping", "friction": "friction"}
 """Kinds that add to a value of the robot's description, and the name there."""
+
+
+LEAST_MASS_FACTOR = 1e-3
+"""Least factor of a mass: a body without any has no center."""
 
 
 def kinds_of(effect: str) -> list[str]:
@@ -143,7 +189,17 @@ class Unknowns:
         for name in kinds:
             kind = UNKNOWN_KINDS[name]
             if kind.per == "link":
-                entries += [Unknown(name, None, 1.0, 1.0, 0.0, link) for link in self.links]
+                entries += [
+                    Unknown(
+                        name,
+                        None,
+                        1.0,
+                        1.0,
+                        LEAST_MASS_FACTOR,
+                        link,
+                    )
+                    for link in self.links
+                ]
                 continue
             for joint in range(len(self.joints)) if kind.per == "joint" else (None,):
                 column = joint or 0
@@ -157,7 +213,16 @@ class Unknowns:
                 if name in DESCRIBED:
                     start += least
                 link = payload_link if name == "payload" else None
-                entries.append(Unknown(name, joint, max(start, least), size, least, link))
+                entries.append(
+                    Unknown(
+                        name,
+                        joint,
+                        max(start, least),
+                        size,
+                        least,
+                        link,
+                    )
+                )
         return replace(self, entries=tuple(entries))
 
     @cached_property

@@ -4,7 +4,7 @@ of controllers in Python; and in programs of JAX.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from functools import lru_cache, partial
 from itertools import groupby
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Float64, Pytree, Rows
-from batchpid.arrays.jax_settings import precision
+from batchpid.arrays.elementwise import precision
 from batchpid.arrays.trees import filled, leaves, structure
 from batchpid.sim.engine.native_model import NativeStep
 from batchpid.sim.engine.protocol import EnginePack
@@ -69,6 +69,16 @@ class NumPyExecutor:
         """Replace the states; they have the arrays of the states before."""
         self._states = states
 
+    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
+        """Change the state of the stage ``name``, between sim steps, to ``function(stage, state)``,
+        which has the same arrays or others in their place.
+        """
+        pairs = zip(self.setup.stages, self._states, strict=True)
+        changed = [
+            function(stage, state) if stage.name == name else state for stage, state in pairs
+        ]
+        self._states = tuple(changed)
+
     def results(self) -> Outputs:
         """Return the results of the last sim step as NumPy arrays."""
         return self.outputs
@@ -96,7 +106,14 @@ class NumPyExecutor:
             step = Step(index, end, control.left(index, end))
             self.before = self.measured.qpos  # where a robot that fails now is suspended
             measured = self.measured
-            values = Values(command, measured, measured, control.timestep, step, setup.model)
+            values = Values(
+                command,
+                measured,
+                measured,
+                control.timestep,
+                step,
+                setup.model,
+            )
             with controller_errors(control.controller, index + 1):
                 self.outputs = outputs = self._stepped(values).outputs
             # Writing the targets of drives costs a call for each joint.
@@ -200,7 +217,7 @@ class JAXExecutor(NumPyExecutor):
         super().__init__(setup, states)
         self._parts = list[tuple[slice, Any]]()
         first = 0
-        for calls_model, group in groupby(map(_traceable, setup.stages), _calls_model):
+        for calls_model, group in groupby(setup.stages, _calls_model):
             part = running(group)
             program = None
             if not calls_model:
@@ -256,12 +273,6 @@ def _without(values: Values, *names: str) -> Values:
 def _calls_model(stage: Any) -> bool:
     calls_model: bool = stage.calls_model
     return calls_model
-
-
-def _traceable(stage: Any) -> Any:
-    """Return a stage with the function of the caller's controller for programs."""
-    controller = getattr(stage, "controller", None)
-    return stage if controller is None else replace(stage, controller=controller.traced)
 
 
 @lru_cache(maxsize=8)

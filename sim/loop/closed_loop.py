@@ -233,7 +233,14 @@ class ClosedLoop:
         if load is None or not (control.gravity and control.coriolis):
             load = passive(qpos, qvel)
         measured = Measured(qpos, qvel, load)
-        return Values(command, measured, measured, control.timestep, step, model)
+        return Values(
+            command,
+            measured,
+            measured,
+            control.timestep,
+            step,
+            model,
+        )
 
 
 def _when(due: Any, function: Callable[[], Any], otherwise: Any) -> Any:
@@ -288,29 +295,13 @@ def closed_loop(
         scene.joints,
         friction,
         slice(0, num_envs),
-        controller and _TracedController(controller),
+        controller,
         scene.dissipation == "urdf",
     )
     tree = robot.kinematic_tree(armature=np.zeros(robot.dof)).held
     if plant is None:
         plant = _tree_plant(checked, tree, control)
     return ClosedLoop(plant, control, tree, robot.start)
-
-
-class _TracedController:
-    """The caller's own controller in a program of JAX."""
-
-    def __init__(self, controller: OwnController) -> None:
-        self._controller = controller
-        self.implicit = controller.implicit
-
-    def init(self, envs: int) -> Pytree:
-        """Return the state of envs that start."""
-        return self._controller.init(envs)
-
-    def __call__(self, state: Any, *inputs: Array) -> Any:
-        is_numpy = namespace(*inputs[1:3]) is np
-        return (self._controller if is_numpy else self._controller.traced)(state, *inputs)
 
 
 def _tree_plant(options: RunnerOptions, tree: RigidTree, control: Control) -> TreePlant:

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Document, Float64, Rows
-from batchpid.arrays.elementwise import read_only
-from batchpid.arrays.jax_settings import precision
+from batchpid.arrays.array_types import Array, Document, Rows
+from batchpid.arrays.elementwise import namespace, precision, read_only
 from batchpid.arrays.trees import flatten, unflatten
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions
@@ -68,7 +67,7 @@ class OwnController:
                 )
         return leaves
 
-    def __call__(self, state: Document, *inputs: Float64) -> tuple[Array, ...]:
+    def __call__(self, state: Document, *inputs: Array) -> tuple[Array, ...]:
         """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel, passive
         force, and the time to the end of the tick, which only operational-space control takes.
 
@@ -76,8 +75,10 @@ class OwnController:
         efforts (M, dof).
 
         Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape
-        or dtype.
+        or dtype, or JAX cannot trace it.
         """
+        if namespace(*inputs[1:3]) is not np:
+            return self._traced(state, *inputs)
         # The controller may keep them, but not write to them.
         copies = (read_only(np.array(rows)) for rows in inputs)
         new, returned, *limited = self._called(unflatten(self._structure, state), *copies)
@@ -92,12 +93,8 @@ class OwnController:
         state, effort = self._controller(*arguments[:-1])
         return state, effort
 
-    def traced(self, leaves: Document, *inputs: Array) -> tuple[Array, ...]:
-        """Call the controller within a JAX program; arguments and results as in :meth:`__call__`.
-
-        Raises InvalidArgumentError if JAX cannot trace the controller, or it returns an effort or a
-        state of a wrong shape or dtype.
-        """
+    def _traced(self, leaves: Document, *inputs: Array) -> tuple[Array, ...]:
+        """Call the controller within a JAX program."""
         import jax
 
         qpos = inputs[1]

@@ -24,14 +24,11 @@ from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_parts import ActingDraws, LinkSensors, Pushes, variation
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
 from batchpid.sim.loop.group_control import GroupControl
-from batchpid.sim.loop.native_executor import NativeExecutor, Table, run_ticks, runs_natively
+from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
 from batchpid.stages.stage import States, adopted, by_name, placed, started
 from batchpid.stages.values import Command, Measured, Values
-
-_TICK_RESULTS = ("effort", "saturated", "guarded")
-"""Results of a sim step that are observed, by name."""
 
 
 class EnvGroup:
@@ -69,8 +66,11 @@ class EnvGroup:
         self._episode = np.zeros(pack.size, np.int64)
         # Results of the last sim step, which outlive executors: native code writes them in each tick.
         shape = (pack.size, pack.dof)
-        last = np.zeros(shape, np.float32), np.zeros(shape, bool), np.zeros(shape, bool)
-        self._last = Table(arrays, *last, self._faults.rows)
+        self._last: dict[str, Rows] = {
+            "effort": np.zeros(shape, np.float32),
+            "saturated": np.zeros(shape, bool),
+            "guarded": np.zeros(shape, bool),
+        }
         reads_base = "base_state" in options.load_engine().capabilities and pack.spec.mjcf is None
         is_read = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
         has_parts = bool(self._sensors.values or self._pushes.counts)
@@ -113,7 +113,9 @@ class EnvGroup:
         if self._options.backend == "jax":
             self._executor = JAXExecutor(setup, states)
         elif self.pack.steps_natively and runs_natively(setup):
-            self._executor = NativeExecutor(setup, states, self._last)
+            self._executor = NativeExecutor(
+                setup, states, self._arrays, self._last, self._faults.rows
+            )
         else:
             self._executor = NumPyExecutor(setup, states)
         if self._options.control == "drive":
@@ -138,11 +140,7 @@ class EnvGroup:
 
     def add_chunk(self, chunk: Float64, latency: Float64) -> None:
         """Add a chunk (M, rows, dof) that is ``latency`` (M,) [s] old to the plan."""
-        executor = self._executor
-        stages, states = executor.setup.stages, list(executor.read_state())
-        place = [stage.name for stage in stages].index("plan")
-        states[place] = stages[place].add(states[place], chunk, latency)
-        executor.write_state(tuple(states))
+        self._executor.change("plan", lambda stage, state: stage.add(state, chunk, latency))
 
     def _put_actuators(self, actuators: bp.Actuators | None, rows: list[int] | None = None) -> None:
         """Put actuators into effect, for the robots ``rows`` or all."""
@@ -282,8 +280,8 @@ class EnvGroup:
     def _take_results(self) -> None:
         outputs = self._executor.results()
         results = outputs.motor, outputs.saturated, outputs.guarded
-        for name, rows in zip(_TICK_RESULTS, results, strict=True):
-            getattr(self._last, name)[...] = False if rows is None else rows
+        for last, rows in zip(self._last.values(), results, strict=True):
+            last[...] = False if rows is None else rows
 
     def _push(self, substeps: int) -> None:
         """Push the bases that are due before a tick of ``substeps`` sim steps."""
@@ -299,11 +297,11 @@ class EnvGroup:
 
     def observe(self, rows: Arrays) -> None:
         """Write observation and faults into these envs' rows."""
-        observation, last = rows.observation, self._last
+        observation = rows.observation
         observation.qpos[...] = self._executor.qpos()
         observation.qvel[...] = self.pack.read_qvel()
-        for name in _TICK_RESULTS:
-            getattr(observation, name)[...] = getattr(last, name)
+        for name, last in self._last.items():
+            getattr(observation, name)[...] = last
         if observation.base_pose is not None and observation.base_twist is not None:
             pose, twist = np.split(self.pack.read_base(), [7], axis=1)
             observation.base_pose[...] = pose
@@ -337,11 +335,7 @@ class EnvGroup:
         sim step, episodes of the motors' noise, those of faults, sensors and pushes, and the
         digests of the user's content.
         """
-        last = self._last
-        return {
-            "effort": last.effort,
-            "saturated": last.saturated,
-            "guarded": last.guarded,
+        return self._last | {
             "episode": self._episode,
             "containment": self._faults.state,
             "sensors": self._sensors.values,
@@ -377,7 +371,7 @@ class EnvGroup:
         for name, array in flatten(self._parts()).items():
             array[...] = rows[name]
         pack.suspend(self._faults.suspended)
-        pack.write_qf(self._last.effort)
+        pack.write_qf(self._last["effort"])
         executor = self._executor
         if stays:
             setup, like = executor.setup, executor.read_state()
@@ -446,7 +440,7 @@ class EnvGroup:
         base = None if pack.spec.fixed_base else self._faults.start_base[rows]
         pack.write_state(rows.tolist(), qpos[rows], qvel[rows], base)
         pack.suspend(self._faults.suspended)
-        for last in self._last[1:4]:
+        for last in self._last.values():
             last[mask] = 0
         if acting.draws is not None:
             self._pushes.begin(mask, acting.draws.episodes)

@@ -161,7 +161,15 @@ def empty_states(
     controller = None if isinstance(options.control, str) else OwnController(options)
     friction = Friction(coulomb=rows if stiction else None)
     envs = slice(0, options.num_envs)
-    control = control_of(options, params, actuators, joints, friction, envs, controller)
+    control = control_of(
+        options,
+        params,
+        actuators,
+        joints,
+        friction,
+        envs,
+        controller,
+    )
     stages = stages_of(control)
     model = Model(
         joint_mass_matrix=lambda qpos: np.eye(len(joints)) + 0.0 * qpos[:, :, None],
@@ -181,8 +189,17 @@ def untraceable(options: RunnerOptions) -> str:
     reading = Measured(row, row, row)
     step = Step(0, 1, np.zeros(()))
     values = Values(Command(*[row] * 4), reading, reading, options.timestep, step)
-    values = values._replace(last=Outputs(row, row), forward=row, limits=(row, row))
-    values = values.told(qf=row, motor=row, saturated=row, guarded=row)
+    values = values._replace(
+        last=Outputs(row, row),
+        forward=row,
+        limits=(row, row),
+    )
+    values = values.told(
+        qf=row,
+        motor=row,
+        saturated=row,
+        guarded=row,
+    )
     for stage in stages:
         if stage.name in names:
             state, _ = stage.init(values)

@@ -142,7 +142,14 @@ class Loop:
             rows = slice(first, min(first + size, count))
             part = arrays.at((slice(None), rows))
             own_params = params.for_envs(rows)
-            group = EnvGroup(self._build(rows), rows, own_params, options, controller, part)
+            group = EnvGroup(
+                self._build(rows),
+                rows,
+                own_params,
+                options,
+                controller,
+                part,
+            )
             self.groups.append(group)
         self.set_actuators(None if options.actuators is None else options.actuators.for_envs(envs))
         # Packs that share working memory cannot run in one native call.
@@ -154,7 +161,12 @@ class Loop:
     def _build(self, envs: slice, draws: Draws | None = None) -> EnginePack:
         first = self.options.first_env + self._first_env + envs.start
         return make_pack(
-            self.options, self._scene, envs.stop - envs.start, first, draws, self._workspace
+            self.options,
+            self._scene,
+            envs.stop - envs.start,
+            first,
+            draws,
+            self._workspace,
         )
 
     def reset(

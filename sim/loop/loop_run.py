@@ -96,7 +96,14 @@ class LoopRun:
         if lanes is not None:
             setup: Any = GroupControl(None, lanes, loop.control, stages, values.model)  # type: ignore[arg-type]
             buffers = Buffers(states, command, values.measured, np.zeros_like(qpos))
-            self._program = TickProgram(setup, buffers, self._copies, (), False, False)
+            self._program = TickProgram(
+                setup,
+                buffers,
+                self._copies,
+                (),
+                False,
+                False,
+            )
             lanes.prepare(self._program)
 
     def run(self, steps: int) -> None:

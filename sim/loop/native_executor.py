@@ -8,11 +8,10 @@ have a native function: see tick.h.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import DType, Float64, Pytree, Rows
 from batchpid.arrays.trees import flatten, leaves, mapped, rebuilt_as
@@ -84,7 +83,11 @@ class TickProgram:
             coriolis=control.coriolis,
         )
         self._left = np.zeros(())
-        self.place(**buffers.measured._asdict(), before=buffers.before, left=self._left)
+        self.place(
+            **buffers.measured._asdict(),
+            before=buffers.before,
+            left=self._left,
+        )
         # SAPIEN knows neither measured states nor the model of varied robots.
         if control.gravity and (control.measures or not reads_force):
             if control.measures:
@@ -117,7 +120,9 @@ class TickProgram:
         """Let fields of the structure of native code point to these arrays."""
         for name, array in arrays.items():
             if array is not None:
-                setattr(self.tick, name, self._address(array, _TYPES.get(name, np.float64)))
+                setattr(
+                    self.tick, name, self._address(array, _CONSTANT_TYPES.get(name, np.float64))
+                )
 
     def use(self, **owners: Any) -> None:
         """Let fields of the structure of native code point to the structures of these objects."""
@@ -165,6 +170,16 @@ class TickProgram:
     def _add_stages(self, values: Values, moves: bool) -> Outputs:
         """Add the stages; return the results after them."""
         setup = self._setup
+        for stage, state in zip(setup.stages, self.buffers.states, strict=True):
+            if stage.due:
+                clock, due = [self._address(getattr(state, name), np.float64) for name in stage.due]
+                self._add_program(
+                    [(stage, state)],
+                    values,
+                    renews=True,
+                    clock=clock,
+                    due=due,
+                )
         waiting = list[tuple[Any, Pytree]]()
         for stage, state in zip(setup.stages, self.buffers.states, strict=True):
             if not stage.native:
@@ -186,23 +201,38 @@ class TickProgram:
         return outputs
 
     def _add_program(
-        self, pairs: list[tuple[Any, Pytree]], values: Values, passes: bool = False
+        self,
+        pairs: list[tuple[Any, Pytree]],
+        values: Values,
+        passes: bool = False,
+        renews: bool = False,
+        **fields: Any,
     ) -> Values:
         """Add a program of stages and their states; return the values after it, which it
-        ``passes`` on to further stages.
+        ``passes`` on to further stages. ``renews`` as for :func:`bind_stages`; ``fields`` are of
+        the program's stage in native code.
         """
         if not pairs:
             return values
         stages, states = zip(*pairs, strict=True)
         # Native code sets the addresses of the noise, which is another in each sim step.
         drawn = [id(block) for block in leaves(values.noise)]
-        made, values = bind_stages(stages, states, values, self.buffers.before.shape, passes)
+        shape = self.buffers.before.shape
+        made, values = bind_stages(
+            stages,
+            states,
+            values,
+            shape,
+            passes,
+            renews,
+        )
         if made.outputs:
             noise = [at for at, array in enumerate(made.inputs) if id(array) in drawn]
             self._add_stage(
                 "PROGRAM",
                 program=len(self._programs),
                 noise=(*noise, -1, -1)[:2],
+                **fields,
             )
             rows = tuple([(array, _row_size(array)) for array in made.inputs])
             arguments = made.program.arguments
@@ -212,11 +242,15 @@ class TickProgram:
 
     def _add_stage(self, kind: str, every: int = 1, **fields: Any) -> None:
         self._stages.append(
-            structure("Stage")(kind=number("StageKind", kind), every=every, **fields)
+            structure("Stage")(
+                kind=number("StageKind", kind),
+                every=every,
+                **fields,
+            )
         )
 
 
-_TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
+_CONSTANT_TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
 """Dtypes of arrays that are not float64."""
 
 
@@ -232,31 +266,27 @@ def _row_size(array: Rows) -> int:
     return size
 
 
-class Table(NamedTuple):
-    """Commands and observations of the ticks of a run, and arrays of its last observation."""
-
-    arrays: Arrays
-    """(ticks, envs, ...), the same in every run."""
-    effort: NDArray[np.float32]
-    """Effort of the last tick (envs, dof), as are the next two."""
-    saturated: NDArray[np.bool_]
-    guarded: NDArray[np.bool_]
-    fault: FaultArrays
-    """Last fault of each env (envs,)."""
-
-
 class NativeExecutor:
     """Executor of the sim steps of the robots of ``setup`` in native code.
 
     It has the methods of :class:`batchpid.sim.loop.array_executors.NumPyExecutor`. With
-    :func:`run_ticks` it also runs whole ticks, with their commands and observations in ``table``.
+    :func:`run_ticks` it also runs whole ticks, with their commands and observations in ``arrays``
+    (ticks, envs, ...); it writes the results of the last one to ``last`` (envs, dof), by name, and
+    reads the ``faults`` of the envs.
     """
 
-    def __init__(self, setup: GroupControl, states: States, table: Table) -> None:
+    def __init__(
+        self,
+        setup: GroupControl,
+        states: States,
+        arrays: Arrays,
+        last: Mapping[str, Rows],
+        faults: FaultArrays,
+    ) -> None:
         self.setup = setup
-        self._table = table
+        self._tables = arrays, last, faults
         self._engine = EngineSteps(setup)
-        shape = table.effort.shape
+        shape = setup.pack.size, setup.pack.dof
         command = Command(*np.zeros((4, *shape)))
         if setup.control.mode == "custom":  # it has its own copy of setpoints, of any size
             command = Command(None, feedforward=command.feedforward)
@@ -302,6 +332,16 @@ class NativeExecutor:
         if sensors is not None:  # the noise is drawn anew for another object as the key
             key = states[self._places["sensors"]].key
             self._replace("sensors", sensors._replace(key=key))
+
+    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
+        """Change the state of a stage:
+        :meth:`batchpid.sim.loop.array_executors.NumPyExecutor.change`.
+        """
+        before = self._buffers.states[self._places[name]]
+        after = function(self.setup.stage(name), before)
+        for array, rows in zip(leaves(before), leaves(after), strict=True):
+            if rows is not array:
+                array[...] = rows
 
     def _sensors(self) -> ActuatorState | None:
         """Return the state of the sensors, if there are some."""
@@ -363,26 +403,21 @@ class NativeExecutor:
 
     def _copies(self, program: TickProgram) -> list[tuple[Rows, Rows]]:
         """Return the copies between the tables of the ticks and the arrays of a sim step."""
-        table = self._table
-        command, seen, fault = table.arrays
+        (command, seen, fault), last, faults = self._tables
         outputs = program.outputs
         measured = self._buffers.measured
         none = np.zeros(measured.qpos.shape, bool)
         copies: list[tuple[Rows, Rows]] = [
             (seen.qpos, measured.qpos),
             (seen.qvel, measured.qvel),
-            (seen.effort, outputs.motor),
             (seen.ok, np.ones(len(none), bool)),
-            # One row, which each tick overwrites.
-            (table.effort[None], outputs.motor),
-            *zip(fault, table.fault, strict=True),
+            *zip(fault, faults, strict=True),
         ]
-        for name in ("saturated", "guarded"):
-            mask = getattr(outputs, name)
-            if mask is None:
-                mask = none
-            copies.append((getattr(seen, name), mask))
-            copies.append((getattr(table, name)[None], mask))
+        results = outputs.motor, outputs.saturated, outputs.guarded
+        for (name, row), rows in zip(last.items(), results, strict=True):
+            rows = none if rows is None else rows
+            # Each tick overwrites the one row of the last.
+            copies += (getattr(seen, name), rows), (row[None], rows)
         if seen.base_pose is not None and seen.base_twist is not None:
             pose = np.zeros((len(none), 7))
             twist = np.zeros((len(none), 6))
@@ -410,7 +445,7 @@ class NativeExecutor:
         tick = self._program.tick
         # The address changes when the engine's robots are built again.
         tick.group = self._engine.compiled().prepare()
-        noise = leaves(self._noise())
+        noise = leaves(self._noise()) if "sensors" in self._places else []
         tick.drawn = min(map(len, noise), default=-1)
         for place, block in enumerate(noise):
             tick.noise[place] = block.ctypes.data
@@ -421,7 +456,9 @@ class NativeExecutor:
         assert self._program is not None
         tick = self._program.tick
         sensors = self._sensors()
-        if sensors is not None and sensors.step is not None:
+        if sensors is None:
+            return False
+        if sensors.step is not None:
             sensors.step[...] += tick.ran
         return bool(tick.status & number("Status", "NO_NOISE"))
 

@@ -115,14 +115,14 @@ class TreePlant:
         push = sign * (-rate_gain * sign * qvel - stiffness * impedance * distance)
         eye = xp.eye(matrix.shape[-1], dtype=matrix.dtype)
 
-        def solution(active: Array, given: Any) -> Array:
-            matrix, effort, cost, push = given
+        def solution(active: Array, system: Any) -> Array:
+            matrix, effort, cost, push = system
             pulled = xp.where(active, cost, 0.0)
             return _solved(matrix + pulled[..., None] * eye, effort + pulled * push, xp)
 
         # The set of limits has no derivative, so a loop of unknown length may find it.
-        given = matrix, effort, cost, push
-        fixed = given if xp is np else lax.stop_gradient(given)
+        system = matrix, effort, cost, push
+        fixed = system if xp is np else lax.stop_gradient(system)
 
         def turn(carry: Any) -> Any:
             turns, active, _ = carry
@@ -137,7 +137,7 @@ class TreePlant:
             carry = lax.while_loop(changes, turn, carry)
         while xp is np and changes(carry):
             carry = turn(carry)
-        return solution(carry[1], given)
+        return solution(carry[1], system)
 
 
 def _solved(matrix: Array, right: Array, xp: Any) -> Array:
@@ -152,6 +152,10 @@ def _solved(matrix: Array, right: Array, xp: Any) -> Array:
     solved = right[..., None]
     for transposed in (False, True):
         solved = linalg.triangular_solve(
-            factor, solved, left_side=True, lower=True, transpose_a=transposed
+            factor,
+            solved,
+            left_side=True,
+            lower=True,
+            transpose_a=transposed,
         )
     return solved[..., 0]

@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike
 
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Rows
-from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.elementwise import read_only, require_jax
 from batchpid.arrays.field_tables import Field, plain
-from batchpid.arrays.jax_settings import require_jax
 from batchpid.checks.validate import array, at_least, choice, instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.physics import MujocoSolver, Physics
@@ -84,7 +83,11 @@ def check_plain(record: object) -> None:
         vars(record)[name] = plain(name, kinds[name], value)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(
+    frozen=True,
+    eq=False,
+    kw_only=True,
+)
 class OptionGroup:
     """Base of the groups of options."""
 
@@ -106,7 +109,11 @@ class OptionGroup:
         return made
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(
+    frozen=True,
+    eq=False,
+    kw_only=True,
+)
 class SceneOptions(OptionGroup):
     """Engine, ground, contacts, and content of the scenes."""
 
@@ -229,7 +236,11 @@ class SceneOptions(OptionGroup):
             ground = robot.has_ground or (file is not None and file.has_floor)
         contacts = self._sensed_links("contacts", self.contacts, robot)
         wrenches = self._sensed_links("wrenches", self.wrenches, robot)
-        return self.changed(ground=ground, contacts=contacts, wrenches=wrenches)
+        return self.changed(
+            ground=ground,
+            contacts=contacts,
+            wrenches=wrenches,
+        )
 
     def _check_randomization(self, robot: Robot) -> None:
         """Raise InvalidArgumentError for draws that robot or scenes do not take."""
@@ -334,7 +345,11 @@ class Controller(Protocol):
         """
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(
+    frozen=True,
+    eq=False,
+    kw_only=True,
+)
 class ControlOptions(OptionGroup):
     """Time step, law, gains, motors and guard; what makes an env fail, and what happens then."""
 
@@ -465,7 +480,12 @@ class ControlOptions(OptionGroup):
             # A copy: the caller may change the array later.
             speeds = array("speed_limit", limit, (1, robot.dof), joints)[0].copy()
             limit = read_only(at_least("speed_limit", speeds, 0.0, joints, above=True))
-        return self.changed(control=control, tool=link, speed_limit=limit, **values)
+        return self.changed(
+            control=control,
+            tool=link,
+            speed_limit=limit,
+            **values,
+        )
 
     @property
     def control_name(self) -> str:
@@ -523,7 +543,11 @@ class Ray:
             raise InvalidArgumentError("address", "has a protocol", value=address, remedy=remedy)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(
+    frozen=True,
+    eq=False,
+    kw_only=True,
+)
 class WorkerOptions(OptionGroup):
     """Processes and machines that run the envs."""
 

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Kind, Rows
-from batchpid.arrays.choices import PerMassMatrix
-from batchpid.arrays.digest import digest
+from batchpid.arrays.array_types import Document, Kind, PerMassMatrix, Rows
 from batchpid.arrays.field_tables import Field, declared, plain
 from batchpid.arrays.records import frozen
+from batchpid.arrays.trees import digest
 from batchpid.checks.validate import AxisKind, instance
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.law.computed_torque import check_gain_units
@@ -59,7 +58,11 @@ IDEAL = bp.Actuators()
 OPTION_GROUPS = (SceneOptions, ControlOptions, WorkerOptions)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(
+    frozen=True,
+    eq=False,
+    kw_only=True,
+)
 class RunnerKeywords(SceneOptions, ControlOptions, WorkerOptions):
     """Arguments of a :class:`batchpid.sim.Runner`, as they are passed; all but the first two may be
     left out.
@@ -146,6 +149,9 @@ class RunnerOptions(RunnerKeywords):
     def _checked_plan(self) -> bp.Plan | None:
         """Return the plan, as a read-only copy, if it fits the robot and the control."""
         if self.plan is None:
+            if self.randomization is not None and self.randomization.latency is not None:
+                problem = "is that of a plan's chunks, and the runner has no plan"
+                raise InvalidArgumentError("latency", problem, remedy="give plan=, or leave it out")
             return None
         if not self.sets_positions:
             problem = "makes positions of joints, which this control does not take"
@@ -331,15 +337,24 @@ def default_params(
     """
     # Other controls need the effort limits alone.
     if control not in ("pid", "drive"):
-        return robot.params(kp=0.0, ki=0.0, kd=0.0)
+        return robot.params(
+            kp=0.0,
+            ki=0.0,
+            kd=0.0,
+        )
     settings = robot.settings
     if control == "drive":
         if settings is None:
             return robot.designed("effort").replace(
-                ki=0.0, setpoint_weight=None, derivative_filter_time=None
+                ki=0.0,
+                setpoint_weight=None,
+                derivative_filter_time=None,
             )
         return robot.params(
-            kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None
+            kp=settings.drive_stiffness,
+            ki=0.0,
+            kd=settings.drive_damping,
+            effort_limit=None,
         )
     if tuned_file(robot) is not None:
         return robot.tuned()

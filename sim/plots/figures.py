@@ -196,14 +196,32 @@ def fit_errors(
     held_out = np.concatenate([time[~fitted] for time, fitted, *_ in fits])
     for joint, (axes,) in enumerate(blocks):
         axes.set_ylabel(units[joint], fontsize=SMALL)
-        axes.semilogy(time, before[:, joint], color=SECOND, lw=0.8, label="before")
-        axes.semilogy(time, after[:, joint], color=ENV, lw=0.8, label="after")
+        axes.semilogy(
+            time,
+            before[:, joint],
+            color=SECOND,
+            lw=0.8,
+            label="before",
+        )
+        axes.semilogy(
+            time,
+            after[:, joint],
+            color=ENV,
+            lw=0.8,
+            label="after",
+        )
         # Minor ticks and exponents as formulas take most of a second to lay out.
         axes.yaxis.set_major_locator(LogLocator(numticks=5))
         axes.yaxis.set_minor_locator(NullLocator())
         axes.yaxis.set_major_formatter("{x:.0e}")
         if len(held_out):
-            axes.axvspan(held_out[0], held_out[-1], color=SETPOINT, alpha=0.15, lw=0)
+            axes.axvspan(
+                held_out[0],
+                held_out[-1],
+                color=SETPOINT,
+                alpha=0.15,
+                lw=0,
+            )
     _add_legend(figure)
     return figure
 
@@ -266,11 +284,21 @@ def _grid(
         line, column = divmod(place, columns)
         block = [figure.add_subplot(grid[line * rows + row, column]) for row in range(rows)]
         for axes in block:
-            axes.tick_params(labelsize=SMALL, length=2, labelbottom=axes is block[-1])
+            axes.tick_params(
+                labelsize=SMALL,
+                length=2,
+                labelbottom=axes is block[-1],
+            )
             axes.spines[["top", "right"]].set_visible(False)
             axes.set_xlim(0, end)
             axes.yaxis.set_major_locator(MaxNLocator(4))
-        block[0].set_title(_plain(name), fontsize=8, loc="left", pad=3, fontweight="bold")
+        block[0].set_title(
+            _plain(name),
+            fontsize=8,
+            loc="left",
+            pad=3,
+            fontweight="bold",
+        )
         # The lowest axes of a column have the unit of time.
         if place + columns >= len(names):
             block[-1].set_xlabel("time [s]", fontsize=SMALL)
@@ -313,7 +341,13 @@ def _draw_fan(axes: Axes, time: Rows, values: Rows) -> None:
     )
     axes.add_collection(fan, autolim=False)
     (median,) = _quantiles(values, 0.5)
-    axes.plot(time, median, color=MEDIAN, lw=1.5, label="median")
+    axes.plot(
+        time,
+        median,
+        color=MEDIAN,
+        lw=1.5,
+        label="median",
+    )
 
 
 def _draw_band(
@@ -325,8 +359,21 @@ def _draw_band(
 ) -> None:
     """Draw the median of the envs as a line, and 10 to 90 % of them as a band."""
     low, median, high = _quantiles(values, 0.1, 0.5, 0.9)
-    axes.fill_between(time, low, high, color=colour, alpha=0.2, lw=0)
-    axes.plot(time, median, color=colour, lw=1.4, label=f"{label}: median, 10 to 90 %")
+    axes.fill_between(
+        time,
+        low,
+        high,
+        color=colour,
+        alpha=0.2,
+        lw=0,
+    )
+    axes.plot(
+        time,
+        median,
+        color=colour,
+        lw=1.4,
+        label=f"{label}: median, 10 to 90 %",
+    )
 
 
 def _draw_line(axes: Axes, time: Rows, values: Rows) -> None:
@@ -334,7 +381,14 @@ def _draw_line(axes: Axes, time: Rows, values: Rows) -> None:
     if (values == values[:, :1]).all():
         values = values[:, :1]
     shown = np.where(np.isfinite(values), values, np.nan)
-    lines = axes.plot(time, shown, color=SETPOINT, lw=1.1, ls="--", zorder=3)
+    lines = axes.plot(
+        time,
+        shown,
+        color=SETPOINT,
+        lw=1.1,
+        ls="--",
+        zorder=3,
+    )
     # One label for all lines: a legend names the setpoint once.
     lines[0].set_label("setpoint")
 
@@ -343,7 +397,13 @@ def _draw_limits(axes: Axes, low: float, high: float) -> None:
     """Draw a line at each finite limit."""
     for limit in (low, high):
         if math.isfinite(limit):
-            axes.axhline(limit, color=LIMIT, lw=0.9, zorder=2, label="limit")
+            axes.axhline(
+                limit,
+                color=LIMIT,
+                lw=0.9,
+                zorder=2,
+                label="limit",
+            )
 
 
 def _draw_efforts(axes: Axes, run: Rollout, joint: int) -> None:
@@ -356,7 +416,15 @@ def _draw_efforts(axes: Axes, run: Rollout, joint: int) -> None:
     peak = np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
     share = run.saturated[..., joint].mean()
     text = f"peak {peak:.3g} of ±{limit:g} {axes.get_ylabel()}, saturated {share:.0%}"
-    axes.text(1, 1, text, transform=axes.transAxes, ha="right", va="bottom", fontsize=6.5)
+    axes.text(
+        1,
+        1,
+        text,
+        transform=axes.transAxes,
+        ha="right",
+        va="bottom",
+        fontsize=6.5,
+    )
 
 
 def _show_positions(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:

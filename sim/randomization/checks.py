@@ -17,7 +17,7 @@ from batchpid.sim.randomization.randomization import EVENTS, RANDOMIZED_FIELDS, 
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.tables import MjcfFile
 
-_ZERO = ("payload", "center_of_mass", *EVENTS)
+_ZERO = ("payload", "center_of_mass", "latency", *EVENTS)
 """Fields whose nominal value is 0, which no draw can scale."""
 
 
@@ -136,7 +136,10 @@ def prepared_actuators(
         nominal = nominal._replace(**values)
     # Histories and noise are on where any draw needs them.
     like = bp.make_actuators(
-        robot.dof, command_delay=delay, position_noise=1.0, continuous=robot.continuous
+        robot.dof,
+        command_delay=delay,
+        position_noise=1.0,
+        continuous=robot.continuous,
     )
     nominal = nominal._replace(continuous=like.continuous)
     if not drawn.keys().isdisjoint(DELAYS):

@@ -277,7 +277,7 @@ Field = Distribution | Mapping[str, Distribution]
 """Distribution for all joints or links, or one for each of those that are named."""
 FIELD_GROUPS = ("params", "actuators")
 """Fields that are mappings, by name of a further field."""
-SINGLE = ("payload", "ground_friction", "push_interval")
+SINGLE = ("payload", "ground_friction", "push_interval", "latency")
 """Fields of one value."""
 _AXES: dict[str, Sequence[str]] = {"gravity": "xyz", "push": tuple(TWIST_UNITS)}
 """Fields of the world or the base, and their axes."""

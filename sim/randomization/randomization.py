@@ -42,7 +42,7 @@ from batchpid.sim.robot.robot_model import link_tree
 
 Drawn = TypeVar("Drawn", bp.PIDParams, bp.Actuators | None)
 LARGEST_SEED = 2**63 - 1
-OF_JOINTS = ("bias", *JOINT_SIDE)
+LEADER_FIELDS = ("bias", *JOINT_SIDE)
 """Fields of the actuators that followers do not have."""
 
 
@@ -106,6 +106,8 @@ class Randomization:
     """
     push_interval: Annotated[Distribution | None, Bounds("s", above=True, group="event")] = None
     """Time from the reset to the first push, and from each to the next [s]."""
+    latency: Annotated[Distribution | None, Bounds("s", group="policy")] = None
+    """Age that is added to the latency of each chunk of a plan [s]; nominal 0."""
     params: Mapping[str, Field] = field(default_factory=dict)
     """Fields of :class:`batchpid.PIDParams` that the runner's params have, e.g. ``{"kp": ...}``."""
     actuators: Mapping[str, Field] = field(default_factory=dict)
@@ -266,7 +268,7 @@ class Randomization:
         for name in getattr(self, group):
             rows = self.apply(f"{group}.{name}", getattr(record, name), draws, robot)
             # Followers have no motor.
-            if name in OF_JOINTS:
+            if name in LEADER_FIELDS:
                 values[name] = rows * robot.independent
             else:
                 values[name] = rows

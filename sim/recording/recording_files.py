@@ -143,7 +143,12 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
             f"{path}: cannot be read as a recording: {error or type(error).__name__}"
         ) from error
     inputs = {name: arrays.pop(name) for name in ("time", "setpoint", *OPTIONAL)}
-    return Rollout(**inputs, observation=Observation(**arrays), tick=tick * every, info=info)
+    return Rollout(
+        **inputs,
+        observation=Observation(**arrays),
+        tick=tick * every,
+        info=info,
+    )
 
 
 def _check_info(info: RunInfo, num_envs: int) -> None:
@@ -184,7 +189,12 @@ def create_datasets(
     info = replace(info, urdf=_urdf_of(info))
     file.attrs.update(attributes(info) | {"format": FORMAT, "num_envs": num_envs, "tick": tick})
     time = file.create_dataset(
-        "time", (0,), "f8", maxshape=(None,), chunks=(4096,), fillvalue=np.nan
+        "time",
+        (0,),
+        "f8",
+        maxshape=(None,),
+        chunks=(4096,),
+        fillvalue=np.nan,
     )
     time.attrs["unit"] = ["s"]
     datasets = {"time": time}

@@ -58,6 +58,8 @@ class Setpoints(NamedTuple):
     """False if the rates are central differences."""
     steps: int
     """Number of changes that count as steps of the setpoint, with rate 0."""
+    period: float
+    """Time from row to row [s]."""
 
 
 def _quoted(name: str) -> str:
@@ -183,12 +185,20 @@ def setpoint_csv(robot: Robot, motion: Trajectory) -> str:
     text = io.StringIO()
     # A name may hold separators and quotation marks.
     header = [name if re.fullmatch(r"[\w.:/-]+", name) else _quoted(name) for name in names]
-    np.savetxt(text, rows, "%.9g", ",", header=",".join(["time", *header]), comments="")
+    np.savetxt(
+        text,
+        rows,
+        "%.9g",
+        ",",
+        header=",".join(["time", *header]),
+        comments="",
+    )
     return text.getvalue()
 
 
-def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) -> Setpoints:
-    """Return the setpoints in a file, for sim steps of ``timestep`` [s].
+def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float | None) -> Setpoints:
+    """Return the setpoints in a file, for sim steps of ``timestep`` [s]; with None, rows may be at
+    any distance, one each "sim step".
 
     Rates that the file does not give are central differences, the short way round on continuous
     joints, and 0 where the setpoint makes a step. Without a row at time 0, the robot's start pose
@@ -207,7 +217,10 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
     columns, lines = read_csv(path)
     tables = _tables(robot, source, columns, lines)
     tables["setpoint"] = robot.coupling.positions(tables["setpoint"])
-    substeps, at_zero = _substeps(source, columns["time"], lines, timestep)
+    times = columns["time"]
+    if timestep is None:
+        timestep = float(times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else times[0]
+    substeps, at_zero = _substeps(source, times, lines, timestep)
     start = None
     if at_zero:
         start = tables["setpoint"][0]
@@ -216,13 +229,31 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float) 
     acceleration = tables.get("setpoint_acceleration")
     if "setpoint_rate" in tables:
         rate = tables["setpoint_rate"]
-        return Setpoints(start, position, rate, acceleration, substeps, True, 0)
+        return Setpoints(
+            start,
+            position,
+            rate,
+            acceleration,
+            substeps,
+            True,
+            0,
+            substeps * timestep,
+        )
     if start is None:
         first = robot.start
     else:
         first = start
     rate, steps = _rates(robot, np.vstack([first, position]), substeps * timestep)
-    return Setpoints(start, position, rate, acceleration, substeps, False, steps)
+    return Setpoints(
+        start,
+        position,
+        rate,
+        acceleration,
+        substeps,
+        False,
+        steps,
+        substeps * timestep,
+    )
 
 
 def _rates(robot: Robot, position: Float64, dt: float) -> tuple[Float64, int]:
@@ -309,7 +340,7 @@ def _substeps(
             if len(time) > 1 and period > 0:
                 # Times are rounded: over all rows the period is closer than between two.
                 period = (time[-1] - time[0]) / np.round(np.diff(time) / period).sum()
-            remedy += f", or use --timestep {period / substeps:.9g} (timestep=)"
+            remedy += f", or use --timestep {period / substeps:.9g} (timestep=), or --plan"
         raise error(source, problem, remedy)
     if first + len(time) == 1:
         problem = f"line {lines[0]}: the only row is at 0 s"

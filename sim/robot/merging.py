@@ -57,7 +57,11 @@ def merge_links(tables: Tables, separate: Separate = ()) -> Tables:
             at = links[body.joint.parent_link]
             position, wxyz = _within(at, body.position, body.wxyz)
             joint = replace(body.joint, parent_link=at.link)
-            body = body._replace(joint=joint, position=position, wxyz=wxyz)
+            body = body._replace(
+                joint=joint,
+                position=position,
+                wxyz=wxyz,
+            )
         # A link alone keeps the axes of its tensor, by which SAPIEN orders the principal ones.
         if members[body.name] > 1 or body.mass <= LEAST_MASS:
             body = _with_inertia(body, parts[body.name])
@@ -66,7 +70,13 @@ def merge_links(tables: Tables, separate: Separate = ()) -> Tables:
     for shape in tables.shapes:
         at = links[shape.owner]
         position, wxyz = _within(at, shape.position, shape.wxyz)
-        shapes.append(shape._replace(body=at.link, position=position, wxyz=wxyz))
+        shapes.append(
+            shape._replace(
+                body=at.link,
+                position=position,
+                wxyz=wxyz,
+            )
+        )
     row = {body.name: index for index, body in enumerate(bodies)}
     # Engines number shapes by body, and SAPIEN builds mirrored ones last.
     shapes.sort(key=lambda shape: (row[shape.body], shape.is_mirrored))
@@ -121,7 +131,12 @@ def _with_inertia(body: Body, parts: Sequence[SpatialInertia]) -> Body:
     if sum(part.mass for part in parts) <= LEAST_MASS * len(parts):
         parts = [nothing]
     mass, center, tensor = total(parts)
-    return body._replace(mass=float(mass), center=center, inertia=tensor, inertia_wxyz=NO_TURN)
+    return body._replace(
+        mass=float(mass),
+        center=center,
+        inertia=tensor,
+        inertia_wxyz=NO_TURN,
+    )
 
 
 def _within(at: Placement, position: Float64, wxyz: Float64) -> tuple[Float64, Float64]:
@@ -287,7 +302,12 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     friction, damping = np.zeros((2, len(joints)))
     np.add.at(friction, coupling.leader, share * [joint.friction for joint in joints])
     np.add.at(damping, coupling.leader, share**2 * [joint.damping for joint in joints])
-    columns = {"lower": lower, "upper": upper, "friction": friction, "damping": damping}
+    columns = {
+        "lower": lower,
+        "upper": upper,
+        "friction": friction,
+        "damping": damping,
+    }
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     return tuple(
         replace(joint, **dict(zip(columns, row, strict=True)))

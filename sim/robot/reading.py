@@ -14,8 +14,8 @@ from lxml import etree
 
 from batchpid import assets
 from batchpid.arrays.array_types import Document
-from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.trees import digest
 from batchpid.checks.validate import file_path, is_name
 from batchpid.errors import RobotError, RobotNotFoundError
 from batchpid.sim.findings import Finding
@@ -70,7 +70,14 @@ def read_robot(
         name = root.get("model") or path.stem
         source = read_mjcf(path, name, findings, fixed_base, missing_meshes)
     else:
-        source = read_urdf(root, path, findings, fixed_base, package_dirs, missing_meshes)
+        source = read_urdf(
+            root,
+            path,
+            findings,
+            fixed_base,
+            package_dirs,
+            missing_meshes,
+        )
     joints = [joint.name for joint in source.tables.joints]
     for name in (source.name, *joints, *source.tables.links):
         if not is_name(name):
@@ -111,7 +118,9 @@ def with_srdf(source: Source) -> Source:
         else:
             disabled.append(DisabledPair(*pair, element.get("reason") or "User"))
     return source._replace(
-        disabled=tuple(disabled), enabled=frozenset(enabled), repairs=tuple(findings)
+        disabled=tuple(disabled),
+        enabled=frozenset(enabled),
+        repairs=tuple(findings),
     )
 
 

@@ -15,22 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import batchpid as bp
-from batchpid.arrays.array_types import Bool, Document, Float64
-from batchpid.arrays.choices import CHOICES
+from batchpid.arrays.array_types import CHOICES, Bool, Document, Float64
 from batchpid.arrays.elementwise import read_only
 from batchpid.checks.validate import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.findings import Finding, Findings, report
+from batchpid.sim.robot import reading
 from batchpid.sim.robot.merging import couple, coupling_of, place_links
-from batchpid.sim.robot.reading import (
-    bundled_robots,
-    find_robot,
-    read_robot,
-    read_settings,
-    tuned_file,
-    with_srdf,
-)
 from batchpid.sim.robot.robot_model import (
     RobotModel,
     SelfContact,
@@ -52,7 +44,11 @@ STANDING_HZ)^2.
 """
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(
+    frozen=True,
+    eq=False,
+    repr=False,
+)
 class Robot:
     """Robot as its file describes it; every array is in the order of ``joint_names``. Load one with
     :meth:`load`.
@@ -141,9 +137,7 @@ class Robot:
 
     @cached_property
     def design_effort_limit(self) -> Float64:
-        """Effort limits (dof,) [N m or N] of designed and tuned gains: those of the URDF, or
-        :func:`batchpid.sim.robot.robot_model.suggested_effort_limit` where it gives none.
-        """
+        """Effort limits (dof,) [N m or N] of designed and tuned gains: stated, or suggested ones."""
         limits = self.effort_limit
         # The dynamics of 50 poses take time that most robots need not spend.
         if np.isfinite(limits).all():
@@ -301,10 +295,7 @@ class Robot:
         RobotNotFoundError
             No bundled robot and no file of that name.
         RobotError
-            The file is neither a usable URDF nor a usable MJCF file, or, with ``strict``, it needs
-            repairs.
-        InvalidArgumentError
-            An option has none of the values above.
+            The file is no usable URDF or MJCF file, or, with ``strict``, it needs repairs.
         """
         choice("missing_meshes", missing_meshes, ("error", "skip"))
         choice("dissipation", dissipation, ("urdf", "sapien"))
@@ -317,18 +308,18 @@ class Robot:
                 "package_dirs", problem, value=package_dirs, remedy="pass a list of paths"
             )
         # A wrong option is not hidden by a fault of the file.
-        path = find_robot(name_or_path)
+        path = reading.find_robot(name_or_path)
         folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
-        source = read_robot(path, fixed_base, folders, missing_meshes)
+        source = reading.read_robot(path, fixed_base, folders, missing_meshes)
         report(path, source.repairs, strict)
         joints = couple([joint for joint in source.tables.joints if joint.moves])
         if not joints:
             raise RobotError(
                 f"{path}: a robot without moving joints cannot be controlled; check the joint types"
             )
-        source = with_srdf(source)
+        source = reading.with_srdf(source)
         source = source._replace(self_collision=self_collision, dissipation=dissipation)
-        robot = cls(source, joints, read_settings(path, joints))
+        robot = cls(source, joints, reading.read_settings(path, joints))
         motors = source.actuators if actuators is None else actuators
         if motors is None:
             return robot
@@ -337,7 +328,7 @@ class Robot:
     @staticmethod
     def bundled() -> tuple[str, ...]:
         """Return the names of the robots that ship with batchpid."""
-        return bundled_robots()
+        return reading.bundled_robots()
 
     def check(
         self,
@@ -374,7 +365,15 @@ class Robot:
             from batchpid.sim.engine.protocol import engine_findings
 
             of_engine = engine_findings(self, engine, timestep)
-        return check(self, params, qpos, setpoint, timestep, control, of_engine)
+        return check(
+            self,
+            params,
+            qpos,
+            setpoint,
+            timestep,
+            control,
+            of_engine,
+        )
 
     def guard(
         self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None
@@ -439,7 +438,7 @@ class Robot:
         """Return the tuned params of a bundled robot; see docs/choosing-gains.md. Raises
         InvalidArgumentError for another robot.
         """
-        file = tuned_file(self)
+        file = reading.tuned_file(self)
         if file is None:
             remedy = "use robot.designed(), or search for gains with: batchpid tune"
             raise InvalidArgumentError("robot", f"{self.name!r} has no tuned gains", remedy=remedy)
@@ -449,13 +448,16 @@ class Robot:
         """Return params with the gains of the servos of an MJCF file: kp, ki and kd, on the
         measured velocity, and the limits of their integrals.
 
-        Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of
-        the servo's control; a velocity servo has kd alone. :meth:`guard` has the limits of their
-        setpoints. Raises InvalidArgumentError for a file without servos.
+        Joints without servo have gains of 0; a velocity servo has kd alone. The setpoint is a
+        joint's position. :meth:`guard` has its limits. Raises InvalidArgumentError without servos.
         """
         gains = self.source.gains
         if gains is None:
             problem = f"{self.name!r} has no servos of an MJCF file"
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
         # MuJoCo's integral grows during saturation, up to its limit.
-        return self.params(**gains, anti_windup="none", measurement_rate="measured")
+        return self.params(
+            **gains,
+            anti_windup="none",
+            measurement_rate="measured",
+        )

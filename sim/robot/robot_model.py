@@ -196,7 +196,12 @@ def link_tree(robot: Robot) -> RigidTree:
     """
     limits = np.where(robot.continuous, [[-np.inf], [np.inf]], [robot.lower, robot.upper])
     tree = body_tree(robot.tables, robot.fixed_base)
-    return replace(tree, coupling=robot.coupling, lower=limits[0], upper=limits[1])
+    return replace(
+        tree,
+        coupling=robot.coupling,
+        lower=limits[0],
+        upper=limits[1],
+    )
 
 
 def suggested_effort_limit(robot: Robot) -> Float64:

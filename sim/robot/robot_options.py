@@ -34,7 +34,12 @@ identified from a log is inexact; friction in the robot's description is exact, 
 simulated with it.
 """
 
-_NO_LIMIT = {"lower": -np.inf, "upper": np.inf, "rate": np.inf, "acceleration": np.inf}
+_NO_LIMIT = {
+    "lower": -np.inf,
+    "upper": np.inf,
+    "rate": np.inf,
+    "acceleration": np.inf,
+}
 
 
 def known_joints(robot: Robot) -> dict[str, Float64]:
@@ -102,7 +107,14 @@ def fit_actuators(
             remedy = "give at least minus the friction or damping of the robot's file"
             # Of a float32 the sum may be zero but for its rounding.
             good = motors[name] >= -(1 + 1e-6) * least
-            entries(name, motors[name], good, problem, robot.joint_names, remedy=remedy)
+            entries(
+                name,
+                motors[name],
+                good,
+                problem,
+                robot.joint_names,
+                remedy=remedy,
+            )
     return actuators.replace(**motors, continuous=robot.continuous)
 
 

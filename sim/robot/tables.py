@@ -26,8 +26,8 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.digest import digest
 from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.trees import digest, mapped
 from batchpid.motors import Actuators
 from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.shapes import LEAST_MASS, Shape
@@ -189,6 +189,7 @@ class Tables:
         vars(self).update(
             bodies=tuple(Body._make(map(read_only, body)) for body in self.bodies),
             shapes=tuple(Shape._make(map(read_only, shape)) for shape in self.shapes),
+            visuals={link: mapped(read_only, rows) for link, rows in self.visuals.items()},
         )
 
     def __eq__(self, other: object) -> bool:
@@ -226,7 +227,12 @@ def unique(name: str, names: set[str]) -> str:
 def without_mass(body: Body) -> Body:
     """Return ``body`` with next to no mass, in place of that of its shapes."""
     tensor = 1e-3 * LEAST_MASS * np.eye(3)
-    return body._replace(mass=LEAST_MASS, center=ORIGIN, inertia=tensor, inertia_wxyz=NO_TURN)
+    return body._replace(
+        mass=LEAST_MASS,
+        center=ORIGIN,
+        inertia=tensor,
+        inertia_wxyz=NO_TURN,
+    )
 
 
 def breadth_first(
@@ -278,7 +284,7 @@ class MjcfFile:
     """MJCF file that MuJoCo simulates itself, with everything in it besides the robot.
 
     ``is_whole`` says whether all of it is compiled
-    (:func:`batchpid.sim.robot.mjcf.model.compile_scene`), and ``content`` is the digest of the
+    (:func:`batchpid.sim.robot.mjcf.reader.compile_scene`), and ``content`` is the digest of the
     model. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
     other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
     links. ``losses`` are findings of what is lost in an engine that does not simulate the file.

@@ -90,7 +90,14 @@ def read_urdf(
     tables = _read_tables(links, joints, path, reader)
     reader.report_missing(missing_meshes)
     name = root.get("name", "").strip() or path.stem
-    return Source(path, name, tables, tuple(findings), fixed_base, start or None)
+    return Source(
+        path,
+        name,
+        tables,
+        tuple(findings),
+        fixed_base,
+        start or None,
+    )
 
 
 def _check_root(root: etree._Element, path: Path) -> None:

@@ -64,7 +64,16 @@ class ElementReader:
         detail: str = "",
     ) -> None:
         """Report a repair."""
-        self._findings.append(Finding(code, text, remedy, joint, link, detail))
+        self._findings.append(
+            Finding(
+                code,
+                text,
+                remedy,
+                joint,
+                link,
+                detail,
+            )
+        )
 
     def read_visuals(self, root: etree._Element) -> None:
         """Read the shapes that are drawn, without findings: they change no motion."""
@@ -123,7 +132,14 @@ class ElementReader:
                 values = (0.0,)
             fields[key] = values[0]
         fields["mimic"] = self._read_mimic(name, element.find("mimic"))
-        return Joint(name, kind, parent, child, axis=axis, **fields)
+        return Joint(
+            name,
+            kind,
+            parent,
+            child,
+            axis=axis,
+            **fields,
+        )
 
     def _read_limits(self, name: str, kind: str, joint: etree._Element) -> Document:
         """Return the limits of a joint by field; missing and placeholder limits are infinite."""
@@ -247,7 +263,12 @@ class ElementReader:
         if repair is not None:
             text, detail = repair
             self.warn("inertia", text, "correct <inertia>", link=body.name, detail=detail)
-        return body._replace(mass=value[0], center=center, inertia=tensor, inertia_wxyz=turn)
+        return body._replace(
+            mass=value[0],
+            center=center,
+            inertia=tensor,
+            inertia_wxyz=turn,
+        )
 
     def _read_collision(self, link: str, collision: etree._Element) -> None:
         """Append a collision shape, unless it has no size or its mesh is missing."""
@@ -310,7 +331,15 @@ def _read_shape(element: etree._Element, link: str) -> tuple[Shape | None, str |
     place = read_origin(element, "")
     if kind == "mesh":
         file = geometry.get("filename", "").strip()
-        return Shape(link, link, kind, (), *place, file, rows[0]), None
+        return Shape(
+            link,
+            link,
+            kind,
+            (),
+            *place,
+            file,
+            rows[0],
+        ), None
     size = rows[0]
     if kind == "box":
         size = tuple(0.5 * side for side in size)

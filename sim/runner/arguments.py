@@ -58,7 +58,14 @@ def read_command(
             entries = read_array(name, entries)
             # Rows for all envs.
             entries = entries[:, None] if entries.ndim == 2 else entries
-        entries = array(name, entries, (*table, len(names)), names, finite=finite, kind=kind).copy()
+        entries = array(
+            name,
+            entries,
+            (*table, len(names)),
+            names,
+            finite=finite,
+            kind=kind,
+        ).copy()
         rows.append(entries[None] if ticks is None else entries)
     coupling = options.command_coupling
     if coupling is not None:
@@ -104,8 +111,22 @@ def read_chunks(
     finite = options.on_invalid_input == "raise"
     chunks = array(name, rows, (*table, count, len(joints)), joints, finite=finite)
     envs = tuple([f"env {env}" for env in range(options.num_envs)])
-    ages = array("latency", latency, table, envs, finite=False, kind="entry")
-    at_least("latency", ages, 0.0, envs, infinite=True, kind="entry")
+    ages = array(
+        "latency",
+        latency,
+        table,
+        envs,
+        finite=False,
+        kind="entry",
+    )
+    at_least(
+        "latency",
+        ages,
+        0.0,
+        envs,
+        infinite=True,
+        kind="entry",
+    )
     return options.robot.coupling.positions(chunks).copy(), ages.copy()
 
 
@@ -210,7 +231,14 @@ def base_rows(
         part[...] = array(name, value, part.shape, columns, kind="entry")
         # As near as positions and velocities of joints.
         near = np.abs(part) <= FARTHEST
-        entries(name, part, near, f"is beyond +-{FARTHEST:g}", columns, kind="entry")
+        entries(
+            name,
+            part,
+            near,
+            f"is beyond +-{FARTHEST:g}",
+            columns,
+            kind="entry",
+        )
     if inputs["base_pose"] is None:
         # An MJCF file may have a ground at another height.
         ground = options.ground and options.mjcf is None
@@ -226,7 +254,13 @@ def base_rows(
     remedy = "give (w, x, y, z), (1, 0, 0, 0) upright"
     is_long = length > _SHORTEST
     entries(
-        "base_pose", length, is_long, "is too short", ("quaternion",), kind="entry", remedy=remedy
+        "base_pose",
+        length,
+        is_long,
+        "is too short",
+        ("quaternion",),
+        kind="entry",
+        remedy=remedy,
     )
     pose[:, 3:] /= length
     return rows

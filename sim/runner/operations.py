@@ -159,7 +159,13 @@ def _after_reset(request: Request, state: RunnerState, outcome: Outcome) -> Runn
         rate = np.where(mask[:, None], qvel, 0.0 if rate is None else rate)
         motion = np.where(mask[:, None], qpos, setpoint), rate
     faults = state.faults.without(mask).with_events(outcome.at(0))
-    return state.changed(RESET, mask, faults=faults, draws=draws, motion=motion)
+    return state.changed(
+        RESET,
+        mask,
+        faults=faults,
+        draws=draws,
+        motion=motion,
+    )
 
 
 def _after_run(request: Request, state: RunnerState, outcome: Outcome) -> RunnerState:
@@ -276,4 +282,12 @@ def _fault(options: RunnerOptions, env: int, arrays: Arrays) -> Fault:
     if command is not None and cause in COMMAND_CAUSES:
         kind, names = "entry", command.names
     joint = names[arrays.fault.joint[env]]
-    return Fault(env, step, step * options.timestep, joint, cause, options.on_fault, kind)
+    return Fault(
+        env,
+        step,
+        step * options.timestep,
+        joint,
+        cause,
+        options.on_fault,
+        kind,
+    )

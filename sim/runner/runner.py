@@ -233,7 +233,14 @@ class Runner(SingleOwner):
         options = self.options
         seed = None if options.randomization is None else 0
         base = {"base_pose": None, "base_twist": None}
-        start = reset_request(options, self._state, (None, None), None, seed, base)
+        start = reset_request(
+            options,
+            self._state,
+            (None, None),
+            None,
+            seed,
+            base,
+        )
         self._call.begin()
         try:
             self._call.waits = True
@@ -304,7 +311,14 @@ class Runner(SingleOwner):
         """
         self._ready()
         base = {"base_pose": base_pose, "base_twist": base_twist}
-        start = reset_request(self.options, self._state, (qpos, qvel), mask, seed, base)
+        start = reset_request(
+            self.options,
+            self._state,
+            (qpos, qvel),
+            mask,
+            seed,
+            base,
+        )
         self._execute(start)
         return self.observe()
 
@@ -449,7 +463,8 @@ class Runner(SingleOwner):
         ticks = count_ticks(options, setpoints)
         chunks = list[tuple[Float64, Float64]]()
         if options.plan is not None:
-            chunks = list(zip(*read_chunks(options, arrays, latency, ticks), strict=True))
+            entries, ages = read_chunks(options, arrays, latency, ticks)
+            chunks = list(zip(entries, ages + self._lateness, strict=True))
             goals = [self._goal]
             for chunk in chunks:
                 goals.append(goal_of(*chunk, goals[-1]))
@@ -484,7 +499,15 @@ class Runner(SingleOwner):
         rated = command.setpoint_rate is not None
         info = replace(info, rates=rated, faults=self._state.faults.events)
         times = steps * options.timestep
-        return Rollout(times, command.setpoint, seen, seconds, info, command.feedforward, changes)
+        return Rollout(
+            times,
+            command.setpoint,
+            seen,
+            seconds,
+            info,
+            command.feedforward,
+            changes,
+        )
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
@@ -642,6 +665,15 @@ class Runner(SingleOwner):
         return {name: rows.copy() for name, rows in self._state.draws.values.items()}
 
     @property
+    def _lateness(self) -> Float64:
+        """Latency of chunks that the randomization draws (envs,) [s]; 0 without one."""
+        options, lateness = self.options, np.zeros((self.num_envs, 1))
+        randomization = options.randomization
+        if randomization is not None and randomization.latency is not None:
+            lateness = randomization.apply("latency", lateness, self._state.draws, options.robot)
+        return lateness[:, 0]
+
+    @property
     def episodes(self) -> NDArray[np.int64]:
         """Stream and number of the present episode of each env (envs, 2); (0, 2) without a
         randomization.
@@ -756,7 +788,7 @@ class Runner(SingleOwner):
             if inputs["setpoint"] is None:
                 inputs["setpoint"], latency = self._goal, np.inf
             chunks, ages = read_chunks(self.options, inputs, latency)
-            chunk = chunks[0], ages[0]
+            chunk = chunks[0], ages[0] + self._lateness
             inputs["setpoint"] = goal_of(*chunk, self._goal)
         if substeps is None:
             count = self.substeps

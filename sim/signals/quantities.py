@@ -21,9 +21,24 @@ from batchpid.checks.validate import array
 from batchpid.checks.validate import names as different_names
 from batchpid.errors import InvalidArgumentError
 
-POSE_UNITS = {"x": "m", "y": "m", "z": "m", "qw": "", "qx": "", "qy": "", "qz": ""}
+POSE_UNITS = {
+    "x": "m",
+    "y": "m",
+    "z": "m",
+    "qw": "",
+    "qx": "",
+    "qy": "",
+    "qz": "",
+}
 """Names and units of the numbers in a pose: position and quaternion (w, x, y, z)."""
-TWIST_UNITS = {"vx": "m/s", "vy": "m/s", "vz": "m/s", "wx": "rad/s", "wy": "rad/s", "wz": "rad/s"}
+TWIST_UNITS = {
+    "vx": "m/s",
+    "vy": "m/s",
+    "vz": "m/s",
+    "wx": "rad/s",
+    "wy": "rad/s",
+    "wz": "rad/s",
+}
 """Names and units of the numbers in a twist: linear and angular velocity."""
 FORCE_UNITS = {"fx": "N", "fy": "N", "fz": "N"}
 """Names and units of the numbers in a force."""
@@ -62,7 +77,11 @@ class CommandSpec:
             raise InvalidArgumentError("units", problem, value=self.units, remedy=remedy)
         neutral = array("neutral", self.neutral, (1, len(names)), names, kind="entry")[0]
         # The class is frozen; its __dict__ is not.
-        vars(self).update(names=names, units=units, neutral=tuple(neutral.tolist()))
+        vars(self).update(
+            names=names,
+            units=units,
+            neutral=tuple(neutral.tolist()),
+        )
 
     @property
     def size(self) -> int:

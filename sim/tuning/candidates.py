@@ -48,7 +48,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.gains.stability import stability_bound
-from batchpid.metrics import StepMetrics
+from batchpid.metrics import SETTLING_SHARE, StepMetrics
 from batchpid.sim.diagnosis.causes import absolute_band
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
@@ -124,7 +124,7 @@ class GainCandidates:
         # Figures of the moves as steps.
         self._steps = len(moves.names)
         self._band = absolute_band(robot)
-        self._size = np.maximum(np.abs(moves.target - moves.start), self._band / 0.02)
+        self._size = np.maximum(np.abs(moves.target - moves.start), self._band / SETTLING_SHARE)
         self._variation = smooth_variation(robot, moves, 1.0)
         self._limit = settling_limits(robot, moves)
         # The moves of a candidate's envs; a move has the same drawn robot both times.
@@ -158,11 +158,14 @@ class GainCandidates:
         leaves = np.stack([designed.ki, designed.kp, designed.kd])
         medians = np.median(leaves[..., self.robot.independent], axis=(1, 2))
         p, w = np.array(DESIGNS).T
-        gains = np.stack([p * w**2, w**2 + 2 * p * w, p + 2 * w], axis=1)
-        ki, kp, kd = (gains / medians).T
+        # Over the designed gains, by their equations.
+        ki = p * w**2 / medians[0]
+        kp = (w**2 + 2 * p * w) / medians[1]
+        kd = (p + 2 * w) / medians[2]
         bandwidth = np.cbrt(ki)
-        points = np.zeros((len(gains), len(FACTORS)))
-        points[:, :3] = np.log(np.stack([bandwidth, kp / bandwidth**2, kd / bandwidth], axis=1))
+        factors = bandwidth, kp / bandwidth**2, kd / bandwidth
+        points = np.zeros((len(p), len(FACTORS)))
+        points[:, :3] = np.log(np.stack(factors, axis=1))
         return points
 
     def params(self, points: Float64) -> bp.PIDParams:
@@ -254,7 +257,12 @@ class GainCandidates:
         ratios = []
         for kp, kd, filter_time in zip(*leaves[..., self.robot.independent], strict=True):
             bound = stability_bound(
-                self._mass, kp, kd, dt, filter_time=filter_time, damping=self._damping
+                self._mass,
+                kp,
+                kd,
+                dt,
+                filter_time=filter_time,
+                damping=self._damping,
             )
             ratios.append(bound.ratio.max())
         return 10 * np.maximum(np.array(ratios) - PENALTY_RATIO, 0)

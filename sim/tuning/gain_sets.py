@@ -58,7 +58,12 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
             problem = "is no drive of finite stiffness and damping, 0 or more"
             remedy = "write drive:STIFFNESS,DAMPING, e.g. drive:20,5"
             raise InvalidArgumentError("gains", problem, value=name, remedy=remedy)
-        params = robot.params(kp=stiffness, ki=0.0, kd=damping, effort_limit=None)
+        params = robot.params(
+            kp=stiffness,
+            ki=0.0,
+            kd=damping,
+            effort_limit=None,
+        )
         return GainSet(f"drive ({stiffness:g}, {damping:g})", params, "drive")
     path = Path(name)
     if not path.is_file():

@@ -220,7 +220,14 @@ def tune(
     options["randomization"] = reseeded(randomization, seed)
     with searched.runner(population, options | fast) as runner:
         evaluate = partial(searched.costs, runner)
-        points, history = _evolve(evaluate, first, generations, population, seed, progress)
+        points, history = _evolve(
+            evaluate,
+            first,
+            generations,
+            population,
+            seed,
+            progress,
+        )
 
     # Final round, on other moves: the designed gains against the candidates that beat them.
     costs = np.concatenate(history)
@@ -277,7 +284,12 @@ def _evolve(
     """
     from cmaes import CMA
 
-    make = partial(CMA, sigma=INITIAL_SPREAD, seed=seed, population_size=population)
+    make = partial(
+        CMA,
+        sigma=INITIAL_SPREAD,
+        seed=seed,
+        population_size=population,
+    )
     optimizer = make(mean=first[0])
     points = []
     history = []

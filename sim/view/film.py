@@ -105,14 +105,23 @@ class Painter:
         edges = TILE * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         places, depth = self._project(corners + edges)
         width, height = self._size
-        figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor=_BACKGROUND)
+        figure = Figure(
+            figsize=(width / 100, height / 100),
+            dpi=100,
+            facecolor=_BACKGROUND,
+        )
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set(xlim=(-width / height, width / height), ylim=(-1, 1))
         axes.axis("off")
         tiles = list(places[(depth > _NEAREST).all(axis=1)])
         face = _FLOOR if scene.ground else "none"
         axes.add_collection(
-            PolyCollection(tiles, facecolors=face, edgecolors=_GRID, linewidths=0.8)
+            PolyCollection(
+                tiles,
+                facecolors=face,
+                edgecolors=_GRID,
+                linewidths=0.8,
+            )
         )
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
@@ -242,7 +251,10 @@ def encode(
     command = [ffmpeg, *source.split(), *options.split(), "-y", f"file:{path}"]
     with tempfile.TemporaryFile() as messages:
         process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=messages
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=messages,
         )
         try:
             # The pipe breaks where ffmpeg has ended, with a message.

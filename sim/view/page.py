@@ -33,7 +33,12 @@ HOST = "127.0.0.1"
 CHART_FRAMES = 5
 """Frames between two updates of chart and status."""
 CURVE = {"label": "qpos", "stroke": "#15803d", "width": 2}
-SETPOINT_CURVE = {"label": "setpoint", "stroke": "#4a82ff", "width": 1, "dash": [6, 4]}
+SETPOINT_CURVE = {
+    "label": "setpoint",
+    "stroke": "#4a82ff",
+    "width": 1,
+    "dash": [6, 4],
+}
 SCALES = {
     # Without a fixed range the axis drifts in viser 1.1.
     "x": {"time": False, "range": (-HISTORY_SECONDS, 0.0)},
@@ -73,14 +78,22 @@ class View(AbstractContextManager["View"]):
         """Address of the page, with the token that opens it."""
         self._stopped = False
         make = partial(
-            viser.ViserServer, host=HOST, port=gate.port, verbose=False, label="batchpid"
+            viser.ViserServer,
+            host=HOST,
+            port=gate.port,
+            verbose=False,
+            label="batchpid",
         )
         with redirect_stdout(io.StringIO()):  # viser's banner
             self._server = gate.start(make)
 
         # Controls on the right, a chart on the left, the scene between them.
         gui = self._server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(43, 92, 199))
+        gui.configure_theme(
+            show_logo=False,
+            show_share_button=False,
+            brand_color=(43, 92, 199),
+        )
         self.panel = Panel(gui, data)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
@@ -269,7 +282,12 @@ class Gate:
                 return response
 
             handlers.append(handler)
-            return serve(handler, sock=self.socket, process_request=process, **options)
+            return serve(
+                handler,
+                sock=self.socket,
+                process_request=process,
+                **options,
+            )
 
         websocket_server.serve = guarded  # type: ignore[assignment, misc]
         try:

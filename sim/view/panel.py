@@ -124,12 +124,8 @@ class Panel:
         """Carry out a button of the motion."""
         if button == "Reset":
             self._data.reset()
-        elif button == "Run":
-            self.frames_left = math.inf
-        elif button == "Pause":
-            self.frames_left = 0
         else:
-            self.frames_left = 1
+            self.frames_left = {"Run": math.inf, "Pause": 0, "Step": 1}[button]
 
     def _add_setpoints(self, live: LiveSimulation) -> None:
         """Add a slider for each joint, and buttons for poses."""

@@ -116,7 +116,8 @@ class LocalWorker(Worker):
         try:
             if self._loop is None:
                 self._loop = self._start.build(Arrays.from_fields(self._shared.arrays))
-            self._result = _called(self._loop, request.method, request.arguments)
+            else:
+                self._result = getattr(self._loop, request.method)(*request.arguments)
         except Exception as error:
             self._result = Failure.of(error)
 
@@ -330,11 +331,6 @@ def _serve(connection: socket.socket, memory: int) -> None:
 
 def _result(loop: Loop, method: str, arguments: tuple[Any, ...]) -> Any:
     try:
-        return _called(loop, method, arguments)
+        return getattr(loop, method)(*arguments)
     except Exception as error:
         return Failure.of(error).portable()
-
-
-def _called(loop: Loop, method: str, arguments: tuple[Any, ...]) -> Any:
-    """Return the result of a method of the loop; the loop itself has been built."""
-    return None if method == "build" else getattr(loop, method)(*arguments)

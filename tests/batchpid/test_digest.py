@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from batchpid.arrays.choices import CHOICE_TYPES, HoldEffort, ZeroEffort
-from batchpid.arrays.digest import digest
+from batchpid.arrays.array_types import CHOICE_TYPES, HoldEffort, ZeroEffort
+from batchpid.arrays.trees import digest
 
 
 class Pair(NamedTuple):
@@ -94,7 +94,7 @@ def test_choices_equal_those_of_their_type_alone():
 def test_digests_are_the_same_in_another_process():
     make = "bp.make_params(2, [3.0, 1.0], non_finite='hold'), {'b': {'x', 'y', 'z'}, 'a': None}"
     program = (
-        f"import batchpid as bp; from batchpid.arrays.digest import digest; print(digest({make}))"
+        f"import batchpid as bp; from batchpid.arrays.trees import digest; print(digest({make}))"
     )
     environment = {"PYTHONPATH": ":".join(filter(None, sys.path)), "PYTHONHASHSEED": "7"}
     out = subprocess.run(

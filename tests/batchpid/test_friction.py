@@ -119,23 +119,3 @@ def test_compensation_never_exceeds_the_friction_it_works_against(seed):
     far = np.abs(error) > 1e-4
     still = friction.compensation(coulomb, error, None, 1e-4)
     np.testing.assert_array_equal(still[far], (np.sign(error) * coulomb)[far])
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
-def test_a_joint_that_moves_begins_sliding_and_one_at_rest_sticking(seed):
-    """The first effort is that of a joint that has been sliding, or sticking, before."""
-    mass, model = random_plant(seed)
-    rng = np.random.default_rng(seed)
-    static = model.coulomb * rng.uniform(1.1, 3.0)
-    model = model._replace(static=static, stribeck=0.01 * np.ones_like(static))
-    threshold = static / np.diagonal(mass, axis1=1, axis2=2) * DT
-    effort = model.coulomb * rng.uniform(-5, 5, static.shape)
-    for factor, sliding in ((1e-3, 0.0), (1e3, 1.0)):
-        velocity = factor * threshold * np.sign(rng.normal(size=static.shape))
-        state = friction.init(model, velocity, 0 * velocity, mass, DT)
-        before = state._replace(sliding=np.full_like(static, sliding))
-        np.testing.assert_array_equal(
-            friction.advance(model, state, effort, velocity)[1],
-            friction.advance(model, before, effort, velocity)[1],
-        )

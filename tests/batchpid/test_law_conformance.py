@@ -18,6 +18,7 @@ from quick_jit import quick_jit
 from scalar_pid import scalar_pids, step_of_robot
 
 import batchpid as bp
+from batchpid.arrays.trees import mapped
 
 GIVEN = [
     (),
@@ -34,15 +35,31 @@ def by_jax(params, inputs):
 
 
 def by_controller(params, inputs, backend="numpy"):
-    pid = bp.BatchPID(params, inputs.setpoint.shape[1], DT, backend)
-    efforts = []
+    """Return the efforts of a BatchPID; arrays of the caller are overwritten after each call, and
+    what it has been given does not change.
+    """
+    own = mapped(np.copy, params)
+    pid = bp.BatchPID(own, inputs.setpoint.shape[1], DT, backend)
+    overwrite(own)
+    efforts, held = [], []
     for at in range(len(inputs.setpoint)):
         row = inputs.at(at, lambda rows: rows.astype(params.dtype))
         if at == RESET:
             pid.reset(row["measurement"], keep_integral=True)
         efforts.append(pid(**row))
+        overwrite(row.values())
         assert efforts[-1].dtype == params.dtype
+        if at % 3 == 0 and backend == "numpy":
+            held += [(leaf, leaf.copy()) for leaf in (*pid.state, efforts[-1]) if leaf is not None]
+    for leaf, before in held:
+        np.testing.assert_array_equal(leaf, before)
     return np.array(efforts, float)
+
+
+def overwrite(arrays):
+    for rows in arrays:
+        if isinstance(rows, np.ndarray):
+            rows[...] = 77
 
 
 def by_numpys_controller(params, inputs):

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.frames import matrix_of, rotate
 from batchpid.trajectories import (
     Trajectory,
@@ -156,9 +155,3 @@ def test_a_tool_moves_on_a_straight_line_and_turns_about_one_axis(sign):
     angle = 2 * np.arccos(path.position[:, 3])  # about y, from 0 to 1.2 rad
     np.testing.assert_allclose(np.diff(angle) / DT, path.velocity[1:, 4], atol=0.05)
     np.testing.assert_allclose(path.velocity[-1], 0, atol=1e-12)
-
-
-@pytest.mark.parametrize("frequency", [0.5 / DT, 1.0 / DT, 0.99 / DT])
-def test_a_sine_of_which_the_ticks_show_another_is_refused(frequency):
-    with pytest.raises(InvalidArgumentError, match="frequency: must be below 125 Hz, half"):
-        sine([0.0], [0.2], DT, frequency=frequency, duration=2.0)

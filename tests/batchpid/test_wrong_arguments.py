@@ -18,7 +18,7 @@ import batchpid as bp
 import batchpid.export
 import batchpid.task_space as ts
 from batchpid import metrics, motors, trajectories
-from batchpid.arrays.choices import CHOICES
+from batchpid.arrays.array_types import CHOICES
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import LAW_FIELDS
 from batchpid.motors import friction, guard
@@ -175,11 +175,11 @@ COMBINATIONS = {
         {"duration": 1.0, "max_velocity": 1.0},
     ],
     trajectories.trapezoidal: [{"max_velocity": [1.0, -1.0]}, {"max_acceleration": math.inf}],
+    trajectories.sine: [{"frequency": frequency} for frequency in (50.0, 99.0, 100.0)],
     metrics.step_metrics: [
         {"measurement": np.zeros((1, 1, 2))},
         {"setpoint": np.zeros(3)},
         {"saturated": np.zeros((9, 1, 2))},
-        {"band": 0.0},
     ],
     bp.design_gains: [
         {"bandwidth_hz": 0.0},

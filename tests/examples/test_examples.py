@@ -49,20 +49,6 @@ def test_every_example_is_tested():
     assert {path.name for path in EXAMPLES.glob("*.py")} <= tested
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("one_process")
-@pytest.mark.parametrize(
-    ("robot", "joint", "seconds"),
-    [("jaco2", "j2s7s300_joint_4", "1.5"), ("panda", "panda_joint2", "4")],
-)
-def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(
-    run, robot, joint, seconds
-):
-    drive = ("drive_robot.py", robot, "--num-envs", "1", "--use-internal-drive", "--seconds")
-    assert errors(run(*drive, "1.5", "--compensate", "none"))[joint] > 0.1
-    assert errors(run(*drive, seconds))[joint] < 0.02
-
-
 @pytest.mark.usefixtures("one_process")
 def test_an_undriven_robot_falls_and_the_pid_reaches_the_target(run):
     panda = ("drive_robot.py", "panda", "--num-envs", "2")
@@ -316,6 +302,14 @@ def test_an_aligned_plan_is_near_and_smooth(run):
     assert error <= 2 < figures["linear"][0] < figures["held"][0]
     assert acceleration <= 10
     assert change <= 4 < figures["cubic"][2]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_process")
+def test_gains_by_gradient_beat_the_designed_ones(run):
+    lines = run("gradient_gains.py", "--moves", "2", "--generations", "1").splitlines()
+    losses = {name: float(value) for name, value, _ in map(str.split, lines)}
+    assert losses["gradient"] < 0.8 * losses["designed"]
 
 
 @pytest.mark.usefixtures("one_process")

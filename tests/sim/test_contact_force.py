@@ -32,11 +32,6 @@ FEET = [f"foot{number}" for number in range(4)]
 GAINS = {"gain_units": "effort", "kp": 2e4, "ki": 0.0, "kd": 400.0}
 
 
-@pytest.fixture(params=["sapien", "mujoco"])
-def engine(request):
-    return request.param
-
-
 @pytest.fixture
 def stool(tmp_path):
     """A trunk of 10 kg on four legs that slide, with balls as feet that a fixed joint holds."""
@@ -49,18 +44,18 @@ def load(folder, **options):
     return Robot.load(path, fixed_base=False, **options)
 
 
-def make_runner(robot, engine, num_envs=1, **options):
+def make_runner(robot, num_envs=1, **options):
     chosen = {"workers": 0, "contacts": [*FEET, "trunk"], "params": robot.params(**GAINS)} | options
-    return Runner(robot, num_envs, engine=engine, **chosen)
+    return Runner(robot, num_envs, **chosen)
 
 
-def stand(robot, engine, ticks=60, **options):
-    with make_runner(robot, engine, **options) as runner:
+def stand(robot, ticks=60, **options):
+    with make_runner(robot, **options) as runner:
         return runner.rollout(np.tile(robot.start, (ticks, 1)))
 
 
 def test_contact_forces_of_a_standing_robot_carry_its_weight(stool, engine):
-    rollout = stand(stool, engine)
+    rollout = stand(stool)
     forces = rollout.contact_force[-1, 0]
     np.testing.assert_allclose(forces[:, 2].sum(), WEIGHT, rtol=5e-3)
     assert np.abs(forces[:, :2].sum(0)).max() < 5e-3 * WEIGHT
@@ -78,7 +73,7 @@ def test_a_link_senses_its_own_contacts_and_not_those_of_the_links_beside_it(tmp
     path = tmp_path / "stool.urdf"
     path.write_text(STOOL.replace("</robot>", f"{toe}</robot>"))
     robot = Robot.load(path, fixed_base=False)
-    rollout = stand(robot, engine, contacts=["toe", "foot0", "imu"])
+    rollout = stand(robot, contacts=["toe", "foot0", "imu"])
     assert rollout.touching[-1, 0].tolist() == [False, True, False]
     assert not rollout.contact_force[-1, 0, [0, 2]].any()
     assert rollout.contact_force[-1, 0, 1, 2] > 0.2 * WEIGHT
@@ -86,7 +81,7 @@ def test_a_link_senses_its_own_contacts_and_not_those_of_the_links_beside_it(tmp
 
 def test_a_wrench_holds_the_links_behind_it(stool, engine):
     """Foot on the ground: its weight, the contact force, and the wrench of the leg cancel."""
-    rollout = stand(stool, engine, wrenches=["foot1", "leg1"])
+    rollout = stand(stool, wrenches=["foot1", "leg1"])
     force, wrench = (
         rollout.contact_force[-1, 0, 1].astype(float),
         rollout.wrench[-1, 0].astype(float),
@@ -99,9 +94,7 @@ def test_a_wrench_holds_the_links_behind_it(stool, engine):
 
 
 def test_nothing_touches_in_free_fall(stool, engine):
-    with make_runner(
-        stool, engine, wrenches=["leg0"], control="effort", compensate="none"
-    ) as runner:
+    with make_runner(stool, wrenches=["leg0"], control="effort", compensate="none") as runner:
         begin = runner.reset(
             base_pose=[0, 0, 2.0, 0.9, 0.1, 0.2, 0.3], base_twist=[0.1, 0, 0, 1.0, 2.0, 3.0]
         )
@@ -113,13 +106,13 @@ def test_nothing_touches_in_free_fall(stool, engine):
 
 
 def test_an_observed_contact_changes_nothing(stool, engine):
-    first = stand(stool, engine, 30, contacts=None)
+    first = stand(stool, 30, contacts=None)
     assert first.contact_force is None
-    assert_identical(first, stand(stool, engine, 30), skip=("contact_force", "touching"))
+    assert_identical(first, stand(stool, 30), skip=("contact_force", "touching"))
 
 
 def test_forces_are_recorded(stool, tmp_path):
-    with make_runner(stool, "mujoco", num_envs=3, wrenches=["leg2"]) as runner:
+    with make_runner(stool, num_envs=3, engine="mujoco", wrenches=["leg2"]) as runner:
         with Recorder(tmp_path / "run.h5", runner):
             run = runner.rollout(np.tile(stool.start, (12, 1)))
         kept = runner.snapshot().rows["sensors/contact_force"]
@@ -132,7 +125,7 @@ def test_forces_are_recorded(stool, tmp_path):
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 def test_an_env_that_fails_has_no_force(stool, engine):
-    with make_runner(stool, engine, 2, on_invalid_input="contain") as runner:
+    with make_runner(stool, 2, on_invalid_input="contain") as runner:
         bad = np.tile(stool.start, (2, 1))
         for _ in range(30):
             before = runner.step(bad)

@@ -90,58 +90,6 @@ def test_options_are_copied(name):
             assert not array.flags.writeable
 
 
-INPUTS = ("setpoint", "measurement", "measurement_rate", "setpoint_rate", "feedforward")
-LAWS = {
-    "plain": {},
-    "all": {
-        "derivative_filter_time": 0.01,
-        "setpoint_weight": 0.5,
-        "setpoint_weight_derivative": 0.5,
-        "effort_rate_limit": 1e3,
-        "continuous": True,
-        "non_finite": "hold",
-    },
-}
-
-
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("backend", ["numpy", pytest.param("jax", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("inputs", [INPUTS[:2], INPUTS], ids=["positions", "rates"])
-def test_a_controller_keeps_nothing_of_the_callers(law, backend, inputs):
-    efforts = [efforts_of(LAWS[law], backend, inputs, disturb) for disturb in (False, True)]
-    np.testing.assert_array_equal(*efforts)
-
-
-def efforts_of(law, backend, inputs, disturb):
-    rng = np.random.default_rng(0)
-    envs, joints = 128, 4  # JAX takes over large and aligned arrays without a copy
-
-    def draw():
-        return own(
-            bp.make_params(joints, kp=rng.uniform(1, 9, (envs, joints)), ki=2.0, kd=0.5, **law)
-        )
-
-    params = draw()
-    pid = bp.BatchPID(params, envs, 0.01, backend)
-    efforts = []
-    for call in ("call", "reset", "call", "track", "call", "params", "reset", "track", "call"):
-        if disturb:
-            scribble(params)
-        rows = {name: rng.normal(size=(envs, joints)) for name in inputs}
-        mask = rng.random(envs) < 0.5
-        if call == "call":
-            efforts.append(np.array(pid(**rows)))
-        elif call == "reset":
-            pid.reset(rows["measurement"], mask)
-        elif call == "track":
-            pid.track(**rows, effort=rng.normal(size=(envs, joints)))
-        else:
-            params = pid.params = draw()
-        if disturb:
-            scribble([rows, mask])
-    return np.array(efforts)
-
-
 # -- arrays that objects hand out
 
 

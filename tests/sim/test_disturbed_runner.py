@@ -315,20 +315,6 @@ DOG = Robot.load("quadruped", fixed_base=False)
 WALK = DOG.start + 0.15 * np.sin(np.arange(24))[:, None, None] * np.ones((1, 3, DOG.dof))
 
 
-def test_an_episode_in_contact_does_not_depend_on_the_time_before_it(engine, monkeypatch) -> None:
-    """Neither do checkpoints change it, of which there are several."""
-    monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 60)
-    episodes = []
-    for ticks in (1, 2, 5):
-        with Runner(DOG, 3, workers=0, engine=engine) as runner:
-            runner.rollout(WALK[:ticks])
-            runner.reset()
-            episodes.append(runner.rollout(WALK))
-    assert np.ptp(episodes[0].qpos, axis=0).max() > 1e-3
-    for episode in episodes[1:]:
-        assert_identical(episode.observation, episodes[0].observation)
-
-
 @pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
 def test_a_replay_from_resets_of_some_envs_in_contact(engine, monkeypatch) -> None:
     monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 60)

@@ -36,13 +36,8 @@ def quadruped(tmp_path):
     return Robot.load(path, fixed_base=False)
 
 
-@pytest.fixture(params=["sapien", "mujoco"])
-def engine(request):
-    return request.param
-
-
 def test_it_starts_on_the_ground_and_stands(quadruped, engine):
-    with Runner(quadruped, 2, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
+    with Runner(quadruped, 2, params=quadruped.params(**GAINS), workers=0) as runner:
         start = runner.observe()
         np.testing.assert_allclose(
             start.base_pose, np.tile([0, 0, 0.35, 1, 0, 0, 0], (2, 1)), atol=1e-6
@@ -57,7 +52,7 @@ def test_it_starts_on_the_ground_and_stands(quadruped, engine):
 
 def test_a_fast_base_keeps_its_speed(quadruped, engine):
     """v = v0 - g t and w = w0, for 2 s; PhysX stops links at 10 m/s and 50 rad/s by default."""
-    with Runner(quadruped, 1, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
+    with Runner(quadruped, 1, params=quadruped.params(**GAINS), workers=0) as runner:
         runner.reset(base_pose=[0, 0, 60, 1, 0, 0, 0], base_twist=[15, 0, 0, 0, 0, 80])
         seen = runner.rollout(np.tile(quadruped.start, (200, 1))).base_twist[-1, 0]
     np.testing.assert_allclose(seen[[2, 5]], [-2 * GRAVITY, 80], rtol=0.05)
@@ -66,7 +61,7 @@ def test_a_fast_base_keeps_its_speed(quadruped, engine):
 
 def test_a_pose_of_the_legs_sets_the_height(quadruped, engine):
     poses = np.stack([np.full(4, -0.05), np.full(4, 0.08)])
-    with Runner(quadruped, 2, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
+    with Runner(quadruped, 2, params=quadruped.params(**GAINS), workers=0) as runner:
         heights = runner.reset(qpos=poses).base_pose[:, 2]
         np.testing.assert_allclose(heights, [0.40, 0.27], atol=1e-6)
         part = runner.reset(qpos=poses[::-1], mask=np.array([True, False])).base_pose[:, 2]
@@ -75,9 +70,7 @@ def test_a_pose_of_the_legs_sets_the_height(quadruped, engine):
         found = runner.reset(base_pose=given).base_pose
         np.testing.assert_allclose(found[:, 3:], [[1, 0, 0, 0], [0, 0, 0, -1]], atol=1e-6)
         np.testing.assert_allclose(found[:, :3], given[:, :3], atol=1e-6)
-    with Runner(
-        quadruped, 1, params=quadruped.params(**GAINS), workers=0, engine=engine, ground=False
-    ) as runner:
+    with Runner(quadruped, 1, params=quadruped.params(**GAINS), workers=0, ground=False) as runner:
         np.testing.assert_allclose(runner.observe().base_pose[0, :3], 0, atol=1e-7)
 
 
@@ -88,7 +81,6 @@ def test_the_twist_is_that_of_the_root_link_in_the_world(quadruped, engine):
     pose, twist = [0, 0, 0, 0.8, 0.6, 0, 0], [1.0, 0, 0, 2.0, 4.0, 8.0]
     options = {
         "workers": 0,
-        "engine": engine,
         "compensate": "none",
         "substeps": 1,
         "control": "effort",
@@ -132,7 +124,6 @@ def test_a_push_changes_the_twist_of_the_base_at_a_tick(quadruped, engine):
         "compensate": "none",
         "workers": 0,
         "ground": False,
-        "engine": engine,
     }
     with Runner(quadruped, 2, randomization=randomization, **options) as runner:
         runner.reset(base_pose=[0, 0, 0, 0.9, 0.1, 0.3, 0.2])
@@ -167,7 +158,7 @@ def test_a_block_slides_down_a_slope_as_it_should(tmp_path, engine):
         "randomization": world,
         "contacts": ["block"],
     }
-    with Runner(block, 1, workers=0, engine=engine, **options) as runner:
+    with Runner(block, 1, workers=0, **options) as runner:
         slide = runner.rollout(np.tile(block.start, (60, 1)))
     speeds = slide.base_twist[20:, 0, 0].astype(float)
     found = (speeds[-1] - speeds[0]) / (slide.time[-1] - slide.time[20])
@@ -201,7 +192,6 @@ def test_gravity_is_compensated_as_if_the_base_were_held(quadruped, engine):
         1,
         params=quadruped.params(kp=0, ki=0, kd=0),
         workers=0,
-        engine=engine,
         ground=False,
     ) as runner:
         for pose in ([0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 1, 0, 0], [0, 0, 0, 0.8, 0.6, 0, 0]):
@@ -237,7 +227,7 @@ def test_designed_gains_carry_the_base(tmp_path, engine):
     path.write_text(DOG)
     dog, sinks = Robot.load(path, fixed_base=False), []
     for params in (None, dog.designed("mass_matrix")):
-        with Runner(dog, 1, workers=0, engine=engine, params=params) as runner:
+        with Runner(dog, 1, workers=0, params=params) as runner:
             start = runner.observe().base_pose[0]
             stood = runner.rollout(np.tile(dog.start, (60, 1)))
         sinks.append(np.abs(stood.base_pose[:, 0, :3] - start[:3]).max())

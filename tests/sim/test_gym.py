@@ -42,6 +42,25 @@ def test_pictures_show_each_env(panda):
     envs.close()
 
 
+def test_chunks_that_come_late_are_executed_whole():
+    """What passes during the latency of an env is made up for, and a step is as long as its rows."""
+    options = {"actions": "increment", "chunk": 4, "latency": (0.03, 0.07), "workers": 0}
+    envs = ReachVectorEnv(3, max_episode_steps=None, **options)
+    start, _ = envs.reset(seed=0)
+    assert envs.step_seconds == pytest.approx(0.08)
+    moves = np.full(envs.action_space.shape, 0.1)
+    begin, (first, *_) = envs.runner.time, envs.step(moves)
+    assert envs.runner.time - begin == pytest.approx(envs.step_seconds)
+    joints = len(envs.joint_names)
+    change = np.abs(first - start)[:, :joints] / envs.max_increment
+    assert (change.max(1) < 0.3).all()  # of 0.4: it came late
+    for _ in range(25):
+        last, *_ = envs.step(0 * moves)
+    reached = np.minimum(start[:, :joints] + 0.4 * envs.max_increment, envs.high)
+    np.testing.assert_allclose(last[:, :joints], reached, atol=1e-3)
+    envs.close()
+
+
 MODES = [AutoresetMode.NEXT_STEP]
 MODES += [pytest.param(mode, marks=pytest.mark.slow) for mode in AutoresetMode if mode not in MODES]
 

@@ -241,6 +241,7 @@ REFUSED: dict[Callable[..., Any], list[dict[str, Any]]] = {
         {"actuators": bp.make_actuators(3, strength=0.9)},
         {"actuators": bp.make_actuators(DOF, strength=np.full((3, DOF), 0.9))},
         {"actuators": MOTORS, "control": "drive"},
+        {"latency": ..., "randomization": Randomization(latency=Uniform(0, 0.1))},
         {"push": ..., "randomization": Randomization(**PUSH, push_interval=Uniform(1, 2))},
         {"push_interval": ..., **FREE_PUSHED},
         {

@@ -18,10 +18,9 @@ import numpy as np
 from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.findings import Notes
 from batchpid.sim.robot.merging import coupling_of
-from batchpid.sim.robot.mjcf.model import RobotInFile, compile_scene
-from batchpid.sim.robot.mjcf.reader import home
+from batchpid.sim.robot.mjcf.bodies import RobotInFile
+from batchpid.sim.robot.mjcf.reader import compile_scene, home
 from batchpid.sim.robot.tables import MjcfFile
 from batchpid.task_space.frames import inverse, matrix_of, rotate
 
@@ -82,7 +81,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
         raise RobotError(
             f"{file.path}: has changed since the robot was loaded; load the robot again"
         )
-    names = RobotInFile(model, Path(file.path), Notes([], []))
+    names = RobotInFile(model, Path(file.path), [])
     robot = {body: name for body, name in names.bodies.items() if names.is_of_robot(body)}
     for joint in scene.joints:
         joint.name = names.joints.get(joint.id, joint.name)

@@ -53,6 +53,8 @@ class FreeMotions:
         What is known about the contacts of each robot (M,), by number of Contact in free_motion.h.
     time
         Time of each robot (M,) [s].
+    ctrl
+        Inputs of the drives (M, dof); not used without drives.
     """
 
     def __init__(self, robot: RobotMj, size: int, model: NativeModel) -> None:
@@ -67,6 +69,7 @@ class FreeMotions:
         ends = np.where(limited, scene.jnt_range[joints].T, [[-np.inf], [np.inf]])
         self.contact = np.full(size, number("Contact", "UNKNOWN"), np.int8)
         self.time = np.zeros(size)
+        self.ctrl = np.zeros((size, dof))
         self._states = [aligned(blocks, dof, WIDTH) for _ in range(3)]
         self._arrays = {
             "bias": aligned(blocks, dof, WIDTH),
@@ -100,6 +103,13 @@ class FreeMotions:
             "weight": [model.dof_invweight0[at] for model in kinds],
             "gravity": [model.opt.gravity for model in kinds],
         }
+        if self._robot.model.nu:
+            self._arrays["ctrl"] = self.ctrl
+            columns |= {
+                "position_gain": [model.actuator_biasprm[:, 1] for model in kinds],
+                "drive_rate_gain": [model.actuator_biasprm[:, 2] for model in kinds],
+                "drive_limit": [model.actuator_forcerange[:, 1] for model in kinds],
+            }
         self._arrays |= {name: table(np.array(rows), self.size) for name, rows in columns.items()}
         # In place, since native code has the address.
         self._structure.model = self._rigid.address
@@ -132,6 +142,12 @@ class FreeMotions:
             array[numbers // WIDTH, :, numbers % WIDTH] = values
         self.contact[numbers] = number("Contact", "UNKNOWN")
 
+    def load(self, row: int, data: MjData) -> None:
+        """Take the state of a robot from its data."""
+        qpos, qvel = data.qpos[self._robot.qpos], data.qvel[self._robot.qvel]
+        self.write([row], qpos, qvel, data.qacc_warmstart[self._robot.qvel])
+        self.time[row] = data.time
+
     def show(self, row: int, model: MjModel, data: MjData) -> None:
         """Bring the data of a robot up to date."""
         at = row // WIDTH, slice(None), row % WIDTH
@@ -140,5 +156,6 @@ class FreeMotions:
         )
         data.qacc_warmstart[self._robot.qvel] = self._states[2][at]
         data.time = self.time[row]
+        data.ctrl[:] = self.ctrl[row, : len(data.ctrl)]
         if (np.abs(data.qpos) <= FARTHEST).all():
             mujoco.mj_step1(model, data)

@@ -1,11 +1,37 @@
 """MJCF of the simulated robot, with the law or its motors in MuJoCo's own actuators.
 
-The equations are in :mod:`batchpid.sim.engine.mujoco.actuator_export`. ``<pid>`` is this package's
-law with the measured velocity and ``integration="output_first"``, without anti-windup.
+Each independent joint has one actuator: MuJoCo's PID, its DC motor, or a plain motor.
+
+``<pid>`` (MuJoCo 3.12 and later), with position q, inputs r, r' and ff, setpoint g and integral A::
+
+    c       = min(max(r, posrange_0), posrange_1)
+    g       = min(max(c, g - dt slewmax), g + dt slewmax)
+    effort  = kp (g - q) + ki A + kv (r' - q') + ff
+    A      <- A + dt (g - q)        while |A| < imax, or towards 0
+
+``<dcmotor>`` has the same effort u, without posrange, and clamps the integral: min(max(A, -Imax),
+Imax). Its supply voltage is 1 V here. The stall effort S and the no-load speed v0 give the
+torque-speed line, and the time constant T of the winding gives the lag::
+
+    i       = min(max(u, S (-1 - q'/v0)), S (1 - q'/v0))
+    effort <- effort + (1 - exp(-dt/T)) (i - effort)
+
+A plain motor is a ``<general>`` actuator, where x is the delayed input u(t - delay), or that after
+a first-order lag::
+
+    effort  = gainprm x + biasprm
+
+Limits of the effort are the joints' (``actuatorfrcrange``): each joint has one actuator. (MuJoCo's
+documentation: XML reference, actuator; "DC Motor Model". All were compared with MuJoCo 4.0 step by
+step.)
+
+``<pid>`` is this package's law with the measured velocity and ``integration="output_first"``, without
+anti-windup.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mujoco
@@ -13,14 +39,13 @@ import numpy as np
 from lxml import etree
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Bool, MjModel, MjSpec
+from batchpid.arrays.array_types import Bool, Float64, MjModel, MjSpec
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.export.differences import Exported, Law, differences, export_law
 from batchpid.law.params import PIDParams, make_params
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.motors.guard import Guard
-from batchpid.sim.engine.mujoco.actuator_export import FAR, MjcfActuators, numbers_text
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
@@ -28,6 +53,119 @@ from batchpid.sim.geometry.shapes import nearest_physical
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_model import base_start
 from batchpid.task_space.frames import SpatialInertia
+
+_FAR = 1e10
+"""Finite limit in place of an infinite one."""
+_INPUTS = {"input": "pos vel ff"}
+
+
+class _Actuators:
+    """Actuators of the ``driven`` joints (a mask), of a law or of its motors alone.
+
+    Attributes
+    ----------
+    elements
+        (tag, attributes) of each actuator.
+    has_rate
+        Mask (joints,) of the joints with a rate-limited setpoint.
+    """
+
+    def __init__(self, law: Law, driven: Bool) -> None:
+        self._law = law
+        self._rate = law.column("rate")
+        self._is_dcmotor = law.is_dcmotor
+        self.has_rate = driven & np.isfinite(self._rate)
+        self.elements = [self._element(int(joint)) for joint in np.flatnonzero(driven)]
+
+    def _element(self, joint: int) -> tuple[str, dict[str, str]]:
+        law = self._law
+        name = law.joints[joint]
+        low, high = law.effort_range[:, joint].tolist()
+        if low >= high:
+            problem = "must be below effort_max for MuJoCo"
+            raise InvalidArgumentError(
+                "effort_min",
+                problem,
+                joint=name,
+                value=low,
+                remedy="widen the limits",
+            )
+        element = {"name": name, "joint": name}
+        if delay := law.column("command_delay")[joint]:
+            # MuJoCo interpolates between samples of the inputs: one more at either end.
+            samples = math.ceil(delay / law.dt) + 2
+            element |= {"delay": _numbers_text(delay), "nsample": str(samples), "interp": "linear"}
+        if self._is_dcmotor[joint]:
+            return "dcmotor", element | self._dcmotor(joint)
+        if law.is_law:
+            return "pid", element | self._pid(joint)
+        element |= {
+            "gainprm": _numbers_text(law.column("strength")[joint]),
+            "biastype": "affine",
+            "biasprm": _numbers_text(law.column("bias")[joint]),
+        }
+        if lag := law.column("lag")[joint]:
+            element |= {"dyntype": "filterexact", "dynprm": _numbers_text(lag), "actearly": "true"}
+        return "general", element
+
+    def _gains(self, joint: int) -> dict[str, float]:
+        """Return gains, and limits of the setpoint's rate and of the integral of the error; 0 for
+        none.
+        """
+        kp, ki, kd, low, high = (
+            float(self._law.column(option)[joint])
+            for option in ("kp", "ki", "kd", "integral_min", "integral_max")
+        )
+        # MuJoCo limits the integral of the error, not its effort, symmetrically, and takes a limit
+        # of 0 for none.
+        limit = max(min(-low, high), 0.0)
+        ki = ki if limit > 0 else 0.0
+        imax = limit / ki if ki and math.isfinite(limit) else 0.0
+        rate = float(self._rate[joint])
+        slewmax = rate if math.isfinite(rate) else 0.0
+        return {
+            "kp": kp,
+            "ki": ki,
+            "kv": kd,
+            "slewmax": slewmax,
+            "imax": imax,
+        }
+
+    def _pid(self, joint: int) -> dict[str, str]:
+        element = {
+            key: _numbers_text(value)
+            for key, value in self._gains(joint).items()
+            if value or key == "kp"
+        } | _INPUTS
+        lower = self._law.column("lower")[joint]
+        # MuJoCo needs a range of some width, also of a joint that is locked.
+        ends = lower, max(self._law.column("upper")[joint], np.nextafter(lower, math.inf))
+        if np.isfinite(ends).any():
+            element["posrange"] = _numbers_text(*np.clip(ends, -_FAR, _FAR))
+        return element
+
+    def _dcmotor(self, joint: int) -> dict[str, str]:
+        law = self._law
+        # The gear, by which the motor's efforts are divided: the strength of motors alone.
+        arm = 1.0 if law.is_law else float(law.column("strength")[joint])
+        element = {"motorconst": "1 1", "resistance": "1"}
+        voltage = 0.0
+        if law.has_line[joint]:
+            voltage = 1.0
+            stall = law.column("saturation_effort")[joint] / arm
+            speed = law.column("no_load_speed")[joint] * arm
+            element = {"nominal": _numbers_text(voltage, stall, speed)}
+        gains = self._gains(joint).values() if law.is_law else [0.0] * 5
+        element |= _INPUTS if law.is_law else {"input": "ff", "gear": _numbers_text(arm)}
+        element["controller"] = _numbers_text(*gains, voltage)
+        if lag := law.column("lag")[joint]:
+            element["inductance"] = _numbers_text(0, lag)
+        return element
+
+
+def _numbers_text(*numbers: Float64 | float) -> str:
+    """Return numbers with all digits."""
+    return " ".join(repr(float(number)) for number in numbers)
 
 
 def to_mjcf(
@@ -82,7 +220,15 @@ def to_mjcf(
             )
     if params is None:
         params = make_params(robot.dof, 0.0, measurement_rate="measured")
-    law = export_law(params, robot.joint_names, dt, inertia, actuators, guard, has_law)
+    law = export_law(
+        params,
+        robot.joint_names,
+        dt,
+        inertia,
+        actuators,
+        guard,
+        has_law,
+    )
     sentences = differences(law, "mjcf", robot.independent)
     spec = SceneSpec.of(robot, law.dt, SOLVERS["accurate"], ground=robot.has_ground)
     # The bodies are those that the engine simulates; inertias and efforts are then written with all
@@ -96,7 +242,7 @@ def to_mjcf(
         if not inertia_kept:
             text = f"the nearest possible tensor instead of that of link {row.name!r}"
             sentences.append(f"inertia: {text}")
-    motors = MjcfActuators(law, robot.independent)
+    motors = _Actuators(law, robot.independent)
     friction = added_friction(own_friction(spec), law.actuators)
     _set_joints(scene, robot, law, friction)
     if np.any(friction.coulomb):
@@ -158,7 +304,7 @@ def _set_joints(
         # Damping is a polynomial of the speed in MuJoCo.
         joint.damping = [damping[at], 0, 0]
         if robot.independent[at] and np.isfinite(effort_range[at]).any():
-            joint.actfrclimited, joint.actfrcrange = True, np.clip(effort_range[at], -FAR, FAR)
+            joint.actfrclimited, joint.actfrcrange = True, np.clip(effort_range[at], -_FAR, _FAR)
     coupling = robot.coupling
     for follower in coupling.followers:
         # MuJoCo's polynomial of the leader's position; the higher coefficients are 0.
@@ -190,7 +336,9 @@ def _start(
         if has_rate[joint]:  # the setpoint is the first of the states
             act[model.actuator_actadr[actuator]] = robot.start[joint]
     columns = {"qpos": qpos, "ctrl": ctrl, "act": act}
-    return {"name": "home"} | {key: numbers_text(*row) for key, row in columns.items() if row.any()}
+    return {"name": "home"} | {
+        key: _numbers_text(*row) for key, row in columns.items() if row.any()
+    }
 
 
 def _exact(scene: MjSpec) -> Any:
@@ -203,14 +351,33 @@ def _exact(scene: MjSpec) -> Any:
         body = scene.body(element.get("name"))
         _write(element, body, pos="pos", quat="quat")
         inertial = element.find("inertial")
-        _write(inertial, body, pos="ipos", quat="iquat", mass="mass", diaginertia="inertia")
+        _write(
+            inertial,
+            body,
+            pos="ipos",
+            quat="iquat",
+            mass="mass",
+            diaginertia="inertia",
+        )
     for element in root.iterfind("worldbody//joint[@name]"):
         joint = scene.joint(element.get("name"))
         if joint.actfrclimited == mujoco.mjtLimited.mjLIMITED_TRUE:
             # MuJoCo leaves out a range that is nearly 0, and then refuses to read the joint.
             element.set("actuatorfrcrange", "0 0")
-        _write(element, joint, axis="axis", range="range", actuatorfrcrange="actfrcrange")
-        _write(element, joint, armature="armature", damping="damping", frictionloss="frictionloss")
+        _write(
+            element,
+            joint,
+            axis="axis",
+            range="range",
+            actuatorfrcrange="actfrcrange",
+        )
+        _write(
+            element,
+            joint,
+            armature="armature",
+            damping="damping",
+            frictionloss="frictionloss",
+        )
     for element, tie in zip(root.findall("equality/joint"), scene.equalities, strict=True):
         _write(element, tie, polycoef="data")
     return root
@@ -224,4 +391,4 @@ def _write(element: Any, source: Any, **fields: str) -> None:
         if element is not None and key in element.attrib:
             # MuJoCo leaves out zeros at the end.
             count = len(element.get(key).split())
-            element.set(key, numbers_text(*np.atleast_1d(getattr(source, field))[:count]))
+            element.set(key, _numbers_text(*np.atleast_1d(getattr(source, field))[:count]))

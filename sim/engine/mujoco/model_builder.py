@@ -158,7 +158,16 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         joint = model.joint(model.body(parts.root).jntadr[0])
         base = int(joint.qposadr[0]), int(joint.dofadr[0])
     bodies = {link: model.body(name).id for link, name in parts.names.items()}
-    return RobotMj(model, spec.joints, qpos, qvel, bodies, parts.terms, parts.frames, base)
+    return RobotMj(
+        model,
+        spec.joints,
+        qpos,
+        qvel,
+        bodies,
+        parts.terms,
+        parts.frames,
+        base,
+    )
 
 
 def robot_spec(spec: SceneSpec) -> tuple[MjSpec, dict[str, str]]:
@@ -313,7 +322,11 @@ def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
     for shape in spec.simulated.shapes:
         add_geom(scene, scene.body(bodies[shape.owner]), shape, mass=0.0, **_contact(spec))
     if spec.ground:
-        scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **_contact(spec))
+        scene.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[0, 0, 1],
+            **_contact(spec),
+        )
 
 
 def _add_drives(scene: MjSpec, spec: SceneSpec) -> None:
@@ -324,7 +337,9 @@ def _add_drives(scene: MjSpec, spec: SceneSpec) -> None:
     scene.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for joint in spec.joints:
         actuator = scene.add_actuator(
-            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+            name=joint.name,
+            target=joint.name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
         )
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         # The limit of the drive replaces this one later.

@@ -13,7 +13,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Bool, Float64, MjData, Rows
 from batchpid.motors import Actuators
@@ -105,8 +104,7 @@ class MujocoPack(EnginePack):
         """
         spec = self.spec
         is_tree = spec.fixed_base and spec.mjcf is None and self.dof > 0
-        has_parts = self._robot.model.nu > 0 or spec.wrenches
-        return is_tree and not has_parts and place_of_contacts() is not None
+        return is_tree and not spec.wrenches and place_of_contacts() is not None
 
     @property
     def data(self) -> list[MjData]:
@@ -462,57 +460,33 @@ class MujocoPack(EnginePack):
         if velocity is not None:
             self._target_rate = velocity
         values = self._stiffness * position + self._rate_gain * self._target_rate
+        if self._free is not None:
+            self._free.ctrl[...] = values
+            return
         for data, row in zip(self.data, values, strict=True):
             data.ctrl[:] = row
 
     # -- snapshots
     # ---------------------------------------------------------------------------------------------
 
-    def state_sizes(self) -> list[int]:
-        """Return the number of values in the state of each robot."""
-        return [mujoco.mj_stateSize(self._robot.model, _KEPT_STATE)] * self.size
-
-    @cached_property
-    def _columns(self) -> list[NDArray[np.intp]]:
-        """Columns of time, positions, velocities, accelerations and efforts in MuJoCo's states."""
-        robot, state = self._robot, mujoco.mjtState
-        places = {
-            state.mjSTATE_TIME: np.arange(1),
-            state.mjSTATE_QPOS: robot.qpos,
-            state.mjSTATE_QVEL: robot.qvel,
-            state.mjSTATE_WARMSTART: robot.qvel,
-            state.mjSTATE_QFRC_APPLIED: robot.qvel,
-        }
-        # The parts of a state are in the order of their bits.
-        return [
-            mujoco.mj_stateSize(robot.model, _KEPT_STATE & (int(part) - 1)) + place
-            for part, place in places.items()
-        ]
-
     def read_state(self) -> Float64:
         """Return the state of each robot (M, values), in MuJoCo's order."""
-        if self._free is not None:
-            start = np.empty(self.state_sizes()[0])
-            mujoco.mj_extractState(self._robot.model, self.rows[0], STATE, start, _KEPT_STATE)
-            states = np.tile(start, (self.size, 1))
-            parts = self._free.time[:, None], *self._free.read(), self.qf
-            for columns, values in zip(self._columns, parts, strict=True):
-                states[:, columns] = values
-            return states
-        states = np.empty((self.size, self.state_sizes()[0]))
-        for model, data, state in zip(self.models, self.data, states, strict=True):
+        states = np.empty((self.size, mujoco.mj_stateSize(self._robot.model, _KEPT_STATE)))
+        for model, data, qf, state in zip(self.models, self.data, self.qf, states, strict=True):
+            if self._free is not None:
+                data.qfrc_applied[self._moves] = qf
             mujoco.mj_getState(model, data, state, _KEPT_STATE)
         return states
 
     def write_state_rows(self, states: Float64) -> None:
-        if self._free is not None:
-            time, *parts, _ = (states[:, columns] for columns in self._columns)
-            self._free.write(slice(None), *parts)
-            self._free.time[:] = time[:, 0]
-            return
-        for model, data, state in zip(self.models, self.data, states, strict=True):
+        for row, (model, data, state) in enumerate(
+            zip(self.models, self.data, states, strict=True)
+        ):
             mujoco.mj_setState(model, data, state, _KEPT_STATE)
-        self._update(range(self.size))
+            if self._free is not None:
+                self._free.load(row, data)
+        if self._free is None:
+            self._update(range(self.size))
 
     def read_poses(self, names: Sequence[str] | None = None) -> list[Rows]:
         """Return the poses of bodies of the file, by name, in each env (names, 7)."""

@@ -44,7 +44,9 @@ def add_link_sensors(
     for link in contact_bodies(spec):
         for part in _parts(scene.body(names[link]), {*names.values()}):
             sensor = scene.add_sensor(
-                type=kinds.mjSENS_CONTACT, objtype=objects.mjOBJ_BODY, objname=part.name
+                type=kinds.mjSENS_CONTACT,
+                objtype=objects.mjOBJ_BODY,
+                objname=part.name,
             )
             sensor.intprm[:3] = _FOUND_AND_FORCE, _NET_FORCE, 1
     for link in spec.wrenches or ():
@@ -55,7 +57,11 @@ def add_link_sensors(
             place = {"pos": frame.position, "quat": frame.wxyz}
         scene.body(names[link]).add_site(name=site, **place)
         for kind in (kinds.mjSENS_FORCE, kinds.mjSENS_TORQUE):
-            scene.add_sensor(type=kind, objtype=objects.mjOBJ_SITE, objname=site)
+            scene.add_sensor(
+                type=kind,
+                objtype=objects.mjOBJ_SITE,
+                objname=site,
+            )
 
 
 def _parts(body: MjsBody, others: set[str]) -> Iterator[MjsBody]:

@@ -82,18 +82,12 @@ inline std::uint16_t shortened(double value) {
   bits -= 1;  // the next number towards 0
   return single > 0.0f ? static_cast<std::uint16_t>(bits >> 16) : NOT_PROVED;
 }
-inline double widened(std::uint16_t value) {
-  std::uint32_t const bits = static_cast<std::uint32_t>(value) << 16;
-  float single = 0.0f;
-  std::memcpy(&single, &bits, sizeof bits);
-  return single;
-}
 
-// The same for WIDTH numbers.
+// The same for WIDTH numbers, and back.
+typedef std::uint16_t Halves __attribute__((vector_size(WIDTH * sizeof(std::uint16_t))));
+typedef std::uint32_t Bits __attribute__((vector_size(WIDTH * sizeof(std::uint32_t))));
+typedef float Singles __attribute__((vector_size(WIDTH * sizeof(float))));
 inline __attribute__((always_inline)) Lanes widened(std::uint16_t const *from) {
-  typedef std::uint16_t Halves __attribute__((vector_size(WIDTH * sizeof(std::uint16_t))));
-  typedef std::uint32_t Bits __attribute__((vector_size(WIDTH * sizeof(std::uint32_t))));
-  typedef float Singles __attribute__((vector_size(WIDTH * sizeof(float))));
   Halves halves;
   std::memcpy(&halves, from, sizeof halves);
   Bits const bits = __builtin_convertvector(halves, Bits) << 16;
@@ -102,9 +96,6 @@ inline __attribute__((always_inline)) Lanes widened(std::uint16_t const *from) {
   return __builtin_convertvector(singles, Lanes::Packed);
 }
 inline __attribute__((always_inline)) void write_shortened(Lanes positive, std::uint16_t *to) {
-  typedef std::uint16_t Halves __attribute__((vector_size(WIDTH * sizeof(std::uint16_t))));
-  typedef std::uint32_t Bits __attribute__((vector_size(WIDTH * sizeof(std::uint32_t))));
-  typedef float Singles __attribute__((vector_size(WIDTH * sizeof(float))));
   Singles const singles = __builtin_convertvector(positive.of, Singles);
   Bits bits;
   std::memcpy(&bits, &singles, sizeof bits);

@@ -25,9 +25,9 @@ struct FOR_PYTHON Constraint {
   std::int64_t size;                       // number of followers
 };
 
-// Set mass matrix and passive force (robots, dof) of the robots of a mask (robots,), or of all for null.
+// Set mass matrix, if it is known that of FreeMotion, and passive force (robots, dof) of robots of a mask; null: of all.
 FOR_EACH_PROCESSOR static void update_constraint(Constraint const &of, std::int64_t robots, double const *qpos,
-                                                 double const *passive, char const *wanted) {
+                                                 double const *passive, char const *wanted, Lanes const *mass) {
   std::int64_t const dof = of.model->dof, size = of.size;
   Posed posed(dof);
   std::vector<Lanes> matrix(static_cast<std::size_t>(dof * dof)), work(matrix.size());
@@ -39,9 +39,12 @@ FOR_EACH_PROCESSOR static void update_constraint(Constraint const &of, std::int6
         if (wanted == nullptr || wanted[first + k]) table[(first + k) * columns + column] = value.of[k];
       }
     };
-    joint_matrix(*of.model, first, robots, qpos, posed, matrix.data());
     Lanes nothing{};  // 0, or nan for a robot that has failed
-    for (std::int64_t j = 0; j < dof; ++j) matrix[j * dof + j] += gather(of.implicit, dof, j, first, robots);
+    if (mass == nullptr) joint_matrix(*of.model, first, robots, qpos, posed, matrix.data());
+    for (std::int64_t i = 0; i < dof; ++i) {
+      if (mass == nullptr) matrix[i * dof + i] += gather(of.implicit, dof, i, first, robots);
+      for (std::int64_t j = 0; j <= i && mass != nullptr; ++j) matrix[i * dof + j] = matrix[j * dof + i] = *mass++;
+    }
     for (Lanes const &each : matrix) nothing += each - each;
     for (std::int64_t j = 0; j < dof; ++j) {
       Lanes const force = gather(passive, dof, j, first, robots);

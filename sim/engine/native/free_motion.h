@@ -4,7 +4,8 @@
 // Dynamics Algorithms, Springer, 2008, section 6.5), and positions from the new velocities. MuJoCo makes joint limits
 // soft: it minimizes the sum of (a - a_free)^T M (a - a_free) / 2 and D_j min(0, s_j a_j - r_j)^2 / 2 over the joints
 // beyond a limit ("Computation" in MuJoCo's documentation). The Hessian is M plus a diagonal, so Newton steps on the set
-// of active limits find the minimum.
+// of active limits find the minimum. Drives then act at the new velocities, as in MuJoCo's integrator "implicitfast": a
+// solves (M + dt D) a = f for the sum f of all forces, where D has the rate gains of the drives within their limits.
 
 #pragma once
 
@@ -29,6 +30,8 @@ struct FOR_PYTHON FreeMotion {
   double const *low, *high;           // (dof,): limits
   Contact *contact;                   // (robots,)
   double *time;                       // (robots,) [s]
+  double *ctrl;                       // (robots, dof): inputs of the drives, or null without drives
+  Lanes const *position_gain, *drive_rate_gain, *drive_limit;  // (blocks, dof): effort = ctrl + gains (q, q'), limited
   std::int64_t robots;
   double stiffness, rate_gain;        // of a limit's reference acceleration
   double least, most, width;          // impedance of limits: MuJoCo's solimp
@@ -40,12 +43,12 @@ struct FOR_PYTHON FreeMotion {
 struct FreeRoom {
   Posed posed;
   std::vector<BodyMotion<Lanes>> motions;
-  std::vector<Lanes> effort, acceleration, inverse, factor, cost, push, sign, active;
+  std::vector<Lanes> effort, acceleration, inverse, factor, cost, push, sign, active, damping, rate;
   std::vector<double> efforts;  // (WIDTH, dof)
 
   explicit FreeRoom(std::int64_t dof) : posed(dof), motions(static_cast<std::size_t>(dof)) {
     auto const n = static_cast<std::size_t>(dof);
-    for (auto *each : {&effort, &acceleration, &inverse, &cost, &push, &sign, &active}) each->resize(n);
+    for (auto *each : {&effort, &acceleration, &inverse, &cost, &push, &sign, &active, &damping, &rate}) each->resize(n);
     factor.resize(n * (n + 1) / 2);
     efforts.resize(WIDTH * n);
   }
@@ -122,14 +125,18 @@ inline __attribute__((always_inline)) Lanes solve_with_limits(FreeMotion const &
   for (std::int64_t j = 0; j < dof; ++j) {
     Lanes const below = qpos[j] - of.low[j], above = of.high[j] - qpos[j];
     Lanes const sign = room.sign[j] = below_mask(below, 0.0) - below_mask(above, 0.0);
+    room.active[j] = sign * sign;
+    effort[j] = a[j];
+    if (!any_positive(room.active[j])) {
+      room.cost[j] = room.push[j] = Lanes{};
+      continue;
+    }
     Lanes const distance = where_positive(sign, below, above), x = absolute(distance) * (1.0 / of.width);
     Lanes const late = 1.0 - x, curve = where_positive(x - 0.5, 1.0 - 2.0 * late * late, 2.0 * x * x);
     Lanes const impedance = where_positive(below_mask(x, 1.0), of.least + curve * (of.most - of.least), of.most);
     Lanes const regularizer = at_least((1.0 - impedance) / impedance * weight[j], LEAST_REGULARIZER);
-    room.active[j] = sign * sign;
     room.cost[j] = 1.0 / regularizer;
     room.push[j] = sign * (-of.rate_gain * sign * qvel[j] - of.stiffness * impedance * distance);
-    effort[j] = a[j];
   }
   Lanes changed{};
   for (int turn = 0; turn < MOST_TURNS; ++turn) {
@@ -158,6 +165,19 @@ struct Efforts {
   std::int64_t first, rows;
 };
 
+// Return accelerations with drives at the new velocities, for the efforts room.rate and the forces of active limits.
+inline __attribute__((always_inline)) Lanes const *solve_with_drives(FreeMotion const &of, std::int64_t block, FreeRoom &room,
+                                                                     bool limited) {
+  std::int64_t const dof = of.model->dof, size = dof * (dof + 1) / 2;
+  std::copy_n(of.mass + block * size, size, room.factor.data());
+  for (std::int64_t j = 0; j < dof; ++j) {
+    room.factor[j * (j + 3) / 2] += room.damping[j];
+    if (limited) room.rate[j] += room.active[j] * room.cost[j] * (room.push[j] - room.acceleration[j]);
+  }
+  solve_along_tree(*of.model, room.factor.data(), room.inverse.data(), room.rate.data());
+  return room.rate.data();
+}
+
 // Advance the robots of the mask `free`, which loses those whose limits were not solved. Return whether all were.
 FOR_EACH_PROCESSOR static bool advance_freely(FreeMotion const &of, std::int64_t block, Efforts const &efforts,
                                               FreeRoom &room, Lanes &free) {
@@ -168,16 +188,28 @@ FOR_EACH_PROCESSOR static bool advance_freely(FreeMotion const &of, std::int64_t
   for (std::int64_t j = 0; j < dof; ++j) {
     a[j] = gather(efforts.table, dof, j, efforts.first, efforts.rows) - bias[j];
     beyond += below_mask(qpos[j], of.low[j]) + below_mask(of.high[j], qpos[j]);
+    if (of.ctrl == nullptr) continue;
+    std::int64_t const at = block * dof + j;
+    Lanes const drive = of.position_gain[at] * qpos[j] + of.drive_rate_gain[at] * qvel[j], limit = of.drive_limit[at];
+    Lanes const asked = gather(of.ctrl, dof, j, block * WIDTH, of.robots) + drive;
+    room.damping[j] = where_positive(below_mask(absolute(asked), limit), -of.timestep * of.drive_rate_gain[at], 0.0);
+    a[j] += at_most(at_least(asked, -limit), limit);
+    room.rate[j] = a[j];
   }
   bool solved = true;
+  Lanes const *change = a;
   if (any_positive(beyond)) {
     Lanes const unsolved = solve_with_limits(of, block, room);
     if (any_positive(free * unsolved)) solved = false, free = where_positive(unsolved, 0.0, free);
   } else {
-    solve_along_tree(*of.model, of.mass + block * (dof * (dof + 1) / 2), room.inverse.data(), a);
+    std::int64_t const size = dof * (dof + 1) / 2;
+    Lanes *mass = of.mass + block * size;
+    if (of.ctrl != nullptr) mass = std::copy_n(mass, size, room.factor.data()) - size;
+    solve_along_tree(*of.model, mass, room.inverse.data(), a);
   }
+  if (of.ctrl != nullptr) change = solve_with_drives(of, block, room, any_positive(beyond));
   for (std::int64_t j = 0; j < dof; ++j) {
-    Lanes const rate = qvel[j] + of.timestep * a[j], place = qpos[j] + of.timestep * rate;
+    Lanes const rate = qvel[j] + of.timestep * change[j], place = qpos[j] + of.timestep * rate;
     before[j] = where_positive(free, a[j], before[j]);
     qvel[j] = where_positive(free, rate, qvel[j]);
     qpos[j] = where_positive(free, place, qpos[j]);

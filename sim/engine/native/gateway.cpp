@@ -3,6 +3,7 @@
 // It calls functions that SAPIEN's shared library exports. Their addresses and the objects' pointers come from Python
 // (sim/engine/sapien/calls.py), so that nothing of SAPIEN, PhysX or Eigen is needed to compile this file.
 
+#define BATCHPID_WIDTH 8  // WIDTH in interface.py: the doubles of an instruction of AVX-512
 #include "tick.h"
 
 #include "structures.h"
@@ -32,9 +33,9 @@ T *structure(PyObject *address) {
 PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto *group = structure<Group>(arguments[0]);
   if (group == nullptr) return nullptr;
-  Py_ssize_t const rows = group->robots, count = rows * group->dof;
+  Py_ssize_t const count = group->robots * group->dof;
   std::int32_t status = 0;
-  auto const step = [&](auto const &of) { status = try_sim_step(*group, rows, of[0], of[1], of[2], of[3]); };
+  auto const step = [&](auto const &of) { status = try_sim_step(*group, of[0], of[1], of[2], of[3]); };
   return on_doubles(arguments + 1, {count, count, count, count}, 1, step, [&] { return PyLong_FromLong(status); });
 }
 
@@ -138,7 +139,7 @@ PyObject *update(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Buffer wanted;
   if (!wanted.open(arguments[3], rows, 1, PyBUF_C_CONTIGUOUS)) return nullptr;
   return on_doubles(arguments + 1, {count, count}, 2,
-                    [&](auto const &at) { update_constraint(*of, rows, at[0], at[1], wanted.as<char>()); });
+                    [&](auto const &at) { update_constraint(*of, rows, at[0], at[1], wanted.as<char>(), nullptr); });
 }
 
 // Add (structure, field, letter of its type, count, offset, size of the structure) to a list.

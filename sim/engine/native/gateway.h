@@ -2,13 +2,11 @@
 
 #pragma once
 
-#include <cstddef>
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
 #include <exception>
 #include <typeinfo>
-#include <vector>
 
 #include "batchpid/native/extension.h"
 

@@ -20,7 +20,7 @@ from batchpid.native.extensions import (
     load,
 )
 
-WIDTH = 4
+WIDTH = 8
 """Number of robots in a vector."""
 FARTHEST = 1e6
 """Largest position of a joint [rad or m]. A robot beyond it has failed: its state is float32."""

@@ -1,4 +1,4 @@
-// Mass matrices and passive forces of many robots of one kind: batchpid/task_space/tree_dynamics.py,
+// Mass matrices and passive forces of many robots of one kind: batchpid/task_space/tree_quantities.py,
 // which have the equations.
 
 #pragma once

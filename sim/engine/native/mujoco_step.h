@@ -82,8 +82,6 @@ class StoppedClock {
     std::lock_guard const lock(mutex_);
     if (--threads_ == 0) *clock_ = before_;
   }
-  StoppedClock(StoppedClock const &) = delete;
-  StoppedClock &operator=(StoppedClock const &) = delete;
 
  private:
   Clock *clock_;
@@ -139,6 +137,7 @@ inline void write_to_mujoco(Mujoco const &mujoco, std::int64_t row) {
     mujoco.qpos[row][mujoco.qpos_at[j]] = free.qpos[at + j].of[k];
     mujoco.qvel[row][mujoco.qvel_at[j]] = free.qvel[at + j].of[k];
     mujoco.warm[row][mujoco.qvel_at[j]] = free.acceleration[at + j].of[k];
+    if (free.ctrl != nullptr) mujoco.ctrl[row][j] = free.ctrl[row * dof + j];
   }
 }
 inline void read_from_mujoco(Mujoco const &mujoco, std::int64_t row) {

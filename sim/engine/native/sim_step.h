@@ -266,9 +266,8 @@ inline void step_in_lanes(FreeMotion const &lanes, double const *effort, double 
   }
 }
 
-// Do one sim step in the engine of the group; rows beyond its robots repeat the first one. Return the status.
-inline std::int32_t try_sim_step(Group &group, std::int64_t rows, double const *effort, double *qpos, double *qvel,
-                                 double *passive) {
+// Do one sim step in the engine of the group, on arrays (robots, dof). Return the status.
+inline std::int32_t try_sim_step(Group &group, double const *effort, double *qpos, double *qvel, double *passive) {
   if (group.lanes != nullptr) {
     step_in_lanes(*group.lanes, effort, qpos, qvel);
     return 0;
@@ -286,9 +285,6 @@ inline std::int32_t try_sim_step(Group &group, std::int64_t rows, double const *
   }
   if (far != 0) status |= NOT_FINITE;
   if (fast != 0) status |= TOO_FAST;
-  for (std::int64_t row = group.robots; row < rows; ++row) {
-    for (double *table : {qpos, qvel, passive}) std::copy_n(table, dof, table + row * dof);
-  }
   return status;
 }
 
@@ -304,7 +300,8 @@ inline void write_targets(Group const &group, double const *target, double const
       continue;
     }
     Mujoco const &mujoco = *group.mujoco;
-    mujoco.ctrl[at / dof][at % dof] = mujoco.stiffness[at] * target[at] + mujoco.rate_gain[at] * speed;
+    double &ctrl = mujoco.free != nullptr ? mujoco.free->ctrl[at] : mujoco.ctrl[at / dof][at % dof];
+    ctrl = mujoco.stiffness[at] * target[at] + mujoco.rate_gain[at] * speed;
   }
 }
 
@@ -369,7 +366,8 @@ inline void update_constraint(Group const &group, double const *qpos, double con
   std::int64_t const dof = group.dof;
   passive.resize(static_cast<std::size_t>(group.robots * dof));
   Model const *force = group.constraint->force;
-  if (force == nullptr && group.mujoco != nullptr && group.mujoco->free != nullptr) evaluate_written(*group.mujoco->free);
+  FreeMotion const *free = group.mujoco != nullptr ? group.mujoco->free : nullptr;
+  if (free != nullptr) evaluate_written(*free);
   if (force != nullptr) write_force(group, *force, {true, true}, qpos, qvel, passive.data());
   for (std::int64_t row = 0; row < group.robots && force == nullptr; ++row) {
     double *own = passive.data() + row * dof;
@@ -377,13 +375,12 @@ inline void update_constraint(Group const &group, double const *qpos, double con
       copy_row(group.functions->compute_passive_force(group.articulations[row], true, true), own, dof);
       continue;
     }
-    FreeMotion const *free = group.mujoco->free;
     for (std::int64_t j = 0; j < dof; ++j) {
       own[j] = free != nullptr ? free->bias[row / WIDTH * dof + j].of[row % WIDTH]
                                : group.mujoco->bias[row][group.mujoco->qvel_at[j]];
     }
   }
-  update_constraint(*group.constraint, group.robots, qpos, passive.data(), nullptr);
+  update_constraint(*group.constraint, group.robots, qpos, passive.data(), nullptr, free == nullptr ? nullptr : free->mass);
 }
 
 }  // namespace batchpid

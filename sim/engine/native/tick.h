@@ -23,6 +23,7 @@ struct FOR_PYTHON Stage {
   std::int32_t program;   // number of a PROGRAM
   std::int32_t noise[2];  // its inputs that are noise of the sensors, or -1
   std::int64_t every;     // sim steps of a tick between two of this stage; 0: in the first one only
+  double const *clock, *due;  // (robots, dof), equal in a row: a PROGRAM for robots whose clock is due in this sim step; or null
 };
 
 enum class TransferKind : std::int32_t { READ, WRITE_FLOATS, WRITE_BYTES };
@@ -124,7 +125,16 @@ inline std::int32_t run_stage(Stage const &stage, BoundProgram *const *programs,
         if (stage.noise[i] < 0) continue;
         bound.inputs[static_cast<std::size_t>(stage.noise[i])].data = tick.noise[i] + at * robots * tick.dof;
       }
-      run(*bound.program, bound.inputs.data(), bound.outputs.data(), 0, robots);
+      auto const is_due = [&](std::int64_t row) {
+        return stage.clock[row * tick.dof] + tick.timestep >= stage.due[row * tick.dof];
+      };
+      for (std::int64_t row = 0, end = robots; row < robots; row = end, end = robots) {
+        if (stage.clock != nullptr) {
+          while (row < robots && !is_due(row)) ++row;
+          for (end = row; end < robots && is_due(end);) ++end;
+        }
+        if (row < end) run(*bound.program, bound.inputs.data(), bound.outputs.data(), row, end - row);
+      }
       return 0;
     }
     case StageKind::FORCE:
@@ -147,7 +157,7 @@ inline std::int32_t run_stage(Stage const &stage, BoundProgram *const *programs,
       return 0;
     case StageKind::ENGINE: {
       std::memcpy(tick.before, tick.qpos, static_cast<std::size_t>(robots * tick.dof) * sizeof(double));
-      std::int32_t const status = try_sim_step(group, robots, tick.qf, tick.qpos, tick.qvel, tick.passive);
+      std::int32_t const status = try_sim_step(group, tick.qf, tick.qpos, tick.qvel, tick.passive);
       if (tick.read_force != nullptr) write_force(group, *tick.read_force, parts, tick.qpos, tick.qvel, tick.passive);
       return status;
     }

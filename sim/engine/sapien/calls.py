@@ -155,7 +155,15 @@ class SapienStep(NativeStep):
         senses = sense is not None
         address = ctypes.addressof(functions())
         arrays = {**arrays, **pointers}
-        super().__init__(size, dof, arrays, speed_limit, senses=senses, functions=address, **fields)
+        super().__init__(
+            size,
+            dof,
+            arrays,
+            speed_limit,
+            senses=senses,
+            functions=address,
+            **fields,
+        )
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension that does a sim

@@ -23,7 +23,7 @@ from sapien.wrapper.actor_builder import ActorBuilder
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.arrays.array_types import Document, Float32
-from batchpid.arrays.digest import digest
+from batchpid.arrays.trees import digest
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import Build, SceneSpec
 

@@ -1,4 +1,6 @@
-r"""Bodies, joints and collision shapes of a compiled MJCF file, as the tables of a robot.
+r"""Robot in a compiled MJCF file: its bodies, joints and collision shapes as tables.
+
+The bodies and joints of the model get the names of the links and joints that they become.
 
 A hinge with anchor p, axis a and reference angle q0 moves its body by Trans(p) Rot(a, q - q0)
 Trans(-p), so that the row of the tables, whose origin is the anchor, is at::
@@ -16,15 +18,16 @@ from __future__ import annotations
 
 from collections import defaultdict
 from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjModel
-from batchpid.sim.findings import Finding, Notes
+from batchpid.errors import RobotError
+from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.shapes import Shape, ShapeKind, possible_inertia
-from batchpid.sim.robot.mjcf.model import RobotInFile, can_collide, label
-from batchpid.sim.robot.mjcf.motors import Couplings, JointMotors
 from batchpid.sim.robot.tables import (
     NO_TURN,
     ORIGIN,
@@ -39,6 +42,11 @@ from batchpid.sim.robot.tables import (
 )
 from batchpid.task_space.frames import about, compose, matrix_of, rotate
 
+if TYPE_CHECKING:
+    from batchpid.sim.robot.mjcf.motors import Couplings, JointMotors
+
+PLANE = mujoco.mjtGeom.mjGEOM_PLANE
+_FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
 _SHAPE_KINDS: dict[int, tuple[ShapeKind, int]] = {
     mujoco.mjtGeom.mjGEOM_SPHERE: ("sphere", 1),
     mujoco.mjtGeom.mjGEOM_BOX: ("box", 3),
@@ -50,22 +58,147 @@ _PARALLELS, _MERIDIANS = 12, 16
 """Rings, poles included, and vertices of a ring, of an ellipsoid's hull."""
 
 
+def label(element: Any) -> str:
+    """Return the quoted name of an element of a model, or its number if it has none."""
+    return repr(element.name or f"number {element.id}")
+
+
+def can_collide(model: MjModel, geom: int) -> bool:
+    """Return whether a geom collides with anything, by its masks or in a ``<pair>``."""
+    paired = geom in model.pair_geom1 or geom in model.pair_geom2
+    return bool(model.geom_contype[geom] | model.geom_conaffinity[geom]) or paired
+
+
+class RobotInFile:
+    """Robot of a compiled file: names of its parts, by their numbers in the model.
+
+    ``bodies`` has all bodies of the file, ``joints`` the hinges and slides of the robot, ``base``
+    is the body of the root, 0 for the world. ``link_names`` and ``joint_names`` are all names in
+    use. ``repairs`` are findings of what is simulated otherwise than the file says, ``losses`` of
+    what is lost where MuJoCo does not simulate the file itself.
+
+    Raises RobotError for a ball joint, and for several robots.
+    """
+
+    def __init__(self, model: MjModel, path: Path, repairs: list[Finding]) -> None:
+        self.model = model
+        self.repairs = repairs
+        self.losses: list[Finding] = []
+        names = [model.body(body).name for body in range(1, model.nbody)]
+        self.link_names = {"world", *names}
+        self.joint_names = {model.joint(joint).name for joint in range(model.njnt)}
+        self.bodies = {0: "world"}
+        for body, name in enumerate(names, start=1):
+            self.bodies[body] = name or unique(f"body{body}", self.link_names)
+        self._roots = model.body_rootid
+        self._left_out: set[int] = set()
+        joints = {
+            joint: model.joint(joint).name or unique(f"joint{joint}", self.joint_names)
+            for joint in range(model.njnt)
+            if int(model.jnt_type[joint]) not in (_FREE, _BALL)
+        }
+        self.base = self._find_base(joints, path)
+        self.joints = {
+            joint: name
+            for joint, name in joints.items()
+            if self.is_of_robot(model.jnt_bodyid[joint])
+        }
+
+    def is_of_robot(self, body: int) -> bool:
+        """Return whether a body, or the world, is of the robot."""
+        return int(self._roots[body]) not in self._left_out
+
+    def repair(
+        self,
+        code: str,
+        text: str,
+        remedy: str,
+        joint: str | None = None,
+        link: str | None = None,
+        detail: str = "",
+    ) -> None:
+        """Report what is simulated otherwise in every engine."""
+        self.repairs.append(
+            Finding(
+                code,
+                text,
+                remedy,
+                joint,
+                link,
+                detail,
+            )
+        )
+
+    def lose(self, text: str, joint: str | None = None, link: str | None = None) -> None:
+        """Report what an engine loses that does not simulate the file."""
+        remedy = "use the engine 'mujoco', which simulates the file itself"
+        self.losses.append(Finding("engine", text, remedy, joint, link))
+
+    def _find_base(self, joints: dict[int, str], path: Path) -> int:
+        """Return the base, after the bodies that are not of the robot are left out."""
+        model = self.model
+        # Every child of the world is the root of an object; some of them are the robot.
+        tops = {body for body in range(1, model.nbody) if model.body_parentid[body] == 0}
+        roots = model.body_rootid[model.jnt_bodyid]
+        free = {int(root) for root in roots[model.jnt_type == _FREE]}
+        balls = {int(root) for root in roots[model.jnt_type == _BALL]}
+        moving = {int(roots[joint]) for joint in joints}
+        # A flexible body has three slides for each vertex.
+        soft = {int(body) for body in model.flex_vertbodyid if not model.body_geomnum[body]} & tops
+        moving -= soft
+        if driven := moving & _roots_of_actuators(model):
+            moving -= (moving & free) - driven
+        floating = moving & free
+        if len(floating) > 1 or (floating and moving - free):
+            listed = ", ".join(repr(self.bodies[body]) for body in sorted(moving))
+            raise RobotError(
+                f"{path}: holds several robots, {listed}; leave one of them in the file"
+            )
+        mocaps = {body for body in tops if model.body_mocapid[body] >= 0}
+        self._left_out = mocaps | soft | (free - moving)
+        if moving:
+            self._left_out |= balls - moving
+        # A robot on a free joint is one object; all others are scenery.
+        if floating:
+            self._left_out |= tops - floating
+        for joint in np.flatnonzero(model.jnt_type == _BALL).tolist():
+            body = int(model.jnt_bodyid[joint])
+            if self.is_of_robot(body):
+                where = f"{path}: body {self.bodies[body]!r}"
+                problem = f"the ball joint {label(model.joint(joint))} has no single position"
+                raise RobotError(f"{where}: {problem} to control; replace it by three hinges")
+        for body in sorted(self._left_out - soft):
+            self.lose("is apart from the robot: left out", link=self.bodies[body])
+        if floating:
+            return floating.pop()
+        # The only body, if it is held at the origin, is the root in place of the world.
+        only, *others = sorted(tops - self._left_out) or [0]
+        pose = [*model.body_pos[only], *model.body_quat[only]]
+        if others or model.body_jntnum[only] or pose != [0, 0, 0, 1, 0, 0, 0]:
+            return 0
+        for geom in np.flatnonzero(model.geom_bodyid == 0).tolist():
+            if model.geom_type[geom] != PLANE and can_collide(model, geom):
+                return 0
+        return only
+
+
+def _roots_of_actuators(model: MjModel) -> set[int]:
+    """Return the children of the world that actuators move, themselves or bodies below them."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    dofs = data.moment_colind[: data.moment_rownnz.sum()]
+    return {int(body) for body in model.body_rootid[model.dof_bodyid[dofs]]}
+
+
 class TableReader:
-    """Reader of the tables of ``robot`` in ``model``.
+    """Reader of the tables of ``robot``.
 
     ``solid`` is the row of each body that has shapes, by the body's number.
     """
 
-    def __init__(
-        self,
-        model: MjModel,
-        robot: RobotInFile,
-        notes: Notes,
-        motors: JointMotors,
-    ) -> None:
-        self._model = model
+    def __init__(self, robot: RobotInFile, motors: JointMotors) -> None:
+        self._model = robot.model
         self._robot = robot
-        self._notes = notes
         self._motors = motors
         self._anchors = {0: ORIGIN}  # origin of each body's row, in the frame of the body
         self._bodies: list[Body] = []
@@ -155,8 +288,7 @@ class TableReader:
             text = "its servo in the file limits position or rate of the setpoint"
             remedy = "pass guard=True to a runner for these limits"
             detail = f"{soft_lower:g} to {soft_upper:g}, {rate:g}/s"
-            finding = Finding("limits", text, remedy, name, detail=detail)
-            self._notes.repairs.append(finding)
+            self._robot.repair("limits", text, remedy, name, detail=detail)
         return Joint(
             name,
             kind,
@@ -194,11 +326,14 @@ class TableReader:
             if repair is not None:
                 text, detail = repair
                 remedy = "correct <inertia>"
-                self._notes.repairs.append(
-                    Finding("inertia", text, remedy, link=row.name, detail=detail)
-                )
+                self._robot.repair("inertia", text, remedy, link=row.name, detail=detail)
             axes = model.body_iquat[body].copy()
-            row = row._replace(mass=mass, center=center, inertia=inertia, inertia_wxyz=axes)
+            row = row._replace(
+                mass=mass,
+                center=center,
+                inertia=inertia,
+                inertia_wxyz=axes,
+            )
         self._bodies.append(row)
 
     def _geoms(self, body: int) -> list[int]:
@@ -216,14 +351,29 @@ class TableReader:
         if shape_type in _SHAPE_KINDS:
             kind, count = _SHAPE_KINDS[shape_type]
             size = tuple(model.geom_size[geom, :count].tolist())
-            return Shape(link, link, kind, size, place, turn)
+            return Shape(
+                link,
+                link,
+                kind,
+                size,
+                place,
+                turn,
+            )
         if shape_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID:  # which PhysX does not have
             vertices = _ellipsoid(model.geom_size[geom])
         elif shape_type in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF):
             vertices = _hull(model, int(model.geom_dataid[geom]))
         else:
             return None
-        return Shape(link, link, "mesh", (), place, turn, vertices=vertices)
+        return Shape(
+            link,
+            link,
+            "mesh",
+            (),
+            place,
+            turn,
+            vertices=vertices,
+        )
 
     def _report_absent(self, rows: set[int]) -> None:
         """Report the shapes of the robot and of the world that are no shapes of the tables. A level
@@ -241,7 +391,7 @@ class TableReader:
                 absent.append(f"{kind} {label(model.geom(geom))}")
         if absent:
             text = f"without planes, height fields and shapes of the world: {', '.join(absent)}"
-            self._notes.lose(text)
+            self._robot.lose(text)
 
 
 def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair, ...]:

@@ -5,7 +5,7 @@ An actuator with force F and moment arm g on a joint (the gear, times the joint'
 fixed tendon) applies the effort g F; a follower q' = m q adds m g' to the arm on its leader. A
 servo F = k u - kp g q - kv g q' has the gains g^2 kp and g^2 kv of a PID whose setpoint is its
 target in units of the joint. (MuJoCo's documentation, "Computation", actuation model.) MuJoCo's PID
-and its DC motor have the laws that :mod:`batchpid.sim.engine.mujoco.actuator_export` describes.
+and its DC motor have the laws that :mod:`batchpid.sim.engine.mujoco.mjcf_export` describes.
 
 Motors, servos, PIDs and DC motors of one joint are read. A finding names every other actuator.
 """
@@ -21,8 +21,8 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import MjModel
-from batchpid.sim.findings import Finding, Notes
-from batchpid.sim.robot.mjcf.model import RobotInFile, label
+from batchpid.sim.findings import Finding
+from batchpid.sim.robot.mjcf.bodies import RobotInFile, label
 
 Couplings = dict[str, tuple[str, float, float]]
 """Leader, multiplier and offset of each follower, as in ``<mimic>``."""
@@ -95,10 +95,11 @@ class JointMotors:
     lag: dict[str, float] = field(default_factory=dict)
 
 
-def read_couplings(model: MjModel, robot: RobotInFile, notes: Notes) -> Couplings:
+def read_couplings(robot: RobotInFile) -> Couplings:
     """Return the joints that linear equalities couple: y - y0 = c0 + c1 (x - x0), with y0, x0 the
     reference pose.
     """
+    model = robot.model
     couplings: Couplings = {}
     others: list[str] = []
     for equality in np.flatnonzero(model.eq_active0).tolist():
@@ -112,26 +113,22 @@ def read_couplings(model: MjModel, robot: RobotInFile, notes: Notes) -> Coupling
         is_linear = leader in robot.joints and multiplier and not any(higher)
         if not is_linear or name in couplings:
             text = "without the joint's equality, which is not linear in one other joint"
-            notes.lose(text, name)
+            robot.lose(text, name)
             continue
         rest, rest_of_leader = model.qpos0[model.jnt_qposadr[[follower, leader]]].tolist()
         offset += rest - multiplier * rest_of_leader
         couplings[name] = robot.joints[leader], multiplier, offset
     if others:
         text = "closed loops are open, without the equality constraints other than between the"
-        notes.lose(f"{text} robot's joints: {', '.join(others)}")
+        robot.lose(f"{text} robot's joints: {', '.join(others)}")
     return couplings
 
 
-def read_motors(
-    model: MjModel,
-    robot: RobotInFile,
-    couplings: Couplings,
-    notes: Notes,
-) -> JointMotors:
+def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
     """Return the motors of the joints, with findings for effects that are not simulated."""
+    model = robot.model
     motors = JointMotors()
-    findings = notes.repairs
+    findings = robot.repairs
     # A follower has no motor: its leader moves its armature, too.
     for joint, name in robot.joints.items():
         for leader, arm in _on_leaders({name: 1.0}, couplings).items():
@@ -150,7 +147,14 @@ def read_motors(
             findings += [Finding("actuator", text, remedy, name) for name in arms or [None]]
             law = ActuatorLaw(law.kp, kv=law.kv) if len(arms) == 1 else ActuatorLaw()
         for name, arm in arms.items():
-            _add_limits(model, actuator, name, arm, motors, findings)
+            _add_limits(
+                model,
+                actuator,
+                name,
+                arm,
+                motors,
+                findings,
+            )
             _add_law(law, name, arm, motors)
         if law.is_servo:
             _add_setpoints(model, actuator, law, robot, motors)
@@ -175,7 +179,7 @@ def read_motors(
     ]
     if tendons:
         text = "joints move freely, without springs, damping, friction, armature and limits of tendons: "
-        notes.lose(text + ", ".join(tendons))
+        robot.lose(text + ", ".join(tendons))
     return motors
 
 
@@ -222,7 +226,14 @@ def _law(model: MjModel, actuator: int) -> ActuatorLaw:
     dynamics = model.actuator_dynprm[actuator].tolist()
     if kind == _GAIN.mjGAIN_DCMOTOR:
         resistance, constant, _, _, kp, ki, kv, supply, *_ = gain
-        law = ActuatorLaw(kp, ki, kv, error_limit=dynamics[8], slew=dynamics[7], lag=dynamics[0])
+        law = ActuatorLaw(
+            kp,
+            ki,
+            kv,
+            error_limit=dynamics[8],
+            slew=dynamics[7],
+            lag=dynamics[0],
+        )
         if supply:
             law = law._replace(stall=constant * supply / resistance, speed=supply / constant)
         return law

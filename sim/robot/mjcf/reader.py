@@ -1,33 +1,58 @@
 """Reader of MJCF files: MuJoCo compiles them, and the model becomes tables, motors and a start
 pose.
+
+Geoms that add neither shape nor mass are not compiled, so their meshes and textures may be missing.
+A collision mesh may be missing if the mass of its body does not depend on it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Document, Float64, MjModel
+from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.arrays.elementwise import read_only
+from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
 from batchpid.motors import make_actuators
-from batchpid.sim.findings import Finding, Notes
-from batchpid.sim.robot.mjcf.bodies import TableReader, excluded_pairs
-from batchpid.sim.robot.mjcf.model import (
+from batchpid.sim.findings import Finding
+from batchpid.sim.robot.mjcf.bodies import (
     PLANE,
-    Compiled,
     RobotInFile,
+    TableReader,
     can_collide,
-    compile_file,
+    excluded_pairs,
     label,
 )
 from batchpid.sim.robot.mjcf.motors import read_couplings, read_motors
 from batchpid.sim.robot.tables import MjcfFile, Source
 from batchpid.task_space.rigid_tree import GRAVITY
 
+_PREFIXES = (
+    "body_",
+    "jnt_",
+    "dof_",
+    "geom_",
+    "pair_",
+    "exclude_",
+    "eq_",
+    "tendon_",
+    "hfield_",
+    "qpos",
+    "key_",
+    "site_",
+    "wrap_",
+    "mesh_vert",
+    "flex",
+    "plugin_",
+)
+"""Beginnings of the names of the model's arrays that the simulation depends on."""
 _KEYFRAME = "home"
 """Keyframe with the start pose."""
 _SWITCHES = (
@@ -39,6 +64,10 @@ _SWITCHES = (
     "CONSTRAINT",
 )
 """Parts of MuJoCo's physics that a file can disable."""
+
+# Without a handler MuJoCo appends warnings to a file in the working folder, too.
+if mujoco.get_mju_user_warning() is None:
+    mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))
 
 
 def read_mjcf(
@@ -58,7 +87,7 @@ def read_mjcf(
     if not path.is_file():
         raise RobotError(f"{path}: an MJCF file is read several times; save it as a file first")
     try:
-        return _read(path, name, Notes(findings, []), fixed_base, missing_meshes)
+        return _read(path, name, findings, fixed_base, missing_meshes)
     except UnicodeDecodeError as error:
         raise RobotError(
             f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
@@ -68,21 +97,21 @@ def read_mjcf(
 def _read(
     path: Path,
     name: str,
-    notes: Notes,
+    findings: list[Finding],
     fixed_base: bool | None,
     missing_meshes: str,
 ) -> Source:
-    compiled = compile_file(path, missing_meshes, notes.repairs)
+    compiled = compile_file(path, missing_meshes, findings)
     model = compiled.model
-    robot = RobotInFile(model, path, notes)
+    robot = RobotInFile(model, path, findings)
     # A base is free where the file has a free joint, unless the caller fixes it.
     if fixed_base is None:
         fixed_base = not (robot.base and model.body_jntnum[robot.base])
-    couplings = read_couplings(model, robot, notes)
-    motors = read_motors(model, robot, couplings, notes)
-    reader = TableReader(model, robot, notes, motors)
+    couplings = read_couplings(robot)
+    motors = read_motors(robot, couplings)
+    reader = TableReader(robot, motors)
     tables = reader.read(couplings, is_held=fixed_base)
-    _report_unused(model, robot, notes)
+    _report_unused(robot)
     # The start pose is that of the keyframe, else the reference pose.
     key = home(model)
     pose = model.qpos0 if key is None else model.key_qpos[key]
@@ -110,12 +139,12 @@ def _read(
         path,
         name,
         tables,
-        tuple(notes.repairs),
+        tuple(findings),
         fixed_base,
         base_start,
         column(start),
         gains if has_gains else None,
-        mjcf=_file(path, compiled, robot, fixed_base, notes.losses),
+        mjcf=_file(path, compiled, robot, fixed_base),
         disabled=excluded_pairs(model, reader.solid),
         actuators=actuators if actuators is not None and actuators.num_joints else None,
     )
@@ -131,7 +160,6 @@ def _file(
     compiled: Compiled,
     robot: RobotInFile,
     fixed_base: bool,
-    losses: Iterable[Finding],
 ) -> MjcfFile:
     """Return the data of the file that the engine MuJoCo needs."""
     model = compiled.model
@@ -157,15 +185,16 @@ def _file(
         bodies=tuple(robot.bodies.values()),
         falling=tuple(robot.bodies[body] for body in free if not robot.is_of_robot(body)),
         loops=tuple(loops),
-        losses=tuple(losses),
+        losses=tuple(robot.losses),
         is_alone=all(robot.is_of_robot(body) for body in model.jnt_bodyid),
         has_floor=bool(grounds) and not (floats and fixed_base),
         friction=float(model.geom_friction[grounds[0], 0]) if grounds else 1.0,
     )
 
 
-def _report_unused(model: MjModel, robot: RobotInFile, notes: Notes) -> None:
+def _report_unused(robot: RobotInFile) -> None:
     """Report content that is not simulated, apart from motors, couplings and shapes."""
+    model = robot.model
     counts = {
         "sites": model.nsite,
         "sensors": model.nsensor,
@@ -176,18 +205,18 @@ def _report_unused(model: MjModel, robot: RobotInFile, notes: Notes) -> None:
     left_out = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
     if left_out:
         text = f"elements that the simulation does not use are left out: {left_out}"
-        notes.repairs.append(Finding("unknown-element", text, "expect no effect"))
+        robot.repair("unknown-element", text, "expect no effect")
     option = model.opt
     bits = mujoco.mjtDisableBit
     if tuple(option.gravity) != GRAVITY:
         text = f"gravity is {GRAVITY} m/s^2, not the file's"
         remedy = "draw the file's with Randomization(gravity=...)"
-        notes.repairs.append(Finding("option", text, remedy))
+        robot.repair("option", text, remedy)
     for switch in ("GRAVITY", "ACTUATION"):
         if option.disableflags & getattr(bits, f"mjDSBL_{switch}"):
             text = f"<flag {switch.lower()}='disable'/> has no effect"
             remedy = "expect gravity, and the efforts of the controller"
-            notes.repairs.append(Finding("option", text, remedy))
+            robot.repair("option", text, remedy)
     disabled = ", ".join(
         switch.lower()
         for switch in _SWITCHES
@@ -201,15 +230,135 @@ def _report_unused(model: MjModel, robot: RobotInFile, notes: Notes) -> None:
         ((model.body_plugin >= 0).any(), "without the plugins of bodies"),
     ):
         if is_there:
-            notes.lose(text)
+            robot.lose(text)
     for joint, name in robot.joints.items():
         if model.jnt_stiffness[joint] or model.jnt_stiffnesspoly[joint].any():
-            notes.lose("without the spring of the joint", name)
+            robot.lose("without the spring of the joint", name)
         if model.dof_dampingpoly[model.jnt_dofadr[joint]].any():
-            notes.lose("the damping that grows with the speed is left out", name)
+            robot.lose("the damping that grows with the speed is left out", name)
     for body in np.flatnonzero(model.body_gravcomp).tolist():
         if robot.is_of_robot(body):
             text = "gravity compensation of this body (gravcomp) is not simulated"
             remedy = "let the controller compensate"
-            finding = Finding("option", text, remedy, link=robot.bodies[body])
-            notes.repairs.append(finding)
+            robot.repair("option", text, remedy, link=robot.bodies[body])
+
+
+class Compiled(NamedTuple):
+    """Model of a file, and the ``mujoco.MjSpec`` that was compiled.
+
+    ``is_whole`` says whether it has the geoms that are only drawn, ``missing`` are the files of
+    collision meshes that it is without.
+    """
+
+    scene: MjSpec
+    model: MjModel
+    is_whole: bool
+    missing: tuple[str, ...]
+
+    @property
+    def content(self) -> str:
+        """Digest of the elements that move, collide or act."""
+        model = self.model
+        names = [name for name in dir(model) if name.startswith(_PREFIXES)]
+        arrays = {name: _rounded(np.asarray(getattr(model, name), float)) for name in names}
+        return digest(arrays, model.names, str(model.opt))
+
+
+def _rounded(values: Float64) -> Float64:
+    """Return ``values`` to nine digits: the last bits may differ between kinds of processors."""
+    # What cancels out leaves a rest of rounding.
+    shares, exponents = np.frexp(np.where(np.abs(values) < 1e-12, 0.0, values))
+    rounded: Float64 = np.ldexp(np.round(shares, 9), exponents)
+    return rounded
+
+
+def compile_file(path: Path, missing_meshes: str, findings: list[Finding]) -> Compiled:
+    """Return the compiled model of a file.
+
+    Raises RobotError if MuJoCo refuses the file, or missing meshes are refused.
+    """
+    lean = None
+    try:
+        lean = compile_scene(path, is_whole=False)
+        if not lean.missing:
+            return lean
+        return compile_scene(path, is_whole=True)
+    except RobotError:
+        # Something may refer to a geom that is only drawn.
+        if lean is None:
+            return compile_scene(path, is_whole=True)
+        if missing_meshes == "error":
+            raise
+    text = f"collision meshes not found, simulated without: {', '.join(lean.missing)}"
+    remedy = "put the files where the MJCF names them"
+    findings.append(Finding("missing-mesh", text, remedy))
+    return lean
+
+
+def compile_scene(path: Path, is_whole: bool) -> Compiled:
+    """Return the compilation of the whole file, or of its collision shapes and masses.
+
+    Raises RobotError if MuJoCo refuses it.
+    """
+    missing: tuple[str, ...] = ()
+    # MuJoCo takes a file of the same name, size and second for the one that it has read.
+    mujoco.mj_clearCache(mujoco.mj_getCache())
+    try:
+        scene = mujoco.MjSpec.from_file(str(path))
+        if not is_whole:
+            missing = _strip(scene, path)
+        return Compiled(scene, scene.compile(), is_whole, missing)
+    except (ValueError, mujoco.FatalError) as error:
+        problem = " ".join(str(error).split())
+        raise RobotError(
+            f"{path}: MuJoCo cannot compile the file: {problem}; correct it, or restore the file"
+            " that it names, e.g. by git lfs pull"
+        ) from error
+
+
+def _strip(spec: Any, path: Path) -> tuple[str, ...]:
+    """Remove materials, geoms that add neither shape nor mass, and collision shapes of missing
+    meshes; return the files of the latter.
+    """
+    # A <pair> makes geoms collide whatever their masks say.
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    absent = {}
+    for mesh in spec.meshes:
+        folder = path.parent / (mesh.compiler.meshdir or "")
+        file = Path(mesh.file).name if spec.strippath else mesh.file
+        if mesh.file and not (folder / file).is_file():
+            absent[mesh.name] = mesh.file
+    missing: dict[str, None] = {}
+    used: set[str] = set()
+    for geom in list(spec.geoms):
+        # A texture that is missing would stop the compilation.
+        geom.material = ""
+        is_solid = geom.contype or geom.conaffinity or geom.name in paired
+        # A missing mesh that weighs stays, and MuJoCo refuses it.
+        if _weighs(spec, geom) or (is_solid and geom.meshname not in absent):
+            used.add(geom.meshname)
+            continue
+        if is_solid:
+            missing[absent[geom.meshname]] = None
+        for pair in list(spec.pairs):
+            if geom.name in (pair.geomname1, pair.geomname2):
+                spec.delete(pair)
+        spec.delete(geom)
+    for site in spec.sites:
+        site.material = ""
+    unused = [mesh for mesh in spec.meshes if mesh.name not in used]
+    for element in [*spec.materials, *spec.textures, *unused]:
+        spec.delete(element)
+    return tuple(missing)
+
+
+def _weighs(spec: Any, geom: Any) -> bool:
+    """Return whether the mass of a geom's body depends on the geom."""
+    body = geom.parent
+    always = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    if body.explicitinertial and spec.compiler.inertiafromgeom != always:
+        return False
+    if geom.mass == 0 or (math.isnan(geom.mass) and geom.density == 0):
+        return False
+    low, high = spec.compiler.inertiagrouprange
+    return bool(low <= geom.group <= high) and body.parent is not None

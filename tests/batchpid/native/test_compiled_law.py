@@ -105,21 +105,6 @@ def test_a_controller_says_whether_it_is_native():
     assert "'numpy' (native)" in repr(ours)
 
 
-def test_efforts_and_states_do_not_change_under_the_caller():
-    ours, theirs, y = both()
-    kept = []
-    for step in range(8):
-        arrays = [ours(y[8], y[step]), *(leaf for leaf in ours.state if leaf is not None)]
-        if step % 3 == 0:
-            kept += [(each, each.copy()) for each in arrays]
-        np.testing.assert_array_equal(arrays[0], theirs(y[8], y[step]))
-        if step == 4:
-            ours(y[8], y[0])
-            theirs(y[8], y[0])
-    for array, before in kept:
-        np.testing.assert_array_equal(array, before)
-
-
 @pytest.mark.parametrize(
     "copied", [copy.copy, copy.deepcopy, lambda pid: pickle.loads(pickle.dumps(pid))]
 )

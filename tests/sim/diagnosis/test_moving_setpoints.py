@@ -105,18 +105,3 @@ def test_the_rates_of_increments_have_no_acceleration():
             )
     np.testing.assert_array_equal(runs[0].qpos, runs[1].qpos)
     assert np.abs(runs[2].qpos - runs[0].qpos).max() > 1e-3
-
-
-def test_a_setpoint_at_rest_with_an_acceleration_gives_its_effort():
-    panda = load_bundled("panda")
-    start, acceleration = panda.settings.target, np.arange(9.0)
-    efforts = []
-    for given in (0 * acceleration, acceleration):
-        with Runner(panda, 1, workers=0, collisions=False, substeps=1) as runner:
-            runner.reset(start)
-            efforts.append(
-                runner.step(start, setpoint_rate=0 * start, setpoint_acceleration=given).effort[0]
-            )
-    np.testing.assert_allclose(
-        np.subtract(*efforts[::-1]), panda.mass_matrix(start)[0] @ acceleration, rtol=0.02
-    )

@@ -62,6 +62,8 @@ CASES = [
     ("panda", True, {}),
     ("panda", False, {"randomization": VARIED}),
     ("panda", False, {"contacts": ["panda_hand"]}),
+    ("panda", False, {"control": "drive"}),
+    ("panda", True, {"control": "drive", "randomization": VARIED}),
     ("jaco2", False, {}),
     ("sliding mimic", False, {}),
     *((seed, True, {}) for seed in range(3)),

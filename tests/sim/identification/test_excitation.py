@@ -13,28 +13,21 @@ def test_the_motion_keeps_the_limits_and_moves_every_joint(name, request):
     assert (motion.position <= robot.upper + 1e-9).all()
     assert (np.abs(motion.velocity) <= robot.velocity_limit).all()
     assert motion.ticks == 400
-    assert (
-        np.ptp(motion.position, axis=0) > [0.02 if unit == "rad" else 0.002 for unit in robot.units]
-    ).all()
+    least = [0.02 if unit == "rad" else 0.002 for unit in robot.units]
+    assert (np.ptp(motion.position, axis=0) > least).all()
     np.testing.assert_allclose(motion.position[[0, -1]], motion.position[[0, 0]], atol=1e-4)
     assert (np.abs(motion.velocity[[0, -1]]) < 0.05).all()
-    assert (
-        np.linalg.cond(np.corrcoef(motion.velocity[:, robot.independent].T)) < 100
-    )  # all motions differ
+    # All motions differ.
+    assert np.linalg.cond(np.corrcoef(motion.velocity[:, robot.independent].T)) < 100
 
 
 def test_the_seed_decides(panda):
     first, again, other = (excite(panda, 2.0, rate=50, seed=seed) for seed in (1, 1, 2))
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
     assert not np.array_equal(first.position, other.position)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("duration", 0), ("rate", 1), ("highest", 0.01), ("seed", -1)]
-)
-def test_options_out_of_range_are_refused(panda, name, value):
-    with pytest.raises(bp.InvalidArgumentError, match=name):
-        excite(panda, **{name: value})
+    for name, value in {"duration": 0, "rate": 1, "highest": 0.01, "seed": -1}.items():
+        with pytest.raises(bp.InvalidArgumentError, match=name):
+            excite(panda, **{name: value})
 
 
 BAR = """<inertial><origin xyz="0.15 0 0"/><mass value="1"/>
@@ -72,17 +65,17 @@ def test_joints_that_would_touch_the_ground_move_less(tmp_path):
     assert not robot.dynamics().in_contact(motion.position, 0.009).any()
 
 
-def test_links_that_touch_near_every_pose_are_named(tmp_path):
-    """The wall is in the middle of the upper bar, whatever the joints do but at their ends."""
-    with pytest.raises(
-        bp.InvalidArgumentError, match=r"'upper' and 'wall' touch|'wall' and 'upper' touch"
-    ):
-        excite(arm(tmp_path, height=1.0, wall=0.03), 2.0, rate=50)
-
-
-def test_a_joint_that_is_too_weak_is_named_with_its_load(tmp_path):
-    with pytest.raises(bp.InvalidArgumentError, match=r"joint 'lift' is too weak"):
-        excite(arm(tmp_path, height=1.0, effort=0.01, bend=0.01), 2.0, rate=50)
+@pytest.mark.parametrize(
+    ("words", "options"),
+    [
+        # The wall is in the middle of the upper bar, whatever the joints do but at their ends.
+        ("'upper' and 'wall' touch|'wall' and 'upper' touch", {"wall": 0.03}),
+        ("joint 'lift' is too weak", {"effort": 0.01, "bend": 0.01}),
+    ],
+)
+def test_what_stops_every_motion_is_named(tmp_path, words, options):
+    with pytest.raises(bp.InvalidArgumentError, match=words):
+        excite(arm(tmp_path, height=1.0, **options), 2.0, rate=50)
 
 
 def test_a_joint_that_is_always_too_weak_stays_still(tmp_path):

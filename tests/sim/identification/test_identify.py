@@ -12,8 +12,6 @@ import batchpid as bp
 from batchpid.sim import Robot, Runner
 from batchpid.sim.identification import Log, draw_motors, identify
 
-pytest.importorskip("scipy")
-
 KINDS = {
     "armature": "armature",
     "damping": "viscous",
@@ -21,6 +19,7 @@ KINDS = {
     "strength": "strength",
 }
 NOISE = 2e-5
+TRUE = {field: np.array(value) for field, value in TRUTH.items()}
 
 
 @pytest.fixture(scope="module")
@@ -73,10 +72,8 @@ def test_motors_are_found_from_efforts(robot, effort_log):
 
 def test_the_number_of_workers_does_not_change_the_result(robot, effort_log):
     short = effort_log.part(slice(0, 200), slice(0, 200))
-    both = [
-        identify(robot, [short], payload=False, evaluations=2, workers=workers)
-        for workers in (0, 2)
-    ]
+    options = {"payload": False, "evaluations": 2}
+    both = [identify(robot, [short], workers=workers, **options) for workers in (0, 2)]
     np.testing.assert_array_equal(both[0].values, both[1].values)
 
 
@@ -171,13 +168,10 @@ def test_rate_limits_and_gains_are_unknowns_of_the_control(robot):
     log = Log("log", (0, 1), "setpoint", rollout.time, qpos, begin, setpoints, True, DT, "none")
     weak = gains().replace(kp=0.5 * gains().kp, kd=0.5 * gains().kd)
     found = identify(robot, [log], weak, payload=False, extras=["slew", "gain"])
-    assert [found.interval("slew", joint)[0] for joint in (0, 1)] == pytest.approx(
-        [2.0, 1.5], rel=0.03
-    )
     strengths = np.array(TRUTH["strength"])
-    assert [found.interval("gain", joint)[0] for joint in (0, 1)] == pytest.approx(
-        2 * strengths, rel=0.03
-    )
+    for kind, true in (("slew", [2.0, 1.5]), ("gain", 2 * strengths)):
+        values = [found.interval(kind, joint)[0] for joint in (0, 1)]
+        assert values == pytest.approx(true, rel=0.03)
     np.testing.assert_allclose(found.gains().kp, gains().kp * strengths, rtol=0.03)
 
 
@@ -188,9 +182,8 @@ def test_further_effects_are_found_on_request(robot):
     log = replace(log, qpos=log.qpos + more["position_offset"])
     found = identify(robot, [log], payload=False, extras=["load_friction", "offset"])
     for joint in (0, 1):
-        assert found.interval("load_friction", joint)[0] == pytest.approx(
-            more["load_friction"][joint], rel=0.1
-        )
+        load = found.interval("load_friction", joint)[0]
+        assert load == pytest.approx(more["load_friction"][joint], rel=0.1)
         value, low, high = found.interval("offset", joint)
         assert value == pytest.approx(more["position_offset"][joint], rel=0.1)
         assert low <= more["position_offset"][joint] <= high
@@ -198,10 +191,10 @@ def test_further_effects_are_found_on_request(robot):
 
 @pytest.mark.slow
 def test_an_effect_that_lowers_the_held_out_error_is_added(robot, tmp_path):
-    text = URDF.replace('mass value="1"', 'mass value="1.4"').replace('ixx="0.01"', 'ixx="0.014"')
-    heavy = load(
-        tmp_path, text.replace('iyy="0.01"', 'iyy="0.014"').replace('izz="0.002"', 'izz="0.0028"')
-    )
+    text = URDF
+    for name, value in {"mass value": "1", "ixx": "0.01", "iyy": "0.01", "izz": "0.002"}.items():
+        text = text.replace(f'{name}="{value}"', f'{name}="{1.4 * float(value)}"')
+    heavy = load(tmp_path, text)
     log = log_of(robot, run(heavy, motion()), NOISE)
     better = identify(robot, [log], payload=False)
     assert better.effects["mass"] < 0.5
@@ -213,18 +206,8 @@ def test_an_effect_that_lowers_the_held_out_error_is_added(robot, tmp_path):
     assert "robot: delay" not in better.not_shown
     (tmp_path / "corrected.urdf").write_text(better.corrected_urdf())
     corrected = Robot.load(tmp_path / "corrected.urdf").mass_matrix(np.zeros((1, 2)))[0, 1, 1]
-    assert corrected == pytest.approx(
-        factors["fore"] * robot.mass_matrix(np.zeros((1, 2)))[0, 1, 1]
-    )
-
-
-def test_an_unknown_that_nothing_shows_is_not_in_the_file(robot):
-    """Joint 1 is never commanded: it swings."""
-    log = log_of(robot, effort_run(robot, (1.0, 0.0)), NOISE)
-    found = identify(robot, [log], payload=False)
-    assert found.interval("strength", 1) is None
-    assert "elbow: strength" in found.not_shown
-    assert "not shown by these logs: elbow: strength" in found.report()
+    before = robot.mass_matrix(np.zeros((1, 2)))[0, 1, 1]
+    assert corrected == pytest.approx(factors["fore"] * before)
 
 
 READINGS = {
@@ -295,6 +278,9 @@ def test_the_report_has_all_values_and_errors(found):
     document = found.document()
     assert document["intervals"]["elbow"]["strength"][0] == found.interval("strength", 1)[0]
     assert len(found.figure().axes) == 2
+    for place in (("strength", 5), ("delay", 0), ("mass", "fore"), ("speed", 0)):
+        with pytest.raises(bp.InvalidArgumentError):
+            found.interval(*place)
     with pytest.raises(bp.InvalidArgumentError, match="no mass was found"):
         found.corrected_urdf()
 
@@ -308,37 +294,26 @@ def test_held_out_logs_are_not_fitted(robot, log):
     assert found.interval("strength", 0)[0] == pytest.approx(0.9, rel=0.01)
 
 
+OTHER = bp.make_params(3, 1.0)
 WRONG = {
-    "contradict .* another kp": {"params": gains().replace(kp=100.0)},
-    "contradicts .*'none'": {"compensate": "gravity"},
-    "contradicts .*0.001": {"timestep": 0.002},
-    "extras": {"extras": ["speed"]},
-    "evaluations": {"evaluations": 0},
-    "hold 3 joints": {"params": bp.make_params(3, 1.0)},
+    "contradict .* another kp": (["log"], {"params": gains().replace(kp=100.0)}),
+    "contradicts .*'none'": (["log"], {"compensate": "gravity"}),
+    "contradicts .*0.001": (["log"], {"timestep": 0.002}),
+    "extras": (["log"], {"extras": ["speed"]}),
+    "evaluations": (["log"], {"evaluations": 0}),
+    "hold 3 joints": (["log"], {"params": OTHER}),
+    "is of a law": (["effort_log"], {"extras": ["slew"]}),
+    "give no params": (["effort_log"], {"params": gains()}),
+    "fit them one by one": (["effort_log", "log"], {}),
+    "are missing": ([], {}),
 }
 
 
 @pytest.mark.parametrize("problem", WRONG)
-def test_options_that_contradict_a_recording_are_refused(robot, log, problem):
+def test_options_that_contradict_the_logs_are_refused(robot, request, problem):
+    names, options = WRONG[problem]
     with pytest.raises(bp.InvalidArgumentError, match=problem):
-        identify(robot, [log], **WRONG[problem])
-
-
-def test_logs_of_efforts_refuse_what_is_of_a_law(robot, effort_log, log):
-    with pytest.raises(bp.InvalidArgumentError, match="is of a law"):
-        identify(robot, [effort_log], extras=["slew"])
-    with pytest.raises(bp.InvalidArgumentError, match="give no params"):
-        identify(robot, [effort_log], gains())
-    with pytest.raises(bp.InvalidArgumentError, match="fit them one by one"):
-        identify(robot, [effort_log, log])
-    with pytest.raises(bp.InvalidArgumentError, match="are missing"):
-        identify(robot, [])
-
-
-def test_intervals_name_unknowns_that_there_are(found):
-    for place in (("strength", 5), ("delay", 0), ("mass", "fore"), ("speed", 0)):
-        with pytest.raises(bp.InvalidArgumentError):
-            found.interval(*place)
+        identify(robot, [request.getfixturevalue(name) for name in names], **options)
 
 
 @pytest.mark.slow
@@ -347,10 +322,10 @@ def test_intervals_hold_the_truth(robot):
     inside = []
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        truth = {
-            field: (np.array(value) * rng.uniform(0.6, 1.4, np.shape(value))).tolist()
-            for field, value in TRUTH.items()
+        draw = {
+            name: value * rng.uniform(0.6, 1.4, np.shape(value)) for name, value in TRUE.items()
         }
+        truth = {name: value.tolist() for name, value in draw.items()}
         log = log_of(robot, run(robot, motion(seed=seed), actuators=truth), 1e-4)
         found = identify(robot, [log], payload=False)
         for kind, field in KINDS.items():

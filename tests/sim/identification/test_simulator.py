@@ -8,7 +8,6 @@ from arms import DT, FALLING, STEPS, TRUTH, gains, load, motion, run
 
 import batchpid as bp
 from batchpid.motors.coupling import Coupling
-from batchpid.sim import Robot
 from batchpid.sim.identification.simulator import Candidates, LogPlant, Stretch, simulate
 from batchpid.stages import Control
 
@@ -27,26 +26,19 @@ MOTORS = {
 def control(params=None, compensate="none") -> Control:
     """Return the control of a log of setpoints, or without params of efforts."""
     mode = "effort" if params is None else "pid"
-    parts = "gravity" in compensate, "coriolis" in compensate
-    law = params or bp.PIDParams(kp=None)
-    return Control(DT, 1, Coupling.of(2), law, mode, gravity=parts[0], coriolis=parts[1])
+    parts = {"gravity": "gravity" in compensate, "coriolis": "coriolis" in compensate}
+    return Control(DT, 1, Coupling.of(2), params or bp.PIDParams(kp=None), mode, **parts)
 
 
-def candidates(
-    count=1, law=None, delay=0.0, lag=0.0, payload=None, mass=None, **actuators
-) -> Candidates:
+def candidates(count=1, law=None, delay=0.0, payload=None, mass=None, **actuators) -> Candidates:
     """Return equal candidates."""
-    made = bp.make_actuators(
-        2, **{name: value for name, value in actuators.items() if value is not None}
-    )
-    spread = {
-        name: np.repeat(leaf, count, axis=0)
-        for name, leaf in made._asdict().items()
-        if leaf is not None
-    }
+    options = {name: value for name, value in actuators.items() if value is not None}
+    made = bp.make_actuators(2, **options)
+    fields = {name: leaf for name, leaf in made._asdict().items() if leaf is not None}
+    spread = {name: np.repeat(leaf, count, axis=0) for name, leaf in fields.items()}
     spread |= {} if made.max_delay is None else {"max_delay": made.max_delay}
-    late = (np.full(count, time) for time in (delay, lag))
-    return Candidates(bp.Actuators(**spread), law or {}, *late, payload or {}, mass or {})
+    late = np.full(count, delay)
+    return Candidates(bp.Actuators(**spread), law or {}, late, 0 * late, payload or {}, mass or {})
 
 
 def stretch_of(commands, start) -> Stretch:
@@ -56,85 +48,73 @@ def stretch_of(commands, start) -> Stretch:
     return Stretch(start, np.zeros(2), table, 0, ends, np.zeros(len(ends)))
 
 
-def simulated(robot: Robot, commands, drive: Control, made: Candidates, start) -> np.ndarray:
-    (table,) = simulate(
-        LogPlant(robot, (0, 1)), drive, made, np.zeros((1, 2, 2)), [stretch_of(commands, start)]
-    )
-    return table[0]
+def simulated(robot, commands, drive, made, start) -> np.ndarray:
+    plant, states = LogPlant(robot, (0, 1)), np.zeros((1, 2, 2))
+    return simulate(plant, drive, made, states, [stretch_of(commands, start)])[0][0]
 
 
 @pytest.mark.parametrize("native", ["1", "0"])
-@pytest.mark.parametrize("compensate", ["none", "gravity", "gravity+coriolis"])
+@pytest.mark.parametrize("compensate", ["none", "gravity", "gravity+coriolis", "efforts"])
 @pytest.mark.parametrize("kind", MOTORS)
-def test_a_log_of_setpoints_is_simulated_as_by_the_runner(
-    tmp_path, monkeypatch, kind, compensate, native
-):
+def test_a_log_is_simulated_as_by_the_runner(tmp_path, monkeypatch, kind, compensate, native):
     monkeypatch.setenv("BATCHPID_NATIVE", native)
-    robot, setpoints = load(tmp_path), motion(0.5)
-    rollout = run(robot, setpoints, compensate=compensate, actuators=MOTORS[kind])
-    drive = control(gains(), compensate)
-    offset = np.array(
-        MOTORS[kind].get("position_offset", 0.0)
-    )  # the log has the measured positions
-    table = simulated(
-        robot, setpoints, drive, candidates(**(TRUTH | MOTORS[kind])), setpoints[0] + offset
-    )
-    np.testing.assert_allclose(table - offset, rollout.qpos[:, 0], atol=1e-4)
-
-
-@pytest.mark.parametrize("kind", MOTORS)
-def test_a_log_of_efforts_is_simulated_as_by_the_runner(tmp_path, kind):
-    robot = load(tmp_path)
-    commands = 3.0 * motion(0.5)
-    rollout = run(robot, commands, "effort", actuators=MOTORS[kind])
-    made, offset = (
-        candidates(**(TRUTH | MOTORS[kind])),
-        np.array(MOTORS[kind].get("position_offset", 0.0)),
-    )
-    table = simulated(robot, commands, control(), made, FALLING + offset)
+    robot, commands, drive = load(tmp_path), motion(0.5), control(gains(), compensate)
+    options, start = {"compensate": compensate}, commands[0]
+    if compensate == "efforts":
+        commands, drive, options, start = 3.0 * commands, control(), {"control": "effort"}, FALLING
+    rollout = run(robot, commands, actuators=MOTORS[kind], **options)
+    # The log has the measured positions.
+    offset = np.array(MOTORS[kind].get("position_offset", 0.0))
+    made = candidates(**(TRUTH | MOTORS[kind]))
+    table = simulated(robot, commands, drive, made, start + offset)
     np.testing.assert_allclose(table - offset, rollout.qpos[:, 0], atol=1e-4)
 
 
 def test_delays_and_rate_limits_of_setpoints_are_those_of_late_rows_and_a_guard(tmp_path):
-    robot, setpoints = load(tmp_path), motion(0.5)
-    drive = control(gains())
+    robot, setpoints, drive = load(tmp_path), motion(0.5), control(gains())
     late = np.vstack([setpoints[:1]] * 4 + [setpoints[:-4]])
     expected = simulated(robot, late, drive, candidates(**TRUTH), setpoints[0])
-    table = simulated(
-        robot, setpoints, drive, candidates(delay=4 * STEPS * DT, **TRUTH), setpoints[0]
-    )
+    delayed = candidates(delay=4 * STEPS * DT, **TRUTH)
+    table = simulated(robot, setpoints, drive, delayed, setpoints[0])
     np.testing.assert_allclose(table, expected, atol=1e-9)
     rollout = run(robot, setpoints, guard=robot.guard(rate=np.array([1.0, 0.5])))
-    slew = {"slew": np.array([[1.0, 0.5]])}
-    table = simulated(robot, setpoints, drive, candidates(law=slew, **TRUTH), setpoints[0])
+    slow = candidates(law={"slew": np.array([[1.0, 0.5]])}, **TRUTH)
+    table = simulated(robot, setpoints, drive, slow, setpoints[0])
     np.testing.assert_allclose(table, rollout.qpos[:, 0], atol=1e-4)
 
 
 def test_masses_are_those_of_another_description(tmp_path):
-    robot, setpoints = load(tmp_path), motion(0.5)
+    robot, setpoints, drive = load(tmp_path), motion(0.5), control(gains())
     text = (tmp_path / "arm.urdf").read_text()
     heavy = text.replace('mass value="1"', 'mass value="1.5"').replace('ixx="0.01"', 'ixx="0.015"')
     heavy = heavy.replace('iyy="0.01"', 'iyy="0.015"').replace('izz="0.002"', 'izz="0.003"')
-    drive = control(gains())
-    table = simulated(
-        robot,
-        setpoints,
-        drive,
-        candidates(mass={"fore": np.array([1.5])}, **TRUTH),
-        setpoints[0],
-    )
-    other = load(tmp_path, heavy)
-    np.testing.assert_allclose(
-        table, simulated(other, setpoints, drive, candidates(**TRUTH), setpoints[0]), atol=1e-9
-    )
-    loaded = simulated(
-        robot,
-        setpoints,
-        drive,
-        candidates(payload={"fore": np.array([0.5])}, **TRUTH),
-        setpoints[0],
-    )
-    assert np.abs(loaded - table).max() < np.abs(loaded - run(robot, setpoints).qpos[:, 0]).max()
+    changed = candidates(mass={"fore": np.array([1.5])}, **TRUTH)
+    table = simulated(robot, setpoints, drive, changed, setpoints[0])
+    other = simulated(load(tmp_path, heavy), setpoints, drive, candidates(**TRUTH), setpoints[0])
+    np.testing.assert_allclose(table, other, atol=1e-9)
+    loaded = candidates(payload={"fore": np.array([0.5])}, **TRUTH)
+    apart = simulated(robot, setpoints, drive, loaded, setpoints[0])
+    assert np.abs(apart - table).max() < np.abs(apart - run(robot, setpoints).qpos[:, 0]).max()
+
+
+def test_followers_move_with_their_leader(tmp_path):
+    """In NumPy: lanes have no coupled joints."""
+    text = (load(tmp_path), (tmp_path / "arm.urdf").read_text())[1]
+    text = text.replace('velocity="6"/></joint></robot>', 'velocity="6"/><mimic joint="shoulder" '
+                        'multiplier="-0.5" offset="0.1"/></joint></robot>')  # fmt: skip
+    robot, setpoints = load(tmp_path, text), motion(0.3)
+    actuators = {name: TRUTH[name] for name in ("strength", "command_delay")}
+    setpoints[:, 1] = 0.1 - 0.5 * setpoints[:, 0]
+    ideal = actuators | dict.fromkeys(("armature", "viscous", "coulomb"))
+    rollout = run(robot, setpoints, actuators=ideal)
+    made = bp.make_actuators(1, strength=0.9, command_delay=TRUTH["command_delay"])
+    none = np.zeros(1)
+    drive = control(gains().for_joints([0]))._replace(coupling=Coupling.of(1))
+    stretch = stretch_of(setpoints, setpoints[0])
+    one = stretch._replace(qpos=setpoints[0, :1], qvel=none, command=stretch.command[:, :1])
+    candidate = Candidates(made, {}, none, none, {}, {})
+    (table,) = simulate(LogPlant(robot, (0,)), drive, candidate, np.zeros((1, 2, 1)), [one])
+    np.testing.assert_allclose(table[0, :, 0], rollout.qpos[:, 0, 0], atol=1e-4)
 
 
 def test_candidates_and_stretches_do_not_affect_each_other(tmp_path):
@@ -147,8 +127,7 @@ def test_candidates_and_stretches_do_not_affect_each_other(tmp_path):
     motors = made.actuators._replace(strength=np.repeat(strengths, 2, axis=0))
     states = np.zeros((6, 2, 2))
     states[2:4, 1] = 0.1
-    made = made._replace(actuators=motors)
-    tables = simulate(plant, drive, made, states, stretches)
+    tables = simulate(plant, drive, made._replace(actuators=motors), states, stretches)
     for number, stretch in enumerate(stretches):
         for row, strength in enumerate(strengths):
             one = candidates(**TRUTH | {"strength": strength})

@@ -16,7 +16,7 @@ from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.robot.robot_model import link_tree
-from batchpid.task_space.frames import about, compose, from_rpy, matrix_of, rotate, to_rpy
+from batchpid.task_space.frames import from_rpy, to_rpy
 
 ODD = """<robot name="odd">
   <link name="tip"/><link name="base"/><link name="mid"/><link name="side"/><link name="bracket"/>
@@ -82,36 +82,6 @@ def test_the_tool_is_the_hand_or_the_end_of_the_chain(panda, jaco2, tmp_path):
         (odd_robot(tmp_path), "mid"),
     ):
         assert link_tree(robot).tool == tool
-
-
-angles = st.floats(-7, 7)
-vectors = st.lists(st.floats(-2, 2), min_size=3, max_size=3).map(np.array)
-
-
-def turned(wxyz, vectors):
-    return rotate(matrix_of(wxyz), vectors)
-
-
-@settings(deadline=None, max_examples=20)
-@given(roll=angles, pitch=angles, yaw=angles, v=vectors)
-def test_rotations_compose_keep_lengths_and_follow_the_urdf_order(roll, pitch, yaw, v):
-    x, y, z = (
-        about(axis, angle) for axis, angle in zip(np.eye(3), (roll, pitch, yaw), strict=True)
-    )
-    q = from_rpy([roll, pitch, yaw])
-    np.testing.assert_allclose(
-        turned(q, v),
-        turned(z, turned(y, turned(x, v))),
-        atol=1e-12,
-    )
-    np.testing.assert_allclose(
-        turned(compose(x, y), v),
-        turned(x, turned(y, v)),
-        atol=1e-12,
-    )
-    np.testing.assert_allclose(np.linalg.norm(turned(q, v)), np.linalg.norm(v), atol=1e-12)
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    np.testing.assert_allclose(turned(z, v)[:2], [[cos, -sin], [sin, cos]] @ v[:2], atol=1e-12)
 
 
 SPECIAL = st.sampled_from([0.0, math.pi / 2, -math.pi / 2, math.pi, 1.5707963])

@@ -115,17 +115,3 @@ def test_a_fixed_joint_is_kept_where_its_merge_would_change_the_order_of_the_joi
     merged = merge_links(original.tables)
     assert sorted(names_of(merged)) == ["a", "b", "base", "c", "d", "mount"]
     assert [each.name for each in merged.joints if not each.moves] == ["fixed"]
-
-
-def test_siblings_of_a_merged_link_stay_in_order(tmp_path):
-    """Joints below a fixed one come after the joints of their new siblings, in any order of the
-    file.
-    """
-    parts = (
-        joint("late", "mount", "c"),
-        joint("early", "base", "a"),
-        joint("fixed", "base", "mount", "fixed", ""),
-    )
-    original = load(tmp_path, *map(link, ("base", "a", "mount", "c")), *parts)
-    assert original.joint_names == ("early", "late")
-    assert [each.name for each in merge_links(original.tables).joints] == ["early", "late"]

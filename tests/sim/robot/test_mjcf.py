@@ -160,24 +160,6 @@ def test_joints_are_those_of_the_file(load):
     )
 
 
-@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
-def test_swings_as_in_mujoco(load, engine):
-    text = ARM.replace('frictionloss=".1"', 'damping="9"')
-    robot = load(text, self_collision="none")
-    model = mujoco.MjModel.from_xml_string(text)
-    off = mujoco.mjtDisableBit
-    model.opt.timestep, model.opt.disableflags = 5e-4, off.mjDSBL_ACTUATION | off.mjDSBL_CONTACT
-    data = mujoco.MjData(model)
-    data.qpos[:] = robot.start
-    mujoco.mj_step(model, data, 200)
-    options = {"control": "effort", "compensate": "none", "ground": False, "workers": 0}
-    with Runner(robot, num_envs=1, substeps=200, engine=engine, **options) as runner:
-        runner.reset()
-        moved = runner.step(np.zeros(3)).qpos[0]
-    assert np.abs(moved - robot.start).max() > 0.01
-    np.testing.assert_allclose(moved, data.qpos, atol=1e-4)
-
-
 # of a geom in directions u (n, 3) in its frame, by type: capsule, ellipsoid, cylinder, box, mesh
 EXTENT = {
     3: lambda u, size, vertices: size[0] + size[1] * np.abs(u[:, 2]),
@@ -324,20 +306,13 @@ def test_the_gear_of_an_actuator_after_an_orientation_servo_is_its_own(load):
     np.testing.assert_array_equal(load(text.replace(BOX, sites, 1)).effort_limit, [6])
 
 
-def test_armature_of_actuators(load):
-    text = two_links(rest='<actuator><motor joint="j" armature=".3" gear="3"/></actuator>')
-    robot = load(text)
-    np.testing.assert_allclose(robot.actuators.armature, [[2.7]])
-    tendon = (
-        '<tendon><fixed name="t"><joint joint="j" coef="2"/><joint joint="k"'
-        ' coef="1"/></fixed></tendon>'
-    )
-    couple = '<equality><joint joint1="k" joint2="j" polycoef="0 3 0 0 0"/></equality>'
-    both = text.replace('joint="j" a', 'tendon="t" a').replace(
-        "</mujoco>", f"{tendon}{couple}</mujoco>"
-    )
-    both = both.replace('<joint name="j"/>', '<joint name="j"/><joint name="k"/>')
-    robot = load(both)  # the moment arm on the leader is 3 (2 + 3 1)
+def test_armature_of_an_actuator_of_coupled_joints(load):
+    text = f"""<mujoco><worldbody><body name="a">{BOX}<body name="b" pos="0 0 1">
+      <joint name="j"/><joint name="k"/>{BOX}</body></body></worldbody>
+      <actuator><motor tendon="t" armature=".3" gear="3"/></actuator>
+      <tendon><fixed name="t"><joint joint="j" coef="2"/><joint joint="k" coef="1"/></fixed></tendon>
+      <equality><joint joint1="k" joint2="j" polycoef="0 3 0 0 0"/></equality></mujoco>"""
+    robot = load(text)  # the moment arm on the leader is 3 (2 + 3 1)
     np.testing.assert_allclose(robot.actuators.armature, [[0.3 * 15**2, 0]])
 
 

@@ -4,7 +4,6 @@ poses.
 
 from __future__ import annotations
 
-import pickle
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +16,8 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
-from batchpid.sim.engine.protocol import SceneSpec
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.geometry.distances import Contacts
 
 BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
 SLIDE = '<limit lower="-0.5" upper="0.5" effort="10" velocity="2"/>'
@@ -121,13 +121,6 @@ def test_an_srdf_disables_and_enables_pairs_whatever_their_reason(tmp_path):
     ) == 2
 
 
-def test_the_pairs_of_a_robot_travel_with_it(tmp_path):
-    loaded = Robot.load(write(tmp_path, sliders(0.0, 0.1)))
-    pairs = loaded.self_contact
-    assert loaded.self_contact is pairs
-    assert vars(pickle.loads(pickle.dumps(loaded)))["self_contact"] == pairs
-
-
 def test_pairs_that_physx_cannot_hold_collide_in_sapien_alone(tmp_path):
     rng, count = np.random.default_rng(0), 60
     path = write(tmp_path, sliders(*(0.0 for _ in range(count))))
@@ -184,7 +177,10 @@ def test_contacts_are_of_all_pairs_but_the_disabled_and_the_neighbours(seed):
         lines = (f'<disable_collisions link1="{a}" link2="{b}"/>' for a, b in disabled)
         write(Path(folder), robot(*lines), "test.srdf")
         loaded = Robot.load(path, self_collision="urdf")
-        near = spec_of(loaded).contact_model(False).near(loaded.start)
+        spec = spec_of(loaded)
+        ignored = {frozenset(pair) for pair in spec.ignored}
+        contacts = Contacts(spec.rigid_tree, spec.simulated.shapes, ignored, False)
+        near = contacts.near(loaded.start)
         seen = {frozenset((first, second)) for first, second, _ in near}
     far = {pair for pair in map(frozenset, pairs) if len({body[name] for name in pair}) == 2}
     neighbours = {frozenset((a, b)) for a, b in pairs if {body[a], body[b]} == {"arm0", "arm4"}}

@@ -2,18 +2,17 @@
 as fallback.
 """
 
+import pickle
 import re
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
 from robots import load_bundled
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.sim import Robot
-from batchpid.sim.view.scene import FEWEST, MOST, segments_of, surfaces
+from batchpid.sim.view.scene import surfaces
 
 RED = '<material name="red"><color rgba="1 0 0 0.5"/></material>'
 BOX = '<box size="0.1 0.2 0.4"/>'
@@ -55,23 +54,11 @@ def volume(vertices, faces):
         ),
     ],
 )
-def test_primitives_are_closed_face_out_and_have_their_size(
-    geometry, size, expected, share, tmp_path
-):
+def test_primitives_face_out_and_have_their_size(geometry, size, expected, share, tmp_path):
     (surface,) = surfaces(load(tmp_path, a=visual(geometry)))
     vertices, faces = surface.vertices, surface.faces
     assert volume(vertices, faces) == pytest.approx(expected, rel=share)
     np.testing.assert_allclose(np.ptp(vertices, axis=0), size, atol=2 * 2e-3)
-    points, index = np.unique((vertices / max(size)).round(9), axis=0, return_inverse=True)
-    corners = index.reshape(-1)[faces]
-    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-    assert (edges[:, 0] != edges[:, 1]).all()
-    forth, back = set(map(tuple, edges.tolist())), set(map(tuple, edges[:, ::-1].tolist()))
-    assert len(forth) == len(
-        edges
-    )  # every edge once in each direction: closed, and wound consistently
-    assert forth == back
-    assert len(points) > 7
 
 
 @pytest.mark.parametrize(
@@ -85,15 +72,6 @@ def test_no_vertex_is_shared_across_a_sharp_edge(geometry, angle, tmp_path):
     for vertex in range(len(surface.vertices)):
         around = normals[(surface.faces == vertex).any(1)]
         assert (around @ around.T > np.cos(np.radians(angle))).all()
-
-
-@given(radius=st.floats(1e-3, 10), deviation=st.floats(1e-4, 1e-2))
-def test_chords_stay_within_the_deviation_asked_for(radius, deviation):
-    segments = segments_of(radius, deviation)
-    if FEWEST < segments < MOST:
-        assert radius * (1 - np.cos(np.pi / segments)) <= deviation * (1 + 1e-9)
-        assert radius * (1 - np.cos(np.pi / (segments - 1))) > deviation
-    assert FEWEST <= segments <= MOST
 
 
 @pytest.mark.parametrize("name", Robot.bundled())
@@ -218,6 +196,9 @@ def test_what_was_repaired_is_drawn(tmp_path):
         link("loose", visual(BOX)),
     )
     text = robot(*parts, joint("j", "a", "b")).replace('xyz="0 0 0.0"', 'xyz=""')
-    (surface,) = surfaces(Robot.load(write(tmp_path, text)))
+    path = write(tmp_path, text)
+    loaded = Robot.load(path)
+    path.unlink()  # a file is read once
+    (surface,) = surfaces(pickle.loads(pickle.dumps(loaded)))
     assert surface.link == "b"
     np.testing.assert_allclose(np.ptp(surface.vertices, axis=0), (0.4, 0.2, 0.1), atol=1e-9)

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
+from tiny_urdf import INERTIAL, joint, link, one_joint, robot, write
 
 from batchpid.errors import RobotError, RobotNotFoundError
 from batchpid.sim import Robot, Runner, to_mjcf, to_urdf
@@ -103,17 +103,6 @@ def test_a_missing_file_and_an_unknown_name_are_not_found(tmp_path):
             Robot.load(path)
 
 
-@pytest.mark.slow
-def test_as_many_links_as_physx_holds_are_simulated(tmp_path):
-    chain = (
-        link(f"l{n + 1}") + joint(f"j{n}", f"l{n}", f"l{n + 1}", origin="0 0 0.01")
-        for n in range(254)
-    )
-    long = Robot.load(write(tmp_path, robot(link("l0"), *chain)))
-    with Runner(long, 1, workers=0, control="effort", substeps=1, ground=False) as runner:
-        assert runner.step(np.zeros(254)).ok.all()
-
-
 def test_the_limit_of_links_is_that_of_one_engine(tmp_path):
     chain = (link(f"l{n + 1}") + joint(f"j{n}", f"l{n}", f"l{n + 1}") for n in range(299))
     long = Robot.load(write(tmp_path, robot(link("l0"), *chain)))
@@ -125,33 +114,6 @@ def test_the_limit_of_links_is_that_of_one_engine(tmp_path):
     for refused in (finding.text, "300 links that move; PhysX holds at most 255.*use the engine"):
         with pytest.raises(RobotError, match=refused):
             Runner(long, 1, engine="sapien", **options)
-
-
-def test_links_of_one_rigid_body_count_once(tmp_path):
-    frames = (link(f"f{n}", "") + joint(f"k{n}", "arm", f"f{n}", "fixed", "") for n in range(300))
-    path = write(tmp_path, robot(BASE, ARM, HINGE, *frames))
-    assert len(Robot.load(path).tables.links) == 302
-
-
-def test_parts_that_sapien_needs_are_added_and_those_that_it_does_not_need_are_removed(tmp_path):
-    """SAPIEN's parser fails on each of these; none has a meaning for the simulation."""
-    inertial = INERTIAL.replace('ixy="0" ixz="0" ', "").replace('iyz="0" ', "")
-    parts = link("base"), link("arm", inertial + "<visual/>"), link("tip"), link("end")
-    joints = (
-        HINGE.replace("</joint>", "<calibration rising='x'/><safety_controller/></joint>"),
-        "<material/>",
-    )
-    fixed = joint("f", "arm", "tip", "fixed", '<limit lower="x"/>').replace("0 1 0", "x")
-    default = joint("k", "tip", "end").replace(' xyz="0 1 0"', "")
-    odd = Robot.load(
-        write(
-            tmp_path,
-            robot(*parts, *joints, fixed, default, "<transmission/>", "<sensor><camera/></sensor>"),
-        )
-    )
-    assert all(link.mass for link in odd.tables.bodies)
-    with Runner(odd, 1, workers=0, params=odd.params(kp=1.0), ground=False) as runner:
-        assert runner.step([0.1, 0.1]).ok.all()
 
 
 BOMB = "<!DOCTYPE robot [<!ENTITY a0 'ha'>{}]>".format(
@@ -196,37 +158,6 @@ def test_an_xinclude_is_not_followed(tmp_path):
     )
     loaded = Robot.load(write(tmp_path, robot(BASE, ARM, HINGE, include)))
     assert "root:" not in to_urdf(loaded).text
-
-
-@pytest.mark.parametrize(("multiplier", "offset"), [(1, 0), (-1, 0), (2, 0), (1, 0.1)])
-def test_sapien_never_gets_a_mimic(multiplier, offset, tmp_path):
-    mimic = f'<mimic joint="left" multiplier="{multiplier}" offset="{offset}"/>'
-    sides = (
-        joint("left", "base", "l", origin="0 1 1"),
-        joint("right", "base", "r", inner=LIMIT + mimic, origin="0 -1 1"),
-    )
-    hand = Robot.load(write(tmp_path, robot(BASE, link("l"), link("r"), *sides)))
-    assert hand.independent.tolist() == [True, False]
-
-
-def test_links_tied_by_fixed_joints_do_not_push_each_other(tmp_path):
-    """A hand overlaps the arm beyond its flange: the engine would find contact there at every
-    step.
-    """
-    box = INERTIAL + '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
-    parts = [link("base"), link("arm", box), link("flange"), link("hand", box), link("finger", box)]
-    chain = [
-        HINGE,
-        joint("mount", "arm", "flange", "fixed", "", "0 0 0.1"),
-        joint("grip", "flange", "hand", "fixed", "", "0 0 0"),
-        joint("close", "hand", "finger", origin="0 0 0.25"),
-    ]
-    arm = Robot.load(write(tmp_path, robot(*parts, *chain)))
-    with Runner(arm, 1, workers=0, control="effort", substeps=400, ground=False) as runner:
-        runner.reset(np.array([0.3, 0.0]))
-        still = runner.step(np.zeros(2))
-    np.testing.assert_allclose(still.qpos, [[0.3, 0.0]], atol=1e-5)
-    assert arm.dynamics().in_contact(np.array([[0.3, 0.0]])).tolist() == [False]
 
 
 def test_building_writes_no_file(tmp_path, monkeypatch):
