@@ -149,7 +149,7 @@ def test_a_plant_of_the_users_own():
     state, seen = loop.step(loop.init(np.zeros(2)), np.full(2, 0.1), substeps=2000)
     np.testing.assert_allclose(seen.qpos, 0.1, atol=1e-6)
     assert not any(rows.any() for rows in loop.reset(state, np.zeros(2)).plant.values())
-    with pytest.raises(InvalidArgumentError, match="^mask: is int64"):
+    with pytest.raises(InvalidArgumentError, match=r"^mask: is int64"):
         loop.reset(state, np.zeros(2), mask=np.arange(2))
     assert repr(loop) == "ClosedLoop(Masses, 2 envs, 2 joints, timestep=0.0005)"
 
