@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace, take_rows, wrap
-from batchpid.checks.validate import is_traced
+from batchpid.checks import is_traced
 from batchpid.errors import InvalidArgumentError
 
 MOST_SAMPLES = 20_000

@@ -29,7 +29,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace
-from batchpid.checks.validate import instance, is_traced, read_array
+from batchpid.checks import instance, is_traced, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.frames import (
     Vector,

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
-from batchpid.checks.validate import array, choice, instance, number, within
+from batchpid.checks import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
 from batchpid.sim.findings import FINDING_KINDS, LIMIT_TOLERANCE, SEVERITIES, Finding, Findings

@@ -19,7 +19,7 @@ from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import DEADBEAT_SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import WIDTH, number, structure
+from batchpid.sim.engine.native import WIDTH, number, structure
 from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64, Rows
-from batchpid.checks.validate import choice
+from batchpid.checks import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, SingleOwner
 from batchpid.io.files import imported
 from batchpid.motors import Actuators

@@ -12,7 +12,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import WIDTH, structure
+from batchpid.sim.engine.native import WIDTH, structure
 from batchpid.sim.engine.native_model import NativeModel, NativeRefresh, aligned, table
 from batchpid.sim.loop.closed_loop import ClosedLoop, LoopState
 from batchpid.sim.loop.group_control import GroupControl

@@ -22,15 +22,15 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Float64, Progress, Rows
-from batchpid.checks.validate import check_keywords, choice, instance
+from batchpid.checks import check_keywords, choice, instance
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
-from batchpid.sim.engine.physics import MujocoSolver, Physics
+from batchpid.sim.engine.scene_spec import MujocoSolver, Physics
 from batchpid.sim.findings import report_shortfalls
+from batchpid.sim.loop.arrays import Snapshot
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.group_control import describe, native_obstacle
-from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import (
     DEFAULT_ENGINE,
     Backend,
@@ -60,12 +60,11 @@ from batchpid.sim.runner.operations import (
     run_request,
     snapshot_of,
 )
-from batchpid.sim.signals.quantities import CommandSpec, Observation, empty_observation
+from batchpid.sim.signals import CommandSpec, Observation, empty_observation
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.node import NodeInfo
-from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, RecoveryWarning, WorkerPool
-from batchpid.sim.workers.requests import Request
+from batchpid.sim.workers.requests import OneCall, Request
 from batchpid.stages import Stage
 from batchpid.stages.values import Command
 

@@ -30,8 +30,7 @@ from batchpid.arrays.array_types import Array, Document, Float64, MjModel, MjSpe
 from batchpid.errors import RobotError
 from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.mujoco_sensors import add_link_sensors
-from batchpid.sim.engine.physics import MujocoSolver
-from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine.scene_spec import MujocoSolver, SceneSpec
 from batchpid.sim.geometry.shapes import add_geom
 from batchpid.sim.robot.tables import CONTACT_FRICTION, Joint, MjcfFile
 from batchpid.task_space.frames import SpatialInertia
