@@ -330,17 +330,17 @@ def _unstable(plan: _Plan) -> Iterator[Finding]:
         return
     robot = plan.robot
     report = stability_report(robot, plan.params, plan.start, plan.timestep, robot.actuators)
-    ratio = report.robot_ratio
+    ratio, participation, _, motion, remedy = report
     if ratio < NEAR_BOUND:
         return
     effect = "it may diverge in other poses"
     if plan.params.discretization is not None:
         effect = f"it diverges if the robot has {1 / ratio:.3g} times the model's inertia, or less"
     elif ratio >= 1:
-        effect = report.effect
-    joint = robot.joint_names[int(np.argmax(report.participation))]
+        effect = motion
+    joint = robot.joint_names[int(np.argmax(participation))]
     detail = f"{ratio:.3g} times the bound at the start pose: {effect}"
-    yield _found("unstable", joint, detail=detail, remedy=report.remedy)
+    yield _found("unstable", joint, detail=detail, remedy=remedy)
 
 
 ODDITIES: tuple[Callable[[_Plan], Iterator[Finding]], ...] = (

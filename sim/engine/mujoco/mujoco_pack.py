@@ -161,7 +161,7 @@ class MujocoPack(EnginePack):
     @cached_property
     def _bias_model(self) -> NativeModel:
         """Model of the forces in the equations of motion of the joints, for constraint efforts."""
-        return NativeModel(self, "fixed" if self.spec.fixed_base else "free")
+        return NativeModel(lambda: self.rigid_tree, "fixed" if self.spec.fixed_base else "free")
 
     # -- stepping
     # ----------------------------------------------------------------------------------------------
