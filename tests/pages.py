@@ -35,8 +35,12 @@ def blocks(page: Path, *languages: str) -> list[re.Match]:
 
 
 def shell_lines(page: Path) -> list[list[str]]:
-    """Return the words of each command in the shell blocks that can be run here."""
+    """Return the words of each command that can be run here: in shell blocks, and after "$ " in
+    blocks that show what commands print.
+    """
     code = "".join(match["code"] for match in blocks(page, "sh") if not missing(match))
+    shown = "".join(match["code"] for match in blocks(page, "text"))
+    code += "\n".join(re.findall(r"^\$ (.*)", shown, re.M))
     return [words for line in code.splitlines() if (words := shlex.split(line, comments=True))]
 
 

@@ -98,7 +98,7 @@ ActuatorCfg DCMotorCfg PDJointPosControllerConfig max_effort mj_initCtrlHistory 
 first_robot zero_qpos pid_qf get_joints viewer sim_freq control_freq pd_joint_pos pd_joint_delta_pos
 _load_scene balance_passive_force proportional_on_measurement error_map set_auto_mode last_output
 gym_env_vectorize_mode impratio noslip_iterations auth verifies ulimit jax_numpy_rank_promotion
-batchpid_reset BATCHPID_SOAK_
+batchpid_reset BATCHPID_SOAK_ arm_
 """
 """Names of other programs, and parts of names."""
 

@@ -137,7 +137,7 @@ def run(name: str, record: object) -> int:
     values = vars(record)
     # A run may take hours: its output files are checked first.
     paths = _output_paths(command, values)
-    arguments = _arguments(command, values)
+    arguments = _arguments(name, values)
     result = command.function(**arguments)
     # The view has run already, and leaves nothing to report.
     if result is None:
@@ -182,10 +182,11 @@ def _default_path(template: str, values: Document) -> Path:
     return Path(template.format_map(words))
 
 
-def _arguments(command: CommandFunction, values: Document) -> Document:
+def _arguments(name: str, values: Document) -> Document:
     """Return the arguments of a command's function, with a bar in place of ``progress``, after a
     line about them.
     """
+    command = COMMANDS[name]
     accepted = inspect.signature(command.function).parameters
     # Output files and --force are for execute(), but identify also takes --force.
     arguments = {name: value for name, value in values.items() if name in accepted}
@@ -202,7 +203,7 @@ def _arguments(command: CommandFunction, values: Document) -> Document:
         if not is_recorded:
             print(_settings(robot, values), flush=True)
     if "progress" in accepted:
-        arguments["progress"] = bar(command.function.__name__)
+        arguments["progress"] = bar(name)
     return arguments
 
 

@@ -107,7 +107,7 @@ def view(
     ] = None,
     **options: Any,
 ) -> None:
-    """Show moving robots in the browser: sliders for setpoints and gains, and charts.
+    """Show moving robots in the browser: sliders for setpoints, and a chart of a joint.
 
     The page is served on localhost only; from another machine, use ``ssh -L``. With ``--play`` it
     shows a recorded run, of the robot in the recording, or of the one that is named.
