@@ -13,7 +13,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Pytree
 from batchpid.arrays.elementwise import exported, namespace, replace_envs
-from batchpid.checks.validate import check_keywords
+from batchpid.checks import check_keywords
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import added_friction, own_friction
 from batchpid.sim.loop.custom import OwnController

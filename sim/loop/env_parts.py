@@ -16,7 +16,7 @@ from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws, elements, nominal_values
 from batchpid.sim.randomization.randomization import PHYSICAL
-from batchpid.sim.signals.quantities import untouched
+from batchpid.sim.signals import untouched
 
 Int64 = NDArray[np.int64]
 COUNTS = ("steps", "due", "number")
