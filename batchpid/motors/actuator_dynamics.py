@@ -48,7 +48,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import TURN, clip, in_dtype_of, namespace, push_history, wrap
 from batchpid.arrays.trees import mapped
-from batchpid.checks.validate import check_time_step
+from batchpid.checks import check_time_step
 from batchpid.motors import delay
 from batchpid.motors import sensor_noise as noise
 from batchpid.motors.actuators import (

@@ -36,7 +36,7 @@ from batchpid.arrays.array_types import Array, Document, DType
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
 from batchpid.arrays.field_tables import Field, declared, in_group
 from batchpid.arrays.records import LeafBuilder, Record, array_summary, with_fields
-from batchpid.checks.validate import entries, integer, is_traced, number
+from batchpid.checks import entries, integer, is_traced, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.documents import RecordFile
 

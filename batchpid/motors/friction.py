@@ -46,7 +46,7 @@ from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
-from batchpid.checks.validate import check_time_step
+from batchpid.checks import check_time_step
 
 DEADBEAT_SHARE = 0.7
 """Share of the deadbeat gain K that is used."""

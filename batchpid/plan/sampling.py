@@ -45,7 +45,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Pytree
 from batchpid.arrays.elementwise import in_dtype_of, namespace, take_rows
 from batchpid.arrays.trees import mapped
-from batchpid.checks.validate import instance
+from batchpid.checks import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import guard as guard_model
 from batchpid.motors.guard import Guard, GuardState

@@ -26,7 +26,7 @@ from typing import NamedTuple
 from batchpid.arrays.array_types import Array, NamedChoice
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.records import array_summary
-from batchpid.checks.validate import check_time_step, instance
+from batchpid.checks import check_time_step, instance
 from batchpid.task_space.frames import in_axes, matrix_of
 from batchpid.task_space.osc_params import MAKE_PARAMS, OSCParams
 from batchpid.task_space.rigid_tree import RigidTree

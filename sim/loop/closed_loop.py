@@ -15,7 +15,7 @@ from batchpid.arrays.array_types import Array, Pytree
 from batchpid.arrays.elementwise import namespace, replace_envs
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import added_friction, own_friction
-from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.loop.env_parts import OwnController
 from batchpid.sim.loop.group_control import control_of
 from batchpid.sim.loop.tree_plant import DYNAMICS, TreePlant
 from batchpid.sim.options.options import RunnerOptions
