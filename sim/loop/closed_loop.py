@@ -16,7 +16,7 @@ from batchpid.arrays.elementwise import exported, namespace, replace_envs
 from batchpid.checks import check_keywords
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import added_friction, own_friction
-from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.loop.env_parts import OwnController
 from batchpid.sim.loop.group_control import control_of
 from batchpid.sim.loop.tree_plant import DYNAMICS, TreePlant
 from batchpid.sim.options.options import OPTIONS, RunnerOptions
