@@ -69,7 +69,7 @@ def fit_stages(stages: Sequence[Stage]) -> tuple[Stage, ...]:
     """Return stages of the caller's, with read-only copies of their constants.
 
     Raises InvalidArgumentError for one that is not a dataclass of :class:`Stage`, has the name of
-    another, or stands behind one that is not there.
+    another, or stands behind one that is not there, or behind the last.
     """
     names = [kind.name for kind in STAGES]
     fitted = list[Stage]()
@@ -81,9 +81,10 @@ def fit_stages(stages: Sequence[Stage]) -> tuple[Stage, ...]:
         if stage.name in names:
             problem = f"has a second stage {stage.name!r}"
             raise InvalidArgumentError("stages", problem, remedy="give each a name of its own")
-        if stage.after not in names:
-            problem = f"has {stage.name!r} after {stage.after!r}, which is no stage"
-            remedy = f"take one of {', '.join(dict.fromkeys(names))}"
+        places = [name for name in dict.fromkeys(names) if name != Last.name]
+        if stage.after not in places:
+            problem = f"has {stage.name!r} after {stage.after!r}, and no stage can stand there"
+            remedy = f"take one of {', '.join(places)}"
             raise InvalidArgumentError("stages", problem, remedy=remedy)
         names.append(stage.name)
         copies: Stage = mapped(lambda leaf: read_only(np.array(leaf)), stage)

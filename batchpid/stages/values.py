@@ -51,7 +51,9 @@ class Measured(NamedTuple):
     qpos: Array
     qvel: Array
     passive: Array
-    """Efforts that cancel gravity, and Coriolis and centrifugal forces; 0 without compensation."""
+    """Efforts that cancel gravity, and Coriolis and centrifugal forces. Without compensation 0, and
+    None at the start of an env.
+    """
 
 
 class Step(NamedTuple):

@@ -2,8 +2,8 @@
 
 An option is a field of :class:`SceneOptions`, :class:`ControlOptions` or :class:`WorkerOptions`. The
 field has its type, default, bounds and text, the places that keep it, and the help of its flag. The
-signature of :class:`batchpid.sim.Runner`, the checks of plain values, the table of options in
-docs/runner.md, the flags, and what snapshots and recordings hold come from it.
+checks of plain values, the table of options in docs/runner.md, the flags, and what snapshots and
+recordings hold come from it. :class:`batchpid.sim.Runner` has the same signature, for editors.
 """
 
 from __future__ import annotations

@@ -47,6 +47,13 @@ class NowhereElse(Thermal):
     after = "nowhere"
 
 
+class BehindTheLast(Thermal):
+    """A stage behind the one that keeps what the others have said."""
+
+    name = "behind the last"
+    after = "last"
+
+
 FREE = robot_with("floating base")
 SAPIENS_OWN = dataclasses.replace(ARM, source=ARM.source._replace(dissipation="sapien"))
 ROW, ROWS, NAN = np.zeros(DOF), np.zeros((N, DOF)), np.array([[0.0, 0.0], [np.nan, 0.0]])
@@ -206,6 +213,7 @@ REFUSED: dict[Callable[..., Any], list[dict[str, Any]]] = {
         {"worker": 1},
         {"stages": [Thermal(1.0, 1.0), Thermal(1.0, 1.0)]},
         {"stages": [NowhereElse(1.0, 1.0)]},
+        {"stages": [BehindTheLast(1.0, 1.0)]},
         {"workers": 2, "cluster": "ray"},
         {"physics": MujocoSolver(), "engine": "sapien"},
         {"physics": Physics("PGS", 4), "engine": "mujoco"},
