@@ -24,7 +24,7 @@ PIP := env BATCHPID_NATIVE=0 $(RUN) -m pip install --progress-bar off --disable-
 ARGS :=
 
 # Sources of the native extensions. BUILD builds those that are older than their sources.
-NATIVE := setup.py batchpid/native/extensions.py batchpid/sim/engine/native/interface.py \
+NATIVE := setup.py batchpid/native/extensions.py batchpid/sim/engine/native/__init__.py \
 	$(filter-out %/codes.h %/passes.h %/structures.h,$(foreach folder,batchpid/native batchpid/sim/engine/native,$(wildcard $(folder)/*.cpp $(folder)/*.h))) \
 	$(wildcard batchpid/native/*.py batchpid/law/*.py)
 BUILD := $(STEP) "compiling native extensions" env -u BATCHPID_NATIVE $(RUN) -u -W ignore setup.py build_ext --inplace

@@ -4,7 +4,6 @@ pyproject.toml.
 With BATCHPID_NATIVE=0 none is built.
 """
 
-import importlib.util
 import os
 import re
 import sys
@@ -24,19 +23,6 @@ if REQUIRED not in ("0", "1"):
         f"batchpid: BATCHPID_REQUIRE_NATIVE is {REQUIRED!r}; set it to 1, or to 0 for a build"
         " without a compiler"
     )
-MODULES = (
-    "batchpid.native.extensions",
-    "batchpid.sim.engine.native.interface",
-)
-"""Definitions of the extensions, each after those that it imports."""
-
-
-def load(name):
-    """Return a module, imported without its package: batchpid needs NumPy."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / f"{name.replace('.', '/')}.py")
-    sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
 
 
 def built(extension):
@@ -81,14 +67,6 @@ class Build(build_ext):
             sys.exit(f"batchpid: the extension {ext.name} cannot be built: {error}; {remedy}")
 
 
-def passes():
-    """Return passes.h: one pass for each of the commonest laws, from their traces."""
-    sys.path.insert(0, str(ROOT))
-    from batchpid.native.passes import header
-
-    return header()
-
-
 def structures(headers, constants):
     """Return structures.h: names of the fields of each structure that is marked FOR_PYTHON, and the
     numbers of enumerations; the compiler adds types and places. ``constants`` are those of Python.
@@ -126,18 +104,24 @@ def write(path, text):
         file.write_text(text)
 
 
-modules = [load(name) for name in MODULES] if os.environ.get("BATCHPID_NATIVE") != "0" else []
-if modules:
-    write("batchpid/native/codes.h", modules[0].codes())
-    write("batchpid/native/passes.h", passes())
+extensions = []
+if os.environ.get("BATCHPID_NATIVE") != "0":
+    sys.path.insert(0, str(ROOT))
+    from batchpid.native import extensions as programs
+    from batchpid.native.compiled import header
+    from batchpid.sim.engine import native
+
+    write("batchpid/native/codes.h", programs.codes())
+    # One pass for each of the commonest laws, from their traces.
+    write("batchpid/native/passes.h", header())
     folder = ROOT / "batchpid/sim/engine/native"
     sources = [path for path in sorted(folder.glob("*.h")) if path.name != "structures.h"]
     sources.append(ROOT / "batchpid/native/rigid_body.h")
     write(
         "batchpid/sim/engine/native/structures.h",
-        structures(sources, {"WIDTH": modules[1].WIDTH, "FARTHEST": modules[1].FARTHEST}),
+        structures(sources, {"WIDTH": native.WIDTH, "FARTHEST": native.FARTHEST}),
     )
-extensions = [extension for module in modules for extension in module.EXTENSIONS.values()]
+    extensions = [*programs.EXTENSIONS.values(), *native.EXTENSIONS.values()]
 setup(
     cmdclass={"build_ext": Build},
     # The longest to compile come first.

@@ -10,7 +10,7 @@ from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.records import frozen
 from batchpid.backends import JAXBackend, NumPyBackend, declined
-from batchpid.checks.validate import (
+from batchpid.checks import (
     choice,
     env_mask,
     flag,

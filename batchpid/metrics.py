@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.records import array_summary
-from batchpid.checks.validate import broadcast, read_array, time_step
+from batchpid.checks import broadcast, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 
 SETTLING_SHARE = 0.02

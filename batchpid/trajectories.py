@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.records import array_summary
-from batchpid.checks.validate import at_least, broadcast, positive, read_array, time_step
+from batchpid.checks import at_least, broadcast, positive, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.frames import compose
 

@@ -10,17 +10,29 @@ compare absolute times with an earlier run of the same machine, use pytest-bench
 from __future__ import annotations
 
 import statistics
+import time
+from contextlib import ExitStack
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 from measure import BY_TICKS, OURS, PYTHON, measure_rates
-from shared_ratios import COUNTS, few_robots, speeds_over_ideal
+from tutorial import TutorialLoop
 from workload import Workload
 
+import batchpid as bp
 from batchpid.sim import Robot
 from batchpid.sim.engine import native
 
 ATTEMPTS = 3
+TICKS = 50
+CASES = {
+    "all off": {},
+    "armature": {"armature": 1e-4},
+    "strength": {"strength": 0.95},
+    "effort limit": {"effort_limit": 60.0},
+}
+"""Options of actuators whose runners are compared with one of ideal ones."""
 
 
 class Floor(NamedTuple):
@@ -66,6 +78,74 @@ ACTUATOR_FLOORS = {
     "strength": 0.88,  # the velocity is read, and the effort processed
     "effort limit": 0.87,  # and limits given to the law
 }
+
+
+def speeds_over_ideal(physics, most, rounds):
+    """Return the speed of each case relative to actuators=None: the median of rounds in which all
+    take turns.
+
+    Processor time of this process, in which the robots are: another program disturbs it less.
+    """
+    num_envs, rounds = min(16, most.envs), min(rounds, most.rounds)
+    workload = Workload(Robot.load("panda"), num_envs, workers=0, physics=physics, ticks=10)
+    setpoints = np.broadcast_to(workload.target, (workload.ticks, num_envs, len(workload.target)))
+    rng, seconds = np.random.default_rng(0), []
+    with ExitStack() as stack:
+        chosen = {name: bp.make_actuators(9, **options) for name, options in CASES.items()}
+        runners = {
+            name: stack.enter_context(workload.runner(actuators=each))
+            for name, each in {"ideal": None, **chosen}.items()
+        }
+        for _ in range(rounds + 1):
+            took = {}
+            for name in rng.permutation(list(runners)):
+                runners[name].reset(workload.start)
+                began = time.process_time()
+                qpos = runners[name].rollout(setpoints).qpos[-1]
+                took[name] = time.process_time() - began
+                assert np.abs(qpos - workload.start)[:, workload.moving].max(1).min() > 0.02, (
+                    "the robots did not move"
+                )
+            seconds.append(took)
+    return {
+        name: statistics.median(took["ideal"] / took[name] for took in seconds[1:])
+        for name in CASES
+    }
+
+
+def few_robots(name, num_envs, physics, most, rounds=3):
+    """Return the seconds per env step of our loop and of the tutorial's in each round (rounds,
+    2).
+    """
+    num_envs, ticks, rounds = (
+        min(num_envs, most.envs),
+        min(TICKS, most.ticks),
+        min(rounds, most.rounds),
+    )
+    workload = Workload(Robot.load(name), num_envs, workers=0, physics=physics, ticks=ticks)
+    tutorial = TutorialLoop(workload.robot, workload.target, start=workload.start)
+    setpoints = np.broadcast_to(workload.target, (ticks, *workload.target.shape))
+    seconds = []
+    with workload.runner() as runner:
+        for _ in range(rounds + 1):
+            tutorial.reset()
+            runner.reset(workload.start)
+            began = time.process_time()
+            qpos = runner.rollout(setpoints).qpos[-1]
+            between = time.process_time()
+            final = tutorial.run(workload.steps)
+            ended = time.process_time()
+            seconds.append(
+                (
+                    (between - began) / (workload.steps * num_envs),
+                    (ended - between) / workload.steps,
+                )
+            )
+    for place in (*qpos, final):
+        assert np.abs(place - workload.start)[workload.moving].max() > 0.05, (
+            "the robots did not move"
+        )
+    return seconds[1:]
 
 
 @pytest.fixture
@@ -123,7 +203,7 @@ def test_ratios_keep_their_floors(check, most, name, physics):
 def test_few_robots_keep_their_floors(check, most, name, physics):
     def measure():
         found = {}
-        for count in COUNTS:
+        for count in FEW_FLOORS:
             seconds = few_robots(name, count, physics, most, rounds=3)
             ratio = statistics.median(theirs / ours for ours, theirs in seconds)
             found[f"{count} in this process / tutorial"] = (

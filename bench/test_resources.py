@@ -1,4 +1,4 @@
-"""Memory of a Runner, and its times to build, to start, and to pass on a tick."""
+"""Memory of a Runner, its time to build, and the cost of many envs."""
 
 import gc
 import os
@@ -91,26 +91,6 @@ def shared_bytes(workload):
     return workload.robot.dof * (3 * 8 + 3 * 4 + 1) + 4 * 8
 
 
-def test_start(benchmark, make_runner, workload, most):
-    """Time from ``Runner(...)`` to the end of the first step of 64 envs."""
-    benchmark.group = "resources"
-    started = []
-
-    def start():
-        runner = make_runner(min(64, most.envs))
-        runner.step(workload.target)
-        started.append(runner)
-
-    def close():
-        while started:
-            started.pop().close()
-
-    benchmark.pedantic(start, setup=close, rounds=min(3, most.rounds), warmup_rounds=1)
-    step_once(started[0], workload)
-    close()
-    benchmark.extra_info["start_seconds"] = round(benchmark.stats.stats.median, 3)
-
-
 def test_cost_of_many_envs(benchmark, compare, make_runner, workload, most):
     """Cost of an env step with 2048 envs over that with 64, in turn on two runners of two
     workers.
@@ -142,22 +122,3 @@ def test_cost_of_many_envs(benchmark, compare, make_runner, workload, most):
         f"{fewest} envs",
         1 / median(ratios),
     )
-
-
-def test_tick(benchmark, make_runner, workload, most):
-    """Time of a tick of one sim step beyond the work of the slower worker: a policy at 2 kHz in the
-    parent.
-    """
-    benchmark.group = "resources"
-    over = []
-    with make_runner(min(64, most.envs), substeps=1) as runner:
-        step_once(runner, workload)
-
-        def run():
-            for _ in range(min(500, most.ticks)):
-                began = time.perf_counter()
-                runner.step(workload.target)
-                over.append(time.perf_counter() - began - runner.work_seconds.max())
-
-        benchmark.pedantic(run, rounds=min(3, most.rounds), warmup_rounds=1)
-    benchmark.extra_info["us_over_work"] = round(1e6 * median(over), 1)

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.sim import Robot, Runner
-from batchpid.sim.engine.physics import PHYSICS
-from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine.scene_spec import PHYSICS, SceneSpec
 
 TIMESTEP = 1 / 2000
 """Time step of simulation and control [s]."""

@@ -14,11 +14,11 @@ from batchpid.io.files import attributes_of
 if TYPE_CHECKING:
     from batchpid.sim.diagnosis.loop_stability import StabilityWarning
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
-    from batchpid.sim.engine.physics import MujocoSolver, Physics
+    from batchpid.sim.engine.scene_spec import MujocoSolver, Physics
     from batchpid.sim.findings import Finding, RepairWarning
+    from batchpid.sim.loop.arrays import Snapshot
     from batchpid.sim.loop.closed_loop import closed_loop
     from batchpid.sim.loop.faults import Fault, FaultWarning
-    from batchpid.sim.loop.snapshot import Snapshot
     from batchpid.sim.options.groups import Controller, Ray
     from batchpid.sim.options.options import RunnerOptions
     from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from batchpid.sim.robot.urdf_export import to_urdf
     from batchpid.sim.rollout import Rollout, RunInfo
     from batchpid.sim.runner.runner import Runner
-    from batchpid.sim.signals.quantities import CommandSpec, Observation
+    from batchpid.sim.signals import CommandSpec, Observation
     from batchpid.sim.tool_space import OperationalSpace
     from batchpid.sim.workers.pool import RecoveryWarning
 
@@ -75,17 +75,17 @@ _MODULES = ("gym", "identification", "plots", "tuning", "view")
 """Public modules, which are imported when they are used."""
 _PLACES = {
     "Choice": "batchpid.sim.randomization.distributions",
-    "CommandSpec": "batchpid.sim.signals.quantities",
+    "CommandSpec": "batchpid.sim.signals",
     "Controller": "batchpid.sim.options.groups",
     "Fault": "batchpid.sim.loop.faults",
     "FaultWarning": "batchpid.sim.loop.faults",
     "Finding": "batchpid.sim.findings",
     "LogUniform": "batchpid.sim.randomization.distributions",
-    "MujocoSolver": "batchpid.sim.engine.physics",
+    "MujocoSolver": "batchpid.sim.engine.scene_spec",
     "Normal": "batchpid.sim.randomization.distributions",
-    "Observation": "batchpid.sim.signals.quantities",
+    "Observation": "batchpid.sim.signals",
     "OperationalSpace": "batchpid.sim.tool_space",
-    "Physics": "batchpid.sim.engine.physics",
+    "Physics": "batchpid.sim.engine.scene_spec",
     "Randomization": "batchpid.sim.randomization.randomization",
     "Ray": "batchpid.sim.options.groups",
     "Recorder": "batchpid.sim.recording.recorder",
@@ -97,7 +97,7 @@ _PLACES = {
     "RunInfo": "batchpid.sim.rollout",
     "Runner": "batchpid.sim.runner.runner",
     "RunnerOptions": "batchpid.sim.options.options",
-    "Snapshot": "batchpid.sim.loop.snapshot",
+    "Snapshot": "batchpid.sim.loop.arrays",
     "StabilityWarning": "batchpid.sim.diagnosis.loop_stability",
     "Uniform": "batchpid.sim.randomization.distributions",
     "closed_loop": "batchpid.sim.loop.closed_loop",

@@ -19,7 +19,7 @@ from batchpid.motors import Actuators
 from batchpid.sim.diagnosis.causes import unsettled_findings
 from batchpid.sim.findings import Findings
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.quantities import (
+from batchpid.sim.signals import (
     QUANTITIES,
     CommandSpec,
     Observation,

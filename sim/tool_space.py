@@ -14,13 +14,13 @@ from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.records import frozen, summary
 from batchpid.arrays.trees import digest
-from batchpid.checks.validate import array, choice, flag, instance, names
+from batchpid.checks import array, choice, flag, instance, names
 from batchpid.errors import InvalidArgumentError, warn
 from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
-from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec
+from batchpid.sim.signals import POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec
 from batchpid.task_space.frames import moved, pose_error
 from batchpid.task_space.native_law import BoundOSC
 from batchpid.task_space.osc_params import AXES

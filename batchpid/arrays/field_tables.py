@@ -25,7 +25,7 @@ from typing import (
 )
 
 from batchpid.arrays.array_types import Array, Kind
-from batchpid.checks.validate import (
+from batchpid.checks import (
     AxisKind,
     at_least,
     choice,

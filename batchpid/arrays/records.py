@@ -26,7 +26,7 @@ from batchpid.arrays.array_types import Array, Document, DType, Rows
 from batchpid.arrays.elementwise import NAMED_TUPLES, namespace
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.trees import mapped, parts
-from batchpid.checks.validate import (
+from batchpid.checks import (
     AxisKind,
     check_keywords,
     entries,

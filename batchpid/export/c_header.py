@@ -19,10 +19,9 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Document, MeasuredRate
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.trees import is_leaf, leaves, parts, structure
-from batchpid.checks.validate import choice, instance, names, time_step
+from batchpid.checks import choice, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.c_functions import plan_functions, rigid_body
-from batchpid.export.c_step import Dialect, comment, helpers, statements
+from batchpid.export.c_step import Dialect, comment, helpers, plan_functions, rigid_body, statements
 from batchpid.export.differences import Exported, check_one_env
 from batchpid.law import pid
 from batchpid.law.coefficients import Coefficients, discretise

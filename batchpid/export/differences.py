@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Bool, Document, Float64
-from batchpid.checks.validate import array, at_least, instance, names, time_step
+from batchpid.checks import array, at_least, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import as_explicit
 from batchpid.law.computed_torque import check_gain_units

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import CHOICES, Float64
-from batchpid.checks.validate import at_least, broadcast, choice, number, positive, time_step
+from batchpid.checks import at_least, broadcast, choice, number, positive, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.gains.stability import stability_bound
 from batchpid.law.params import PIDParams

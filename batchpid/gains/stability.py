@@ -43,7 +43,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.checks.validate import at_least, broadcast, read_array, time_step
+from batchpid.checks import at_least, broadcast, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 
 _FREQUENCIES = 100

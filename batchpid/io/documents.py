@@ -25,7 +25,7 @@ import numpy as np
 from batchpid.arrays.array_types import CHOICES, Document, Rows
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.records import Record
-from batchpid.checks.validate import choice, file_path, instance, names
+from batchpid.checks import choice, file_path, instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 from batchpid.law.params import LAW_FIELDS, PIDParams, make_params

@@ -52,7 +52,7 @@ from typing import NamedTuple
 from batchpid.arrays.array_types import Array, NamedChoice
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
 from batchpid.arrays.records import array_summary
-from batchpid.checks.validate import instance
+from batchpid.checks import instance
 from batchpid.law.params import PIDParams
 from batchpid.law.state import checked_dt
 

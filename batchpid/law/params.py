@@ -28,7 +28,7 @@ from batchpid.arrays.array_types import (
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.records import Ends, LeafBuilder, Record, is_everywhere, with_fields
-from batchpid.checks.validate import choice, entries, is_traced
+from batchpid.checks import choice, entries, is_traced
 from batchpid.errors import InvalidArgumentError
 
 ANTI_WINDUP = ("none", "clamp", "conditional", "back_calculation")

@@ -11,7 +11,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array, HoldEffort
 from batchpid.arrays.elementwise import in_dtype_of, namespace
 from batchpid.arrays.records import Record, array_summary
-from batchpid.checks.validate import instance, read_array, time_step
+from batchpid.checks import instance, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 

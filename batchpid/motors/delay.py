@@ -13,24 +13,20 @@ Lagrange filter of order 1).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace, take_rows, wrap
-from batchpid.checks.validate import is_traced
+from batchpid.checks import is_traced
 from batchpid.errors import InvalidArgumentError
 
 MOST_SAMPLES = 20_000
 _NEAR = 1e-5  # steps: a delay that is a whole number of steps but for rounding is one
 
 
-class Delay(NamedTuple):
-    """A delay at one time step, for histories (..., samples, joints)."""
-
-    whole: Array
-    """n (1 | envs, joints)."""
-    fraction: Array
-    """f (1 | envs, joints); None: 0 everywhere."""
+Delay = tuple[Array, Array]
+"""A delay at one time step, for histories (..., samples, joints): n (1 | envs, joints), and f
+(1 | envs, joints) or None for 0 everywhere.
+"""
 
 
 def samples_of(longest: Array, dt: float) -> int:
@@ -67,8 +63,8 @@ def discretise(delay: Array, dt: Array, samples: int) -> Delay:
     fraction = steps - whole
     # Delays of whole steps need no interpolation.
     if not is_traced(fraction) and not fraction.any():
-        return Delay(whole, None)
-    return Delay(whole, fraction)
+        return whole, None
+    return whole, fraction
 
 
 def start(value: Array, samples: int) -> Array:
@@ -86,7 +82,8 @@ def read(
     """Return the delayed value (..., joints); ``turns`` is 1 / (2 pi) where it is an angle, 0
     elsewhere, or None.
     """
-    later = take_rows(history, k.whole)
-    if k.fraction is None:
+    whole, fraction = k
+    later = take_rows(history, whole)
+    if fraction is None:
         return later
-    return later + k.fraction * wrap(take_rows(history, k.whole + 1) - later, turns, xp)
+    return later + fraction * wrap(take_rows(history, whole + 1) - later, turns, xp)

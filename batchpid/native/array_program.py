@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from batchpid.arrays.array_types import DType, Pytree, Rows
 from batchpid.arrays.trees import filled, leaves, structure
 from batchpid.errors import warn
-from batchpid.native.extensions import PROGRAM, TASK_SPACE, Extension, StaleExtensionError, load
+from batchpid.native.extensions import PROGRAM, TASK_SPACE, Extension, load
 from batchpid.native.tracing import Trace, trace_change
 
 NUMBERS_PER_THREAD = 2**17
@@ -39,7 +39,7 @@ def interpreter() -> ModuleType:
     # The extension reads the fields of arrays in memory, whose layout is NumPy's.
     entry = np.empty((4, 3), np.float32)
     if native.look(entry) != (entry.ctypes.data, *entry.shape, entry.dtype.num, True):
-        raise StaleExtensionError(f"cannot read the arrays of NumPy {np.__version__}")
+        raise ImportError(f"cannot read the arrays of NumPy {np.__version__}")
     return native
 
 
@@ -237,9 +237,9 @@ def _fault(extensions: tuple[Extension, ...]) -> str:
         for extension in extensions:
             load(extension)
         interpreter()
-    except StaleExtensionError as error:
-        warn(f"native code is not used, only Python: {error}", RuntimeWarning)
-        return str(error)
     except ModuleNotFoundError as error:
+        return str(error)
+    except ImportError as error:
+        warn(f"native code is not used, only Python: {error}", RuntimeWarning)
         return str(error)
     return ""

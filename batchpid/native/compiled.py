@@ -1,18 +1,28 @@
-"""The law as a native program, traced from its only definition. Results are bit-identical."""
+"""The law as a native program, traced from its only definition. Results are bit-identical.
+
+The interpreter (program.h) makes a pass over a block for each operation, which
+loads and stores every value in between. A law whose segments
+(:class:`batchpid.native.tracing.Segment`) :func:`law_segments` yields is one loop. ``setup.py``
+writes ``passes.h`` from the traces when it builds the extensions. The operations, their order and
+so all bits are those of the interpreter, which runs all other programs.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Rows
-from batchpid.arrays.trees import leaves
-from batchpid.law.coefficients import Coefficients
-from batchpid.law.pid import advance
+from batchpid.arrays.trees import leaves, structure
+from batchpid.law.coefficients import Coefficients, discretise
+from batchpid.law.params import make_params
+from batchpid.law.pid import advance, init
 from batchpid.law.state import PIDState, Terms
 from batchpid.native.array_program import TreeProgram
+from batchpid.native.tracing import Segment, trace_change
 
 _MEASUREMENT = 1
 """Index of the measurement among the inputs: the only input that must be (envs, joints)."""
@@ -108,3 +118,113 @@ class CompiledLaw:
 
 def _overlap(entry: Rows, out: Rows | None) -> bool:
     return out is not None and np.may_share_memory(entry, out)
+
+
+BESIDE_P: tuple[dict[str, Any], ...] = (
+    {},
+    {"ki": 1.0},
+    {"kd": 1.0},
+    {"ki": 1.0, "kd": 1.0},
+)
+"""Gains of P, PI, PD and PID in addition to kp."""
+ANTI_WINDUPS = ("none", "clamp", "conditional", "back_calculation")
+FILTER_TIMES = (None, 0.01)
+NUMBERS = np.zeros((1, 1))
+
+
+def law_segments() -> Iterator[Segment]:
+    """Yield the segments of P, PI, PD and PID with effort limits, with each strategy of
+    anti-windup, with and without derivative filter and feedforward.
+    """
+    for gains, strategy, time, feedforward in product(
+        BESIDE_P, ANTI_WINDUPS, FILTER_TIMES, (None, NUMBERS)
+    ):
+        # What has no gain has no option.
+        if (strategy != "none" and "ki" not in gains) or (time is not None and "kd" not in gains):
+            continue
+        params = make_params(
+            1,
+            kp=1.0,
+            **gains,
+            effort_limit=1.0,
+            anti_windup=strategy,
+            derivative_filter_time=time,
+        )
+        inputs = (NUMBERS, NUMBERS, None, None, feedforward)
+        state = init(params, NUMBERS)
+        trees = map(structure, (discretise(params, 1.0), state, inputs))
+        histories = (False,) * len(leaves(state))
+        yield from trace_change(law_with_effort, histories, *trees).program.segments
+
+
+def header() -> str:
+    """Return the text of passes.h."""
+    codes = dict.fromkeys(segment.code for segment in law_segments())
+    functions = [_function(number, code) for number, code in enumerate(codes)]
+    rows = [
+        f"    {{{len(code) // 4}, detail::code_{number}, detail::float_{number},"
+        f" detail::double_{number}}},"
+        for number, code in enumerate(codes)
+    ]
+    return _HEADER.format(functions="\n".join(functions), rows="\n".join(rows))
+
+
+def _function(number: int, packed: bytes) -> str:
+    """Return the pass of a segment."""
+    read, count, *code = np.frombuffer(packed, np.int32).tolist()
+    operations = [code[start : start + 4] for start in range(0, len(code) - count, 4)]
+    pointers = [f"*x{i} = x[{i}].data + at * x[{i}].step" for i in range(read)]
+    lines = [f"T const v{i} = x{i}[i];" for i in range(read)]
+    for value, (operation, *operands) in enumerate(operations, read):
+        names = ", ".join(f"v{operand}" for operand in operands)
+        lines.append(f"T const v{value} = result_of<Code({operation}), T>({names});")
+    # All operands are read before a result is written: they may share memory.
+    lines += [f"y{i}[i] = v{value};" for i, value in enumerate(code[-count:])]
+    results = [f"*y{i} = y[{i}] + start" for i in range(count)]
+    return _PASS.format(
+        number=number,
+        code=", ".join(map(str, (read, count, *code))),
+        pointers=", ".join(pointers),
+        results=", ".join(results),
+        lines="\n      ".join(lines),
+    )
+
+
+_PASS = """
+constexpr std::int32_t code_{number}[] = {{{code}}};
+template <class T>
+BATCHPID_INLINE void pass_{number}(Operand<T> const *x, T *const *y, Index n, Index chunk) {{
+  for (Index start = 0, at = 0; start < n; start += chunk, ++at) {{
+    T const {pointers};
+    T {results};
+    Index const count = std::min(chunk, n - start);
+    _Pragma("GCC ivdep") for (Index i = 0; i < count; ++i) {{
+      {lines}
+    }}
+  }}
+}}
+BATCHPID_CLONES static void float_{number}(Operand<float> const *x, float *const *y, Index n, Index chunk) {{
+  pass_{number}(x, y, n, chunk);
+}}
+BATCHPID_CLONES static void double_{number}(Operand<double> const *x, double *const *y, Index n, Index chunk) {{
+  pass_{number}(x, y, n, chunk);
+}}"""
+_HEADER = """// Written by setup.py: compiled.py.
+
+#pragma once
+
+#include "program.h"
+
+namespace batchpid {{
+namespace detail {{
+#pragma GCC push_options
+#pragma GCC optimize("no-tree-pre")  // with it GCC does not vectorize a pass with two limits
+{functions}
+#pragma GCC pop_options
+}}  // namespace detail
+
+static Fused const PASSES[] = {{
+{rows}
+}};
+}}  // namespace batchpid
+"""

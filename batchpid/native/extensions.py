@@ -46,10 +46,6 @@ VECTORIZED_ONLY = ("-O2", "-fvect-cost-model=dynamic")
 """Flags for code that gains nothing from -O3 but vectors: a third less to compile, equally fast."""
 
 
-class StaleExtensionError(ImportError):
-    """Extension that was built from other files, or that cannot be loaded."""
-
-
 class Extension(NamedTuple):
     """Extension module in C++."""
 
@@ -239,7 +235,7 @@ def load(extension: Extension) -> ModuleType:
 
     Raises
     ------
-    StaleExtensionError
+    ImportError
         It was built from other files, or cannot be loaded; the message ends with the remedy.
     ModuleNotFoundError
         It was not built.
@@ -250,15 +246,13 @@ def load(extension: Extension) -> ModuleType:
     except ModuleNotFoundError:
         raise ModuleNotFoundError(NOT_BUILT, name=extension.module) from None
     except ImportError as error:
-        raise StaleExtensionError(
-            f"{name} cannot be loaded ({error}); {_remedy(extension)}"
-        ) from error
+        raise ImportError(f"{name} cannot be loaded ({error}); {_remedy(extension)}") from error
     # The digests were compiled in: a file that has changed since makes the extension stale.
     built = getattr(module, "sources", "").split()
     if changed := [
         digest.partition("=")[0] for digest in extension.digests() if digest not in built
     ]:
-        raise StaleExtensionError(
+        raise ImportError(
             f"{name} was built from other sources ({', '.join(changed)}); {_remedy(extension)}"
         )
     return module

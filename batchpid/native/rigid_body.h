@@ -9,7 +9,7 @@
 #include <cstddef>
 #include <cstdint>
 
-// Structure whose fields Python fills in: setup.py lists them for interface.py.
+// Structure whose fields Python fills in: setup.py lists them for sim/engine/native/__init__.py.
 #define FOR_PYTHON
 
 namespace batchpid {

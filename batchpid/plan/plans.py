@@ -24,7 +24,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Document, DType
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.records import LeafBuilder, Record, with_fields
-from batchpid.checks.validate import choice, integer, positive
+from batchpid.checks import choice, integer, positive
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.documents import RecordFile
 from batchpid.motors.guard import GUARD_FIELDS

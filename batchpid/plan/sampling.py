@@ -43,9 +43,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Pytree
-from batchpid.arrays.elementwise import in_dtype_of, namespace, take_rows
+from batchpid.arrays.elementwise import exported, in_dtype_of, namespace, take_rows
 from batchpid.arrays.trees import mapped
-from batchpid.checks.validate import instance
+from batchpid.checks import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import guard as guard_model
 from batchpid.motors.guard import Guard, GuardState
@@ -62,6 +62,7 @@ cube of the time to it.
 """
 
 
+@exported
 class PlanState(NamedTuple):
     """State of a plan. Arrays are (envs, joints), tables (envs, horizon + 2, joints)."""
 

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.records import array_summary
-from batchpid.checks.validate import array, choice, entries, instance, integer, positive
+from batchpid.checks import array, choice, entries, instance, integer, positive
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import pose_error

@@ -52,7 +52,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import clip, in_dtype_of, namespace, wrap
-from batchpid.checks.validate import instance
+from batchpid.checks import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_law
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error

@@ -20,7 +20,7 @@ from batchpid.arrays.records import (
     frozen,
     with_fields,
 )
-from batchpid.checks.validate import AxisKind, choice, entries, instance, read_array
+from batchpid.checks import AxisKind, choice, entries, instance, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.tree_quantities import check_masses

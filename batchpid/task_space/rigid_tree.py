@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.elementwise import namespace, read_only
-from batchpid.checks.validate import array, at_least, choice, read_array
+from batchpid.checks import array, at_least, choice, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.task_space.frames import (

@@ -23,13 +23,13 @@ bit.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace
-from batchpid.checks.validate import instance, is_traced, read_array
+from batchpid.checks import instance, is_traced, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.frames import (
     Vector,
@@ -41,30 +41,15 @@ from batchpid.task_space.frames import (
 )
 from batchpid.task_space.rigid_tree import MAKE_TREE, Bodies, RigidTree
 
-
-class Motions(NamedTuple):
-    """Frames of the bodies, and motions per rate of each joint, in the world, at given joint
-    positions.
-    """
-
-    frames: Array
-    """(dof, 3, 4, rows)."""
-    linear: Vector
-    """Velocity per rate of the joint, of the body's point that is at the origin of the world, and
-    its angular velocity; components (dof, rows).
-    """
-    angular: Vector
-
-
-class Velocities(NamedTuple):
-    """Velocities of the bodies, and their accelerations at q'' = 0, as fields about the origin;
-    components (dof, rows).
-    """
-
-    linear: Vector
-    angular: Vector
-    linear_rate: Vector
-    angular_rate: Vector
+Motions = tuple[Array, Vector, Vector]
+"""Frames of the bodies (dof, 3, 4, rows) at given joint positions; and motions per rate of each joint
+in the world: the velocity of the body's point that is at the origin of the world, and its angular
+velocity; components (dof, rows).
+"""
+Velocities = tuple[Vector, Vector, Vector, Vector]
+"""Velocities of the bodies, linear and angular, and their accelerations at q'' = 0, as fields about the
+origin; components (dof, rows).
+"""
 
 
 def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Array], Bodies, ArrayModule]:
@@ -152,7 +137,7 @@ def motions_of(
     origin = frames[:, 0, 3], frames[:, 1, 3], frames[:, 2, 3]
     turning = scaled(axis, 1 - bodies.slides)
     moving = added(crossed(origin, turning), scaled(axis, bodies.slides))
-    return Motions(frames, moving, turning)
+    return frames, moving, turning
 
 
 def velocities_of(
@@ -166,8 +151,7 @@ def velocities_of(
     """Return the velocities of the bodies, and their accelerations at q'' = 0, on a base that turns
     at ``turning`` (rows, 3).
     """
-    linear = scaled(motions.linear, qvel)
-    angular = scaled(motions.angular, qvel)
+    linear, angular = (scaled(motion, qvel) for motion in motions[1:])
     # Velocities about the world's origin add up along the chain without a shift.
     sums = summed(tree, bodies, (*linear, *angular), xp, outwards=True)
     v, w = (sums[0], sums[1], sums[2]), (sums[3], sums[4], sums[5])
@@ -175,7 +159,7 @@ def velocities_of(
         w = added(w, components(turning[None]))
     rates = *added(crossed(w, linear), crossed(v, angular)), *crossed(w, angular)
     sums = summed(tree, bodies, rates, xp, outwards=True)
-    return Velocities(v, w, (sums[0], sums[1], sums[2]), (sums[3], sums[4], sums[5]))
+    return (v, w, (sums[0], sums[1], sums[2]), (sums[3], sums[4], sums[5]))
 
 
 def summed(
@@ -214,7 +198,7 @@ def tool_frame(
     """Return the frame (rows, 3, 4) of a link, with its origin at ``point`` (3,) or (rows, 3) of
     the link.
     """
-    frames = motions.frames
+    frames, *_ = motions
     xp = namespace(frames)
     body = tree.link_bodies[index]
     frame = bodies.link_frames[index]
@@ -258,8 +242,9 @@ def jacobian_at(
     """
     xp = namespace(place)
     body = tree.link_bodies[index]
-    linear = added(motions.linear, crossed(motions.angular, components(place[None])))
-    twists = xp.moveaxis(xp.stack((*linear, *motions.angular)), -1, 0)
+    _, linear, angular = motions
+    linear = added(linear, crossed(angular, components(place[None])))
+    twists = xp.moveaxis(xp.stack((*linear, *angular)), -1, 0)
     if body < 0:
         return xp.zeros_like(twists)
     return tree.efforts(xp.where(bodies.moves[body][None, None] > 0, twists, 0.0 * twists))

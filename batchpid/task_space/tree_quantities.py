@@ -98,8 +98,8 @@ def _inertias(mass: Array, center: Array, tensor: Array, frames: Array) -> Inert
     return mass + 0.0 * square, *[mass * at for at in r], *entries
 
 
-def _of_bodies(bodies: Bodies, motions: Motions) -> Inertias:
-    return _inertias(bodies.mass, bodies.center, bodies.tensor, motions.frames)
+def _of_bodies(bodies: Bodies, frames: Array) -> Inertias:
+    return _inertias(bodies.mass, bodies.center, bodies.tensor, frames)
 
 
 def _products(a: Sequence[Array], b: Sequence[Array]) -> Array:
@@ -156,9 +156,10 @@ def mass_matrix_of(
     xp: ArrayModule,
 ) -> Array:
     """Return the mass matrices (rows, dof, dof) at given motions of the joints."""
-    whole = summed(tree, bodies, _of_bodies(bodies, motions), xp, outwards=False)
-    p, k = _momenta(whole, motions.linear, motions.angular)
-    twists = [part[:, None] for part in (*motions.linear, *motions.angular)]
+    frames, linear, angular = motions
+    whole = summed(tree, bodies, _of_bodies(bodies, frames), xp, outwards=False)
+    p, k = _momenta(whole, linear, angular)
+    twists = [part[:, None] for part in (*linear, *angular)]
     table = _products(twists, [part[None] for part in (*p, *k)])
     # Only entries of joints on one branch differ from 0: one of them moves the other.
     moves = bodies.moves[..., None] > 0
@@ -185,19 +186,19 @@ def effort_of(
 
     A floating base turns at ``turning`` (rows, 3) [rad/s]; ``rates`` must include this rotation.
     """
-    inertias = _of_bodies(bodies, motions)
-    acceleration = rates.linear_rate
+    frames, linear, angular = motions
+    v, w, acceleration, turning_rate = rates
+    inertias = _of_bodies(bodies, frames)
     # A free base falls with its joints: gravity cancels there.
     if tree.fixed_base:
         weight = -bodies.gravity[:, None]
         acceleration = added(acceleration, (weight[0], weight[1], weight[2]))
-    v, w = rates.linear, rates.angular
     p, k = _momenta(inertias, v, w)
-    p_rate, k_rate = _momenta(inertias, acceleration, rates.angular_rate)
+    p_rate, k_rate = _momenta(inertias, acceleration, turning_rate)
     force = added(p_rate, crossed(w, p))
     torque = added(k_rate, added(crossed(w, k), crossed(v, p)))
     wrench = summed(tree, bodies, (*force, *torque), xp, outwards=False)
-    effort = _products((*motions.linear, *motions.angular), wrench).T
+    effort = _products((*linear, *angular), wrench).T
     if not tree.fixed_base:
         whole = summed(tree, bodies, inertias, xp, outwards=False)
         base, matrix = _of_base(tree, bodies, whole, xp)
@@ -206,7 +207,7 @@ def effort_of(
             turn = components(turning[None])
             p, k = _momenta(base, scaled(turn, 0.0), turn)
             on_base = on_base + xp.stack((*crossed(turn, p), *crossed(turn, k)), axis=-1)[0]
-        p, k = _momenta(whole, motions.linear, motions.angular)
+        p, k = _momenta(whole, linear, angular)
         falls = solve(matrix, on_base[..., None])
         effort = effort - gram(_by_row(xp.stack((*p, *k)), xp), falls)[..., 0]
     return tree.efforts(effort)

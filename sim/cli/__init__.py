@@ -19,7 +19,7 @@ from typing import Any
 import tyro
 
 import batchpid
-from batchpid.checks.validate import choice
+from batchpid.checks import choice
 from batchpid.errors import BatchPIDError
 
 INPUT_ERROR = 2

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from batchpid.arrays.array_types import Document, Progress, T
-from batchpid.checks.validate import file_path
+from batchpid.checks import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 from batchpid.sim import Robot

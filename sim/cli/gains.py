@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 
 from batchpid.arrays.field_tables import Field
-from batchpid.checks.validate import file_path
+from batchpid.checks import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 from batchpid.sim import Robot, tuning

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Document, Float64, Progress, Rows
 from batchpid.arrays.field_tables import Field
-from batchpid.checks.validate import array
+from batchpid.checks import array
 from batchpid.errors import InvalidArgumentError
 from batchpid.plan import make_plan
 from batchpid.sim import OperationalSpace, Robot, Rollout, write_recording

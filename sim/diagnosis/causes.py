@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,22 +68,23 @@ def unsettled_findings(rollout: Rollout, robot: Robot) -> Findings:
     unexplained = run.unsettled.copy()
     # Of one cause the joint that is farthest from its setpoint comes first.
     farthest = np.argsort(-np.abs(run.error[run.tail]).max((0, 1)))
-    for rule in RULES:
-        fits = unexplained & rule.test(run)
+    for code, test in RULES.items():
+        names_joint = code not in OF_ENVS
+        fits = unexplained & test(run)
         is_concerned = fits.any(1)
         unexplained[is_concerned] = False
-        if not rule.names_joint:
+        if not names_joint:
             fits[:, farthest[0]] = is_concerned
-        for joint in farthest if rule.names_joint else farthest[:1]:
+        for joint in farthest if names_joint else farthest[:1]:
             rows = np.flatnonzero(fits[:, joint])
             if len(rows):
-                findings.append(_finding(run, rule, joint, rows, envs))
+                findings.append(_finding(run, code, joint, rows, envs))
     return findings
 
 
 def _finding(
     run: _Run,
-    rule: Rule,
+    code: str,
     joint: int,
     rows: NDArray[np.intp],
     envs: NDArray[np.intp],
@@ -96,17 +97,17 @@ def _finding(
     first = rows[0]
     name = None
     detail = run.pressed[first]
-    if rule.names_joint:
+    if code not in OF_ENVS:
         name = run.robot.joint_names[joint]
         detail = f"{run.error[-1, first, joint]:.2g} {run.robot.units[joint]} remain"
-        if rule.code == "slow" and run.lag[first, joint] > 0:
+        if code == "slow" and run.lag[first, joint] > 0:
             detail += f", {1000 * run.lag[first, joint]:.0f} ms behind the moving setpoint"
     for fault in run.info.faults:
         if run.failed[first] and fault.env == first:
             detail = f"{fault.joint}: {fault.cause}"
     numbers = tuple(envs[rows].tolist())
     time = times.min()
-    kind = FINDING_KINDS[rule.code]
+    kind = FINDING_KINDS[code]
     return Finding(
         kind.code,
         kind.when,
@@ -271,14 +272,6 @@ class _Run:
         return links
 
 
-class Rule(NamedTuple):
-    """Cause for which joints do not settle, a kind of finding."""
-
-    code: str
-    test: Callable[[_Run], Bool]  # the joints that have it (envs, dof), or the envs (envs, 1)
-    names_joint: bool = True  # False for a cause of whole envs
-
-
 def _is_beyond_limits(run: _Run) -> Bool:
     low = run.robot.lower - LIMIT_TOLERANCE
     high = run.robot.upper + LIMIT_TOLERANCE
@@ -316,19 +309,23 @@ def _is_blocked(run: _Run) -> Bool:
 # touch. An effort at its limit and oscillations come before rest, since such a joint can rest for a
 # moment. A force that the model does not explain comes before gains that are small, which would
 # explain any error at rest.
-RULES: tuple[Rule, ...] = (
-    Rule("failed", lambda run: run.failed, names_joint=False),
-    Rule("out-of-limits", _is_beyond_limits),
-    Rule("out-of-reach", lambda run: run.out_of_reach, names_joint=False),
-    Rule("guard", lambda run: run.rollout.guarded[-1]),
-    Rule("touching", lambda run: np.array(run.pressed)[:, None] != "", names_joint=False),
-    Rule("effort-limit", _is_too_weak),
-    Rule("oscillates", _oscillates),
-    Rule("blocked", _is_blocked),
-    Rule("gains", lambda run: run.is_at_rest),
-    Rule("slow", lambda run: run.unsettled),
-)
-"""Every cause, in the order in which they are tested and listed."""
+RULES: dict[str, Callable[[_Run], Bool]] = {
+    "failed": lambda run: run.failed,
+    "out-of-limits": _is_beyond_limits,
+    "out-of-reach": lambda run: run.out_of_reach,
+    "guard": lambda run: run.rollout.guarded[-1],
+    "touching": lambda run: np.array(run.pressed)[:, None] != "",
+    "effort-limit": _is_too_weak,
+    "oscillates": _oscillates,
+    "blocked": _is_blocked,
+    "gains": lambda run: run.is_at_rest,
+    "slow": lambda run: run.unsettled,
+}
+"""Every cause, a kind of finding, in the order in which they are tested and listed: whether the
+joints (envs, dof) have it, or the envs (envs, 1).
+"""
+OF_ENVS = ("failed", "out-of-reach", "touching")
+"""Causes of whole envs, which name no joint."""
 
 
 def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:

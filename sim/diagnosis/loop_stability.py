@@ -11,7 +11,7 @@ armature and viscous friction of the motors are counted, each where it is known.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,23 +25,6 @@ if TYPE_CHECKING:
 
 NEAR_BOUND = 0.5
 """Share of the stability range from which gains are reported: other poses may have less inertia."""
-
-
-class StabilityReport(NamedTuple):
-    """Share of the stability range that the gains use at one pose.
-
-    ``robot_ratio``: 1 is the bound; ``participation`` (dof,): share of each joint in the mode that
-    is the first to become unstable; a follower has its leader's.
-    """
-
-    robot_ratio: float
-    participation: Float64
-    env: int
-    """Env of the params and actuators that is the least stable."""
-    effect: str
-    """Motion of a robot beyond the bound."""
-    remedy: str
-    """Gains that would be stable, and other ways to make the loop stable."""
 
 
 def _loop(
@@ -103,9 +86,14 @@ def stability_report(
     qpos: Float64,
     timestep: float,
     actuators: bp.Actuators | None = None,
-) -> StabilityReport:
+) -> tuple[float, Float64, int, str, str]:
     """Return the share of the stability range that ``params`` (their least stable env) use at
-    ``qpos`` (dof,).
+    ``qpos`` (dof,), of which 1 is the bound.
+
+    Further results are the share of each joint (dof,) in the mode that is the first to become
+    unstable, where a follower has its leader's; the least stable env of the params and actuators;
+    the motion of a robot beyond the bound; and the remedy: gains that would be stable, and other
+    ways to make the loop stable.
 
     ``actuators`` are motors and sensors, of which delay, lag, strength, armature and viscous
     friction count; rows are envs, as of the params.
@@ -128,7 +116,7 @@ def stability_report(
     else:
         remedy += ", discretization='implicit'"
     shares = robot.coupling.of_all(bound.participation[worst])
-    return StabilityReport(ratio, shares, worst, effect, f"{remedy}, or robot.designed()")
+    return ratio, shares, worst, effect, f"{remedy}, or robot.designed()"
 
 
 class StabilityWarning(UserWarning):
@@ -174,19 +162,20 @@ class StabilityCheck:
         start = self._robot.start
         try:
             report = stability_report(self._robot, params, start, self._timestep, motors)
+            ratio, participation, worst, effect, remedy = report
         except InvalidArgumentError:  # the robot's mass matrix is not positive definite
             return
         # A caller who changes gains in a loop gets one warning.
-        is_beyond = report.robot_ratio >= 1
+        is_beyond = ratio >= 1
         if is_beyond and not self._has_warned:
-            joint = self._robot.joint_names[int(np.argmax(report.participation))]
+            joint = self._robot.joint_names[int(np.argmax(participation))]
             env = ""
             if params.num_envs > 1 or (motors is not None and motors.num_envs > 1):
-                env = f", env {report.env}"
+                env = f", env {worst}"
             warn(
-                f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the"
+                f"params: the gains are {ratio:.3g} times the stability bound of the"
                 f" sampled PID loop, mostly of joint {joint!r}{env}, at the start pose with a time"
-                f" step of {self._timestep:g} s: {report.effect}; {report.remedy}",
+                f" step of {self._timestep:g} s: {effect}; {remedy}",
                 StabilityWarning,
             )
         self._has_warned = is_beyond

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
-from batchpid.checks.validate import array, choice, instance, number, within
+from batchpid.checks import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
 from batchpid.sim.findings import FINDING_KINDS, LIMIT_TOLERANCE, SEVERITIES, Finding, Findings
@@ -330,17 +330,17 @@ def _unstable(plan: _Plan) -> Iterator[Finding]:
         return
     robot = plan.robot
     report = stability_report(robot, plan.params, plan.start, plan.timestep, robot.actuators)
-    ratio = report.robot_ratio
+    ratio, participation, _, motion, remedy = report
     if ratio < NEAR_BOUND:
         return
     effect = "it may diverge in other poses"
     if plan.params.discretization is not None:
         effect = f"it diverges if the robot has {1 / ratio:.3g} times the model's inertia, or less"
     elif ratio >= 1:
-        effect = report.effect
-    joint = robot.joint_names[int(np.argmax(report.participation))]
+        effect = motion
+    joint = robot.joint_names[int(np.argmax(participation))]
     detail = f"{ratio:.3g} times the bound at the start pose: {effect}"
-    yield _found("unstable", joint, detail=detail, remedy=report.remedy)
+    yield _found("unstable", joint, detail=detail, remedy=remedy)
 
 
 ODDITIES: tuple[Callable[[_Plan], Iterator[Finding]], ...] = (

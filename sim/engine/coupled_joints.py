@@ -33,7 +33,7 @@ from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.arrays.elementwise import TURN, matrix_vector
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import structure
+from batchpid.sim.engine.native import structure
 from batchpid.sim.engine.native_model import NativeModel
 
 RATE_GAIN, POSITION_GAIN = 0.5, 0.25

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import DEADBEAT_SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import WIDTH, number, structure
+from batchpid.sim.engine.native import WIDTH, number, structure
 from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:
@@ -81,31 +81,28 @@ def table(rows: Rows, size: int) -> Float64:
     return out
 
 
-class HasTree(Protocol):
-    """Robots of one kind."""
-
-    @property
-    def rigid_tree(self) -> RigidTree:
-        """Their tree."""
-
-
 class NativeModel:
-    """Model of the robots of ``pack``, on a base of this kind of Base in model.h, with ``inertias``
+    """Model of the robots of a ``tree``, on a base of this kind of Base in model.h, with ``inertias``
     (robots, dof + 1, 13) where they differ: :meth:`RigidTree.inertias`.
     """
 
-    def __init__(self, pack: HasTree, base: str = "fixed", inertias: Float64 | None = None) -> None:
-        # The pack's tree is read at the first use: SAPIEN has to build a robot for it.
-        self._pack = pack
+    def __init__(
+        self,
+        tree: Callable[[], RigidTree],
+        base: str = "fixed",
+        inertias: Float64 | None = None,
+    ) -> None:
+        # The tree is read at the first use: SAPIEN has to build a robot for it.
+        self._tree = tree
         self._base = base
         self._native = native.extension("_gateway")
         self._inertias = inertias
 
     @cached_property
     def _structure(self) -> tuple[Any, Any]:
-        tree, rows = self._pack.rigid_tree.tables
+        tree, rows = self._tree().tables
         if self._inertias is None:
-            inertias = self._pack.rigid_tree.inertias()[None]
+            inertias = self._tree().inertias()[None]
         else:
             inertias = self._inertias
         arrays: dict[str, Rows] = {"tree": tree, "rows": rows, "inertias": inertias}
@@ -115,7 +112,7 @@ class NativeModel:
             "varies": self._inertias is not None,
             "base": number("Base", self._base.upper()),
         }
-        gravity = tuple(self._pack.rigid_tree.bodies.gravity)
+        gravity = tuple(self._tree().bodies.gravity)
         return structure("Model")(
             gravity=gravity,
             **numbers,
@@ -134,7 +131,7 @@ class NativeModel:
         They are :func:`batchpid.task_space.frames.spatial_matrix`, in the axes of the
         links.
         """
-        tree = self._pack.rigid_tree
+        tree = self._tree()
         if self._inertias is None:
             # From now on the robots have different inertias.
             self.__dict__.pop("_structure", None)
@@ -310,7 +307,7 @@ def mass_matrix_of(pack: EnginePack, natively: bool) -> Callable[[Float64], Floa
     NumPy's differ in the last bits.
     """
     if natively:
-        return NativeModel(pack).mass_matrix
+        return NativeModel(lambda: pack.rigid_tree).mass_matrix
     return lambda qpos: ts.mass_matrix(pack.rigid_tree.held, qpos)
 
 

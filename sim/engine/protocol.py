@@ -22,7 +22,7 @@ import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64, Rows
-from batchpid.checks.validate import choice
+from batchpid.checks import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, SingleOwner
 from batchpid.io.files import imported
 from batchpid.motors import Actuators
@@ -123,7 +123,7 @@ class EnginePack(SingleOwner, ABC):
     @cached_property
     def joint_model(self) -> NativeModel:
         """Native model of :meth:`joint_mass_matrix`."""
-        model = NativeModel(self, "fixed" if self.spec.fixed_base else "free")
+        model = NativeModel(lambda: self.rigid_tree, "fixed" if self.spec.fixed_base else "free")
         if self._masses.added:
             model.vary(range(self.size), self.size, self._masses.added)
         return model
@@ -133,7 +133,7 @@ class EnginePack(SingleOwner, ABC):
         """Native model of the passive force, for compiled steps that do not read it in the
         engine.
         """
-        return NativeModel(self, "fixed" if self.spec.fixed_base else "held")
+        return NativeModel(lambda: self.rigid_tree, "fixed" if self.spec.fixed_base else "held")
 
     def joint_mass_matrix(self, qpos: Rows) -> Float64:
         """Return the mass matrices of the joints at ``qpos`` (M, dof, dof) [kg m^2 or kg]; a

@@ -1,5 +1,5 @@
 """Description of the envs of a pack: the robot and its scene, and how each robot differs from the
-model.
+model; and the settings of the engines' solvers, with their presets.
 
 A variation changes a robot's inertias, and the friction and damping of its joints.
 """
@@ -30,6 +30,60 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.tables import Joint, MjcfFile, Tables
 from batchpid.task_space.frames import SpatialInertia, spatial_matrix, total
 from batchpid.task_space.rigid_tree import GRAVITY, RigidTree
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Solver of a PhysX scene, "TGS" or "PGS" (temporal or projected Gauss-Seidel), and its
+    iterations per sim step.
+    """
+
+    solver: str
+    position_iterations: int
+    velocity_iterations: int = 1
+
+
+PHYSICS = {
+    # SAPIEN's own settings.
+    "accurate": Physics("TGS", 10),
+    # At 2 kHz PGS keeps its error with 4 iterations, which TGS does not; see docs/performance.md.
+    "fast": Physics("PGS", 4),
+}
+
+
+@dataclass(frozen=True)
+class MujocoSolver:
+    """Settings of MuJoCo's constraint solver, which acts on contacts and joint limits, and on
+    constraints of a file.
+
+    The integrator is always semi-implicit Euler, as PhysX's is. See "Computation" in MuJoCo's
+    documentation.
+    """
+
+    iterations: int = 100
+    """Largest number of iterations of Newton's method per sim step."""
+    tolerance: float = 1e-8
+    """Relative improvement of the cost at which it ends."""
+    elliptic: bool = True
+    """Whether friction cones are elliptic, not pyramids, which are faster and slip a little."""
+    limit_time: float = 0.0
+    """Time constant of joint limits [s]; at least two sim steps, which are the hardest limits that
+    MuJoCo simulates. An MJCF file gives its own time constants, for contacts too.
+    """
+    contact_time: float = 0.005
+    """Time constant of contacts [s], at least two sim steps."""
+
+
+SOLVERS = {
+    "accurate": MujocoSolver(),
+    "fast": MujocoSolver(
+        iterations=20,
+        tolerance=1e-6,
+        elliptic=False,
+    ),
+}
+"""Presets, by the names of the option ``physics``."""
+
 
 Build = Callable[[Any, int], Any]
 """``build(scene, env)`` adds content to the engine's scene of env ``env``; returns objects whose

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.arrays.elementwise import TURN, wrap
-from batchpid.checks.validate import array, choice, number
+from batchpid.checks import array, choice, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.findings import LIMIT_TOLERANCE
 from batchpid.sim.gym.robot_env import RobotEnv
 from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.quantities import Observation
+from batchpid.sim.signals import Observation
 
 EPISODE_SPREAD = 0.1
 """Largest distance of a joint from the robot's start pose at the beginning of an episode [rad or

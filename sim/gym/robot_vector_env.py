@@ -19,14 +19,14 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Bool, Document, Float32, Float64, Rows
-from batchpid.checks.validate import array, check_keywords, choice, env_mask, flag, integer, number
+from batchpid.checks import array, check_keywords, choice, env_mask, flag, integer, number
 from batchpid.errors import CallOrderError, InvalidArgumentError, SingleOwner
 from batchpid.plan import make_plan
 from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import LARGEST_SEED
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
-from batchpid.sim.signals.quantities import Observation
+from batchpid.sim.signals import Observation
 
 
 def check_free(owner: object, options: Document, chosen: Document) -> None:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.checks.validate import integer, number
+from batchpid.checks import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.moves import FREE_VELOCITY, easy_pose, motion_effort

@@ -16,7 +16,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
-from batchpid.checks.validate import choice, flag, instance, integer, number
+from batchpid.checks import choice, flag, instance, integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.log import CommandKind, Log, checked
 from batchpid.sim.identification.logs import Reading, read_logs

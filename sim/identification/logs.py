@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.checks.validate import file_path
+from batchpid.checks import file_path
 from batchpid.errors import BatchPIDError, MissingDependencyError
 from batchpid.sim.identification.log import GAP, CommandKind, Log, checked
 from batchpid.sim.recording.recording_files import RecordingError, read_recording

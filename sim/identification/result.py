@@ -15,7 +15,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64
-from batchpid.checks.validate import integer
+from batchpid.checks import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.sim.identification.fit import INTERVAL, Fit

@@ -16,7 +16,7 @@ from batchpid.arrays.elementwise import precision
 from batchpid.arrays.trees import filled, leaves, structure
 from batchpid.sim.engine.native_model import NativeStep
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.custom import controller_errors
+from batchpid.sim.loop.env_parts import controller_errors
 from batchpid.sim.loop.faults import is_near
 from batchpid.sim.loop.group_control import GroupControl
 from batchpid.stages.stage import States, recalled, running, stepped

@@ -1,16 +1,33 @@
-"""Arrays between a loop and its caller, in shared memory where they are in different processes."""
+"""Arrays between a loop and its caller, in shared memory where they are in different processes;
+and snapshots: the state of all envs, physics and controller, as arrays by name.
+
+A snapshot is a barrier. The engine has more state than positions and velocities: contact caches,
+warm starts, and the order in which it solves contacts. All of these depend on the past, and can be
+neither read nor written. So every continuation from a snapshot, in this process or in another,
+starts in a new world in that state, and the results are bit-identical. The barrier itself changes
+the last bits.
+
+``Runner.restore`` checks names, shapes and dtypes of the arrays against the runner's own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Rows
-from batchpid.sim.signals.quantities import Observation, Quantity
+import batchpid as bp
+from batchpid.arrays.array_types import Document, Rows
+from batchpid.checks import file_path, integer
+from batchpid.errors import InvalidArgumentError
+from batchpid.io.files import write_atomically
+from batchpid.sim.signals import Observation, Quantity
 from batchpid.stages.values import Command
 
 Layout = dict[str, tuple[tuple[int, ...], Any]]
@@ -82,3 +99,182 @@ class Arrays(NamedTuple):
             self.observation.map(part),
             FaultArrays._make(map(part, self.fault)),
         )
+
+
+_FORMAT = 17
+_SAME_CONTENT = "take one with the same build=, and keep each env's number where it depends on it"
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """State of all envs of a runner at one moment. It can be pickled, or kept in a file:
+    :meth:`save`, :meth:`load`.
+    """
+
+    about: Document
+    """Options that a runner must share to restore it:
+    :meth:`batchpid.sim.RunnerOptions.describe`.
+    """
+    steps: int
+    """Sim steps up to this moment."""
+    params: bp.PIDParams
+    rows: dict[str, Rows]
+    """State of the envs, arrays (envs, ...) by name: :meth:`batchpid.sim.loop.env_group.EnvGroup.read`.
+
+    Besides these there are ``motion``, the last joint setpoints and their rates (envs, 2, dof),
+    where setpoints are for joints, and with a randomization ``episodes``, stream and episode of
+    each env (envs, 2), from which everything is drawn again.
+    """
+    actuators: bp.Actuators | None = None
+
+    def check_options(self, about: Document) -> None:
+        """Raise InvalidArgumentError if a runner with options ``about`` cannot restore it."""
+        others = [key for key, ours in about.items() if self.about.get(key) != ours]
+        if others:
+            problem = f"comes from a runner with another {' and '.join(others)}"
+            raise InvalidArgumentError("snapshot", problem, remedy="take one with the same options")
+
+    def check_rows(self, own: Mapping[str, Rows]) -> None:
+        """Check names, shapes and dtypes of the arrays against the runner's ``own``.
+
+        Raises
+        ------
+        InvalidArgumentError
+            An array is missing, unknown, or of another shape or dtype, or an env has other content.
+        """
+        theirs, ours = (
+            {name: f"{table.dtype.str} {table.shape}" for name, table in rows.items()}
+            for rows in (self.rows, own)
+        )
+        for name in ours | theirs:
+            kind, other = theirs.get(name), ours.get(name)
+            _expect(kind == other, f"has {kind} for {name}, not {other}")
+        # An env of a fork may have come from one for which build made something else.
+        content = self.rows.get("content/digest")
+        if content is not None:
+            is_same = np.array_equal(content, own["content/digest"])
+            _expect(is_same, "is of envs for which build made other content", _SAME_CONTENT)
+        # The engine's values of an env end where NaN begin.
+        lengths = np.isnan(self.rows["engine"]) == np.isnan(own["engine"])
+        _expect(lengths.all(), "holds other content than this runner's build makes", _SAME_CONTENT)
+
+    def episodes(self, num_envs: int) -> NDArray[np.int64]:
+        """Return the checked stream and episode of each of ``num_envs`` envs."""
+        episodes = self.rows.get("episodes", np.zeros(0))
+        is_table = episodes.shape == (num_envs, 2) and episodes.dtype == np.int64
+        is_valid = is_table and (episodes >= 0).all()
+        _expect(is_valid, "has no valid episode numbers", "take another: this one is damaged")
+        return episodes
+
+    def for_envs(self, envs: slice | Sequence[int] | Rows) -> Snapshot:
+        """Return a snapshot of the envs with these numbers, in this order, and repeatedly where a
+        number repeats.
+
+        A runner of as many envs restores it, if its ``build`` makes the same content for each as
+        for the original. An env continues bit by bit as the original would, with the noise of the
+        original's sensors, until it is reset.
+
+        Raises
+        ------
+        IndexError
+            A number is not one of an env.
+        """
+        envs = np.arange(len(self.rows["effort"]))[envs]
+        return replace(
+            self,
+            about=self.about | {"num_envs": len(envs)},
+            params=self.params.for_envs(envs),
+            rows={name: rows[envs] for name, rows in self.rows.items()},
+            actuators=None if self.actuators is None else self.actuators.for_envs(envs),
+        )
+
+    def copy(self) -> Snapshot:
+        """Return a snapshot with arrays of its own."""
+        return self.for_envs(slice(None))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write an .npz file, as a whole or not at all: an older file stays until this one is
+        complete.
+
+        Raises
+        ------
+        OSError
+            The file cannot be written.
+        """
+        joints = self.about["joints"]
+        head = {"format": _FORMAT, "about": self.about, "steps": self.steps}
+        head["params"] = bp.dumps_params(self.params, joints, format="json")
+        if self.actuators is not None:
+            head["actuators"] = bp.motors.dumps_actuators(self.actuators, joints, format="json")
+        tables: Document = {"head": np.array(json.dumps(head))} | self.rows
+        write_atomically(file_path("path", path), lambda file: np.savez(file, **tables))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Snapshot:
+        """Read a file of :meth:`save`. Nothing in it is executed.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The file is missing, damaged, or no snapshot of this version.
+        """
+        path = file_path("path", path)
+        try:
+            if not path.is_file():
+                raise ValueError("there is no such file")
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as tables:
+                return cls._read(dict(tables))
+        except Exception as error:  # a damaged file can make the libraries raise anything
+            raise InvalidArgumentError(
+                "path",
+                f"cannot be read as a snapshot: {error or type(error).__name__}",
+                value=str(path),
+                remedy="pass a file that Snapshot.save wrote",
+            ) from error
+
+    @classmethod
+    def _read(cls, rows: dict[str, Rows]) -> Snapshot:
+        """Return the snapshot in the arrays of a file."""
+        head = json.loads(str(rows.pop("head")))
+        if head["format"] != _FORMAT:
+            raise ValueError(f"format {head['format']}, not {_FORMAT}")
+        about: Document = dict(head["about"])
+        steps = integer("steps", head["steps"], 0, 2**62)
+        params, _ = bp.loads_params(head["params"], about["joints"])
+        actuators = None
+        if "actuators" in head:
+            actuators, _ = bp.motors.loads_actuators(head["actuators"], about["joints"])
+        return cls(about, steps, params, rows, actuators)
+
+    def __repr__(self) -> str:
+        about = self.about
+        return (
+            f"Snapshot({about.get('robot')}, {about.get('num_envs')} envs, control"
+            f" {about.get('control')!r}, after {self.steps} sim steps)"
+        )
+
+
+def join_rows(parts: Sequence[dict[str, Rows]]) -> dict[str, Rows]:
+    """Return the state of the envs of all ``parts``. Where ``build`` adds other content to an env,
+    the engine has fewer values for it, with NaN after them.
+    """
+    width = max(part["engine"].shape[1] for part in parts)
+    joined = {}
+    for name in parts[0]:
+        tables = [part[name] for part in parts]
+        if name == "engine":
+            tables = [_widened(table, width) for table in tables]
+        joined[name] = np.concatenate(tables)
+    return joined
+
+
+def _widened(table: Rows, width: int) -> Rows:
+    """Return a table with NaN in further columns."""
+    missing = width - table.shape[1]
+    return np.pad(table, ((0, 0), (0, missing)), constant_values=np.nan)
+
+
+def _expect(holds: Any, problem: str, remedy: str = "take one with the same options") -> None:
+    """Raise InvalidArgumentError with a ``problem`` of a snapshot unless something ``holds``."""
+    if not holds:
+        raise InvalidArgumentError("snapshot", problem, remedy=remedy)

@@ -20,8 +20,7 @@ from batchpid.arrays.trees import flatten, leaves, structure, unflatten
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.array_executors import JAXExecutor, NumPyExecutor
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.custom import OwnController
-from batchpid.sim.loop.env_parts import ActingDraws, LinkSensors, Pushes, variation
+from batchpid.sim.loop.env_parts import ActingDraws, LinkSensors, OwnController, Pushes, variation
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
 from batchpid.sim.loop.group_control import GroupControl
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Bool, Float64, Rows
-from batchpid.sim.engine.native.interface import FARTHEST
+from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST, EnginePack
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.options.groups import FaultAction

@@ -23,7 +23,7 @@ from batchpid.native.extensions import MOST_SUMMED
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.loop.env_parts import OwnController
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.merging import coupling_of
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints

@@ -19,13 +19,11 @@ from batchpid.arrays.array_types import Rows
 from batchpid.errors import BatchPIDError, ControllerError, WorkerError
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.array_executors import ROWS
-from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.loop.arrays import Arrays, Snapshot, join_rows
 from batchpid.sim.loop.env_group import EnvGroup
-from batchpid.sim.loop.env_parts import make_pack
+from batchpid.sim.loop.env_parts import OwnController, make_pack
 from batchpid.sim.loop.group_control import native_obstacle
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks
-from batchpid.sim.loop.snapshot import Snapshot, join_rows
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 

@@ -12,7 +12,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import WIDTH, structure
+from batchpid.sim.engine.native import WIDTH, structure
 from batchpid.sim.engine.native_model import NativeModel, NativeRefresh, aligned, table
 from batchpid.sim.loop.closed_loop import ClosedLoop, LoopState
 from batchpid.sim.loop.group_control import GroupControl
@@ -145,7 +145,7 @@ class Lanes:
         plant = loop.plant
         self.rigid_tree = loop.tree
         self.size, self.dof = qpos.shape
-        self.force_model = NativeModel(self)
+        self.force_model = NativeModel(lambda: self.rigid_tree)
         self.joint_model = self.force_model
         self.steps_natively = isinstance(plant, TreePlant)
         self._control = loop.control
@@ -154,7 +154,9 @@ class Lanes:
         if not isinstance(plant, TreePlant):
             return
         if plant.bodies.mass.ndim > 2:
-            self.joint_model = NativeModel(self, inertias=self.rigid_tree.inertias(plant.bodies))
+            self.joint_model = NativeModel(
+                lambda: self.rigid_tree, inertias=self.rigid_tree.inertias(plant.bodies)
+            )
         least, most, width = IMPEDANCE
         blocks = -(-self.size // WIDTH)
         arrays = {

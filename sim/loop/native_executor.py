@@ -17,7 +17,7 @@ from batchpid.arrays.array_types import DType, Float64, Pytree, Rows
 from batchpid.arrays.trees import flatten, leaves, mapped, rebuilt_as
 from batchpid.motors import ActuatorState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import number, structure
+from batchpid.sim.engine.native import number, structure
 from batchpid.sim.loop.array_executors import COUPLING_STEPS, EngineSteps
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.loop.group_control import GroupControl, native_obstacle

@@ -20,7 +20,7 @@ from batchpid.arrays.array_types import Document, Kind, PerMassMatrix, Rows
 from batchpid.arrays.field_tables import Field, declared, plain
 from batchpid.arrays.records import frozen
 from batchpid.arrays.trees import digest
-from batchpid.checks.validate import AxisKind, instance
+from batchpid.checks import AxisKind, instance
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.state import check_drive
@@ -43,7 +43,7 @@ from batchpid.sim.robot.reading import describe, tuned_file
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import fit_actuators, fit_guard, known_joints
 from batchpid.sim.robot.tables import MjcfFile
-from batchpid.sim.signals.quantities import (
+from batchpid.sim.signals import (
     CommandSpec,
     Observation,
     Quantity,

@@ -23,10 +23,10 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.checks.validate import choice, file_path
+from batchpid.checks import choice, file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.sim.signals.quantities import OBSERVED
+from batchpid.sim.signals import OBSERVED
 
 if TYPE_CHECKING:
     from batchpid.sim.rollout import Rollout

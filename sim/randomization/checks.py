@@ -8,7 +8,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
-from batchpid.checks.validate import choice
+from batchpid.checks import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN
 from batchpid.motors.actuators import ACTUATOR_FIELDS, DELAYS, NOISES

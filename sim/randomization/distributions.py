@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Document, Float64, Rows
-from batchpid.checks.validate import choice, flag, number, read_array
+from batchpid.checks import choice, flag, number, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.sim.robot.merging import link_inertias
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.tables import CONTACT_FRICTION, MjcfFile
-from batchpid.sim.signals.quantities import TWIST_UNITS
+from batchpid.sim.signals import TWIST_UNITS
 
 Episodes = NDArray[np.int64]
 Operation = Literal["add", "scale", "abs"]

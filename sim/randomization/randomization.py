@@ -21,7 +21,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.arrays.field_tables import Field as Bounds
 from batchpid.arrays.field_tables import declared, in_group
-from batchpid.checks.validate import choice, instance, integer, read_array
+from batchpid.checks import choice, instance, integer, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
 from batchpid.sim.randomization.distributions import (

@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from batchpid.arrays.array_types import Rows
-from batchpid.checks.validate import flag, instance
+from batchpid.checks import flag, instance
 from batchpid.errors import ClosedError, InvalidArgumentError, SingleOwner
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import RecordingError
 from batchpid.sim.rollout import RunInfo
-from batchpid.sim.signals.quantities import Observation
+from batchpid.sim.signals import Observation
 from batchpid.stages.values import Command
 
 if TYPE_CHECKING:

@@ -25,12 +25,12 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document
-from batchpid.checks.validate import file_path, instance, integer
+from batchpid.checks import file_path, instance, integer
 from batchpid.errors import BatchPIDError, InvalidArgumentError, RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.rollout import OPTIONAL, Rollout, RunInfo, merged_changes
-from batchpid.sim.signals.quantities import CommandSpec, Observation
+from batchpid.sim.signals import CommandSpec, Observation
 
 if TYPE_CHECKING:
     import h5py  # functions load it, since commands that record nothing start sooner without it

@@ -27,7 +27,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import TURN, wrap
-from batchpid.checks.validate import choice, file_path
+from batchpid.checks import choice, file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
 from batchpid.trajectories import Trajectory

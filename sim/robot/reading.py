@@ -16,7 +16,7 @@ from batchpid import assets
 from batchpid.arrays.array_types import Document
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.trees import digest
-from batchpid.checks.validate import file_path, is_name
+from batchpid.checks import file_path, is_name
 from batchpid.errors import RobotError, RobotNotFoundError
 from batchpid.sim.findings import Finding
 from batchpid.sim.robot.mjcf.reader import read_mjcf

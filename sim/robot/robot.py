@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 import batchpid as bp
 from batchpid.arrays.array_types import CHOICES, Bool, Document, Float64
 from batchpid.arrays.elementwise import read_only
-from batchpid.checks.validate import check_keywords, choice, file_path, flag
+from batchpid.checks import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.findings import Finding, Findings, report

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.records import frozen
-from batchpid.checks.validate import entries, instance
+from batchpid.checks import entries, instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN, JOINT_SIDE
 from batchpid.sim.robot.merging import coupling_of, narrowed

@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.checks.validate import array, at_least, entries, read_array, within
+from batchpid.checks import array, at_least, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.engine.native.interface import FARTHEST
+from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot_model import base_start
-from batchpid.sim.signals.quantities import POSE_UNITS, TWIST_UNITS
+from batchpid.sim.signals import POSE_UNITS, TWIST_UNITS
 from batchpid.stages.values import Command
 
 if TYPE_CHECKING:

@@ -17,12 +17,11 @@ from numpy.typing import ArrayLike
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.trees import flatten
-from batchpid.checks.validate import env_mask
+from batchpid.checks import env_mask
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.arrays import Arrays, Snapshot
 from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, Fault, FaultLog
 from batchpid.sim.loop.group_control import empty_states
-from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE

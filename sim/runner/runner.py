@@ -13,24 +13,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from operator import itemgetter
-from pathlib import Path
 from time import strftime
-from typing import Any, Literal, Never, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Never
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64, Progress, Rows
-from batchpid.checks.validate import check_keywords, choice, instance
+from batchpid.arrays.array_types import Float64, Progress
+from batchpid.checks import check_keywords, choice, instance
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
-from batchpid.sim.engine.physics import MujocoSolver, Physics
+from batchpid.sim.engine.scene_spec import MujocoSolver, Physics
 from batchpid.sim.findings import report_shortfalls
+from batchpid.sim.loop.arrays import Snapshot
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.group_control import describe, native_obstacle
-from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.groups import (
     DEFAULT_ENGINE,
     Backend,
@@ -60,39 +59,19 @@ from batchpid.sim.runner.operations import (
     run_request,
     snapshot_of,
 )
-from batchpid.sim.signals.quantities import CommandSpec, Observation, empty_observation
+from batchpid.sim.signals import CommandSpec, Observation, empty_observation
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.node import NodeInfo
-from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, RecoveryWarning, WorkerPool
-from batchpid.sim.workers.requests import Request
+from batchpid.sim.workers.requests import OneCall, Request
 from batchpid.stages import Stage
 from batchpid.stages.values import Command
 
+if TYPE_CHECKING:
+    from batchpid.sim.recording.recorder import Recorder
+
 CHECKPOINT_STEPS = 8000
 """Least number of sim steps between checkpoints, from the last of which a lost worker is replayed."""
-
-
-class TickRecorder(Protocol):
-    """Receives every tick of a runner; :class:`batchpid.sim.Recorder` is one."""
-
-    path: Path
-
-    def prepare(self) -> None:
-        """Prepare for the next tick; raise if it cannot be recorded."""
-
-    def append(
-        self,
-        time_: float,
-        command: Command,
-        observation: Observation,
-        changes: Rows | None,
-    ) -> None:
-        """Record the state at ``time_`` [s] after a tick under ``command`` (envs, ...), which may
-        change afterwards, and the ``changes`` (envs,) before it.
-
-        It must return soon, and without an error: Ctrl-C waits for it.
-        """
 
 
 class Runner(SingleOwner):
@@ -207,7 +186,7 @@ class Runner(SingleOwner):
         self.control = checked.control
         self.timestep = checked.timestep
         self.substeps = checked.substeps
-        self.recorder: TickRecorder | None = None
+        self.recorder: Recorder | None = None
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call = OneCall()
         self._derived = checked.derived
@@ -898,7 +877,7 @@ class Runner(SingleOwner):
 
     def _record(
         self,
-        recorder: TickRecorder,
+        recorder: Recorder,
         run: Request,
         before: RunnerState,
         outcome: Outcome,

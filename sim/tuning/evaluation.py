@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Float64, Progress, Rows
 from batchpid.arrays.elementwise import TURN
-from batchpid.checks.validate import file_path, number
+from batchpid.checks import file_path, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.metrics import StepMetrics, step_metrics

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.checks.validate import integer, number
+from batchpid.checks import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_model import RobotModel

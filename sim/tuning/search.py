@@ -27,7 +27,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64, Progress
-from batchpid.checks.validate import integer, number
+from batchpid.checks import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import package_versions
 from batchpid.sim.options.groups import DEFAULT_ENGINE, EngineName

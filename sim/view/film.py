@@ -20,7 +20,7 @@ from matplotlib.transforms import IdentityTransform
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, Progress, Rows
-from batchpid.checks.validate import file_path, integer, number
+from batchpid.checks import file_path, integer, number
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import replacing
 from batchpid.sim.robot.robot import Robot

@@ -21,9 +21,8 @@ import numpy as np
 from batchpid.errors import BatchPIDError, MissingDependencyError
 from batchpid.io.files import uninterrupted
 from batchpid.sim.findings import summary
-from batchpid.sim.view.panel import Panel
 from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
-from batchpid.sim.view.view_data import HISTORY_SECONDS, ViewData
+from batchpid.sim.view.view_data import HISTORY_SECONDS, Panel, ViewData
 
 if TYPE_CHECKING:
     from viser import ViserServer

@@ -165,9 +165,9 @@ def test_a_delay_of_whole_steps_is_one_but_for_rounding(dtype):
     """Written in seconds it is no whole number of steps in binary; a longer one is interpolated."""
     for steps in range(40):
         seconds = np.full((1, 1), round(steps * DT, 7), dtype)
-        k = delay.discretise(seconds, dtype(DT), 64)
-        assert (k.whole.ravel().tolist(), k.fraction) == ([steps], None)
+        whole, fraction = delay.discretise(seconds, dtype(DT), 64)
+        assert (whole.ravel().tolist(), fraction) == ([steps], None)
         assert delay.samples_of(seconds, DT) == steps + 2
-        k = delay.discretise(seconds + dtype(1e-4 * DT), dtype(DT), 64)
-        assert k.whole[0, 0] == steps
-        assert k.fraction[0, 0] == pytest.approx(1e-4, rel=0.2)
+        whole, fraction = delay.discretise(seconds + dtype(1e-4 * DT), dtype(DT), 64)
+        assert whole[0, 0] == steps
+        assert fraction[0, 0] == pytest.approx(1e-4, rel=0.2)

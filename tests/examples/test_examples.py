@@ -81,13 +81,6 @@ def test_the_engines_move_alike(run):
     assert float(text.split()[-2]) < 1e-3
 
 
-def test_list_joints_lists_every_joint(run):
-    text = run("list_joints.py", "jaco2")
-    assert text.count("name: ") == 13
-    assert "child link: j2s7s300_link_1  parent link: j2s7s300_link_base" in text
-    assert "qpos: [0.   3.14 0." in text
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_process")
 def test_a_profile_is_followed_with_less_error_than_a_step(run):

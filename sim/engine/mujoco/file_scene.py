@@ -54,24 +54,13 @@ class BodyFrame(NamedTuple):
     welded: tuple[int, ...]
 
 
-class FileScene(NamedTuple):
-    """``mujoco.MjSpec`` of a file.
-
-    ``names`` has the body of each simulated link, ``frames`` the frame of the link in this body,
-    ``root`` the body of a floating base, or "". ``terms`` (2, dof) is armature and damping that the
-    file's joints have in addition to the robot's description, in which leaders include their
-    followers.
-    """
-
-    scene: MjSpec
-    names: dict[str, str]
-    frames: dict[str, BodyFrame]
-    root: str
-    terms: Float64
-
-
-def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
-    """Return the scene of ``file``, without the options of ``spec``.
+def file_scene(
+    spec: SceneSpec, file: MjcfFile
+) -> tuple[MjSpec, dict[str, str], dict[str, BodyFrame], str, Float64]:
+    """Return the scene of ``file``, without the options of ``spec``; the body of each simulated
+    link; the frame of the link in this body; the body of a floating base, or ""; and armature and
+    damping (2, dof) that the file's joints have in addition to the robot's description, in which
+    leaders include their followers.
 
     Raises RobotError if the file has changed since the robot was loaded.
     """
@@ -112,7 +101,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
         [_of_followers(table[dofs], spec) for table in (model.dof_armature, model.dof_damping)]
     )
     bodies, frames = _frames(model, robot, spec)
-    return FileScene(scene, bodies, frames, root, terms)
+    return scene, bodies, frames, root, terms
 
 
 def check_links(spec: SceneSpec, file: MjcfFile, links: Iterable[str]) -> None:

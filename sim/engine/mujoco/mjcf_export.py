@@ -47,8 +47,7 @@ from batchpid.motors.actuators import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.motors.guard import Guard
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
-from batchpid.sim.engine.physics import SOLVERS
-from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
+from batchpid.sim.engine.scene_spec import SOLVERS, SceneSpec, added_friction, own_friction
 from batchpid.sim.geometry.shapes import nearest_physical
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_model import base_start

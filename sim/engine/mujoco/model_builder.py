@@ -30,8 +30,7 @@ from batchpid.arrays.array_types import Array, Document, Float64, MjModel, MjSpe
 from batchpid.errors import RobotError
 from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.mujoco_sensors import add_link_sensors
-from batchpid.sim.engine.physics import MujocoSolver
-from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine.scene_spec import MujocoSolver, SceneSpec
 from batchpid.sim.geometry.shapes import add_geom
 from batchpid.sim.robot.tables import CONTACT_FRICTION, Joint, MjcfFile
 from batchpid.task_space.frames import SpatialInertia
@@ -126,8 +125,8 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     """Return the model of a file, with the damping of the robot's joints, and without their
     friction and motors.
     """
-    parts = file_scene(spec, file)
-    scene, off = parts.scene, mujoco.mjtDisableBit
+    scene, names, frames, root, terms = file_scene(spec, file)
+    off = mujoco.mjtDisableBit
     option = scene.option
     option.disableflags &= ~(
         off.mjDSBL_GRAVITY | off.mjDSBL_ACTUATION | off.mjDSBL_CLAMPCTRL | off.mjDSBL_SENSOR
@@ -138,7 +137,7 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     if not spec.collisions:
         option.disableflags |= off.mjDSBL_CONTACT
     set_ground(scene, spec.ground)
-    add_link_sensors(scene, spec, parts.names, parts.frames)
+    add_link_sensors(scene, spec, names, frames)
     if drives:
         _add_drives(scene, spec)
     try:
@@ -148,24 +147,24 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         remedy = f"correct it; nothing may refer to {', '.join(REMOVED)}, which are left out"
         raise RobotError(f"{file.path}: {problem}; {remedy}") from error
     qpos, qvel = _places(model, spec)
-    armature, damping = parts.terms
+    armature, damping = terms
     model.dof_armature[qvel] = np.maximum(armature, 0.0)
     model.dof_frictionloss[qvel] = 0.0
     model.dof_damping[qvel] = np.maximum(damping + [joint.damping for joint in spec.joints], 0.0)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     base = None
-    if parts.root:
-        joint = model.joint(model.body(parts.root).jntadr[0])
+    if root:
+        joint = model.joint(model.body(root).jntadr[0])
         base = int(joint.qposadr[0]), int(joint.dofadr[0])
-    bodies = {link: model.body(name).id for link, name in parts.names.items()}
+    bodies = {link: model.body(name).id for link, name in names.items()}
     return RobotMj(
         model,
         spec.joints,
         qpos,
         qvel,
         bodies,
-        parts.terms,
-        parts.frames,
+        terms,
+        frames,
         base,
     )
 

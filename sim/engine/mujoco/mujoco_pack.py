@@ -17,7 +17,6 @@ import numpy as np
 from batchpid.arrays.array_types import Bool, Float64, MjData, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.mujoco.data_pool import STATE, DataPool, rest
 from batchpid.sim.engine.mujoco.file_scene import check_links
 from batchpid.sim.engine.mujoco.free_motion import FreeMotions, place_of_contacts
 from batchpid.sim.engine.mujoco.model_builder import (
@@ -28,12 +27,11 @@ from batchpid.sim.engine.mujoco.model_builder import (
     set_inertia,
 )
 from batchpid.sim.engine.mujoco.mujoco_sensors import MujocoLinkSensors
-from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
-from batchpid.sim.engine.native.interface import FARTHEST
+from batchpid.sim.engine.mujoco.mujoco_step import STATE, DataPool, MujocoStep, obstacle, rest
+from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel, passive_force
-from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.engine.scene_spec import SOLVERS, SceneSpec, Variation
 from batchpid.sim.robot.merging import coupling_of
 from batchpid.sim.robot.tables import CONTACT_FRICTION
 from batchpid.task_space.frames import matrix_of, rotate, unrotate
@@ -163,7 +161,7 @@ class MujocoPack(EnginePack):
     @cached_property
     def _bias_model(self) -> NativeModel:
         """Model of the forces in the equations of motion of the joints, for constraint efforts."""
-        return NativeModel(self, "fixed" if self.spec.fixed_base else "free")
+        return NativeModel(lambda: self.rigid_tree, "fixed" if self.spec.fixed_base else "free")
 
     # -- stepping
     # ----------------------------------------------------------------------------------------------

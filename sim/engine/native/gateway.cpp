@@ -3,7 +3,7 @@
 // It calls functions that SAPIEN's shared library exports. Their addresses and the objects' pointers come from Python
 // (sim/engine/sapien/calls.py), so that nothing of SAPIEN, PhysX or Eigen is needed to compile this file.
 
-#define BATCHPID_WIDTH 8  // WIDTH in interface.py: the doubles of an instruction of AVX-512
+#define BATCHPID_WIDTH 8  // WIDTH in __init__.py: the doubles of an instruction of AVX-512
 #include "tick.h"
 
 #include "structures.h"

@@ -19,8 +19,7 @@ from sapien.physx import PhysxArticulation, PhysxCpuSystem
 
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native import SWITCH, extension
-from batchpid.sim.engine.native.interface import number, structure
+from batchpid.sim.engine.native import SWITCH, extension, number, structure
 from batchpid.sim.engine.native_model import NativeStep
 
 TESTED = ("3.0.3",)

@@ -23,8 +23,7 @@ from sapien import Pose, physx
 from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.native.interface import FARTHEST
-from batchpid.sim.engine.physics import PHYSICS
+from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
 from batchpid.sim.engine.sapien.building import (
     RESTITUTION,
@@ -39,7 +38,7 @@ from batchpid.sim.engine.sapien.calls import SapienStep, obstacle
 from batchpid.sim.engine.sapien.limits import refusals, shortfalls
 from batchpid.sim.engine.sapien.sapien_sensors import SapienLinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.engine.scene_spec import PHYSICS, SceneSpec, Variation
 from batchpid.sim.robot.merging import coupling_of
 from batchpid.task_space.frames import matrix_of, unrotate
 from batchpid.task_space.rigid_tree import RigidTree

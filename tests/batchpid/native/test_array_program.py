@@ -191,7 +191,7 @@ def test_histories_are_changed_in_place(shape, samples, seed, threads):
 
     def function(whole, fraction, held, value):
         xp = value.__array_namespace__()
-        return [delay.read(push_history(held, value), delay.Delay(whole, fraction), None, xp)]
+        return [delay.read(push_history(held, value), (whole, fraction), None, xp)]
 
     with mock.patch.object(array_program, "NUMBERS_PER_THREAD", 64):
         program = ArrayProgram(trace(function, 2, 2), late, 2, shape, threads=threads)

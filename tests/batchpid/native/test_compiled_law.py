@@ -19,7 +19,7 @@ from native_cases import bits, numbers
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.native import extensions
-from batchpid.native.passes import header, law_segments
+from batchpid.native.compiled import header, law_segments
 
 NATIVE = bp.BatchPID(bp.make_params(1, 1.0), 1, 0.01).native
 needs_extension = pytest.mark.skipif(not NATIVE, reason="there are no native programs")

@@ -16,7 +16,7 @@ from batchpid import native
 from batchpid.native import array_program, extensions
 from batchpid.native.array_program import obstacle
 from batchpid.native.extensions import PROGRAM, ROOT, TASK_SPACE, load
-from batchpid.sim.engine.native.interface import EXTENSIONS
+from batchpid.sim.engine.native import EXTENSIONS
 
 needs_extension = pytest.mark.skipif(bool(obstacle()), reason="there is no native code")
 needs_sources = pytest.mark.skipif(

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from batchpid.native.extensions import ROOT
-from batchpid.sim.engine.native.interface import EXTENSIONS
+from batchpid.sim.engine.native import EXTENSIONS
 
 SETS = {"SSE2": ("sse2", "-msse2"), "AVX2": ("avx2", "-mavx2"), "AVX-512": ("avx512f", "-mavx512f")}
 """Flag of the processor, and of the compiler."""

@@ -13,8 +13,7 @@ from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform
 from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.mujoco.mujoco_pack import ENGINE
-from batchpid.sim.engine.physics import SOLVERS
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.engine.scene_spec import SOLVERS, SceneSpec, Variation
 from batchpid.sim.randomization.distributions import nominal_values
 from batchpid.sim.robot.reading import describe
 

@@ -15,7 +15,7 @@ from batchpid.native import array_program, extensions
 from batchpid.native.extensions import PROGRAM, load
 from batchpid.sim import Runner
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import EXTENSIONS, structure
+from batchpid.sim.engine.native import EXTENSIONS, structure
 from batchpid.sim.engine.sapien import calls
 
 needs_extension = pytest.mark.skipif(bool(native.obstacle()), reason="there are no native calls")

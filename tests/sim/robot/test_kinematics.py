@@ -12,9 +12,9 @@ from tiny_urdf import link, write
 
 import batchpid.task_space as ts
 from batchpid.sim import Robot
-from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.sapien.building import build_scene, new_system
+from batchpid.sim.engine.scene_spec import PHYSICS
 from batchpid.sim.robot.robot_model import link_tree
 from batchpid.task_space.frames import from_rpy, to_rpy
 

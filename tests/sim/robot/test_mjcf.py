@@ -15,8 +15,8 @@ import pytest
 from batchpid.errors import RobotError
 from batchpid.sim import Robot, Runner, to_urdf
 from batchpid.sim.engine.mujoco.model_builder import robot_model
-from batchpid.sim.engine.physics import SOLVERS
 from batchpid.sim.engine.protocol import SceneSpec
+from batchpid.sim.engine.scene_spec import SOLVERS
 from batchpid.sim.robot.reading import describe
 from batchpid.sim.view.scene import surfaces
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Bool, DType, Float32, Rows
-from batchpid.checks.validate import array
-from batchpid.checks.validate import names as different_names
+from batchpid.checks import array
+from batchpid.checks import names as different_names
 from batchpid.errors import InvalidArgumentError
 
 POSE_UNITS = {

@@ -1,1 +1,0 @@
-"""What goes into robots and comes out: commands, observations, rollouts."""
