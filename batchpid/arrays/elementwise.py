@@ -22,7 +22,7 @@ T = TypeVar("T")
 V = TypeVar("V")
 TURN = 2 * math.pi
 NAMED_TUPLES: list[type] = [*CHOICE_TYPES]
-"""Types of records and choices, as ``jax.export`` writes them into files."""
+"""Types of records, choices and states that JAX is still to know, for files of ``jax.export``."""
 _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
 
 
@@ -40,12 +40,18 @@ def namespace(*leaves: Array) -> ArrayModule:
     return np
 
 
-@cache
-def _register_in_jax() -> None:
-    """Register the named tuples of records for ``jax.export``. Nothing else in JAX needs it."""
-    from jax.export import register_namedtuple_serialization
+def exported(kind: type[T]) -> type[T]:
+    """Decorate a named tuple that ``jax.export`` is to write into files."""
+    NAMED_TUPLES.append(kind)
+    return kind
 
-    for kind in NAMED_TUPLES:
+
+def _register_in_jax() -> None:
+    """Register the named tuples for ``jax.export``. Nothing else in JAX needs it."""
+    while NAMED_TUPLES:
+        from jax.export import register_namedtuple_serialization
+
+        kind = NAMED_TUPLES.pop()
         register_namedtuple_serialization(kind, serialized_name=f"batchpid.{kind.__name__}")
 
 

@@ -114,8 +114,9 @@ def init(
         Number of each env, default 0, 1, ..., and of its episode (envs,): the noise depends on
         both. One robot (joints,) is number 0, so pass its number under ``jax.vmap``.
     samples
-        Length of the histories, at least 2; None: as long as ``max_delay`` needs. Needed where that
-        is traced by JAX.
+        Length of the histories, at least 2; None: as long as ``max_delay`` needs, which is
+        floor(max_delay / dt) + 2. Needed where that is traced by JAX, as in actuators that are
+        arguments of ``jax.jit``. A longer delay returns the oldest sample.
 
     Raises
     ------

@@ -228,7 +228,7 @@ def make_actuators(
     max_delay
         Length of the histories that delayed signals have [s]; None: the largest delay of all envs.
         A longer one is needed where delays are to grow in flight: a delay beyond the history
-        returns its oldest sample.
+        returns its oldest sample. Where a delay is traced by JAX, None is 1 s, which is slow.
     continuous
         Bools: joints whose position is an angle modulo 2 pi [rad].
     joint_names
@@ -296,7 +296,8 @@ def _longest_delay(leaves: Document, max_delay: float | None) -> float | None:
     # A traced delay is not known; its history is as long as any delay may be.
     most = {name: float(rows.max()) for name, rows in delays.items() if not is_traced(rows)}
     for name, delay in most.items():
-        if delay > longest:
+        # The same number in float32 may be larger.
+        if delay > max(longest, float(delays[name].dtype.type(longest))):
             remedy = f"use a number from 0 to {longest:g} (seconds)"
             raise InvalidArgumentError(name, "out of range", value=delay, remedy=remedy)
     if max_delay is None and len(most) == len(delays):

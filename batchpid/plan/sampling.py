@@ -1,5 +1,5 @@
-r"""State of a plan: chunks are added when they come, and sampled at any time. Pure functions, for
-NumPy and JAX.
+r"""State of a plan: chunks are added when they come, and the plan is sampled at any time. Pure
+functions, for NumPy and JAX.
 
 A chunk has rows c_k for the times T_k = time + k P. Of two and more rows, with the present plan
 x(t) and the time t of the last sample, the blended rows are, by :func:`batchpid.make_plan`'s blend::
@@ -43,7 +43,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Pytree
-from batchpid.arrays.elementwise import in_dtype_of, namespace, take_rows
+from batchpid.arrays.elementwise import exported, in_dtype_of, namespace, take_rows
 from batchpid.arrays.trees import mapped
 from batchpid.checks import instance
 from batchpid.errors import InvalidArgumentError
@@ -62,6 +62,7 @@ cube of the time to it.
 """
 
 
+@exported
 class PlanState(NamedTuple):
     """State of a plan. Arrays are (envs, joints), tables (envs, horizon + 2, joints)."""
 
@@ -82,7 +83,7 @@ class PlanState(NamedTuple):
     now: Array
     """Time of the last sample [s]."""
     starved: Array
-    """Number of samples so far that were later than the last row."""
+    """Number of samples so far that were later than the last row, or before the first chunk."""
     guard: GuardState | None
     """State of the limits; None without limits."""
 

@@ -24,7 +24,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array, NamedChoice
-from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.elementwise import exported, namespace
 from batchpid.arrays.records import array_summary
 from batchpid.checks import check_time_step, instance
 from batchpid.task_space.frames import in_axes, matrix_of
@@ -188,6 +188,7 @@ class TaskDynamics(NamedTuple):
     """1.0 for the joints between the base and the tool, else 0.0 (dof,)."""
 
 
+@exported
 class OSCState(NamedTuple):
     """State of the law."""
 

@@ -12,13 +12,14 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Pytree
-from batchpid.arrays.elementwise import namespace, replace_envs
+from batchpid.arrays.elementwise import exported, namespace, replace_envs
+from batchpid.checks import check_keywords
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import added_friction, own_friction
 from batchpid.sim.loop.env_parts import OwnController
 from batchpid.sim.loop.group_control import control_of
 from batchpid.sim.loop.tree_plant import DYNAMICS, TreePlant
-from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.options.options import OPTIONS, RunnerOptions
 from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control, stages_of
 from batchpid.stages.stage import States, placed, started, stepped
@@ -42,6 +43,7 @@ class Plant(Protocol):
         """
 
 
+@exported
 class LoopState(NamedTuple):
     """State of a closed loop, a tree of arrays (envs, ...)."""
 
@@ -51,6 +53,7 @@ class LoopState(NamedTuple):
     """Number of the episode of each env (envs,), on which the noise of sensors depends."""
 
 
+@exported
 class LoopObservation(NamedTuple):
     """Robots after a tick, arrays (envs, dof) as in :class:`batchpid.sim.Observation`."""
 
@@ -74,6 +77,11 @@ class ClosedLoop:
     tree: RigidTree
     start: Array
 
+    def __repr__(self) -> str:
+        control = self.control
+        sizes = f"{control.envs} envs, {len(self.start)} joints"
+        return f"ClosedLoop({type(self.plant).__name__}, {sizes}, timestep={control.timestep:g})"
+
     def changed(
         self,
         params: bp.PIDParams | None = None,
@@ -82,7 +90,8 @@ class ClosedLoop:
     ) -> Self:
         """Return this loop with other params, actuators or plant, whose arrays may be traced.
 
-        Friction and armature belong to the plant: those of other actuators have no effect.
+        Friction and armature belong to the plant: those of other actuators have no effect. State
+        comes from :meth:`init` of the changed loop, unless the same options and delays are on.
         """
         control = self.control
         if params is not None:
@@ -93,7 +102,8 @@ class ClosedLoop:
 
     def init(self, qpos: Array = None, qvel: Array = None) -> LoopState:
         """Return the state of robots that start at ``qpos`` and ``qvel`` (dof,) or (envs, dof); by
-        default at rest at the robot's start pose.
+        default at rest at the robot's start pose, in NumPy's arrays. For a loop in JAX, give one
+        of JAX.
         """
         plant = self._placed(qpos, qvel)
         xp = namespace(*self.plant.read(plant))
@@ -104,12 +114,15 @@ class ClosedLoop:
     def reset(
         self, state: LoopState, qpos: Array = None, qvel: Array = None, mask: Array = None
     ) -> LoopState:
-        """Return ``state`` with the envs of ``mask`` (envs,) restarted as by :meth:`init`; by
-        default all.
+        """Return ``state`` with the envs of ``mask`` (envs,) bool restarted as by :meth:`init`; by
+        default all. Raises InvalidArgumentError for another mask.
         """
         fresh = self._placed(qpos, qvel)
         xp = namespace(*self.plant.read(state.plant))
         mask = xp.ones(self.control.envs, bool) if mask is None else xp.asarray(mask)
+        if mask.dtype != bool or mask.shape != (self.control.envs,):
+            problem = f"is {mask.dtype} {mask.shape}, not bool ({self.control.envs},)"
+            raise InvalidArgumentError("mask", problem, remedy="give one bool per env")
         episode = state.episode + mask
         plant = replace_envs(state.plant, fresh, mask)
         values = self.values(plant, Command(None), Step(0, 1), episode)
@@ -128,7 +141,8 @@ class ClosedLoop:
     ) -> tuple[LoopState, LoopObservation]:
         """Advance by a tick of ``substeps`` sim steps; return the state and the observation.
 
-        The command is that of :meth:`batchpid.sim.Runner.step`, (dof,) or (envs, dof).
+        The command is that of :meth:`batchpid.sim.Runner.step`, (dof,) or (envs, dof). ``substeps``
+        cannot be traced.
         """
         qpos, _ = self.plant.read(state.plant)
         xp = namespace(qpos)
@@ -260,8 +274,9 @@ def closed_loop(
     """Return the closed loop of ``num_envs`` robots as pure functions, ``init``, ``step`` and
     ``reset``, for programs of JAX and for NumPy.
 
-    The control is that of a Runner with these ``options``, stage by stage. Arrays have JAX's
-    default precision; under ``jax.enable_x64`` motions equal a Runner's in MuJoCo without contact.
+    The control is that of a Runner with these ``options``, stage by stage; those of engines and
+    workers have no effect. Arrays have JAX's default precision; under ``jax.enable_x64`` motions
+    equal a Runner's in MuJoCo without contact.
 
     Parameters
     ----------
@@ -275,6 +290,7 @@ def closed_loop(
         An option is out of range, control is "drive", which an engine has, a randomization is
         given, which is a ``jax.vmap`` of :meth:`ClosedLoop.changed` here, or the base floats.
     """
+    check_keywords("closed_loop", options, OPTIONS)
     for argument, is_there in (
         ("control", options.get("control") == "drive"),
         ("randomization", options.get("randomization") is not None),

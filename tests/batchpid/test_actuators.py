@@ -38,6 +38,13 @@ def test_replace_and_parts():
         bp.make_actuators(2).replace(lag=0.1)
 
 
+def test_a_delay_in_float32_is_not_above_the_longest():
+    jax = pytest.importorskip("jax")
+    motors = bp.make_actuators(2, command_delay=0.004)
+    share = jax.vmap(lambda strength: motors.replace(strength=strength).strength[0])
+    assert share(jax.numpy.ones((3, 2), "float32")).shape == (3, 2)
+
+
 def test_a_longer_delay_in_flight_keeps_the_history():
     short, long = (bp.make_actuators(1, command_delay=steps * DT) for steps in (2, 4))
     q = np.zeros((1, 1))
