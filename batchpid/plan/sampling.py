@@ -1,5 +1,5 @@
-r"""State of a plan: chunks are added when they come, and sampled at any time. Pure functions, for
-NumPy and JAX.
+r"""State of a plan: chunks are added when they come, and the plan is sampled at any time. Pure
+functions, for NumPy and JAX.
 
 A chunk has rows c_k for the times T_k = time + k P. Of two and more rows, with the present plan
 x(t) and the time t of the last sample, the blended rows are, by :func:`batchpid.make_plan`'s blend::
@@ -83,7 +83,7 @@ class PlanState(NamedTuple):
     now: Array
     """Time of the last sample [s]."""
     starved: Array
-    """Number of samples so far that were later than the last row."""
+    """Number of samples so far that were later than the last row, or before the first chunk."""
     guard: GuardState | None
     """State of the limits; None without limits."""
 

@@ -21,10 +21,9 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.drawing import plot, view
 from batchpid.sim.cli.gains import ENDINGS, compare, export, tune
 from batchpid.sim.cli.identify import excite_joints, identify_logs
-from batchpid.sim.cli.inspect import inspect_robot
+from batchpid.sim.cli.inspect import inspect_robot, plot, view
 from batchpid.sim.cli.rollout import demo, rollout
 
 PICTURES = (".png", ".svg")

@@ -40,8 +40,8 @@ class ReachVectorEnv(RobotVectorEnv):
     - *Observation* (envs, 3 joints): qpos, qvel, goal [rad or m, and per second], clipped to the
       space. On a floating base its pose and twist (13) stand before the goal.
     - *Action* (envs, joints) in [-1, 1]: the setpoint within its limits, or an increment of the
-      setpoint, which moves during the step. An episode begins with the setpoint at the joints'
-      pose.
+      setpoint, which moves during the step; with ``chunk`` (envs, rows, joints). An episode begins
+      with the setpoint at the joints' pose.
     - *Reward*: minus the mean over joints of |goal - qpos| / range, plus 1 where every joint is
       within ``tolerance``. A joint without a range counts as 0.
     - *Terminated*: the env diverged (``info["diverged"]``), or reached its goal if
@@ -62,7 +62,7 @@ class ReachVectorEnv(RobotVectorEnv):
         ``"setpoint"`` or ``"increment"``.
     max_increment
         Change of the setpoint by an increment of 1, scalar or (joints,) [rad or m]; default the
-        velocity limit times the time of a step.
+        velocity limit times the time of a step, or of a row of a chunk.
     tolerance
         Largest error of a reached goal [rad or m].
     options

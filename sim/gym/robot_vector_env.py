@@ -81,10 +81,11 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         a plan executes (``plan=`` of the runner; default :func:`batchpid.make_plan` with a fade of
         half a step). None: no plan.
     execute
-        Rows of a chunk that a step executes; default all.
+        Rows of a chunk that a step executes; default all. No effect without ``chunk``.
     latency
-        Range of the time after which a chunk takes effect [s], at most the time of a step; drawn
-        for each env and episode, in whole rows: up, and before the step ends.
+        Least and largest time after which a chunk takes effect [s], at most the time of a step;
+        drawn for each env and episode, and rounded up to whole rows, but less than a step. No
+        effect without ``chunk``.
     options
         Of :class:`batchpid.sim.Runner`: params, workers, timestep, physics, compensate, build,
         randomization, ...
@@ -103,9 +104,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     runner: Runner
     """Runner of the robots: ``runner.poses()``, ``runner.faults``, ... may be used in hooks."""
     step_seconds: float
-    """Simulated time of a step [s]."""
+    """Simulated time of a step [s]; in :meth:`spaces` that of a row, if there are chunks."""
     action: Float64
-    """Last action (envs, size), within the action space."""
+    """Last action (envs, size), within the action space; of a chunk the last row of the step."""
     observed: Observation
     """Last observation of the runner: joint positions, velocities, efforts, ..."""
 
@@ -231,7 +232,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     def command(self, action: Float64, setpoint: Float64) -> ArrayLike:
         """Return the setpoints of the Runner (envs, command size) for the actions (envs, size).
 
-        ``setpoint`` are the setpoints of the last step. Default: the action is the setpoint.
+        ``setpoint`` are the setpoints of the last step. With ``chunk`` each row of a chunk is an
+        action, from the setpoints of the row before it; rows that are not executed count, too.
+        Default: the action is the setpoint.
         """
         return action
 
@@ -241,7 +244,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
 
         Increments move the setpoint over the whole step: their rate is the change by
         :attr:`step_seconds`. Without a rate, setpoints that move in every step are followed with a
-        lag. None: setpoints are steps. Default: None.
+        lag. None: setpoints are steps. Not called with ``chunk``: a plan makes the rates. Default:
+        None.
         """
         return None
 

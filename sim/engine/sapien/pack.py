@@ -34,9 +34,8 @@ from batchpid.sim.engine.sapien.building import (
     rounded_tree,
     set_inertia,
 )
-from batchpid.sim.engine.sapien.calls import SapienStep, obstacle
+from batchpid.sim.engine.sapien.calls import SapienLinkSensors, SapienStep, obstacle
 from batchpid.sim.engine.sapien.limits import refusals, shortfalls
-from batchpid.sim.engine.sapien.sapien_sensors import SapienLinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import PHYSICS, SceneSpec, Variation
 from batchpid.sim.robot.merging import coupling_of
