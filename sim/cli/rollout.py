@@ -129,7 +129,7 @@ def rollout(
             "FILE",
         ),
     ] = None,
-    plan: Annotated[
+    by_plan: Annotated[
         bool,
         flag("Execute the rows of the trajectory by a plan: they may be slow, as 30 a second."),
     ] = False,
@@ -183,11 +183,13 @@ def rollout(
     notes: list[str] = []
     further = Document()
     meant: Rows | None = None
-    if trajectory is None and plan:
-        raise InvalidArgumentError("plan", "is for a trajectory", remedy="give --trajectory FILE")
-    if plan and not rates:
-        raise InvalidArgumentError("plan", "makes the rates", remedy="leave --no-rates out")
-    if trajectory is not None and plan:
+    if trajectory is None and by_plan:
+        raise InvalidArgumentError(
+            "by_plan", "is for a trajectory", remedy="give --trajectory FILE"
+        )
+    if by_plan and not rates:
+        raise InvalidArgumentError("by_plan", "makes the rates", remedy="leave --no-rates out")
+    if trajectory is not None and by_plan:
         from batchpid.sim.recording.setpoint_files import read_setpoints
 
         _refuse("setpoint", setpoint, "is given by the trajectory")

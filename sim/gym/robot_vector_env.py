@@ -81,11 +81,10 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         a plan executes (``plan=`` of the runner; default :func:`batchpid.make_plan` with a fade of
         half a step). None: no plan.
     execute
-        Rows of a chunk that a step executes; default all. No effect without ``chunk``.
+        Rows of a chunk that a step executes; default all.
     latency
         Least and largest time after which a chunk takes effect [s], at most the time of a step;
-        drawn for each env and episode, and rounded up to whole rows, but less than a step. No
-        effect without ``chunk``.
+        drawn for each env and episode, and rounded up to whole rows, but less than a step.
     options
         Of :class:`batchpid.sim.Runner`: params, workers, timestep, physics, compensate, build,
         randomization, ...
@@ -170,7 +169,14 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             box = self.single_action_space
             low, high = (np.tile(end, (self._rows, 1)) for end in (box.low, box.high))
             self.single_action_space = spaces.Box(low, high, dtype=box.dtype.type)
-        self._latency = [number("latency", end, 0.0, self.step_seconds, "s") for end in latency]
+        elif execute is not None or latency != (0.0, 0.0):
+            name = "latency" if execute is None else "execute"
+            raise InvalidArgumentError(name, "has no effect without chunks", remedy="give chunk=")
+        low, high = array("latency", latency, (1, 2), ("least", "largest"), kind="entry")[0]
+        self._latency = [
+            number("latency", low, 0.0, high, "s"),
+            number("latency", high, 0.0, self.step_seconds, "s"),
+        ]
         self._waits = np.zeros(self.num_envs, np.int64)
         self._chunks: list[tuple[Float64, Float64]] = []
         self.action_space = batch_space(self.single_action_space, self.num_envs)

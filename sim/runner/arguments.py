@@ -77,6 +77,14 @@ def read_command(
     return accelerated(command, state.motion, seconds)
 
 
+def refuse_latency(latency: ArrayLike) -> None:
+    """Raise InvalidArgumentError for a latency of setpoints that no plan executes."""
+    if not (isinstance(latency, float | int) and latency == 0):
+        raise InvalidArgumentError(
+            "latency", "has no effect without a plan", remedy="make the Runner with plan="
+        )
+
+
 def read_chunks(
     options: RunnerOptions,
     inputs: Mapping[str, ArrayLike | None],

@@ -46,7 +46,12 @@ from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.rollout import Rollout, RunInfo
-from batchpid.sim.runner.arguments import count_ticks, read_chunks, read_command
+from batchpid.sim.runner.arguments import (
+    count_ticks,
+    read_chunks,
+    read_command,
+    refuse_latency,
+)
 from batchpid.sim.runner.operations import (
     READ,
     SNAPSHOT,
@@ -441,7 +446,9 @@ class Runner(SingleOwner):
         options = self.options
         ticks = count_ticks(options, setpoints)
         chunks = list[tuple[Float64, Float64]]()
-        if options.plan is not None:
+        if options.plan is None:
+            refuse_latency(latency)
+        else:
             entries, ages = read_chunks(options, arrays, latency, ticks)
             chunks = list(zip(entries, ages + self._lateness, strict=True))
             goals = [self._goal]
@@ -761,9 +768,11 @@ class Runner(SingleOwner):
         """Return the request for the arguments of :meth:`step`, checked; a chunk enters the plan."""
         inputs = dict(zip(Command._fields, arrays, strict=True))
         chunk = None
-        if self.options.plan is not None and not any(entry is not None for entry in arrays[:3]):
+        if self.options.plan is None:
+            refuse_latency(latency)
+        elif not any(entry is not None for entry in arrays[:3]):
             inputs["setpoint"] = self._goal
-        elif self.options.plan is not None:
+        else:
             if inputs["setpoint"] is None:
                 inputs["setpoint"], latency = self._goal, np.inf
             chunks, ages = read_chunks(self.options, inputs, latency)

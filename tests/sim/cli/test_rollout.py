@@ -314,7 +314,7 @@ def test_rows_at_30_hz_need_the_time_step_that_the_error_names_or_a_plan(
     timestep = re.search(r"--timestep ([\d.]+)", error)[1]
     status, _, error = batchpid("rollout", "--trajectory", path, "--timestep", timestep, *ONE)
     assert (status, error) == (0, "")
-    run, said = saved("--trajectory", path, "--plan", short=ONE)
+    run, said = saved("--trajectory", path, "--by-plan", short=ONE)
     assert "Rows every 33.33 ms, executed by a plan." in said
     assert run.info.plan == "newest"
     assert following_errors(said).max() < 5e-3
@@ -326,7 +326,7 @@ def test_rows_at_30_hz_need_the_time_step_that_the_error_names_or_a_plan(
         (("--seconds", 1), "seconds: is given by the trajectory"),
         (("--setpoint", 0, 0), "setpoint: is given by the trajectory"),
         (("--control", "osc"), "excludes --control osc"),
-        (("--plan", "--no-rates"), "plan: makes the rates"),
+        (("--by-plan", "--no-rates"), "by_plan: makes the rates"),
         (("--gains", "sapien-tutorial"), "setpoint_accelerations: needs gains in accelerations"),
         (("--control", "drive"), "setpoint_accelerations: needs gains in accelerations"),
     ],
