@@ -41,6 +41,12 @@ RATES = {
 }
 """Optional inputs of a step."""
 
+NO_ACCELERATION = (
+    "plan: its acceleration is no input of the law; add M(q) times the change of the rate per second"
+    " to the feedforward"
+)
+"""Difference of a header with a plan from a Runner."""
+
 
 def to_c(
     params: PIDParams,
@@ -84,18 +90,17 @@ def to_c(
         Params for several envs, options that exclude each other, names that C does not allow, or a
         tree with other joints.
     """
-    return Exported(
-        Header(
-            params,
-            dt,
-            joint_names,
-            guard,
-            inputs,
-            prefix,
-            tree,
-            plan,
-        ).text()
+    header = Header(
+        params,
+        dt,
+        joint_names,
+        guard,
+        inputs,
+        prefix,
+        tree,
+        plan,
     )
+    return Exported(header.text(), () if plan is None else (NO_ACCELERATION,))
 
 
 class Header:

@@ -25,7 +25,7 @@ static inline void batchpid_plan_init(batchpid_plan *state, const double qpos[BA
   }
 }
 
-/* Setpoint [rad or m] and its rate at a time t [s], no earlier than that of the last sample. */
+/* Setpoint [rad or m] and rate at t [s], not before the last sample; M(q) r'' belongs to the feedforward. */
 static inline void batchpid_sample(batchpid_plan *state, double t, double setpoint[BATCHPID_JOINTS], double rate[BATCHPID_JOINTS]) {
   /* [step] */
   if (t >= state->end)
