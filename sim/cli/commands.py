@@ -25,6 +25,7 @@ from batchpid.sim.cli.gains import ENDINGS, compare, export, tune
 from batchpid.sim.cli.identify import excite_joints, identify_logs
 from batchpid.sim.cli.inspect import inspect_robot, plot, view
 from batchpid.sim.cli.rollout import demo, rollout
+from batchpid.sim.robot.reading import tuned_file
 
 PICTURES = (".png", ".svg")
 DOCUMENTS = (".yaml", ".yml", ".json")
@@ -207,13 +208,15 @@ def _arguments(name: str, values: Document) -> Document:
 
 
 def _settings(robot: Robot, values: Document) -> str:
-    """Return the first line: the robot, and the flags that say how it is run."""
+    """Return the first line: the robot, the flags that say how it is run, and its default gains."""
     words = [f"{robot.name}: {robot.dof} dof"]
     for name in SHOWN_FLAGS:
         value = values.get(name)
         if value:
             words.append(f"{name} {value if isinstance(value, str) else ' '.join(value)}")
     if "num_envs" in values:
+        if not values.get("gains") and values.get("control", "pid") == "pid":
+            words.append(f"gains {'designed' if tuned_file(robot) is None else 'tuned'}")
         words.append(f"{values['num_envs']} robots")
     return ", ".join(words)
 

@@ -11,7 +11,10 @@ SHORT = ("--num-envs", 2, "--seconds", 0.02)
 @pytest.mark.usefixtures("undrawn")
 def test_demo_reports_every_joint(batchpid):
     status, said, _ = batchpid("demo", *SHORT)
-    assert (status, said.splitlines()[0]) == (0, "panda: 9 dof, engine mujoco, 2 robots")
+    assert (status, said.splitlines()[0]) == (
+        0,
+        "panda: 9 dof, engine mujoco, gains tuned, 2 robots",
+    )
     assert "panda_joint4 goes to -1 rad" in said
     assert "NOT SETTLED" in said
     assert all(f"\n{joint} " in said for joint in load_bundled("panda").joint_names)
