@@ -111,6 +111,9 @@ def read_chunks(
     axes = rows.ndim - (ticks is not None)
     while 0 < axes < 3:
         rows, axes = rows[..., None, :], axes + 1
+    if rows.ndim and rows.shape[-3] not in (1, options.num_envs):
+        problem = f"is for {rows.shape[-3]} envs, and there are {options.num_envs}"
+        raise InvalidArgumentError(name, problem, remedy="chunks are (envs, rows, dof)")
     count = rows.shape[-2] if rows.ndim else 1
     if count > options.plan.horizon:
         problem = f"has {count} rows, and the plan a horizon of {options.plan.horizon}"

@@ -365,3 +365,26 @@ def test_a_recorder_that_is_refused_is_not_attached(arguments: Any) -> None:
         with pytest.raises(BatchPIDError):
             Recorder(*(*arguments, runner)[:2])
         assert runner.recorder is None
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"setpoint": np.zeros((N + 1, DOF))}, "setpoint: is for 3 envs, and there are 2; chunks"),
+        ({"setpoint": np.zeros((N, 5, DOF))}, "setpoint: has 5 rows, and the plan a horizon of 4"),
+        ({"setpoint": ROW, "setpoint_rate": ROW}, "setpoint_rate: has no effect with a plan"),
+        ({"setpoint": ROW, "latency": -0.1}, "latency.* -0.1"),
+    ],
+)
+def test_chunks_that_a_plan_cannot_take_are_refused_before_anything_changes(given, message):
+    plan = bp.make_plan(DOF, period=0.1, horizon=4)
+    with Runner(ARM, N, workers=0, plan=plan) as runner:
+        with pytest.raises(InvalidArgumentError, match=message):
+            runner.step(**given)
+        assert runner.time == 0
+
+
+def test_a_latency_without_a_plan_is_refused():
+    words = "latency: has no effect without a plan"
+    with Runner(ARM, N, workers=0) as runner, pytest.raises(InvalidArgumentError, match=words):
+        runner.step(ROW, latency=0.1)
