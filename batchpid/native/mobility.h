@@ -138,7 +138,7 @@ inline void selected_inverse(Lanes const (&mobility)[AXES * AXES], Lanes const *
   std::copy(mobility, mobility + AXES * AXES, matrix);
   for (int i = 0; i < AXES && axes != nullptr; ++i) {
     for (int j = 0; j < AXES; ++j) {
-      Lanes const alone = i == j ? (1.0 - axes[i]) * at_least(s0, 1.0) : Lanes{};
+      Lanes const alone = i == j ? (1.0 - axes[i]) * at_least(2.0 * s0, 1.0) : Lanes{};
       matrix[i * AXES + j] = where_positive(axes[i] * axes[j], matrix[i * AXES + j], alone);
     }
   }

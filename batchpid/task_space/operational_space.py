@@ -441,7 +441,8 @@ def _selected_inverse(
         return bounded_inverse(mobility, smallest, *smooth)
     both = axes[..., :, None] * axes[..., None, :] > 0
     free = (1 - axes)[..., None] * xp.eye(6, dtype=mobility.dtype)
-    # The other axes get an eigenvalue apart from the selected ones, at or above the bound.
-    alone = free * xp.maximum(smallest, 1.0)[..., None, None]
+    # The other axes get an eigenvalue apart from the selected ones, above the bound by more than
+    # rounding.
+    alone = free * xp.maximum(2 * smallest, 1.0)[..., None, None]
     *inverses, near = bounded_inverse(xp.where(both, mobility, alone), smallest, *smooth)
     return *[xp.where(both, inverse, xp.zeros_like(inverse)) for inverse in inverses], near

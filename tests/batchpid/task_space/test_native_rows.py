@@ -90,6 +90,19 @@ def test_kinematics_and_dynamics(name, rows, seed, pointed):
     learns=st.booleans(),
     avoids=st.booleans(),
 )
+@example(
+    "panda",
+    1,
+    104,
+    [False, False, False, True, False, True],
+    None,
+    "world",
+    10.0,
+    0,
+    200.0,
+    True,
+    False,
+)
 def test_the_law(name, rows, seed, axes, forces, frame, smallest, extras, limit, learns, avoids):
     tree, tool = tree_of(name), tool_of(name)
     qpos, qvel = states(tree, rows, seed)
