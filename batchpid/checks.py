@@ -133,8 +133,8 @@ def is_name(text: str) -> bool:
     """Return whether ``text`` can be a name: without control characters, line breaks and halves of
     surrogate pairs.
 
-    Names of strangers' robots stand in files, messages and pictures, where these would end a line
-    or cannot be written.
+    Robots of others have any names. In a file, a message or a picture these characters would end
+    the line, or cannot be written.
     """
     categories = {unicodedata.category(character) for character in text}
     return categories.isdisjoint({"Cc", "Cs", "Zl", "Zp"})

@@ -175,7 +175,7 @@ def test_arms_in_free_motion(benchmark, report, compare, most, name, tmp_path):
     def measure() -> dict[str, list[tuple[float, float]]]:
         rows: dict[str, list[tuple[float, float]]] = {kind: [] for kind in lengths}
         with closed_loop(robot, num_envs) as ours:
-            # A run of another length makes its programs anew: all of one length come together.
+            # For a run of another length new programs are made: runs of one length come together.
             for kind, length in lengths.items():
                 for _ in range(rounds + 1):
                     rows[kind].append((ours[kind](length), theirs(length)))

@@ -180,7 +180,7 @@ class LeafBuilder:
         kind: AxisKind = "joint",
     ) -> None:
         """Without a ``dtype``, use the dtype of the traced arrays among ``values``, else
-        float64. ``kind`` says what the names are of.
+        float64. ``kind``: whether the names are joints or entries of a command.
         """
         self.kind: AxisKind = kind
         self.joints = integer("joints", joints, 1, MOST_JOINTS)

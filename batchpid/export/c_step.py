@@ -1,5 +1,5 @@
 """Statements of a traced step in C: loops over the joints, and the operations across joints between
-them; and C functions beside the law: a robot's rigid-body dynamics, and a plan.
+them. Beside the law: C functions of a robot's rigid-body dynamics, and of a plan.
 
 The text of these functions is in ``c_rigid_body.h`` and ``c_plan.h``. The curve of a plan and its
 limits are traced from :mod:`batchpid.plan.sampling`; the rows of a chunk are blended by the same

@@ -14,7 +14,7 @@ contain a. Solved for it, with D = 1 + dt kd + dt^2 kp + dt^3 ki and e = r - y::
 
     D a = kp (b r - y - dt v) + kd (c r' - v) + I + ki dt (e - dt v) + r''
 
-with the setpoint's acceleration r'', 0 unless given. (b r stands for o + b (r - o); a given rate
+with the setpoint's acceleration r'', 0 unless given. (b r is short for o + b (r - o); a given rate
 moves the origin o to the end of the step, too.) That is the explicit law with other gains, so a
 step costs no more::
 

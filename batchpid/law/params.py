@@ -340,7 +340,7 @@ def strategy_names(
 
 
 def _clamped(clamp: Bool, effort: Ends) -> Ends:
-    """Return the limits of an integral without limits of its own: the effort limits on the joints
+    """Return the limits of an integral for which none are given: the effort limits on the joints
     of the mask ``clamp``.
     """
     if all(end is None for end in effort):

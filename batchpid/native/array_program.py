@@ -198,8 +198,8 @@ class TreeProgram:
         )
 
     def bind(self, state: Pytree, inputs: Pytree, last: Rows | None = None) -> Bound:
-        """Return arrays for the program: it changes those of the state in place, and makes its
-        results in new ones, the last one in ``last``.
+        """Return arrays for the program: it changes the state's arrays in place, and writes results
+        to new arrays, the last one to ``last``.
         """
         program = self.program
         read = leaves((state, inputs))

@@ -3,8 +3,8 @@
 The interpreter (program.h) makes a pass over a block for each operation, which
 loads and stores every value in between. A law whose segments
 (:class:`batchpid.native.tracing.Segment`) :func:`law_segments` yields is one loop. ``setup.py``
-writes ``passes.h`` from the traces when it builds the extensions. The operations, their order and
-so all bits are those of the interpreter, which runs all other programs.
+writes ``passes.h`` from the traces when it builds the extensions. The interpreter runs
+all other programs. It has the same operations in the same order, so all bits are equal.
 """
 
 from __future__ import annotations

@@ -267,8 +267,7 @@ def trace_change(
     others.
 
     The arguments are structures; ``histories`` says which arrays of the state are histories, which
-    a program changes in place. Of the results each is an array of its own, while an input may be
-    among the others.
+    a program changes in place. Each result is a new array; an input may be among the others.
     """
     count = len(leaves((state, inputs)))
     parts: list[Any] = []

@@ -380,7 +380,7 @@ def _row(plan: Plan, row: Array) -> Array:
 
 
 def _wide(tree: Pytree) -> Any:
-    """Return a tree with an axis of rows before that of the joints."""
+    """Return a tree of arrays (..., joints) as (..., 1, joints), one row."""
     return mapped(lambda leaf: leaf[..., None, :], tree)
 
 

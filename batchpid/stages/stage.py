@@ -42,7 +42,7 @@ class Stage:
     calls_model: ClassVar[bool] = False
     """Whether ``step`` calls functions of the robots' model, which no program has."""
     is_brief: ClassVar[bool] = False
-    """Whether each tick makes its state anew, so that snapshots do not hold it."""
+    """Whether the state is made at the start of each tick, so that snapshots do not hold it."""
     starting: ClassVar[tuple[str, ...]] = ()
     """Constants that only ``init`` needs."""
     due: ClassVar[tuple[str, ...]] = ()

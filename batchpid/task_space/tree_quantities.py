@@ -1,5 +1,5 @@
 r"""Poses, Jacobians, mass matrices and forces of a kinematic tree: natively where that is possible,
-else by the equations below and those of :mod:`batchpid.task_space.tree_kinematics`.
+else by the equations below and in :mod:`batchpid.task_space.tree_kinematics`.
 
 Arrays have any leading axes. Every function raises InvalidArgumentError for an unknown link, or an
 array of a wrong shape.
