@@ -172,7 +172,7 @@ def solve(
             square = max(float(triangle[:, 0] @ triangle[:, 0]) / rows_of(problem), 1e-6)
             hessian = triangle[:, 1:].T @ triangle[:, 1:] / square
             axes, _ = axes_of(hessian, np.maximum(abs(further), 1))
-            place = iterate(problem, further, _inward(further, axes, low, high))
+            place = iterate(problem, further, inward(further, axes, low, high))
             damping = max(damping * (0.1 if gain > 0.5 * expected else 0.5), 1e-9)
             growth = GROWTH
         else:
@@ -250,7 +250,7 @@ def bounded_step(
     return step, 0.5 * float(decrease)
 
 
-def _inward(
+def inward(
     point: Float64,
     axes: Float64,
     low: Float64,

@@ -31,7 +31,7 @@ from batchpid.sim.identification.regression import (
 )
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import Exact, LogPlant
-from batchpid.sim.identification.trials import fit, with_effects
+from batchpid.sim.identification.trials import fit
 from batchpid.sim.identification.unknowns import (
     BASIC,
     EXTRAS,
@@ -53,7 +53,7 @@ FOLLOWS = 0.01
 """A joint is stuck if the standard deviation of its positions is at most this share of its
 setpoints'.
 """
-LONGEST_STEP, USUAL_STEP = 2.5e-3, 1e-3
+LONGEST_STEP, USUAL_STEP = 2.5e-3, 5e-4
 """Period up to which the rows of a log count as steps of the control, and the longest time step
 otherwise [s].
 """
@@ -154,7 +154,7 @@ def identify(
                     share,
                 )
                 starts.setdefault((place, share), []).append(Problem(data, windows, unknowns, run))
-        solution = with_effects(fit(starts, evaluations, progress), evaluations, progress)
+        solution = fit(starts, evaluations, progress)
     # Worker processes end with the fit.
     return Identification(solution._replace(problem=replace(solution.problem, run=map)), still)
 

@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.motors.actuators import Actuators
-from batchpid.motors.friction import Friction
+from batchpid.arrays.elementwise import wrap
+from batchpid.motors.friction import compensation
 from batchpid.sim.identification.log import Log, interpolated
-from batchpid.sim.identification.simulator import Candidates, LogPlant
-from batchpid.sim.loop.loop_run import LoopRun, MotionPlant
+from batchpid.sim.identification.simulator import LogPlant
 from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control
 from batchpid.task_space.tree_quantities import inverse_dynamics
@@ -229,37 +229,27 @@ def _commanded(part: LogData) -> Float64:
     """Return logged efforts (1, steps, joints), or the law's along a motion (setpoint delays,
     steps, joints).
     """
-    motion, drive, plant = part.motion, part.drive, part.plant
+    motion, drive = part.motion, part.drive
     if drive.mode == "effort":
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
-    none = np.zeros(count)
-    alone = drive._replace(
-        gravity=False,
-        coriolis=False,
-        further=(),
-    )
-    loop = plant.loop(
-        alone,
-        Candidates(
-            Actuators(),
-            {},
-            none,
-            none,
-            {},
-            {},
-        ),
-    )
-    loop = replace(loop, control=loop.control._replace(friction=Friction()))
-    tables = [np.repeat(plant.spread(table)[:, None], count, axis=1) for table in motion[:2]]
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)
     setpoints = motion.command[np.clip(np.arange(steps)[:, None] - late, 0, steps - 1)]
-    moving = loop.changed(plant=MotionPlant(*tables))
-    run = LoopRun(moving, tables[0][0], tables[1][0], plant.spread(setpoints[0]), steps)
-    run.setpoints[...] = plant.spread(setpoints)
-    run.run(steps)
-    efforts: Float64 = run.effort[..., plant.columns]
-    return efforts.swapaxes(0, 1)
+    qpos, qvel = (np.repeat(table[:, None], count, axis=1) for table in motion[:2])
+    forward = np.zeros_like(setpoints)
+    if drive.modelled is not None:
+        error = wrap(setpoints - qpos, drive.turns, np)
+        forward = compensation(
+            drive.modelled,
+            error,
+            None,
+            drive.band,
+        )
+    law = bp.BatchPID(drive.params, count, drive.timestep)
+    rates = qvel if drive.params.measurement_rate is not None else [None] * steps
+    inputs = zip(setpoints, qpos, rates, forward, strict=True)
+    efforts = [law(row, y, rate, feedforward=f) for row, y, rate, f in inputs]
+    return np.array(efforts).swapaxes(0, 1)
 
 
 def _solve(table: Sequence[Float64]) -> list[float]:

@@ -26,6 +26,7 @@ from batchpid.sim.identification.fit import (
     axes_of,
     bounded_step,
     inverse,
+    inward,
     iterate,
     solve,
     triangle_of,
@@ -71,10 +72,11 @@ def fit(
             ROUGH_TOLERANCE,
         ).point
     result = with_certainty(solve(problem, point, None, evaluations, progress))
+    result = _with_effects(result, evaluations, progress)
     return _without_sender(result, evaluations, progress)
 
 
-def with_effects(
+def _with_effects(
     result: Fit,
     evaluations: int,
     progress: Progress = None,
@@ -190,6 +192,7 @@ def _with_effect(
     changes[:count, :count] = _axes(result)
     if progress is not None:
         progress()
+    changes = inward(point, changes, *wider.bounds)
     triangle = triangle_of(wide, iterate(wide, point, changes), result.size)
     low, high = wider.bounds - point
     names = np.array([entry.kind for entry in wider.entries])
