@@ -140,28 +140,26 @@ class Fit(NamedTuple):
 def solve(
     problem: Problem,
     point: Float64,
-    size: Float64 | None = None,
-    evaluations: int = 60,
-    progress: Callable[[], object] | None = None,
+    *,
+    evaluations: int,
+    progress: Callable[[], object],
     tolerance: float = TOLERANCE,
 ) -> Fit:
-    """Return the fit from a ``point``; it begins with a ``size`` (joints,) of the residuals, or the
-    one at the point.
+    """Return the fit from a ``point``.
 
-    The size of residuals that are left may be far smaller, which would give the prior too much
-    weight: it is taken anew until it stays.
+    The size of the residuals that are left may be far smaller than at the point, which would give
+    the prior too much weight: it is taken anew until it stays.
     """
     low, high = problem.unknowns.bounds
     point = np.clip(point, low, high)
     place = iterate(problem, point, FIRST_CHANGE * np.eye(len(point)))
-    weight = problem.size(place.evaluation) if size is None else size
+    weight = problem.size(place.evaluation)
     damping = DAMPING
     growth = GROWTH
     rounds = 1
     settled = False
     for _ in range(evaluations - 1):
-        if progress is not None:
-            progress()
+        progress()
         before = cost(problem, place, weight)
         triangle = triangle_of(problem, place, weight)
         step, expected = bounded_step(triangle, damping, low - place.point, high - place.point)

@@ -32,8 +32,8 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control
 from batchpid.task_space.tree_quantities import inverse_dynamics
 
-VALUES = "armature", "damping", "friction", "strength", "bias", "cost"
-"""Results for a joint."""
+VALUES = "armature", "damping", "friction", "strength", "bias"
+"""Values of a joint."""
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
 EFFORT_DELAYS = np.arange(0.0, 0.03, 1e-3)
@@ -105,12 +105,6 @@ class Guess(NamedTuple):
         """Mean of the costs."""
         return float(self.costs.mean())
 
-    @property
-    def odd(self) -> Bool:
-        """Mask (joints,): the motor explains little of the efforts, or its strength is far from 1."""
-        strength = self.values["strength"]
-        return (self.costs > WORST) | (strength < STRENGTHS[0]) | (strength > STRENGTHS[1])
-
 
 def smooth(log: Log, timestep: float) -> Motion:
     """Return the motion of ``log`` on the grid, filtered without phase lag."""
@@ -146,9 +140,9 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
     return np.ascontiguousarray((line + filtered[: len(line)])[: len(table)])
 
 
-def regress(data: Sequence[LogData]) -> list[Guess]:
-    """Return the motors of logs at the delays of the least cost, the best first: one guess for each
-    delay of the setpoints that explains the efforts about as well.
+def regress(data: Sequence[LogData]) -> Guess:
+    """Return the motors of logs at the delays of the least cost; setpoints that were logged late are
+    the last explanation.
     """
     every = 1 + sum(len(part.motion.qpos) for part in data) // MOST_REGRESSION_ROWS
     cutoff = min(_cutoff(part.log) for part in data)
@@ -166,18 +160,15 @@ def regress(data: Sequence[LogData]) -> list[Guess]:
         for joint, fast in enumerate(moves.T):
             table = [column[fast, joint] for column in (*columns, efforts[shift, delay])]
             joints.append(_solve(table))
-        values = dict(zip(VALUES, np.array(joints).T, strict=True))
-        values |= {"delay": delays[[delay]], "setpoint_delay": shifts[[shift]]}
-        guesses.append(Guess(values, values.pop("cost")))
+        *values, costs = np.array(joints).T
+        named = dict(zip(VALUES, values, strict=True))
+        named |= {"delay": delays[[delay]], "setpoint_delay": shifts[[shift]]}
+        guesses.append(Guess(named, costs))
+    best = min(guesses, key=attrgetter("cost"))
     # Logs show the sum of both delays; armature and damping can hide how it is divided.
-    guesses.sort(key=attrgetter("cost"))
-    alike = [guess for guess in guesses if guess.cost < guesses[0].cost + ALIKE_COSTS]
-    # Setpoints that were logged late are the last explanation.
+    alike = [guess for guess in guesses if guess.cost < best.cost + ALIKE_COSTS]
     usual = [guess for guess in alike if guess.values["setpoint_delay"][0] > -1e-9]
-    best = dict[float, Guess]()
-    for guess in usual or alike:
-        best.setdefault(float(guess.values["setpoint_delay"][0]), guess)
-    return list(best.values())
+    return min(usual or alike, key=attrgetter("cost"))
 
 
 def _table(
@@ -320,7 +311,7 @@ def better_reading(
     robot: Robot,
     data: LogData,
     guess: Guess,
-    progress: Callable[[], object] | None,
+    progress: Callable[[], object],
 ) -> str:
     """Return the reading of a log that explains its efforts far better than the present one, in
     words; "" for none.
@@ -329,20 +320,22 @@ def better_reading(
     robot's limits.
     """
     log = data.log
+    strength = guess.values["strength"]
+    # The motor explains little of the efforts, or its strength is far from 1.
+    odd = (guess.costs > WORST) | (strength < STRENGTHS[0]) | (strength > STRENGTHS[1])
     limits = robot.effort_limit[list(log.joints)]
     beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > OTHER_UNIT_RATIO * limits
-    if guess.odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
+    if odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
         begin = log.part(
             log.time < log.time[0] + TRIED_SECONDS, log.command_time < log.time[0] + TRIED_SECONDS
         )
         names = [robot.joint_names[joint] for joint in log.joints]
         costs = dict[str, float]()
-        for words, on_qpos, on_command in _readings(log.kind, names, guess.odd):
-            if progress is not None:
-                progress()
+        for words, on_qpos, on_command in _readings(log.kind, names, odd):
+            progress()
             other = replace(begin, qpos=begin.qpos @ on_qpos, command=begin.command @ on_command)
             motion = smooth(other, data.drive.timestep)
-            costs[words] = regress([data._replace(log=other, motion=motion)])[0].cost
+            costs[words] = regress([data._replace(log=other, motion=motion)]).cost
         present = costs.pop("")
         best = min(costs.values())
         if best < min(present - EVIDENCE, WORST):
