@@ -34,7 +34,7 @@ at least the correlation rho of neighbouring residuals.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,7 +42,6 @@ import numpy as np
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import bounded_solution
-from batchpid.sim.identification.unknowns import Unknown
 
 OUTLIER = 2.0
 """Ratio C of a residual to its size above which its weight in the loss decreases."""
@@ -131,8 +130,8 @@ class Fit(NamedTuple):
     """Size of the residuals that the fit was weighted with (joints,)."""
     converged: bool
     certainty: Certainty = UNCERTAIN
-    dropped: tuple[Unknown, ...] = ()
-    """Delay and lag of setpoints that the logs do not need."""
+    dropped: Sequence[str] = ()
+    """"setpoint_delay" and "setpoint_lag", where the logs do not need them."""
     effects: Mapping[str, float] = {}
     """Effects that were added, with the share of the held-out error that each left."""
 
@@ -286,6 +285,8 @@ def with_certainty(fit: Fit) -> Fit:
     scale = prior * unknowns.sizes
     total = np.abs(unknowns.values(point) + unknowns.described)
     deviation = np.maximum(np.sqrt(ratio) * scale, LEAST_DEVIATION * total)
+    is_delay = np.array([entry.kind == "delay" for entry in unknowns.entries])
+    deviation += problem.half_row / INTERVAL * is_delay
     # Correlations come from the information.
     spans, axes = np.linalg.eigh(covariance)
     lengths = np.minimum(deviation, scale) / np.sqrt(variance)

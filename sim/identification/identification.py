@@ -97,7 +97,7 @@ def identify(
         Default: as the recordings say, else "gravity+coriolis+friction".
     timestep
         Time step of the control that drove the robot [s]. Default: as the recordings say, else the
-        period of the rows up to 2.5 ms, or a part of a longer one of at most 1 ms.
+        period of the rows up to 2.5 ms, or a part of a longer one of at most 0.5 ms.
     payload
         Find a payload, too.
     payload_link
@@ -428,8 +428,14 @@ def _unknowns(
         "top_speed": np.quantile(np.abs(motion.qvel), 0.99, axis=0),
         "error": share * np.quantile(np.abs(motion.command - motion.qpos), 0.95, axis=0),
     }
-    unknowns = Unknowns(robot, log.joints, sizes, plant.heavy_links)
-    return unknowns.adding(kinds, starts, payload_link)
+    unknowns = Unknowns(
+        robot,
+        log.joints,
+        sizes,
+        plant.heavy_links,
+        payload_link,
+    )
+    return unknowns.adding(kinds, starts)
 
 
 def _map(stack: ExitStack, workers: int) -> Callable[..., Any]:

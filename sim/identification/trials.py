@@ -109,7 +109,7 @@ def _without_sender(result: Fit, solver: Solver) -> Fit:
         if _left(smaller._replace(size=result.size)) * KEPT <= error:
             return smaller._replace(
                 certainty=result.certainty.only(is_kept),
-                dropped=unknowns.only(~is_kept).entries,
+                dropped=kinds,
                 effects=result.effects,
             )
     return result
