@@ -280,3 +280,13 @@ def test_signals_are_those_of_plain_numbers(case, name, seed, request):
     np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=tolerance)
     if name == "programs":
         np.testing.assert_array_equal(found, signals(by_numpy(made, dtype)))
+
+
+def test_every_field_is_tried():
+    """But for noise, whose seed and moments have tests of their own; armature is the simulator's."""
+    fields = {*bp.Guard._fields, *friction.Friction._fields, *bp.Actuators._fields}
+    for case in CASES.values():
+        for seed in range(6):
+            fields -= case(np.random.default_rng(seed), np.float64).options.keys()
+    others = {"armature", "load_friction", "max_delay", "turns"}  # continuous
+    assert fields == {"position_noise", "velocity_noise", "seed"} | others
