@@ -2,8 +2,6 @@
 params changes the result; the other fields have oracles in the tables of conformance.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tiny_urdf import one_joint, write

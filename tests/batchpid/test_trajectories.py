@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from batchpid.task_space.frames import matrix_of, rotate
 from batchpid.trajectories import (
-    Trajectory,
     minimum_jerk,
     sine,
     straight_line,
@@ -29,7 +28,7 @@ MOVES = {
 each_move = pytest.mark.parametrize("move", MOVES.values(), ids=MOVES)
 
 
-def with_start(trajectory: Trajectory, start: np.ndarray) -> np.ndarray:
+def with_start(trajectory, start):
     return np.concatenate(
         [np.broadcast_to(start, trajectory.position.shape[1:])[None], trajectory.position]
     )

@@ -2,8 +2,6 @@
 snapshots.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from identical import assert_identical
