@@ -115,7 +115,7 @@ def test_forces_are_recorded(stool, tmp_path):
     with make_runner(stool, num_envs=3, engine="mujoco", wrenches=["leg2"]) as runner:
         with Recorder(tmp_path / "run.h5", runner):
             run = runner.rollout(np.tile(stool.start, (12, 1)))
-        kept = runner.snapshot().rows["sensors/contact_force"]
+        kept = runner.snapshot().rows["contact_force"]
         np.testing.assert_array_equal(runner.observe().contact_force, kept)
     again = read_recording(tmp_path / "run.h5")
     assert_identical(run, again)
