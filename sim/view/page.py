@@ -87,7 +87,7 @@ class View(AbstractContextManager["View"]):
             self._server = gate.start(make)
 
         # Controls on the right, a chart on the left, the scene between them.
-        gui = self._server.gui
+        gui: Any = self._server.gui
         gui.configure_theme(
             show_logo=False,
             show_share_button=False,

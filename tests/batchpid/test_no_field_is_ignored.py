@@ -17,6 +17,8 @@ import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
 from batchpid.export import to_c, to_ros2_control
 from batchpid.law import advance_with_mass_matrix
+from batchpid.law.pid import advance_drive
+from batchpid.law.state import check_drive
 from batchpid.motors import guard as guards
 from batchpid.sim import Robot, to_mjcf
 
@@ -121,7 +123,12 @@ def stepped(step, params):
     return results
 
 
-LAWS = {"step": bp.step, "drive": bp.drive_target}
+def driven(params, state, r, y, dt):
+    check_drive(params)
+    return advance_drive(bp.discretise(params, dt), state, r, y)
+
+
+LAWS = {"step": bp.step, "drive": driven}
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
@@ -147,12 +154,12 @@ def test_a_drive_refuses_options_that_it_does_not_have(name):
     value = "hold" if name == "non_finite" else 0.3
     params, y = bp.make_params(1, 4.0, 1.0, 1.0, **{name: value}), np.zeros((1, 1))
     with pytest.raises(InvalidArgumentError, match=rf"params.{name}: .*replace\({name}="):
-        bp.drive_target(params, bp.init(params, y), y, y, DT)
+        driven(params, bp.init(params, y), y, y, DT)
 
 
 def test_a_drives_target_is_next_to_the_measurement_on_continuous_joints():
     params, y = bp.make_params(1, 4.0, 1.0, continuous=True), np.full((1, 1), -3.0)
-    _, target = bp.drive_target(params, bp.init(params, y), np.full((1, 1), 3.0), y, DT)
+    _, target = driven(params, bp.init(params, y), np.full((1, 1), 3.0), y, DT)
     np.testing.assert_allclose(target, 3.0 - 2 * np.pi)
 
 
