@@ -105,7 +105,7 @@ class Painter:
         """
         scene = self._scene
         counts = np.rint(2 * scene.half_floor / TILE).astype(int)
-        tiles = np.stack(np.indices(counts.tolist()), axis=-1).reshape(-1, 2)
+        tiles = np.argwhere(np.ones(counts.tolist()))
         if not scene.ground:
             tiles = tiles[tiles.sum(1) % 2 == 0]
         places = np.insert(TILE * tiles - scene.half_floor, 2, scene.floor, axis=1)

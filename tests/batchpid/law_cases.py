@@ -83,6 +83,11 @@ NUMBERS = {
     "integral_max": (math.inf, 4.0),
 }
 """Options that are numbers: the value that is off, and one that has an effect."""
+DRIVE_LACKS = (
+    *("effort_rate_limit", "derivative_filter_time", "setpoint_weight"),
+    *("setpoint_weight_derivative", "deadband", "non_finite"),
+)
+"""Options of the law that a drive does not have."""
 
 
 def generated_options(

@@ -148,6 +148,12 @@ COMBINATIONS = {
         {"limit_stiffness": [10.0, 20.0]},
         *({name: "other"} for name in osc_params.TASK_CHOICES),
     ],
+    bp.step: [
+        {
+            "measurement_rate": ...,
+            "params": bp.make_params(2, 1.0, kd=1.0, measurement_rate="measured"),
+        }
+    ],
     bp.track: [
         {"ki": ..., "params": bp.make_params(2, 1.0)},
         {"dt": None, "params": LATE._replace(gain_units=None)},
