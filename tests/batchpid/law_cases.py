@@ -83,6 +83,11 @@ NUMBERS = {
     "integral_max": (math.inf, 4.0),
 }
 """Options that are numbers: the value that is off, and one that has an effect."""
+DRIVE_LACKS = (
+    *("effort_rate_limit", "derivative_filter_time", "setpoint_weight"),
+    *("setpoint_weight_derivative", "deadband", "non_finite"),
+)
+"""Options of the law that a drive does not have."""
 
 
 def generated_options(
@@ -174,9 +179,10 @@ def by_steps(
     inputs: Inputs,
     step: Callable[..., Any] = advanced,
     array: Callable[..., Any] = read_only,
+    keep: bool = True,
 ) -> np.ndarray:
     """Return the efforts (steps, envs, joints) of ``step``; ``array`` makes its arrays, by default
-    read-only ones.
+    read-only ones. Without ``keep`` the reset takes the integral, too.
     """
     own = [array(leaf, params.dtype) if isinstance(leaf, np.ndarray) else leaf for leaf in params]
     params = bp.PIDParams(*own)
@@ -185,7 +191,8 @@ def by_steps(
         row = inputs.at(at, lambda rows: array(rows, params.dtype))
         if at == RESET:
             mask = np.ones(len(row["measurement"]), bool)
-            state = bp.reset(params, state, row["measurement"], mask, keep_integral=True)
+            fresh = bp.reset(params, state, row["measurement"], mask)
+            state = fresh._replace(integral=state.integral) if keep else fresh
         state, effort = step(params, state, row)
         assert effort.dtype == params.dtype
         efforts.append(np.asarray(effort, float))

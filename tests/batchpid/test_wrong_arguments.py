@@ -148,13 +148,15 @@ COMBINATIONS = {
         {"limit_stiffness": [10.0, 20.0]},
         *({name: "other"} for name in osc_params.TASK_CHOICES),
     ],
+    bp.step: [
+        {
+            "measurement_rate": ...,
+            "params": bp.make_params(2, 1.0, kd=1.0, measurement_rate="measured"),
+        }
+    ],
     bp.track: [
         {"ki": ..., "params": bp.make_params(2, 1.0)},
         {"dt": None, "params": LATE._replace(gain_units=None)},
-    ],
-    bp.drive_target: [
-        {"state": 3},
-        {"measurement_rate": np.ones((1, 3))},
     ],
     batchpid.export.to_c: [
         {"params": bp.make_params(2, np.ones((2, 2)))},
@@ -175,7 +177,6 @@ COMBINATIONS = {
         {"duration": 1.0, "max_velocity": 1.0},
     ],
     trajectories.trapezoidal: [{"max_velocity": [1.0, -1.0]}, {"max_acceleration": math.inf}],
-    trajectories.sine: [{"frequency": frequency} for frequency in (50.0, 99.0, 100.0)],
     metrics.step_metrics: [
         {"measurement": np.zeros((1, 1, 2))},
         {"setpoint": np.zeros(3)},

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from featured import robot_with
 from identical import assert_identical
-from option_values import ARM, MOTORS, box
+from option_values import ARM, FRICTION, LINE, MOTORS, NOISE, SENSORS, SIGNALS, box
 from robots import load_bundled
 from thermal import Thermal
 
@@ -33,10 +33,13 @@ from batchpid.sim import (
     Normal,
     OperationalSpace,
     Randomization,
+    Recorder,
     Robot,
+    RunInfo,
     Runner,
     Snapshot,
     Uniform,
+    read_recording,
 )
 from batchpid.sim.options.options import OPTIONS
 
@@ -118,26 +121,6 @@ LAW = EFFORTS | {
         "integral_limit": 2.0,
         "effort_limit": 4.0,
     },
-}
-SIGNALS = {"command_delay": 2e-3, "lag": 1e-3, "strength": 0.9, "bias": 0.1, "effort_limit": 6.0}
-SENSORS = {
-    "sensor_delay": 1e-3,
-    "position_offset": 0.01,
-    "backlash": 1e-3,
-    "position_resolution": 1e-4,
-}
-NOISE = {"position_noise": 1e-5, "velocity_noise": 1e-3, "velocity_resolution": 1e-3}
-LINE = {
-    "saturation_effort": 8.0,
-    "no_load_speed": 3.0,
-}
-FRICTION = {
-    "coulomb": 0.2,
-    "static": 0.3,
-    "stribeck": 0.05,
-    "load_friction": 0.05,
-    "viscous": 0.1,
-    "armature": 0.02,
 }
 DRAWN = {
     **{
@@ -508,6 +491,33 @@ def restored(case: tuple[str, str]) -> None:
     check_equal(expected._replace(second=second, end=end, poses=poses), expected)
 
 
+def recorded(case: tuple[str, str]) -> None:
+    """A recording has the rows of its rollout, and what it was made with."""
+
+    def content(info: RunInfo) -> list:
+        # A file has no neutral values, which draws may change.
+        skipped = {"begun", "urdf", "description", "actuators" if info.draws else ""}
+        return [*leaves({name: part for name, part in vars(info).items() if name not in skipped})]
+
+    def rollout(runner: Runner, given: dict[str, np.ndarray]) -> Any:
+        draws, episodes = runner.draws, runner.episodes
+        with tempfile.TemporaryDirectory() as folder:
+            with Recorder(path := f"{folder}/run.h5", runner):
+                run = runner.rollout(**given)
+            read = read_recording(path)
+        assert read.info.command == runner.command
+        expected = dataclasses.replace(run.info, draws=draws, episodes=episodes)
+        if runner.options.randomization is None:
+            expected = run.info
+        for (path, mine), (name, other) in zip(content(read.info), content(expected), strict=True):
+            assert path == name
+            np.testing.assert_array_equal(mine, other, path)
+        return read
+
+    with make(case) as runner:
+        check_equal(program(runner, case, rollout), reference(case))
+
+
 def again(case: tuple[str, str]) -> None:
     """A second episode is bit-identical to the first."""
     with make(case) as runner:
@@ -557,6 +567,7 @@ PATHS = (
     tick_by_tick,
     alone,
     restored,
+    recorded,
     again,
     in_workers,
     in_jax,
