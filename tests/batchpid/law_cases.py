@@ -176,9 +176,10 @@ def by_steps(
     inputs,
     step=advanced,
     array=read_only,
+    keep=True,
 ):
     """Return the efforts (steps, envs, joints) of ``step``; ``array`` makes its arrays, by default
-    read-only ones.
+    read-only ones. Without ``keep`` the reset takes the integral, too.
     """
     own = [array(leaf, params.dtype) if isinstance(leaf, np.ndarray) else leaf for leaf in params]
     params = bp.PIDParams(*own)
@@ -187,7 +188,8 @@ def by_steps(
         row = inputs.at(at, lambda rows: array(rows, params.dtype))
         if at == RESET:
             mask = np.ones(len(row["measurement"]), bool)
-            state = bp.reset(params, state, row["measurement"], mask, keep_integral=True)
+            fresh = bp.reset(params, state, row["measurement"], mask)
+            state = fresh._replace(integral=state.integral) if keep else fresh
         state, effort = step(params, state, row)
         assert effort.dtype == params.dtype
         efforts.append(np.asarray(effort, float))

@@ -5,6 +5,7 @@ import pytest
 from tiny_urdf import one_joint, write
 
 import batchpid as bp
+from batchpid.io import documents
 from batchpid.sim import Robot
 from batchpid.sim.tuning.moves import random_moves
 
@@ -34,7 +35,7 @@ def test_tune_writes_the_better_gains_with_settings(batchpid, tmp_path, monkeypa
     flags = ("--actuators", "motors.yaml", "--randomize", "payload.yaml", "--out", "gains.yaml")
     status, said, error = batchpid("tune", "my arm.urdf", "--generations", 1, *flags)
     assert status == 0, error
-    about = bp.load_about("gains.yaml")
+    about = documents.read("gains.yaml")["about"]
     assert (about["seed"], about["engine"]) == (0, "mujoco")
     assert about["gains"] == ("designed" if "rejected" in about else "tuned")
     assert ("The designed gains are the result" in said) == ("rejected" in about)
