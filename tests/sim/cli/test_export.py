@@ -30,7 +30,7 @@ def test_the_header_is_that_of_the_function(batchpid, tmp_path):
     )
     assert (status, out.read_text()) == (0, exported.text)
     lines = [
-        "panda: 9 dof, gains tuned",
+        "panda: 9 dof",
         "The file has no differences.",
         f"written: {out}",
     ]
