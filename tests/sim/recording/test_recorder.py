@@ -1,7 +1,5 @@
 """A recorder streams every tick to a file that any reader of HDF5 reads, even after a kill."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -20,7 +18,7 @@ from batchpid.errors import ClosedError, InvalidArgumentError
 from batchpid.sim import FaultWarning, Recorder, RecordingError, Runner, read_recording
 from batchpid.sim.cli import main
 from batchpid.sim.recording import recorder as recorder_module
-from batchpid.sim.robot.reading import content
+from batchpid.sim.robot.robot_options import content
 from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE
 
 ROBOT = load_bundled("panda")
