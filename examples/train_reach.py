@@ -100,12 +100,11 @@ def potential(envs, observation, config):
 
 
 def shaping(envs, config):
-    """Return the shaping by a potential, which keeps the best policy (A. Y. Ng, 1999), for two
-    observations.
+    """Return the shaping for two observations, the change of the potential: progress, whose sum
+    over an episode depends on its ends alone.
     """
     return lambda before, after: (
-        config.shaping
-        * (config.discount * potential(envs, after, config) - potential(envs, before, config))
+        config.shaping * (potential(envs, after, config) - potential(envs, before, config))
     )
 
 
