@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
+from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
@@ -125,16 +125,12 @@ def _read(
     def column(values: Mapping[str, float], missing: float = 0.0) -> Float64:
         return read_only(np.array([values.get(joint, missing) for joint in joints], np.float64))
 
-    gains = {name: column(getattr(motors, name)) for name in ("kp", "ki", "kd")}
     # A file of motors alone has no gains to offer.
-    has_gains = any(gain.any() for gain in gains.values())
-    gains["integral_limit"] = column(motors.integral_limit, np.inf)
-    effects: Document = {"armature": column(motors.armature), "lag": column(motors.lag)}
-    for effect in ("saturation_effort", "no_load_speed"):
-        effects[effect] = column(getattr(motors, effect), np.inf)
+    has_gains = any(motors.kp.values()) or any(motors.kd.values())
+    gains = {"kp": column(motors.kp), "kd": column(motors.kd)}
     actuators = None
     if joints:
-        actuators = make_actuators(len(joints), **effects)
+        actuators = make_actuators(len(joints), armature=column(motors.armature))
     return Source(
         path,
         name,

@@ -283,11 +283,10 @@ class TableReader:
         else:
             kind = "continuous"
         soft_lower, soft_upper = motors.setpoints.get(name, (-np.inf, np.inf))
-        rate = motors.setpoint_rate.get(name, np.inf)
-        if soft_lower > lower or soft_upper < upper or rate < np.inf:
-            text = "its servo in the file limits position or rate of the setpoint"
+        if soft_lower > lower or soft_upper < upper:
+            text = "its servo in the file limits the setpoint"
             remedy = "pass guard=True to a runner for these limits"
-            detail = f"{soft_lower:g} to {soft_upper:g}, {rate:g}/s"
+            detail = f"{soft_lower:g} to {soft_upper:g}"
             self._robot.repair("limits", text, remedy, name, detail=detail)
         return Joint(
             name,
@@ -297,7 +296,6 @@ class TableReader:
             lower,
             upper,
             effort_limit=motors.effort_limit[name],
-            velocity_limit=rate,
             soft_lower=soft_lower,
             soft_upper=soft_upper,
             damping=float(model.dof_damping[dof]),

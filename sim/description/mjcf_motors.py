@@ -1,19 +1,18 @@
-"""Actuators and coupled joints of a compiled MJCF file, as effort limits, armature, gains, motors
-and mimic joints.
+"""Actuators and coupled joints of a compiled MJCF file, as effort limits, armature, gains and mimic
+joints.
 
 An actuator with force F and moment arm g on a joint (the gear, times the joint's coefficient in a
 fixed tendon) applies the effort g F; a follower q' = m q adds m g' to the arm on its leader. A
 servo F = k u - kp g q - kv g q' has the gains g^2 kp and g^2 kv of a PID whose setpoint is its
-target in units of the joint. (MuJoCo's documentation, "Computation", actuation model.) MuJoCo's PID
-and its DC motor have the laws that :mod:`batchpid.sim.robot.mjcf_export` describes.
+target in units of the joint. (MuJoCo's documentation, "Computation", actuation model.)
 
-Motors, servos, PIDs and DC motors of one joint are read. A finding names every other actuator.
+Motors and servos of one joint are read. A finding names every other actuator.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -30,7 +29,6 @@ _TRN, _EQ = mujoco.mjtTrn, mujoco.mjtEq
 _GAIN, _BIAS, _DYN = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn
 _FILTERS = (_DYN.mjDYN_NONE, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT)
 """Dynamics whose state follows the control, so that the control's range limits the force."""
-_INPUT = mujoco.mjtCtrlInput
 _OF_TENDONS = (
     "stiffness",
     "stiffnesspoly",
@@ -43,33 +41,13 @@ _OF_TENDONS = (
 """Effects of a tendon by itself."""
 
 
-class ActuatorLaw(NamedTuple):
-    """Law and motor of an actuator, in units of its transmission. Without gains it is a motor."""
+class Servo(NamedTuple):
+    """Law of an actuator, in units of its transmission. Without gains it is a motor."""
 
     kp: float = 0.0
-    ki: float = 0.0
     kv: float = 0.0
-    error_limit: float = 0.0
-    """Limit of the integral of the error; 0 for none."""
-    slew: float = 0.0
-    """Limit of the setpoint's rate; 0 for none."""
     input_gain: float = 1.0
     """Setpoint per unit of the control."""
-    stall: float = math.inf
-    """Effort at stall; with the speed without load, the line between them."""
-    speed: float = math.inf
-    lag: float = 0.0
-    """Time constant of the effort [s]."""
-
-    @property
-    def is_servo(self) -> bool:
-        """Whether its control is a setpoint, not an effort."""
-        return any((self.kp, self.ki, self.kv))
-
-    @property
-    def adds(self) -> bool:
-        """Whether several actuators of one joint with such laws are one with the sum of gains."""
-        return self == ActuatorLaw(self.kp, kv=self.kv, input_gain=self.input_gain)
 
 
 @dataclass(frozen=True)
@@ -83,16 +61,10 @@ class JointMotors:
     armature: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     """Reflected inertia [kg m^2 or kg]; a follower's armature is added to its leader's."""
     kp: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    ki: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     kd: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     """Gains of servos."""
-    integral_limit: dict[str, float] = field(default_factory=dict)
     setpoints: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Range of the setpoints of a servo."""
-    setpoint_rate: dict[str, float] = field(default_factory=dict)
-    saturation_effort: dict[str, float] = field(default_factory=dict)
-    no_load_speed: dict[str, float] = field(default_factory=dict)
-    lag: dict[str, float] = field(default_factory=dict)
 
 
 def read_couplings(robot: RobotInFile) -> Couplings:
@@ -134,18 +106,14 @@ def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
         for leader, arm in _on_leaders({name: 1.0}, couplings).items():
             motors.armature[leader] += arm**2 * float(model.dof_armature[model.jnt_dofadr[joint]])
     # nu counts inputs, of which some actuators have several.
-    numbers = range(len(model.actuator_trntype))
-    arms_of = [_on_leaders(_arms(model, actuator, robot), couplings) for actuator in numbers]
-    counts = Counter(name for arms in arms_of for name in arms)
-    for actuator, arms in enumerate(arms_of):
-        law = _law(model, actuator)
-        is_read = len(arms) == 1 and _is_plain(model, actuator, law)
-        if not is_read or not (law.adds or counts[next(iter(arms))] == 1):
+    for actuator in range(len(model.actuator_trntype)):
+        arms = _on_leaders(_arms(model, actuator, robot), couplings)
+        servo = _servo(model, actuator) if len(arms) == 1 else Servo()
+        if len(arms) != 1 or not _is_plain(model, actuator):
             text = f"actuator {label(model.actuator(actuator))} has effects that are not simulated"
             text += ": only motors and servos of one joint are"
             remedy = "check gains and limits of the joint"
             findings += [Finding("actuator", text, remedy, name) for name in arms or [None]]
-            law = ActuatorLaw(law.kp, kv=law.kv) if len(arms) == 1 else ActuatorLaw()
         for name, arm in arms.items():
             _add_limits(
                 model,
@@ -155,9 +123,10 @@ def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
                 motors,
                 findings,
             )
-            _add_law(law, name, arm, motors)
-        if law.is_servo:
-            _add_setpoints(model, actuator, law, robot, motors)
+            motors.kp[name] += arm**2 * servo.kp
+            motors.kd[name] += arm**2 * servo.kv
+        if servo.kp:
+            _add_setpoints(model, actuator, servo, robot, motors)
     for joint, name in robot.joints.items():
         if model.nu and name not in motors.effort_limit and name not in couplings:
             text = (
@@ -183,8 +152,8 @@ def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
     return motors
 
 
-def _is_plain(model: MjModel, actuator: int, law: ActuatorLaw) -> bool:
-    """Return whether an actuator is a motor, or has this ``law``, without further effects."""
+def _is_plain(model: MjModel, actuator: int) -> bool:
+    """Return whether an actuator is a motor or a servo without further effects."""
     effects = ("delay", "damping", "dampingpoly")
     if model.actuator_plugin[actuator] >= 0:
         return False
@@ -194,88 +163,43 @@ def _is_plain(model: MjModel, actuator: int, law: ActuatorLaw) -> bool:
     group = int(model.actuator_group[actuator])
     if 0 <= group <= 30 and model.opt.disableactuator & (1 << group):
         return False
-    gain, bias, dynamics = (
-        getattr(model, f"actuator_{name}prm")[actuator] for name in ("gain", "bias", "dyn")
-    )
-    kind = int(model.actuator_gaintype[actuator])
-    inputs = int(model.actuator_ctrlspec[actuator])
-    if kind == _GAIN.mjGAIN_DCMOTOR:
-        # Without cogging, heat and friction of its own. A voltage is no effort, nor a setpoint.
-        others = (*gain[2:4], *bias, *dynamics[1:7])
-        controls = inputs & _INPUT.mjINPUT_POS or (inputs == _INPUT.mjINPUT_FF and not law.is_servo)
-        return bool(controls and not any(others))
-    constant, stiffness, damping = bias[:3].tolist()
-    is_affine = model.actuator_biastype[actuator] == _BIAS.mjBIAS_AFFINE
-    is_law = is_affine and constant == 0 and stiffness <= 0 and damping <= 0
-    if kind == _GAIN.mjGAIN_PID:
-        return bool(is_law and inputs & _INPUT.mjINPUT_POS)
+    is_fixed = model.actuator_gaintype[actuator] == _GAIN.mjGAIN_FIXED
     is_direct = model.actuator_dyntype[actuator] == _DYN.mjDYN_NONE
-    if kind != _GAIN.mjGAIN_FIXED or gain[0] == 0 or not is_direct:
+    if not is_fixed or not is_direct or model.actuator_gainprm[actuator, 0] == 0:
         return False
-    is_motor = model.actuator_biastype[actuator] == _BIAS.mjBIAS_NONE
-    return bool(is_motor or (is_law and (stiffness < 0 or damping == 0)))
+    bias = model.actuator_biastype[actuator]
+    constant, stiffness, damping = model.actuator_biasprm[actuator, :3].tolist()
+    is_law = bias == _BIAS.mjBIAS_AFFINE and constant == 0 and damping <= 0
+    # A damping alone is a servo of velocities.
+    is_law = is_law and (stiffness < 0 or (stiffness == damping == 0))
+    return bool(bias == _BIAS.mjBIAS_NONE or is_law)
 
 
-def _law(model: MjModel, actuator: int) -> ActuatorLaw:
+def _servo(model: MjModel, actuator: int) -> Servo:
     """Return the law of an actuator; that of a motor for unknown laws."""
     # A plugin's parameters have other meanings.
-    if model.actuator_plugin[actuator] >= 0:
-        return ActuatorLaw()
-    kind = int(model.actuator_gaintype[actuator])
-    gain = model.actuator_gainprm[actuator].tolist()
-    dynamics = model.actuator_dynprm[actuator].tolist()
-    if kind == _GAIN.mjGAIN_DCMOTOR:
-        resistance, constant, _, _, kp, ki, kv, supply, *_ = gain
-        law = ActuatorLaw(
-            kp,
-            ki,
-            kv,
-            error_limit=dynamics[8],
-            slew=dynamics[7],
-            lag=dynamics[0],
-        )
-        if supply:
-            law = law._replace(stall=constant * supply / resistance, speed=supply / constant)
-        return law
-    if model.actuator_biastype[actuator] != _BIAS.mjBIAS_AFFINE:
-        return ActuatorLaw()
+    is_affine = model.actuator_biastype[actuator] == _BIAS.mjBIAS_AFFINE
+    if model.actuator_plugin[actuator] >= 0 or not is_affine:
+        return Servo()
     kp, kv = np.maximum(-model.actuator_biasprm[actuator, 1:3], 0.0).tolist()
-    if kind == _GAIN.mjGAIN_PID:
-        return ActuatorLaw(kp, gain[0], kv, error_limit=dynamics[0], slew=dynamics[1])
-    if kind == _GAIN.mjGAIN_FIXED and kp:
-        return ActuatorLaw(kp, kv=kv, input_gain=gain[0] / kp)
-    return ActuatorLaw(kp, kv=kv)
-
-
-def _add_law(law: ActuatorLaw, name: str, arm: float, motors: JointMotors) -> None:
-    """Add gains and motor of an actuator to a joint."""
-    motors.kp[name] += arm**2 * law.kp
-    motors.ki[name] += arm**2 * law.ki
-    motors.kd[name] += arm**2 * law.kv
-    if law.ki and law.error_limit:
-        motors.integral_limit[name] = abs(arm) * law.ki * law.error_limit
-    if law.slew:
-        motors.setpoint_rate[name] = law.slew / abs(arm)
-    if math.isfinite(law.stall):
-        motors.saturation_effort[name] = abs(arm) * law.stall
-        motors.no_load_speed[name] = law.speed / abs(arm)
-    if law.lag:
-        motors.lag[name] = law.lag
+    if model.actuator_gaintype[actuator] == _GAIN.mjGAIN_FIXED and kp:
+        return Servo(kp, kv, float(model.actuator_gainprm[actuator, 0]) / kp)
+    return Servo(kp, kv)
 
 
 def _add_setpoints(
     model: MjModel,
     actuator: int,
-    law: ActuatorLaw,
+    servo: Servo,
     robot: RobotInFile,
     motors: JointMotors,
 ) -> None:
     """Add the range of a servo's setpoints, where its transmission moves with one joint alone."""
     arms = _arms(model, actuator, robot)
     control = int(model.actuator_ctrladr[actuator])
-    if len(arms) == 1 and law.kp and model.actuator_ctrllimited[control]:
+    if len(arms) == 1 and model.actuator_ctrllimited[control]:
         ((name, arm),) = arms.items()
-        ends = law.input_gain * model.actuator_ctrlrange[control] / arm
+        ends = servo.input_gain * model.actuator_ctrlrange[control] / arm
         motors.setpoints[name] = float(ends.min()), float(ends.max())
 
 
@@ -294,18 +218,11 @@ def _add_limits(
         low, high = model.actuator_forcerange[actuator].tolist()
     # The range of a servo's control is one of positions, not of forces.
     control = int(model.actuator_ctrladr[actuator])
-    gains = {
-        int(_GAIN.mjGAIN_FIXED): float(model.actuator_gainprm[actuator, 0]),
-        int(_GAIN.mjGAIN_DCMOTOR): 1.0,
-    }
-    gain = gains.get(int(model.actuator_gaintype[actuator]))
-    is_force = (
-        int(model.actuator_dyntype[actuator]) in _FILTERS
-        or model.actuator_ctrlspec[actuator] == _INPUT.mjINPUT_FF
-    )
-    is_motor = gain is not None and not _law(model, actuator).is_servo
+    is_fixed = model.actuator_gaintype[actuator] == _GAIN.mjGAIN_FIXED
+    is_force = is_fixed and int(model.actuator_dyntype[actuator]) in _FILTERS
+    is_motor = not any(_servo(model, actuator)[:2])
     if is_motor and is_force and model.actuator_ctrllimited[control]:
-        forces = gain * model.actuator_ctrlrange[control]
+        forces = float(model.actuator_gainprm[actuator, 0]) * model.actuator_ctrlrange[control]
         low = max(low, float(forces.min()))
         high = min(high, float(forces.max()))
     force = _magnitude((low, high), name, findings)

@@ -319,9 +319,7 @@ class Source(NamedTuple):
     start: Float64 | None = None
     """Start pose (dof,) [rad or m] of the file, None if it has none."""
     gains: Mapping[str, Float64] | None = None
-    """Gains ``kp``, ``ki``, ``kd`` of the servos of an MJCF file (dof,), and the ``integral_limit``
-    [N m or N]; None without servos.
-    """
+    """Gains ``kp`` and ``kd`` of the servos of an MJCF file (dof,); None without servos."""
     mjcf: MjcfFile | None = None
     actuators: Actuators | None = None
     disabled: tuple[DisabledPair, ...] = ()

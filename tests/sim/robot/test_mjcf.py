@@ -358,7 +358,7 @@ REPAIRED = {  # a file, code of the finding in every engine, and what it says
     "range of a servo": (
         two_links(rest=DRIVEN.format("position", 'ctrlrange="-.5 .7" gear="2"')),
         "limits",
-        r"'j' \(-0.25 to 0.35, inf/s\): its servo.*guard=True",
+        r"'j' \(-0.25 to 0.35\): its servo.*guard=True",
     ),
 }
 NOTED = {  # what is left out everywhere and changes no motion
