@@ -74,8 +74,8 @@ class RobotInFile:
 
     ``bodies`` has all bodies of the file, ``joints`` the hinges and slides of the robot, ``base``
     is the body of the root, 0 for the world. ``link_names`` and ``joint_names`` are all names in
-    use. ``repairs`` are findings of what is simulated otherwise than the file says, ``losses`` of
-    what is lost where MuJoCo does not simulate the file itself.
+    use. ``repairs`` are findings of what is simulated otherwise than the file says. ``lost`` has names
+    of contents, by kind, that only an engine simulates that reads the file itself.
 
     Raises RobotError for a ball joint, and for several robots.
     """
@@ -83,7 +83,7 @@ class RobotInFile:
     def __init__(self, model: MjModel, path: Path, repairs: list[Finding]) -> None:
         self.model = model
         self.repairs = repairs
-        self.losses: list[Finding] = []
+        self.lost: dict[str, list[str]] = defaultdict(list)
         names = [model.body(body).name for body in range(1, model.nbody)]
         self.link_names = {"world", *names}
         self.joint_names = {model.joint(joint).name for joint in range(model.njnt)}
@@ -129,11 +129,6 @@ class RobotInFile:
             )
         )
 
-    def lose(self, text: str, joint: str | None = None, link: str | None = None) -> None:
-        """Report what an engine loses that does not simulate the file."""
-        remedy = "use the engine 'mujoco', which simulates the file itself"
-        self.losses.append(Finding("engine", text, remedy, joint, link))
-
     def _find_base(self, joints: dict[int, str], path: Path) -> int:
         """Return the base, after the bodies that are not of the robot are left out."""
         model = self.model
@@ -167,8 +162,8 @@ class RobotInFile:
                 where = f"{path}: body {self.bodies[body]!r}"
                 problem = f"the ball joint {label(model.joint(joint))} has no single position"
                 raise RobotError(f"{where}: {problem} to control; replace it by three hinges")
-        for body in sorted(self._left_out - soft):
-            self.lose("is apart from the robot: left out", link=self.bodies[body])
+        apart = sorted(self._left_out - soft)
+        self.lost["bodies apart from the robot"] += [repr(self.bodies[body]) for body in apart]
         if floating:
             return floating.pop()
         # The only body, if it is held at the origin, is the root in place of the world.
@@ -378,7 +373,7 @@ class TableReader:
         plane at height 0 is the ground of the engines.
         """
         model = self._model
-        absent = []
+        absent = self._robot.lost["planes, height fields and shapes of the world"]
         for geom in [geom for body in sorted({0, *rows}) for geom in self._geoms(body)]:
             body = int(model.geom_bodyid[geom])
             kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
@@ -387,9 +382,6 @@ class TableReader:
             is_solid = body in self.solid and kind not in ("plane", "hfield")
             if not is_ground and not is_solid:
                 absent.append(f"{kind} {label(model.geom(geom))}")
-        if absent:
-            text = f"without planes, height fields and shapes of the world: {', '.join(absent)}"
-            self._robot.lose(text)
 
 
 def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair, ...]:

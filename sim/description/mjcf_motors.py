@@ -73,26 +73,21 @@ def read_couplings(robot: RobotInFile) -> Couplings:
     """
     model = robot.model
     couplings: Couplings = {}
-    others: list[str] = []
     for equality in np.flatnonzero(model.eq_active0).tolist():
         follower = int(model.eq_obj1id[equality])
         leader = int(model.eq_obj2id[equality])
         if model.eq_type[equality] != _EQ.mjEQ_JOINT or follower not in robot.joints:
-            others.append(label(model.equality(equality)))
+            robot.lost["equality constraints"].append(label(model.equality(equality)))
             continue
         name = robot.joints[follower]
         offset, multiplier, *higher = model.eq_data[equality, :5].tolist()
         is_linear = leader in robot.joints and multiplier and not any(higher)
         if not is_linear or name in couplings:
-            text = "without the joint's equality, which is not linear in one other joint"
-            robot.lose(text, name)
+            robot.lost["equalities that are not linear in one other joint"].append(repr(name))
             continue
         rest, rest_of_leader = model.qpos0[model.jnt_qposadr[[follower, leader]]].tolist()
         offset += rest - multiplier * rest_of_leader
         couplings[name] = robot.joints[leader], multiplier, offset
-    if others:
-        text = "closed loops are open, without the equality constraints other than between the"
-        robot.lose(f"{text} robot's joints: {', '.join(others)}")
     return couplings
 
 
@@ -141,14 +136,11 @@ def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
         if model.jnt_actfrclimited[joint]:
             limit = min(limit, _magnitude(model.jnt_actfrcrange[joint], name, findings))
         motors.effort_limit[name] = limit
-    tendons = [
+    robot.lost["effects of tendons"] += [
         label(model.tendon(tendon))
         for tendon in range(model.ntendon)
         if any(np.any(getattr(model, f"tendon_{effect}")[tendon]) for effect in _OF_TENDONS)
     ]
-    if tendons:
-        text = "joints move freely, without springs, damping, friction, armature and limits of tendons: "
-        robot.lose(text + ", ".join(tendons))
     return motors
 
 

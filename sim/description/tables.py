@@ -287,7 +287,7 @@ class MjcfFile:
     (:func:`batchpid.sim.description.mjcf.compile_scene`), and ``content`` is the digest of the
     model. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
     other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
-    links. ``losses`` are findings of what is lost in an engine that does not simulate the file.
+    links. ``lost`` is what an engine lacks that does not simulate the file, in words.
     ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of
     the world can collide, unless the root is fixed to the origin in place of its free joint.
     ``friction`` is the coefficient of its ground, the first of these planes.
@@ -299,7 +299,7 @@ class MjcfFile:
     bodies: tuple[str, ...]
     falling: tuple[str, ...] = ()
     loops: tuple[str, ...] = ()
-    losses: tuple[Finding, ...] = ()
+    lost: str = ""
     is_alone: bool = True
     has_floor: bool = False
     friction: float = 1.0
