@@ -203,7 +203,7 @@ def _report_unused(robot: RobotInFile) -> None:
     unused = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
     if unused:
         text = f"elements that the simulation does not use are left out: {unused}"
-        robot.repair("unknown-element", text, "expect no effect")
+        robot.repairs.append(Finding("unknown-element", text, "expect no effect"))
     disabled = {
         switch
         for switch in (*_SWITCHES, "GRAVITY", "ACTUATION")
@@ -221,7 +221,7 @@ def _report_unused(robot: RobotInFile) -> None:
     if ignored:
         text = f"has no effect, gravity is {GRAVITY} m/s^2: {', '.join(ignored)}"
         remedy = "let the controller compensate, or use Randomization(gravity=...)"
-        robot.repair("option", text, remedy)
+        robot.repairs.append(Finding("option", text, remedy))
     lost = robot.lost
     lost["<flag>"] += [switch.lower() for switch in _SWITCHES if switch in disabled]
     if option.density or option.viscosity:

@@ -36,10 +36,11 @@ from batchpid.sim.description.tables import (
     Tables,
     breadth_first,
     unique,
+    with_mass,
     without_mass,
 )
 from batchpid.sim.findings import Finding
-from batchpid.sim.geometry.shapes import Shape, ShapeKind, possible_inertia
+from batchpid.sim.geometry.shapes import Shape, ShapeKind, hull_graph
 from batchpid.task_space.frames import about, compose, matrix_of, rotate
 
 if TYPE_CHECKING:
@@ -107,27 +108,6 @@ class RobotInFile:
     def is_of_robot(self, body: int) -> bool:
         """Return whether a body, or the world, is of the robot."""
         return int(self._roots[body]) not in self._left_out
-
-    def repair(
-        self,
-        code: str,
-        text: str,
-        remedy: str,
-        joint: str | None = None,
-        link: str | None = None,
-        detail: str = "",
-    ) -> None:
-        """Report what is simulated otherwise in every engine."""
-        self.repairs.append(
-            Finding(
-                code,
-                text,
-                remedy,
-                joint,
-                link,
-                detail,
-            )
-        )
 
     def _find_base(self, joints: dict[int, str], path: Path) -> int:
         """Return the base, after the bodies that are not of the robot are left out."""
@@ -282,7 +262,7 @@ class TableReader:
             text = "its servo in the file limits the setpoint"
             remedy = "pass guard=True to a runner for these limits"
             detail = f"{soft_lower:g} to {soft_upper:g}"
-            self._robot.repair("limits", text, remedy, name, detail=detail)
+            self._robot.repairs.append(Finding("limits", text, remedy, name, detail=detail))
         return Joint(
             name,
             kind,
@@ -309,24 +289,14 @@ class TableReader:
                 self._shapes.append(shape)
                 self.solid[body] = row.name
         mass = float(model.body_mass[body])
-        center = model.body_ipos[body] - anchor
-        inertia = np.diag(model.body_inertia[body])
         # Else the row would get the mass of its shapes.
         if mass == 0 and body in self.solid:
             row = without_mass(row)
         if mass > 0:
-            inertia, repair = possible_inertia(mass, inertia)
-            if repair is not None:
-                text, detail = repair
-                remedy = "correct <inertia>"
-                self._robot.repair("inertia", text, remedy, link=row.name, detail=detail)
-            axes = model.body_iquat[body].copy()
-            row = row._replace(
-                mass=mass,
-                center=center,
-                inertia=inertia,
-                inertia_wxyz=axes,
-            )
+            center = model.body_ipos[body] - anchor
+            inertia = np.diag(model.body_inertia[body])
+            turn = model.body_iquat[body].copy()
+            row = with_mass(row, mass, center, inertia, turn, self._robot.repairs)
         self._bodies.append(row)
 
     def _geoms(self, body: int) -> list[int]:
@@ -420,19 +390,12 @@ def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair,
 
 
 def _hull(model: MjModel, mesh: int) -> Float64:
-    """Return the vertices (n, 3) [m] of the convex hull of a mesh, or of the mesh if it has none.
-
-    The hull's graph has the layout of ``mesh_graph`` in MuJoCo's mjmodel.h: two counts, an address
-    for each vertex, and the numbers of the vertices.
-    """
+    """Return the vertices (n, 3) [m] of the convex hull of a mesh, or of the mesh if it has none."""
     first = int(model.mesh_vertadr[mesh])
     count = int(model.mesh_vertnum[mesh])
     vertices: Float64 = model.mesh_vert[first : first + count].astype(np.float64)
-    begin = int(model.mesh_graphadr[mesh])
-    if begin >= 0:
-        corners = int(model.mesh_graph[begin])
-        begin += 2 + corners
-        vertices = vertices[np.sort(model.mesh_graph[begin : begin + corners])]
+    if model.mesh_graphadr[mesh] >= 0:
+        vertices = vertices[np.sort(hull_graph(model, mesh)[0])]
     return vertices
 
 

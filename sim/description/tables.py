@@ -30,7 +30,7 @@ from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.trees import digest, mapped
 from batchpid.motors import Actuators
 from batchpid.sim.findings import Finding
-from batchpid.sim.geometry.shapes import LEAST_MASS, Shape
+from batchpid.sim.geometry.shapes import LEAST_MASS, Shape, possible_inertia
 from batchpid.task_space.frames import SpatialInertia, matrix_of
 
 CONTACT_FRICTION = 0.3
@@ -222,6 +222,30 @@ def unique(name: str, names: set[str]) -> str:
         number += 1
     names.add(new)
     return new
+
+
+def with_mass(
+    body: Body,
+    mass: float,
+    center: Float64,
+    inertia: Float64,
+    wxyz: Float64,
+    findings: list[Finding],
+) -> Body:
+    """Return ``body`` with a mass [kg], and an inertia that a body can have: another than
+    ``inertia`` is a finding.
+    """
+    inertia, repair = possible_inertia(mass, inertia)
+    if repair is not None:
+        text, detail = repair
+        remedy = "correct <inertia>"
+        findings.append(Finding("inertia", text, remedy, link=body.name, detail=detail))
+    return body._replace(
+        mass=mass,
+        center=center,
+        inertia=inertia,
+        inertia_wxyz=wxyz,
+    )
 
 
 def without_mass(body: Body) -> Body:
