@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -119,18 +118,16 @@ def _read(
     if robot.base and not fixed_base:
         at = model.jnt_qposadr[model.body_jntadr[robot.base]]
         base_start = tuple(pose[at : at + 7].tolist())
-    start = {name: pose[model.jnt_qposadr[joint]] for joint, name in robot.joints.items()}
-    joints = [joint.name for joint in tables.joints if joint.moves]
+    numbers = {name: joint for joint, name in robot.joints.items()}
+    order = [numbers[joint.name] for joint in tables.joints if joint.moves]
 
-    def column(values: Mapping[str, float], missing: float = 0.0) -> Float64:
-        return read_only(np.array([values.get(joint, missing) for joint in joints], np.float64))
+    def column(values: Float64) -> Float64:
+        return read_only(values[order].astype(np.float64))
 
-    # A file of motors alone has no gains to offer.
-    has_gains = any(motors.kp.values()) or any(motors.kd.values())
-    gains = {"kp": column(motors.kp), "kd": column(motors.kd)}
     actuators = None
-    if joints:
-        actuators = make_actuators(len(joints), armature=column(motors.armature))
+    if order:
+        actuators = make_actuators(len(order), armature=column(motors.armature))
+    gains = {"kp": column(motors.kp), "kd": column(motors.kd)}
     return Source(
         path,
         name,
@@ -138,8 +135,9 @@ def _read(
         tuple(findings),
         fixed_base,
         base_start,
-        column(start),
-        gains if has_gains else None,
+        column(pose[model.jnt_qposadr]),
+        # A file of motors alone has no gains to offer.
+        gains if (motors.kp + motors.kd).any() else None,
         mjcf=_file(path, compiled, robot, fixed_base),
         disabled=excluded_pairs(model, reader.solid),
         actuators=actuators if actuators is not None and actuators.num_joints else None,

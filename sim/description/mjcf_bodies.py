@@ -74,7 +74,8 @@ class RobotInFile:
     """Robot of a compiled file: names of its parts, by their numbers in the model.
 
     ``bodies`` has all bodies of the file, ``joints`` the hinges and slides of the robot, ``base``
-    is the body of the root, 0 for the world. ``link_names`` and ``joint_names`` are all names in
+    is the body of the root, 0 for the world. ``moments`` are the moment arms of the outputs of
+    actuators on the degrees of freedom, at the reference pose. ``link_names`` and ``joint_names`` are all names in
     use. ``repairs`` are findings of what is simulated otherwise than the file says. ``lost`` has names
     of contents, by kind, that only an engine simulates that reads the file itself.
 
@@ -92,6 +93,11 @@ class RobotInFile:
         for body, name in enumerate(names, start=1):
             self.bodies[body] = name or unique(f"body{body}", self.link_names)
         self._roots = model.body_rootid
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        self.moments = np.zeros((len(data.moment_rownnz), model.nv))
+        sparse = data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        mujoco.mju_sparse2dense(self.moments, *sparse)
         self._left_out: set[int] = set()
         joints = {
             joint: model.joint(joint).name or unique(f"joint{joint}", self.joint_names)
@@ -121,7 +127,9 @@ class RobotInFile:
         # A flexible body has three slides for each vertex.
         soft = {int(body) for body in model.flex_vertbodyid if not model.body_geomnum[body]} & tops
         moving -= soft
-        if driven := moving & _roots_of_actuators(model):
+        # Actuators move the children of the world, themselves or bodies below them.
+        driven = moving & set(model.body_rootid[model.dof_bodyid[self.moments.any(0)]].tolist())
+        if driven:
             moving -= (moving & free) - driven
         floating = moving & free
         if len(floating) > 1 or (floating and moving - free):
@@ -155,14 +163,6 @@ class RobotInFile:
             if model.geom_type[geom] != PLANE and can_collide(model, geom):
                 return 0
         return only
-
-
-def _roots_of_actuators(model: MjModel) -> set[int]:
-    """Return the children of the world that actuators move, themselves or bodies below them."""
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    dofs = data.moment_colind[: data.moment_rownnz.sum()]
-    return {int(body) for body in model.body_rootid[model.dof_bodyid[dofs]]}
 
 
 class TableReader:
@@ -257,12 +257,16 @@ class TableReader:
             kind = "revolute"
         else:
             kind = "continuous"
-        soft_lower, soft_upper = motors.setpoints.get(name, (-np.inf, np.inf))
+        soft_lower, soft_upper = motors.setpoints[:, number].tolist()
         if soft_lower > lower or soft_upper < upper:
             text = "its servo in the file limits the setpoint"
             remedy = "pass guard=True to a runner for these limits"
             detail = f"{soft_lower:g} to {soft_upper:g}"
             self._robot.repairs.append(Finding("limits", text, remedy, name, detail=detail))
+        mimic = None
+        if number in couplings:
+            leader, *law = couplings[number]
+            mimic = Mimic(self._robot.joints[leader], *law)
         return Joint(
             name,
             kind,
@@ -270,14 +274,14 @@ class TableReader:
             link,
             lower,
             upper,
-            effort_limit=motors.effort_limit[name],
+            effort_limit=float(motors.effort_limit[number]),
             soft_lower=soft_lower,
             soft_upper=soft_upper,
             damping=float(model.dof_damping[dof]),
             friction=float(model.dof_frictionloss[dof]),
-            mimic=Mimic(*couplings[name]) if name in couplings else None,
+            mimic=mimic,
             axis=tuple(model.jnt_axis[number].tolist()),
-            has_motor=name not in motors.unmoved,
+            has_motor=not motors.unmoved[number],
         )
 
     def _add(self, body: int, row: Body, anchor: Float64) -> None:

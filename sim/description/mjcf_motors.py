@@ -12,19 +12,17 @@ Motors and servos of one joint are read. A finding names every other actuator.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import MjModel
+from batchpid.arrays.array_types import Bool, Float64, MjModel
 from batchpid.sim.description.mjcf_bodies import RobotInFile, label
 from batchpid.sim.findings import Finding
 
-Couplings = dict[str, tuple[str, float, float]]
-"""Leader, multiplier and offset of each follower, as in ``<mimic>``."""
+Couplings = dict[int, tuple[int, float, float]]
+"""Leader, multiplier and offset of each follower, as in ``<mimic>``, by the joints' numbers."""
 _TRN, _EQ = mujoco.mjtTrn, mujoco.mjtEq
 _GAIN, _BIAS, _DYN = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn
 _FILTERS = (_DYN.mjDYN_NONE, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT)
@@ -50,21 +48,20 @@ class Servo(NamedTuple):
     """Setpoint per unit of the control."""
 
 
-@dataclass(frozen=True)
-class JointMotors:
-    """Motors of the joints by name, in N m or N; joints without an entry have none, or no limit."""
+class JointMotors(NamedTuple):
+    """Motors of the joints (joints,), in N m or N, by the joints' numbers in the file."""
 
-    effort_limit: dict[str, float] = field(default_factory=dict)
+    effort_limit: Float64
     """Infinite where the file gives none."""
-    unmoved: set[str] = field(default_factory=set)
-    """Joints that no actuator moves, in a file with actuators."""
-    armature: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    armature: Float64
     """Reflected inertia [kg m^2 or kg]; a follower's armature is added to its leader's."""
-    kp: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    kd: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    kp: Float64
+    kd: Float64
     """Gains of servos."""
-    setpoints: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Range of the setpoints of a servo."""
+    setpoints: Float64
+    """Range of the setpoints of a servo (2, joints), infinite where the file gives none."""
+    unmoved: Bool
+    """Joints that no actuator moves, in a file with actuators."""
 
 
 def read_couplings(robot: RobotInFile) -> Couplings:
@@ -79,69 +76,105 @@ def read_couplings(robot: RobotInFile) -> Couplings:
         if model.eq_type[equality] != _EQ.mjEQ_JOINT or follower not in robot.joints:
             robot.lost["equality constraints"].append(label(model.equality(equality)))
             continue
-        name = robot.joints[follower]
         offset, multiplier, *higher = model.eq_data[equality, :5].tolist()
         is_linear = leader in robot.joints and multiplier and not any(higher)
-        if not is_linear or name in couplings:
-            robot.lost["equalities that are not linear in one other joint"].append(repr(name))
+        if not is_linear or follower in couplings:
+            name = repr(robot.joints[follower])
+            robot.lost["equalities that are not linear in one other joint"].append(name)
             continue
         rest, rest_of_leader = model.qpos0[model.jnt_qposadr[[follower, leader]]].tolist()
         offset += rest - multiplier * rest_of_leader
-        couplings[name] = robot.joints[leader], multiplier, offset
+        couplings[follower] = leader, multiplier, offset
     return couplings
 
 
 def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
     """Return the motors of the joints, with findings for effects that are not simulated."""
     model = robot.model
-    motors = JointMotors()
     findings = robot.repairs
-    # A follower has no motor: its leader moves its armature, too.
-    for joint, name in robot.joints.items():
-        for leader, arm in _on_leaders({name: 1.0}, couplings).items():
-            motors.armature[leader] += arm**2 * float(model.dof_armature[model.jnt_dofadr[joint]])
-    # nu counts inputs, of which some actuators have several.
-    for actuator in range(len(model.actuator_trntype)):
-        arms = _on_leaders(_arms(model, actuator, robot), couplings)
-        servo = _servo(model, actuator) if len(arms) == 1 else Servo()
-        if len(arms) != 1 or not _is_plain(model, actuator):
+    # Motion of each joint over that of its leader: a follower has no motor.
+    shares = np.eye(model.njnt)
+    for _ in couplings:  # at most as many leaders of leaders
+        for follower, (leader, multiplier, _offset) in couplings.items():
+            shares[follower] = multiplier * shares[leader]
+    joints = list(robot.joints)
+    armature = np.zeros(model.njnt)
+    armature[joints] = model.dof_armature[model.jnt_dofadr[joints]]
+    armature = shares.T**2 @ armature
+    limits, kp, kd = np.zeros((3, model.njnt))
+    setpoints = np.outer([-np.inf, np.inf], np.ones(model.njnt))
+    moments = _moments(robot)
+    arms = moments @ shares
+    for actuator, row in enumerate(arms):
+        moved = np.flatnonzero(row).tolist()
+        servo = _servo(model, actuator) if len(moved) == 1 else Servo()
+        if len(moved) != 1 or not _is_plain(model, actuator):
             text = f"actuator {label(model.actuator(actuator))} has effects that are not simulated"
             text += ": only motors and servos of one joint are"
             remedy = "check gains and limits of the joint"
-            findings += [Finding("actuator", text, remedy, name) for name in arms or [None]]
-        for name, arm in arms.items():
-            _add_limits(
-                model,
-                actuator,
-                name,
-                arm,
-                motors,
-                findings,
-            )
-            motors.kp[name] += arm**2 * servo.kp
-            motors.kd[name] += arm**2 * servo.kv
-        if servo.kp:
-            _add_setpoints(model, actuator, servo, robot, motors)
+            names = [robot.joints[joint] for joint in moved]
+            findings += [Finding("actuator", text, remedy, name) for name in names or [None]]
+        for joint in moved:
+            force = _largest_force(model, actuator, robot.joints[joint], findings)
+            limits[joint] += abs(row[joint]) * force
+            armature[joint] += row[joint] ** 2 * np.ravel(model.actuator_armature[actuator])[0]
+            kp[joint] += row[joint] ** 2 * servo.kp
+            kd[joint] += row[joint] ** 2 * servo.kv
+        # The range of a servo's setpoints, where it moves with one joint alone.
+        alone = np.flatnonzero(moments[actuator]).tolist()
+        control = int(model.actuator_ctrladr[actuator])
+        if servo.kp and len(alone) == 1 and model.actuator_ctrllimited[control]:
+            ends = servo.input_gain * model.actuator_ctrlrange[control]
+            setpoints[:, alone[0]] = np.sort(ends / moments[actuator, alone[0]])
+    unmoved = np.zeros(model.njnt, bool)
     for joint, name in robot.joints.items():
-        if model.nu and name not in motors.effort_limit and name not in couplings:
+        if model.nu and not arms[:, joint].any() and joint not in couplings:
             text = (
                 "no actuator of the file moves the joint: it is controlled like all others, without"
                 " compensation of gravity and friction"
             )
             remedy = "give it gains of 0 to let it move freely, or pass free_joints=[] to a runner"
-            motors.unmoved.add(name)
+            unmoved[joint] = True
             findings.append(Finding("actuator", text, remedy, name))
         # A limit of 0 counts as none.
-        limit = motors.effort_limit.get(name, math.inf) or math.inf
+        limits[joint] = limits[joint] or math.inf
         if model.jnt_actfrclimited[joint]:
-            limit = min(limit, _magnitude(model.jnt_actfrcrange[joint], name, findings))
-        motors.effort_limit[name] = limit
+            narrower = _magnitude(model.jnt_actfrcrange[joint], name, findings)
+            limits[joint] = min(limits[joint], narrower)
     robot.lost["effects of tendons"] += [
         label(model.tendon(tendon))
         for tendon in range(model.ntendon)
         if any(np.any(getattr(model, f"tendon_{effect}")[tendon]) for effect in _OF_TENDONS)
     ]
-    return motors
+    return JointMotors(
+        limits,
+        armature,
+        kp,
+        kd,
+        setpoints,
+        unmoved,
+    )
+
+
+def _moments(robot: RobotInFile) -> Float64:
+    """Return the moment arms of the actuators on the joints (actuators, joints), 0 for an actuator
+    that acts otherwise than by constant arms on joints of the robot.
+    """
+    model = robot.model
+    joints = list(robot.joints)
+    arms = np.zeros((len(model.actuator_trntype), model.njnt))
+    for actuator, kind in enumerate(model.actuator_trntype.tolist()):
+        # A tendon is fixed, and has constant arms, if joints are its parts.
+        if kind == _TRN.mjTRN_TENDON:
+            first = model.tendon_adr[model.actuator_trnid[actuator, 0]]
+            is_constant = model.wrap_type[first] == mujoco.mjtWrap.mjWRAP_JOINT
+        else:
+            is_constant = kind in (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT)
+        row = robot.moments[model.actuator_outadr[actuator]]
+        of_joints = row[model.jnt_dofadr[joints]]
+        if is_constant and np.count_nonzero(row) == np.count_nonzero(of_joints):
+            arms[actuator, joints] = of_joints
+    return arms
 
 
 def _is_plain(model: MjModel, actuator: int) -> bool:
@@ -179,32 +212,8 @@ def _servo(model: MjModel, actuator: int) -> Servo:
     return Servo(kp, kv)
 
 
-def _add_setpoints(
-    model: MjModel,
-    actuator: int,
-    servo: Servo,
-    robot: RobotInFile,
-    motors: JointMotors,
-) -> None:
-    """Add the range of a servo's setpoints, where its transmission moves with one joint alone."""
-    arms = _arms(model, actuator, robot)
-    control = int(model.actuator_ctrladr[actuator])
-    if len(arms) == 1 and model.actuator_ctrllimited[control]:
-        ((name, arm),) = arms.items()
-        ends = servo.input_gain * model.actuator_ctrlrange[control] / arm
-        motors.setpoints[name] = float(ends.min()), float(ends.max())
-
-
-def _add_limits(
-    model: MjModel,
-    actuator: int,
-    name: str,
-    arm: float,
-    motors: JointMotors,
-    findings: list[Finding],
-) -> None:
-    """Add armature and effort limit of an actuator to a joint."""
-    motors.armature[name] += arm**2 * float(np.ravel(model.actuator_armature[actuator])[0])
+def _largest_force(model: MjModel, actuator: int, name: str, findings: list[Finding]) -> float:
+    """Return the limit of the force of an actuator, which moves the joint ``name``."""
     low, high = -math.inf, math.inf
     if model.actuator_forcelimited[actuator]:
         low, high = model.actuator_forcerange[actuator].tolist()
@@ -221,41 +230,7 @@ def _add_limits(
     tendon = int(model.actuator_trnid[actuator, 0])
     if model.actuator_trntype[actuator] == _TRN.mjTRN_TENDON and model.tendon_actfrclimited[tendon]:
         force = min(force, _magnitude(model.tendon_actfrcrange[tendon], name, findings))
-    motors.effort_limit[name] = motors.effort_limit.get(name, 0.0) + abs(arm) * force
-
-
-def _arms(model: MjModel, actuator: int, robot: RobotInFile) -> dict[str, float]:
-    """Return the moment arms of an actuator on the joints that it acts on by a constant arm, by
-    name; none if it acts otherwise.
-    """
-    kind = int(model.actuator_trntype[actuator])
-    target = int(model.actuator_trnid[actuator, 0])
-    # An orientation servo has several outputs, each with a gear.
-    gear = float(model.actuator_gear[int(model.actuator_outadr[actuator]), 0])
-    if kind in (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT) and target in robot.joints:
-        return {robot.joints[target]: gear}
-    if kind != _TRN.mjTRN_TENDON:
-        return {}
-    arms: dict[str, float] = defaultdict(float)
-    first = int(model.tendon_adr[target])
-    for wrap in range(first, first + int(model.tendon_num[target])):
-        joint = int(model.wrap_objid[wrap])
-        if model.wrap_type[wrap] != mujoco.mjtWrap.mjWRAP_JOINT or joint not in robot.joints:
-            return {}
-        arms[robot.joints[joint]] += gear * float(model.wrap_prm[wrap])
-    return dict(arms)
-
-
-def _on_leaders(arms: dict[str, float], couplings: Couplings) -> dict[str, float]:
-    """Return the moment arms on the independent joints, with those on their followers."""
-    sums: dict[str, float] = defaultdict(float)
-    for name, arm in arms.items():
-        for _ in couplings:  # at most as many leaders of leaders
-            if name in couplings:
-                name, multiplier, _offset = couplings[name]
-                arm = arm * multiplier
-        sums[name] += arm
-    return {name: arm for name, arm in sums.items() if arm}
+    return force
 
 
 def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
