@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -170,6 +171,7 @@ def describe(robot: Robot) -> Document:
     }
 
 
+@lru_cache(maxsize=16)
 def content(robot: Robot) -> str:
     """Return the digest of bodies, joints and shapes, with the content of mesh files in place of
     their paths.
