@@ -28,11 +28,6 @@ struct Tree {
   Coupling coupling() const { return {coupled ? leader.data() : nullptr, multiplier.data()}; }
 };
 
-// Write cosines and sines of angles.
-inline void write_cosines(std::int64_t count, Lanes const *angle, Lanes *cosine, Lanes *sine) {
-  for (std::int64_t i = 0; i < count; ++i) sine_and_cosine(angle[i], sine[i], cosine[i]);
-}
-
 inline void put(Vector<Lanes> const &v, Lanes *out, std::int64_t stride = 1) {
   out[0] = v.x;
   out[stride] = v.y;
