@@ -26,9 +26,9 @@ from lxml import etree
 
 from batchpid import PIDParams
 from batchpid.sim import MujocoSolver, Robot, Runner
-from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
 from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.mjcf_export import to_mjcf
 
 NUM_ENVS, TICKS, ROUNDS, SUBSTEPS = 16, 20, 5, 20
 SHAKE = 0.02

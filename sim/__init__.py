@@ -13,7 +13,6 @@ from batchpid.io.files import attributes_of
 
 if TYPE_CHECKING:
     from batchpid.sim.diagnosis.loop_stability import StabilityWarning
-    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
     from batchpid.sim.engine.scene_spec import MujocoSolver, Physics
     from batchpid.sim.findings import Finding, RepairWarning
     from batchpid.sim.loop.arrays import Snapshot
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
         read_recording,
         write_recording,
     )
+    from batchpid.sim.robot.mjcf_export import to_mjcf
     from batchpid.sim.robot.robot import Robot
     from batchpid.sim.robot.urdf_export import to_urdf
     from batchpid.sim.rollout import Rollout, RunInfo
@@ -102,7 +102,7 @@ _PLACES = {
     "Uniform": "batchpid.sim.randomization.distributions",
     "closed_loop": "batchpid.sim.loop.closed_loop",
     "read_recording": "batchpid.sim.recording.recording_files",
-    "to_mjcf": "batchpid.sim.engine.mujoco.mjcf_export",
+    "to_mjcf": "batchpid.sim.robot.mjcf_export",
     "to_urdf": "batchpid.sim.robot.urdf_export",
     "write_recording": "batchpid.sim.recording.recording_files",
 }

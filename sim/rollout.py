@@ -159,7 +159,7 @@ class RunInfo:
         """Return the info of a run of a :class:`batchpid.sim.Robot`; ``options`` are further
         fields.
         """
-        from batchpid.sim.robot.reading import content
+        from batchpid.sim.robot.robot_options import content
 
         values = {name: getattr(robot, name) for name in _OF_ROBOT}
         values |= {"digest": content(robot), "dissipation": robot.source.dissipation}

@@ -173,6 +173,8 @@ LAW = (
     "effort_min",
     "effort_max",
     "turns",
+    "coulomb",
+    "band",
     "effort",
     "next_integral",
     "limited",

@@ -42,31 +42,6 @@ class Given {
   std::vector<Lanes> of_;
 };
 
-// Write the efforts of damping and Coulomb friction (dof,) on the way of a tool to its setpoint. Without a twist the
-// setpoint rests; without a viscous damping that part is left out.
-inline void write_friction(std::int64_t dof, Given const &at, Lanes const *viscous, Lanes const *coulomb,
-                           Lanes const *band, Lanes *out) {
-  constexpr double LOOKAHEAD = 0.1;  // of batchpid/motors/friction.py
-  Lanes const *jacobian = at[LAW_JACOBIAN], *chain = at[LAW_CHAIN];
-  Lanes ahead[AXES], mobility[AXES * AXES];
-  write_error(at[LAW_SETPOINT], at[LAW_POSE], ahead);
-  for (int a = 0; a < AXES; ++a) {
-    if (at[LAW_TWIST] != nullptr) ahead[a] += LOOKAHEAD * at[LAW_TWIST][a];
-    for (int b = 0; b <= a; ++b) {
-      mobility[a * AXES + b] = mobility[b * AXES + a] = along(jacobian + a * dof, jacobian + b * dof, dof);
-    }
-    mobility[a * AXES + a] += 1e-4;
-  }
-  factorize(AXES, mobility);
-  solve_both<1>(AXES, mobility, ahead);
-  for (std::int64_t j = 0; j < dof; ++j) {
-    Lanes const moved = along(jacobian + j, ahead, AXES, dof);
-    Lanes const way = chain[j] * moved + (1.0 - chain[j]) * (at[LAW_POSTURE][j] - at[LAW_QPOS][j]);
-    out[j] = at_most(at_least(way * (coulomb[j] / band[j]), -coulomb[j]), coulomb[j]);
-    if (viscous != nullptr) out[j] = viscous[j] * at[LAW_QVEL][j] + out[j];
-  }
-}
-
 // Return the share of an effort, added to efforts `at`, with which the joints within their limits stay there.
 inline Lanes share_within(std::int64_t dof, Lanes const *effort, Lanes const *at, Lanes const *base, Lanes const *low,
                           Lanes const *high) {
@@ -94,9 +69,11 @@ class OSCLaw {
     factor_.resize(links * links);
     white_.resize(links * AXES);
     both_.resize(links * 2);
-    for (auto *leaf : {&a_n_, &a_s_, &base_, &task_, &posture_, &of_task_, &of_posture_, &effort_, &whole_, &limited_}) {
+    for (auto *leaf : {&a_n_, &a_s_, &base_, &task_, &posture_, &of_task_, &of_posture_, &effort_, &whole_, &limited_,
+                       &friction_}) {
       leaf->resize(n);
     }
+    if (table[LAW_COULOMB]) given_.set(LAW_FEEDFORWARD, friction_.data());
     if (dynamics == nullptr) return;
     given_.set(LAW_POSE, dynamics->pose);
     given_.set(LAW_JACOBIAN, dynamics->jacobian.data());
@@ -130,11 +107,10 @@ class OSCLaw {
   }
   Lanes const *qpos() const { return given_[LAW_QPOS]; }
   Lanes const *qvel() const { return given_[LAW_QVEL]; }
-  Given &given() { return given_; }
-  Given const &given() const { return given_; }
 
   // Write the results of the rows loaded.
   void advance(std::int64_t first) {
+    if (given_[LAW_COULOMB] != nullptr) set_friction();
     for (std::int64_t i = 0; i < dof_ && given_[LAW_ADDED_INERTIA] != nullptr; ++i) {
       given_[LAW_MASS_MATRIX][i * dof_ + i] += given_[LAW_ADDED_INERTIA][i];
     }
@@ -153,6 +129,26 @@ class OSCLaw {
   void add_moved(Lanes const *v, Lanes *out) const {
     for (std::int64_t const j : chain_) {
       for (int axis = 0; axis < AXES; ++axis) out[axis] += given_[LAW_JACOBIAN][axis * dof_ + j] * v[j];
+    }
+  }
+
+  // Set the efforts of Coulomb friction on the way of the tool to its setpoint.
+  void set_friction() {
+    constexpr double LOOKAHEAD = 0.1;  // of batchpid/motors/friction.py
+    Lanes const *jacobian = given_[LAW_JACOBIAN], *coulomb = given_[LAW_COULOMB];
+    Lanes ahead[AXES], mobility[AXES * AXES];
+    write_error(given_[LAW_SETPOINT], given_[LAW_POSE], ahead);
+    for (int a = 0; a < AXES; ++a) {
+      if (given_[LAW_TWIST] != nullptr) ahead[a] += LOOKAHEAD * given_[LAW_TWIST][a];
+      for (int b = 0; b <= a; ++b) mobility[a * AXES + b] = along(jacobian + a * dof_, jacobian + b * dof_, dof_);
+      mobility[a * AXES + a] += 1e-4;
+    }
+    factorize(AXES, mobility);
+    solve_both<1>(AXES, mobility, ahead);
+    for (std::int64_t j = 0; j < dof_; ++j) {
+      Lanes const chain = given_[LAW_CHAIN][j], away = given_[LAW_POSTURE][j] - given_[LAW_QPOS][j];
+      Lanes const way = chain * along(jacobian + j, ahead, AXES, dof_) + (1.0 - chain) * away;
+      friction_[j] = at_most(at_least(way * (coulomb[j] / given_[LAW_BAND][j]), -coulomb[j]), coulomb[j]);
     }
   }
 
@@ -335,7 +331,7 @@ class OSCLaw {
   std::vector<std::int64_t> chain_, others_;
   std::vector<Lanes> factor_, white_, both_;
   std::vector<Lanes> a_n_, a_s_, base_, task_, posture_, of_task_, of_posture_;  // 0 for joints without a part in an effort
-  std::vector<Lanes> effort_, whole_, limited_;
+  std::vector<Lanes> effort_, whole_, limited_, friction_;
   Lanes error_[AXES], near_error_[AXES], turned_[2][AXES], a_[AXES], force_[AXES], near_, null_near_;
   Lanes const *target_ = nullptr;  // twist of the setpoint in the law's axes
   Lanes task_inertia_[AXES * AXES], null_inertia_[AXES * AXES], *inertia_ = null_inertia_;

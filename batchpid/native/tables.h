@@ -95,7 +95,7 @@ class Tables {
   Table const &operator[](int at) const { return tables_[at]; }
 
  private:
-  static constexpr int MOST = 52;
+  static constexpr int MOST = 56;
 
   Buffer buffers_[MOST];
   Table tables_[MOST];

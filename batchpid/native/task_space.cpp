@@ -41,15 +41,15 @@ FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, st
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
     table[KINEMATICS_QPOS].load(first, qpos.data());
     if (table[KINEMATICS_QVEL]) table[KINEMATICS_QVEL].load(first, qvel.data());
-    at.place(qpos.data(), table[KINEMATICS_QVEL] ? qvel.data() : nullptr);
-    if (table[KINEMATICS_TOOL]) {
-      table[KINEMATICS_TOOL].load(first, frame);
-      bool const moves{table[KINEMATICS_JACOBIAN_RATE]};
-      at.set_tool(frame, bool{table[KINEMATICS_POSE]}, bool{table[KINEMATICS_JACOBIAN]}, moves);
-      table[KINEMATICS_POSE].store(first, at.pose);
-      table[KINEMATICS_JACOBIAN].store(first, at.jacobian.data());
-      table[KINEMATICS_JACOBIAN_RATE].store(first, at.rate);
-    }
+    at.place(qpos.data());
+    if (table[KINEMATICS_QVEL]) at.move(qvel.data());
+    table[KINEMATICS_TOOL].load(first, frame);
+    at.set_tool(frame);
+    table[KINEMATICS_POSE].store(first, at.pose);
+    if (table[KINEMATICS_JACOBIAN]) at.set_jacobian();
+    table[KINEMATICS_JACOBIAN].store(first, at.jacobian.data());
+    if (table[KINEMATICS_JACOBIAN_RATE]) at.set_rate();
+    table[KINEMATICS_JACOBIAN_RATE].store(first, at.rate);
     if (table[KINEMATICS_BIAS] || table[KINEMATICS_MASS_MATRIX]) at.weigh();
     if (table[KINEMATICS_BIAS]) at.set_bias();
     table[KINEMATICS_BIAS].store(first, at.bias.data());
@@ -84,112 +84,68 @@ std::int64_t law_columns(int array, std::int64_t dof) {
   return std::count(std::begin(SIX), std::end(SIX), array) ? AXES : dof;
 }
 
-// Friction of some robots, from damping, Coulomb friction and band of their joints; the damping may be left out.
-class JointFriction {
- public:
-  JointFriction(Tables const &table, std::int64_t dof) : out(static_cast<std::size_t>(dof)), table_(table), dof_(dof) {
-    for (auto &each : columns_) each.resize(out.size());
-  }
-  // Write the friction of the rows from `first` on, which a law has loaded.
-  void write(std::int64_t first, Given const &at) {
-    auto &[viscous, coulomb, band] = columns_;
-    for (int i = 0; i < 3; ++i) {
-      if (table_[i]) table_[i].load(first, columns_[i].data());
-    }
-    write_friction(dof_, at, table_[0] ? viscous.data() : nullptr, coulomb.data(), band.data(), out.data());
-  }
-
-  std::vector<Lanes> out;
-
- private:
-  Tables const &table_;
-  std::int64_t dof_;
-  std::vector<Lanes> columns_[3];
-};
-
-// Law of some robots on given arrays, with dynamics of a tree where it has a tool.
+// Law of some robots on given arrays, with dynamics of a tree where it has a tool, and its room. A bound step keeps it:
+// to make it takes longer than to step four robots.
 struct Step : Call {
-  Tree tree{};
-  std::int64_t body, rows, dof;
-  bool in_tool_axes;
-  Tables law, tool, friction;
+  static constexpr char CAPSULE[] = "batchpid.Step";
 
   // Arguments: rows, dof, in_tool_axes, tree, body and tool (None, any and None without them), *arrays of Law.
   bool open(PyObject *const *arguments) {
     rows = PyLong_AsLong(arguments[0]);
-    dof = PyLong_AsLong(arguments[1]);
-    in_tool_axes = PyLong_AsLong(arguments[2]) != 0;
-    body = PyLong_AsLong(arguments[4]);
+    std::int64_t const dof = PyLong_AsLong(arguments[1]), body = PyLong_AsLong(arguments[4]);
+    bool const in_tool_axes = PyLong_AsLong(arguments[2]) != 0;
     if (!PyErr_Occurred() && arguments[3] != Py_None) {
       if (Tree const *given = held<Tree>(arguments[3])) tree = *given;
     }
     if (PyErr_Occurred() || !tool.open(arguments[5], FRAME, rows, false)) return false;
     for (int i = 0; i < LAW; ++i) {
-      if (!law.open(arguments[6 + i], law_columns(i, dof), i == LAW_CHAIN ? 1 : rows, i >= LAW_EFFORT)) return false;
+      if (!table.open(arguments[6 + i], law_columns(i, dof), i == LAW_CHAIN ? 1 : rows, i >= LAW_EFFORT)) return false;
     }
+    if (tool[0]) dynamics = std::make_unique<ToolDynamics>(tree, body);
+    law = std::make_unique<OSCLaw>(dof, in_tool_axes, table, dynamics.get());
     return true;
   }
+
+  Tree tree{};
+  std::int64_t rows;
+  Tables table, tool;
+  std::unique_ptr<ToolDynamics> dynamics;
+  std::unique_ptr<OSCLaw> law;
 };
 
-// Room for the step of WIDTH robots. A bound step keeps it: to make it takes longer than to step four robots.
-struct StepRoom {
-  explicit StepRoom(Step const &step)
-      : dynamics(step.tree, step.body),
-        law(step.dof, step.in_tool_axes, step.law, step.tool[0] ? &dynamics : nullptr),
-        friction(step.friction, step.dof) {
-    if (step.friction[1]) law.given().set(LAW_FEEDFORWARD, friction.out.data());
-  }
-  ToolDynamics dynamics;
-  OSCLaw law;
-  JointFriction friction;
-};
-
-FOR_EACH_PROCESSOR void write_step(Step const &step, StepRoom &room) {
-  auto &[dynamics, law, friction] = room;
+FOR_EACH_PROCESSOR void write_step(Call const &call) {
+  auto const &step = static_cast<Step const &>(call);
   Lanes tool[FRAME];
   for (std::int64_t first = 0; first < step.rows; first += WIDTH) {
-    law.load(first);
-    if (step.tool[0]) {
+    step.law->load(first);
+    if (step.dynamics) {
       step.tool[0].load(first, tool);
-      dynamics.place(law.qpos(), law.qvel());
-      dynamics.set_tool(tool, true, true, true);
-      dynamics.weigh();
-      if (!step.law[LAW_BIAS]) dynamics.set_bias();
-      dynamics.set_mass();
+      step.dynamics->place(step.law->qpos());
+      step.dynamics->move(step.law->qvel());
+      step.dynamics->set_tool(tool);
+      step.dynamics->set_jacobian();
+      step.dynamics->set_rate();
+      step.dynamics->weigh();
+      if (!step.table[LAW_BIAS]) step.dynamics->set_bias();
+      step.dynamics->set_mass();
     }
-    if (step.friction[1]) friction.write(first, law.given());
-    law.advance(first);
+    step.law->advance(first);
   }
-}
-
-// Step on arrays that stay, with its room.
-struct BoundStep : Step {
-  static constexpr char CAPSULE[] = "batchpid.BoundStep";
-  std::unique_ptr<StepRoom> room;
-};
-
-void write_bound_step(Call const &call) {
-  auto const &step = static_cast<BoundStep const &>(call);
-  write_step(step, *step.room);
 }
 
 // law(*arguments of Step::open)
 PyObject *law(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Step once;
   if (!once.open(arguments)) return nullptr;
-  StepRoom room(once);
-  write_step(once, room);
+  write_step(once);
   Py_RETURN_NONE;
 }
 
-// bind(*arguments of Step::open, damping, Coulomb friction and band of the joints) -> (object, address of Call)
+// bind(*arguments of Step::open) -> (object, address of Call)
 PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  auto bound = std::make_unique<BoundStep>();
-  bound->run = write_bound_step;
+  auto bound = std::make_unique<Step>();
+  bound->run = write_step;
   if (!bound->open(arguments)) return nullptr;
-  std::int64_t const dof = bound->dof;
-  if (!bound->friction.open_all(arguments + 6 + LAW, {dof, dof, dof}, bound->rows, 3)) return nullptr;
-  bound->room = std::make_unique<StepRoom>(*bound);
   PyObject *address = PyLong_FromVoidPtr(static_cast<Call *>(bound.get()));
   return Py_BuildValue("NN", capsule_of(std::move(bound)), address);
 }

@@ -66,28 +66,12 @@ struct Tool {
       if (k == 3) columns[k] = body->origin + columns[k];
     }
   }
-  Vector<Lanes> const &place() const { return columns[3]; }
   // Write the pose (7,): position and quaternion.
   void write_pose(Lanes *pose) const {
     put(columns[3], pose);
     write_quaternion(columns[0], columns[1], columns[2], pose + 3);
   }
 };
-
-// Write the column (6,) of the Jacobian of a place that belongs to the joint of a body.
-inline void write_column(BodyState<Lanes> const &body, bool slides, Vector<Lanes> const &place, Lanes *out,
-                         std::int64_t stride = 1) {
-  Vector<Lanes> const w = turning(body, slides);
-  put(body.moving + cross(w, place), out, stride);
-  put(w, out + 3 * stride, stride);
-}
-
-// Write J' q' (6,) of a place on a body.
-inline void write_rate(BodyMotion<Lanes> const &at, Vector<Lanes> const &place, Lanes *out) {
-  Vector<Lanes> const inward = cross(at.turning, at.moving + cross(at.turning, place));
-  put(at.moving_change + cross(at.turning_change, place) + inward, out);
-  put(at.turning_change, out + 3);
-}
 
 // Rotation matrix of a quaternion (w, x, y, z): matrix_of in frames.py.
 struct Turn {
@@ -141,25 +125,33 @@ class ToolDynamics {
     motions_.resize(size);
   }
 
-  // Set the bodies at positions and velocities (dof,); without velocities, their frames alone.
-  void place(Lanes const *qpos, Lanes const *qvel) {
+  // Set the frames of the bodies at positions (dof,).
+  void place(Lanes const *qpos) {
     write_cosines(tree_.dof, qpos, cosine_.data(), sine_.data());
     place_bodies(tree_.dof, above(), tree_.bodies(), cosine_.data(), sine_.data(), qpos, bodies_.data());
-    if (qvel != nullptr) move_bodies(tree_.dof, above(), bodies_.data(), qvel, {}, motions_.data());
   }
-  // Set the pose of a tool, its Jacobian, and J' q' where the bodies have velocities.
-  void set_tool(Lanes const *frame, bool poses, bool columns, bool moves) {
+  // Set the velocities of the bodies, from those of the joints (dof,).
+  void move(Lanes const *qvel) { move_bodies(tree_.dof, above(), bodies_.data(), qvel, {}, motions_.data()); }
+  // Set the pose of a tool; each of the next two needs it.
+  void set_tool(Lanes const *frame) {
     Tool const tool(frame, body_ < 0 ? nullptr : &bodies_[body_]);
-    if (poses) tool.write_pose(pose);
-    if (columns && tree_.coupled) std::fill(jacobian.begin(), jacobian.end(), Lanes{});  // leaders are added to
-    for (std::int64_t j = columns ? body_ : -1; j >= 0; j = above()[2 * j]) {
-      write_column(bodies_[j], above()[2 * j + 1], tool.place(), &jacobian[j], tree_.dof);
+    place_ = tool.columns[3];
+    tool.write_pose(pose);
+  }
+  void set_jacobian() {
+    if (tree_.coupled) std::fill(jacobian.begin(), jacobian.end(), Lanes{});  // leaders are added to
+    for (std::int64_t j = body_; j >= 0; j = above()[2 * j]) {
+      Vector<Lanes> const w = turning(bodies_[j], above()[2 * j + 1]);
+      put(bodies_[j].moving + cross(w, place_), &jacobian[j], tree_.dof);
+      put(w, &jacobian[j + 3 * tree_.dof], tree_.dof);
     }
-    for (int axis = 0; axis < AXES && columns && tree_.coupled; ++axis) {
-      Lanes *row = &jacobian[axis * tree_.dof];
-      tree_.coupling().fold_vector(size(), row);
-    }
-    if (moves) write_rate(body_ < 0 ? BodyMotion<Lanes>{} : motions_[body_], tool.place(), rate);
+    for (int axis = 0; axis < AXES; ++axis) tree_.coupling().fold_vector(size(), &jacobian[axis * tree_.dof]);
+  }
+  void set_rate() {  // the bodies have velocities
+    BodyMotion<Lanes> const at = body_ < 0 ? BodyMotion<Lanes>{} : motions_[body_];
+    Vector<Lanes> const inward = cross(at.turning, at.moving + cross(at.turning, place_));
+    put(at.moving_change + cross(at.turning_change, place_) + inward, rate);
+    put(at.turning_change, rate + 3);
   }
   // Set the inertias of the bodies; each of the following needs them, and the first must come first.
   void weigh() { weigh_bodies(tree_.dof, tree_.bodies(), bodies_.data()); }
@@ -184,6 +176,7 @@ class ToolDynamics {
 
   Tree const &tree_;
   std::int64_t body_;
+  Vector<Lanes> place_;  // of the tool
   std::vector<Lanes> cosine_, sine_;
   std::vector<BodyState<Lanes>> bodies_;
   std::vector<BodyMotion<Lanes>> motions_;

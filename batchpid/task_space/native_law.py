@@ -63,7 +63,7 @@ def law(
         (qpos, qvel), *_ = prepared(tool.tree, qpos=inputs.qpos, qvel=inputs.qvel)
         inputs = inputs._replace(qpos=qpos, qvel=qvel)
         dynamics_arrays = (read_point(qpos, tool.point),)
-    arrays = (*inputs, None, None, None, *state, *k[:-1])
+    arrays = (*inputs, None, None, None, *state, *k[:-1], None, None)
     if (native := native_rows.for_rows(inputs.qpos, *dynamics_arrays, *arrays)) is None:
         return None
     rows, dof = inputs.qpos.shape
@@ -174,10 +174,9 @@ class BoundOSC:
         # Implicit damping appears to the law as an inertia of dt times it.
         if damping is not None:
             arrays |= {"damping": damping, "added_inertia": timestep * damping}
-        rubbing: list[Float64 | None] = [None, None, None]
-        if friction is not None:  # damping is part of this friction, and not an input of the law
-            rubbing = [arrays.pop("damping", None), *friction]
-        self._kept, self.address = native.bind(rows, dof, *fixed, *map(arrays.get, LAW), *rubbing)
+        if friction is not None:
+            arrays["coulomb"], arrays["band"] = friction
+        self._kept, self.address = native.bind(rows, dof, *fixed, *map(arrays.get, LAW))
 
     def set_state(self, state: Document) -> None:
         """Copy a state."""

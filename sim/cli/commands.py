@@ -25,7 +25,7 @@ from batchpid.sim.cli.gains import ENDINGS, compare, export, tune
 from batchpid.sim.cli.identify import excite_joints, identify_logs
 from batchpid.sim.cli.inspect import inspect_robot, plot, view
 from batchpid.sim.cli.rollout import demo, rollout
-from batchpid.sim.robot.reading import tuned_file
+from batchpid.sim.robot.robot_options import tuned_file
 
 PICTURES = (".png", ".svg")
 DOCUMENTS = (".yaml", ".yml", ".json")

@@ -277,7 +277,7 @@ def _mjcf(
     from batchpid.sim.engine.protocol import load_engine
 
     load_engine("mujoco")  # raises without MuJoCo
-    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+    from batchpid.sim.robot.mjcf_export import to_mjcf
 
     options: dict[str, Any] = {"actuators": robot.actuators, "inertia": _inertia(robot)}
     if limits:

@@ -23,12 +23,12 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Finding, Robot, Rollout, read_recording
 from batchpid.sim.cli.flags import Gains, flag
 from batchpid.sim.cli.gains import law_gains
+from batchpid.sim.description.merging import link_inertias
+from batchpid.sim.description.tables import Body, Joint
 from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.findings import summary
 from batchpid.sim.geometry.shapes import DENSITY
-from batchpid.sim.robot.merging import link_inertias
-from batchpid.sim.robot.reading import tuned_file
-from batchpid.sim.robot.tables import Body, Joint
+from batchpid.sim.robot.robot_options import tuned_file
 from batchpid.sim.tuning.gain_sets import GainSet, gain_set, gain_table
 
 if TYPE_CHECKING:

@@ -36,7 +36,6 @@ from batchpid.sim.engine.scene_spec import (
     own_friction,
 )
 from batchpid.sim.findings import Finding
-from batchpid.sim.robot.robot import Robot
 from batchpid.task_space.rigid_tree import RigidTree
 
 Capability = Literal["build", "partial_force", "base_state", "complete_state", "sapien_dissipation"]
@@ -440,15 +439,6 @@ def load_engine(name: str) -> Engine:
         raise InvalidArgumentError("engine", problem, value=name, remedy="use 'mujoco'")
     engine: Engine = imported(module).ENGINE
     return engine
-
-
-def engine_findings(robot: Robot, name: str, timestep: float) -> Iterator[Finding]:
-    """Yield what of ``robot`` an engine cannot run, or runs otherwise than the file says."""
-    engine = load_engine(name)
-    ground = {"ground": robot.has_ground, "mjcf": robot.mjcf}
-    scene = SceneSpec.of(robot, timestep, engine.physics["accurate"], **ground)
-    yield from engine.refusals(scene)
-    yield from engine.shortfalls(scene)
 
 
 def _require_mujoco() -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
-from batchpid.sim.robot.merging import (
+from batchpid.sim.description.merging import (
     Part,
     body_tree,
     coupling_of,
@@ -26,8 +26,7 @@ from batchpid.sim.robot.merging import (
     place_links,
     varied_bodies,
 )
-from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.tables import Joint, MjcfFile, Tables
+from batchpid.sim.description.tables import Joint, MjcfFile, Tables
 from batchpid.task_space.frames import SpatialInertia, spatial_matrix, total
 from batchpid.task_space.rigid_tree import GRAVITY, RigidTree
 
@@ -122,26 +121,6 @@ class SceneSpec:
     mjcf: MjcfFile | None = None
     carrier: str = ""
     varied_links: tuple[str, ...] = ()
-
-    @classmethod
-    def of(
-        cls,
-        robot: Robot,
-        timestep: float,
-        physics: object,
-        **options: Any,
-    ) -> SceneSpec:
-        """Return the description of scenes of ``robot``; ``options`` are further fields."""
-        return cls(
-            robot.tables,
-            robot.self_contact.ignored,
-            robot.joints,
-            timestep,
-            physics,
-            dissipation=robot.source.dissipation,
-            fixed_base=robot.fixed_base,
-            **options,
-        )
 
     @property
     def simulated(self) -> Tables:

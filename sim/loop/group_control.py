@@ -20,14 +20,14 @@ from batchpid.arrays.trees import leaves, mapped
 from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
 from batchpid.motors.friction import Friction
 from batchpid.native.extensions import MOST_SUMMED
+from batchpid.sim.description.merging import coupling_of
+from batchpid.sim.description.tables import Joint
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.env_parts import OwnController
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.merging import coupling_of
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
-from batchpid.sim.robot.tables import Joint
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.stages import Control, Stage, stages_of
 from batchpid.stages.friction import REFRESH_STEPS

@@ -21,14 +21,14 @@ from batchpid.arrays.elementwise import read_only, require_jax
 from batchpid.arrays.field_tables import Field, plain
 from batchpid.checks import array, at_least, choice, instance, names
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.description.merging import place_links
+from batchpid.sim.description.tables import MjcfFile
 from batchpid.sim.engine.protocol import Engine, load_engine, require
 from batchpid.sim.engine.scene_spec import MujocoSolver, Physics
 from batchpid.sim.randomization.checks import check_robot
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_model import link_tree
-from batchpid.sim.robot.tables import MjcfFile
 from batchpid.sim.signals import own_command
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.stages import Stage, fit_stages

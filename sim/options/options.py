@@ -26,6 +26,7 @@ from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.state import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
+from batchpid.sim.description.tables import MjcfFile
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction
 from batchpid.sim.options.groups import (
     Controller,
@@ -39,10 +40,15 @@ from batchpid.sim.options.groups import (
     option,
 )
 from batchpid.sim.randomization.checks import check_params, prepared_actuators
-from batchpid.sim.robot.reading import describe, tuned_file
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.robot_options import fit_actuators, fit_guard, known_joints
-from batchpid.sim.robot.tables import MjcfFile
+from batchpid.sim.robot.robot_options import (
+    describe,
+    fit_actuators,
+    fit_guard,
+    known_joints,
+    scene_of,
+    tuned_file,
+)
 from batchpid.sim.signals import (
     CommandSpec,
     Observation,
@@ -135,7 +141,7 @@ class RunnerOptions(RunnerKeywords):
     def scene(self) -> SceneSpec:
         """Description of the scenes, for the engine."""
         options = self.values_for("scene")
-        return SceneSpec.of(self.robot, mjcf=self.mjcf, **options)
+        return scene_of(self.robot, mjcf=self.mjcf, **options)
 
     def _check_tree(self, argument: str, value: object, remedy: str) -> None:
         """Raise InvalidArgumentError for an option that needs a kinematic tree, if the robot has

@@ -12,10 +12,10 @@ from batchpid.checks import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN
 from batchpid.motors.actuators import ACTUATOR_FIELDS, DELAYS, NOISES
+from batchpid.sim.description.tables import MjcfFile
 from batchpid.sim.randomization.distributions import Field, elements, nominal_values, parts
 from batchpid.sim.randomization.randomization import EVENTS, RANDOMIZED_FIELDS, Randomization
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.tables import MjcfFile
 
 _ZERO = ("payload", "center_of_mass", "latency", *EVENTS)
 """Fields whose nominal value is 0, which no draw can scale."""

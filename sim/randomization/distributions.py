@@ -18,9 +18,9 @@ from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.checks import choice, flag, number, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.sim.robot.merging import link_inertias
+from batchpid.sim.description.merging import link_inertias
+from batchpid.sim.description.tables import CONTACT_FRICTION, MjcfFile
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.tables import CONTACT_FRICTION, MjcfFile
 from batchpid.sim.signals import TWIST_UNITS
 
 Episodes = NDArray[np.int64]

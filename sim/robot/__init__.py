@@ -1,1 +1,1 @@
-"""Robot descriptions, from a URDF to a checked :class:`batchpid.sim.Robot`, without SAPIEN."""
+"""Robots: :class:`batchpid.sim.Robot`, what it is asked for, and its export to other programs."""

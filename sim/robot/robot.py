@@ -1,5 +1,5 @@
 """Robot: a URDF or MJCF file, parsed once and checked: joints, limits and defaults, checks and
-gains. Nothing here depends on an engine.
+gains.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ from batchpid.arrays.elementwise import read_only
 from batchpid.checks import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.motors.coupling import Coupling
+from batchpid.sim.description import reading
+from batchpid.sim.description.merging import couple, coupling_of, place_links
+from batchpid.sim.description.tables import Joint, MjcfFile, Placement, Settings, Source, Tables
+from batchpid.sim.diagnosis.preflight import check
 from batchpid.sim.findings import Finding, Findings, report
-from batchpid.sim.robot import reading
-from batchpid.sim.robot.merging import couple, coupling_of, place_links
 from batchpid.sim.robot.robot_model import (
     RobotModel,
     SelfContact,
@@ -32,8 +34,12 @@ from batchpid.sim.robot.robot_model import (
     self_contact,
     suggested_effort_limit,
 )
-from batchpid.sim.robot.robot_options import load_robot_actuators, setpoint_guard
-from batchpid.sim.robot.tables import Joint, MjcfFile, Placement, Settings, Source, Tables
+from batchpid.sim.robot.robot_options import (
+    engine_findings,
+    load_robot_actuators,
+    setpoint_guard,
+    tuned_file,
+)
 from batchpid.task_space.rigid_tree import RigidTree
 
 DESIGN_HZ = 1.7
@@ -355,15 +361,10 @@ class Robot:
             ``"mujoco"`` or ``"sapien"``: add what this engine cannot run, and what it runs
             otherwise than the file says.
         """
-        from batchpid.sim.diagnosis.preflight import check
-
         if params is None and self.settings is not None and control == "pid":
             params = self.params()
         of_engine: Iterable[Finding] = ()
         if engine is not None:
-            # The one import that leads upwards: an engine knows robots, and is asked by its name.
-            from batchpid.sim.engine.protocol import engine_findings
-
             of_engine = engine_findings(self, engine, timestep)
         return check(
             self,
@@ -438,7 +439,7 @@ class Robot:
         """Return the tuned params of a bundled robot; see docs/choosing-gains.md. Raises
         InvalidArgumentError for another robot.
         """
-        file = reading.tuned_file(self)
+        file = tuned_file(self)
         if file is None:
             remedy = "use robot.designed(), or search for gains with: batchpid tune"
             raise InvalidArgumentError("robot", f"{self.name!r} has no tuned gains", remedy=remedy)

@@ -23,9 +23,9 @@ import numpy as np
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.motors.coupling import Coupling
+from batchpid.sim.description.merging import body_tree, merge_links, rigid_bodies
+from batchpid.sim.description.tables import DisabledPair, Tables
 from batchpid.sim.geometry.distances import Contacts
-from batchpid.sim.robot.merging import body_tree, merge_links, rigid_bodies
-from batchpid.sim.robot.tables import DisabledPair, Tables
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 

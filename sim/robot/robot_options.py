@@ -1,22 +1,28 @@
-"""Actuators and guard of a run, fitted to the robot's joints and the control."""
+"""What a run takes from its robot: scene, actuators and guard, tuned params, and digests."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.arrays.records import frozen
+from batchpid.arrays.trees import digest
 from batchpid.checks import entries, instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN, JOINT_SIDE
-from batchpid.sim.robot.merging import coupling_of, narrowed
-from batchpid.sim.robot.tables import Joint
+from batchpid.sim.description.merging import coupling_of, narrowed
+from batchpid.sim.description.tables import Joint
+from batchpid.sim.engine.protocol import load_engine
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.findings import Finding
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
@@ -198,3 +204,69 @@ def _of_leaders(guard: bp.Guard, joints: Sequence[Joint]) -> bp.Guard:
         limits[name][:, coupling.followers] = none
         leaves[name] = None if np.isinf(limits[name]).all() else limits[name]
     return guard._replace(**leaves)
+
+
+def scene_of(
+    robot: Robot,
+    timestep: float,
+    physics: object,
+    **options: Any,
+) -> SceneSpec:
+    """Return the description of scenes of ``robot`` for an engine; ``options`` are further
+    fields.
+    """
+    return SceneSpec(
+        robot.tables,
+        robot.self_contact.ignored,
+        robot.joints,
+        timestep,
+        physics,
+        dissipation=robot.source.dissipation,
+        fixed_base=robot.fixed_base,
+        **options,
+    )
+
+
+def engine_findings(robot: Robot, name: str, timestep: float) -> Iterator[Finding]:
+    """Yield what of ``robot`` an engine cannot run, or runs otherwise than the file says."""
+    engine = load_engine(name)
+    ground = {"ground": robot.has_ground, "mjcf": robot.mjcf}
+    scene = scene_of(robot, timestep, engine.physics["accurate"], **ground)
+    yield from engine.refusals(scene)
+    yield from engine.shortfalls(scene)
+
+
+def tuned_file(robot: Robot) -> Path | None:
+    """Return the file of the tuned params that ship with a robot, None without one."""
+    file = robot.path.with_suffix(".tuned.yaml")
+    return file if robot.settings is not None and file.is_file() else None
+
+
+def describe(robot: Robot) -> Document:
+    """Return a description of the simulated robot as plain values, equal for robots of equal
+    content.
+
+    The tables with the collision meshes, the pairs that do not collide, and the settings of a
+    bundled robot are given by digests. The actuators are left out.
+    """
+    source = robot.source
+    return {
+        "robot": robot.name,
+        "content": content(robot),
+        "srdf": digest(source.disabled, source.enabled),
+        "settings": digest(robot.settings, source.start, source.gains),
+        "mjcf": None if robot.mjcf is None else digest(replace(robot.mjcf, path="")),
+        "self_collision": source.self_collision,
+        "dissipation": source.dissipation,
+        "fixed_base": robot.fixed_base,
+        "base_start": source.base_start,
+    }
+
+
+@lru_cache(maxsize=16)
+def content(robot: Robot) -> str:
+    """Return the digest of bodies, joints and shapes, with the content of mesh files in place of
+    their paths.
+    """
+    shapes = [shape._replace(file="") for shape in robot.tables.shapes]
+    return digest(robot.tables.bodies, shapes, robot.joints)

@@ -14,16 +14,16 @@ from lxml import etree
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.export.differences import Exported
+from batchpid.sim.description.merging import link_inertias
+from batchpid.sim.description.reading import is_mjcf, read_robot
+from batchpid.sim.description.tables import NO_TURN, Body
+from batchpid.sim.description.urdf import UNUSED
+from batchpid.sim.description.xml import parse_xml
 from batchpid.sim.findings import summary
 from batchpid.sim.geometry.mesh_files import find_mesh
 from batchpid.sim.geometry.shapes import MOMENTS, Shape, mesh_file
-from batchpid.sim.robot.merging import link_inertias
-from batchpid.sim.robot.reading import is_mjcf, read_robot
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_model import link_tree
-from batchpid.sim.robot.tables import NO_TURN, Body
-from batchpid.sim.robot.urdf import UNUSED
-from batchpid.sim.robot.xml import parse_xml
 from batchpid.task_space.frames import to_rpy
 
 COPIED = {*UNUSED, "safety_controller"}

@@ -12,8 +12,8 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.options.groups import ControlMode
-from batchpid.sim.robot.reading import tuned_file
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_options import tuned_file
 
 
 class GainSet(NamedTuple):

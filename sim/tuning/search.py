@@ -32,8 +32,8 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import package_versions
 from batchpid.sim.options.groups import DEFAULT_ENGINE, EngineName
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.robot.reading import describe
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_options import describe
 from batchpid.sim.tuning.candidates import FACTORS, GainCandidates
 from batchpid.sim.tuning.evaluation import EVALUATION_SUBSTEPS, Comparison, compare, reseeded
 from batchpid.sim.tuning.gain_sets import GainSet, gain_table

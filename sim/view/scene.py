@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.io.files import imported
+from batchpid.sim.description.tables import Visual
 from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.mesh_files import find_mesh, read_mesh
 from batchpid.sim.geometry.shapes import convex_hull
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_model import link_tree
-from batchpid.sim.robot.tables import Visual
 from batchpid.task_space.frames import matrix_of, placed, rotate
 
 MAX_ROBOTS = 64

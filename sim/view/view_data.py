@@ -19,8 +19,8 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks import integer, number
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.reading import content
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_options import content
 from batchpid.sim.rollout import Rollout, RunInfo
 from batchpid.sim.runner.runner import Runner
 from batchpid.sim.signals import Observation

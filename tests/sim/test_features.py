@@ -19,8 +19,8 @@ import batchpid.task_space as ts
 from batchpid.errors import BatchPIDError
 from batchpid.export import to_c
 from batchpid.sim import OperationalSpace, Robot, Runner, write_recording
-from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
 from batchpid.sim.identification import identify
+from batchpid.sim.robot.mjcf_export import to_mjcf
 from batchpid.sim.robot.urdf_export import to_urdf
 from batchpid.trajectories import minimum_jerk
 

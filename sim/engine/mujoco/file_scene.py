@@ -17,11 +17,11 @@ import numpy as np
 
 from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
+from batchpid.sim.description.merging import coupling_of
+from batchpid.sim.description.mjcf import compile_scene, home
+from batchpid.sim.description.mjcf_bodies import RobotInFile
+from batchpid.sim.description.tables import MjcfFile
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.merging import coupling_of
-from batchpid.sim.robot.mjcf.bodies import RobotInFile
-from batchpid.sim.robot.mjcf.reader import compile_scene, home
-from batchpid.sim.robot.tables import MjcfFile
 from batchpid.task_space.frames import inverse, matrix_of, rotate
 
 REMOVED = ("tuples", "sensors", "actuators", "keys", "cameras", "lights")

@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
+from batchpid.sim.description.tables import CONTACT_FRICTION, Joint, MjcfFile
 from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.mujoco_sensors import add_link_sensors
 from batchpid.sim.engine.scene_spec import MujocoSolver, SceneSpec
 from batchpid.sim.geometry.shapes import add_geom
-from batchpid.sim.robot.tables import CONTACT_FRICTION, Joint, MjcfFile
 from batchpid.task_space.frames import SpatialInertia
 
 FLOATING = 6

@@ -16,6 +16,8 @@ import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64, MjData, Rows
 from batchpid.motors import Actuators
+from batchpid.sim.description.merging import coupling_of
+from batchpid.sim.description.tables import CONTACT_FRICTION
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.mujoco.file_scene import check_links
 from batchpid.sim.engine.mujoco.free_motion import FreeMotions, place_of_contacts
@@ -32,8 +34,6 @@ from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel, passive_force
 from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
 from batchpid.sim.engine.scene_spec import SOLVERS, SceneSpec, Variation
-from batchpid.sim.robot.merging import coupling_of
-from batchpid.sim.robot.tables import CONTACT_FRICTION
 from batchpid.task_space.frames import matrix_of, rotate, unrotate
 
 _KEPT_STATE = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)

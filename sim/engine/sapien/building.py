@@ -17,13 +17,13 @@ from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
+from batchpid.sim.description.merging import body_tree
+from batchpid.sim.description.tables import CONTACT_FRICTION, Body, Tables
 from batchpid.sim.engine.sapien.limits import Words, filter_words
 from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.geometry.mesh_files import mesh_bytes
 from batchpid.sim.geometry.shapes import Shape, hull, mesh_file
-from batchpid.sim.robot.merging import body_tree
-from batchpid.sim.robot.tables import CONTACT_FRICTION, Body, Tables
 from batchpid.task_space.frames import SpatialInertia, from_rpy, matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 

@@ -22,9 +22,9 @@ from itertools import combinations
 
 import numpy as np
 
+from batchpid.sim.description.merging import rigid_bodies
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.findings import Finding
-from batchpid.sim.robot.merging import rigid_bodies
 from batchpid.task_space.frames import matrix_of
 
 MAX_LINKS = 255

@@ -22,6 +22,7 @@ from sapien import Pose, physx
 
 from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.motors import Actuators
+from batchpid.sim.description.merging import coupling_of
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
@@ -38,7 +39,6 @@ from batchpid.sim.engine.sapien.calls import SapienLinkSensors, SapienStep, obst
 from batchpid.sim.engine.sapien.limits import refusals, shortfalls
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import PHYSICS, SceneSpec, Variation
-from batchpid.sim.robot.merging import coupling_of
 from batchpid.task_space.frames import matrix_of, unrotate
 from batchpid.task_space.rigid_tree import RigidTree
 

@@ -16,7 +16,7 @@ from batchpid.sim import (
     read_recording,
     write_recording,
 )
-from batchpid.sim.robot.reading import content
+from batchpid.sim.robot.robot_options import content
 from batchpid.sim.view.view_data import recorded_robot
 
 pytest.importorskip("viser")

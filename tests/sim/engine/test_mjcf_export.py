@@ -15,7 +15,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors import actuator_dynamics as motor_model
 from batchpid.motors import guard as guard_model
 from batchpid.sim import Robot, Runner
-from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+from batchpid.sim.robot.mjcf_export import to_mjcf
 
 DT = 1 / 2000
 

@@ -15,7 +15,7 @@ from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.mujoco.mujoco_pack import ENGINE
 from batchpid.sim.engine.scene_spec import SOLVERS, SceneSpec, Variation
 from batchpid.sim.randomization.distributions import nominal_values
-from batchpid.sim.robot.reading import describe
+from batchpid.sim.robot.robot_options import describe
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits"

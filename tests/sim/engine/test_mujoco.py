@@ -11,7 +11,7 @@ import batchpid as bp
 from batchpid.errors import MissingDependencyError
 from batchpid.sim import MujocoSolver, Robot, Runner
 from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.robot_options import scene_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
@@ -87,7 +87,7 @@ def test_a_state_that_is_not_finite_is_the_loops_to_report(capfd):
     """MuJoCo's own warning would name no env."""
     engine = load_engine("mujoco")
     legs = Robot.load("quadruped", fixed_base=False)  # a robot that MuJoCo steps, in any state
-    pack = engine.make_pack(SceneSpec.of(legs, 5e-4, engine.physics["accurate"]), 1)
+    pack = engine.make_pack(scene_of(legs, 5e-4, engine.physics["accurate"]), 1)
     states = pack.read_state()
     pack.write_state_rows(np.full_like(states, np.nan))
     assert np.isnan(pack.read_qpos()).all()

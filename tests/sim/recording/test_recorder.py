@@ -20,7 +20,7 @@ from batchpid.errors import ClosedError, InvalidArgumentError
 from batchpid.sim import FaultWarning, Recorder, RecordingError, Runner, read_recording
 from batchpid.sim.cli import main
 from batchpid.sim.recording import recorder as recorder_module
-from batchpid.sim.robot.reading import content
+from batchpid.sim.robot.robot_options import content
 from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE
 
 ROBOT = load_bundled("panda")

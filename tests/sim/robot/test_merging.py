@@ -6,7 +6,7 @@ from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
 import batchpid.task_space as ts
 from batchpid.sim import Robot
-from batchpid.sim.robot.merging import body_tree, link_inertias, merge_links, place_links
+from batchpid.sim.description.merging import body_tree, link_inertias, merge_links, place_links
 from batchpid.sim.robot.robot_model import link_tree
 from batchpid.task_space.frames import compose, matrix_of, rotate, total
 

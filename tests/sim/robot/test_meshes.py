@@ -14,7 +14,7 @@ from tiny_urdf import INERTIAL, one_joint, write
 
 from batchpid.errors import RobotError
 from batchpid.sim import Robot, Runner
-from batchpid.sim.robot.reading import describe
+from batchpid.sim.robot.robot_options import describe
 
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
 CLAIM = 4_000_000_000

@@ -17,7 +17,7 @@ from batchpid.sim import Robot, Runner, to_urdf
 from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.scene_spec import SOLVERS
-from batchpid.sim.robot.reading import describe
+from batchpid.sim.robot.robot_options import describe
 from batchpid.sim.view.scene import surfaces
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")

@@ -16,8 +16,8 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 from batchpid.errors import RobotError
 from batchpid.sim import RepairWarning, Robot
+from batchpid.sim.description.merging import link_inertias
 from batchpid.sim.geometry.shapes import ball, nearest_physical, triangle_excess
-from batchpid.sim.robot.merging import link_inertias
 
 
 @pytest.mark.parametrize("case", REPAIRED)

@@ -23,8 +23,8 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import read_only
 from batchpid.motors.coupling import Coupling, Follower
+from batchpid.sim.description.tables import NO_TURN, ORIGIN, Body, Joint, Placement, Tables
 from batchpid.sim.geometry.shapes import LEAST_MASS, inertia_of
-from batchpid.sim.robot.tables import NO_TURN, ORIGIN, Body, Joint, Placement, Tables
 from batchpid.task_space.frames import SpatialInertia, compose, matrix_of, rotate, total
 from batchpid.task_space.rigid_tree import GRAVITY, RigidTree
 

@@ -26,9 +26,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.errors import RobotError
-from batchpid.sim.findings import Finding
-from batchpid.sim.geometry.shapes import Shape, ShapeKind, possible_inertia
-from batchpid.sim.robot.tables import (
+from batchpid.sim.description.tables import (
     NO_TURN,
     ORIGIN,
     Body,
@@ -40,10 +38,12 @@ from batchpid.sim.robot.tables import (
     unique,
     without_mass,
 )
+from batchpid.sim.findings import Finding
+from batchpid.sim.geometry.shapes import Shape, ShapeKind, possible_inertia
 from batchpid.task_space.frames import about, compose, matrix_of, rotate
 
 if TYPE_CHECKING:
-    from batchpid.sim.robot.mjcf.motors import Couplings, JointMotors
+    from batchpid.sim.description.mjcf_motors import Couplings, JointMotors
 
 PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 _FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL

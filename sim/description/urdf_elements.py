@@ -11,10 +11,7 @@ from lxml import etree
 
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.errors import RobotError
-from batchpid.sim.findings import Finding
-from batchpid.sim.geometry.mesh_files import LARGEST_NUMBER, check_mesh, find_mesh
-from batchpid.sim.geometry.shapes import MOMENTS, SMALLEST, Shape, from_entries, possible_inertia
-from batchpid.sim.robot.tables import (
+from batchpid.sim.description.tables import (
     MOVING_TYPES,
     NO_TURN,
     ORIGIN,
@@ -24,7 +21,10 @@ from batchpid.sim.robot.tables import (
     Visual,
     without_mass,
 )
-from batchpid.sim.robot.xml import fault, numbers, read_numbers
+from batchpid.sim.description.xml import fault, numbers, read_numbers
+from batchpid.sim.findings import Finding
+from batchpid.sim.geometry.mesh_files import LARGEST_NUMBER, check_mesh, find_mesh
+from batchpid.sim.geometry.shapes import MOMENTS, SMALLEST, Shape, from_entries, possible_inertia
 from batchpid.task_space.frames import from_rpy
 
 GIVE_RANGE = "give <limit lower= upper=>"

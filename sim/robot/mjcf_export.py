@@ -47,10 +47,11 @@ from batchpid.motors.actuators import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.motors.guard import Guard
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
-from batchpid.sim.engine.scene_spec import SOLVERS, SceneSpec, added_friction, own_friction
+from batchpid.sim.engine.scene_spec import SOLVERS, added_friction, own_friction
 from batchpid.sim.geometry.shapes import nearest_physical
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_model import base_start
+from batchpid.sim.robot.robot_options import scene_of
 from batchpid.task_space.frames import SpatialInertia
 
 _FAR = 1e10
@@ -229,7 +230,7 @@ def to_mjcf(
         has_law,
     )
     sentences = differences(law, "mjcf", robot.independent)
-    spec = SceneSpec.of(robot, law.dt, SOLVERS["accurate"], ground=robot.has_ground)
+    spec = scene_of(robot, law.dt, SOLVERS["accurate"], ground=robot.has_ground)
     # The bodies are those that the engine simulates; inertias and efforts are then written with all
     # their digits.
     scene, names = robot_spec(spec)

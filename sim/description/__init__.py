@@ -1,4 +1,4 @@
-"""MJCF files: MuJoCo compiles them, and the model becomes the tables of a robot."""
+"""Robot descriptions: a URDF or MJCF file becomes rows of bodies, joints and shapes."""
 
 # It imports MuJoCo, and says why that fails.
 import batchpid.sim.geometry  # noqa: F401

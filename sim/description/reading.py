@@ -1,32 +1,24 @@
 """Reading of a robot: its file by name or path, as a URDF or an MJCF file, with the .srdf and the
-settings beside it; digests of what was read.
+settings beside it.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from lxml import etree
 
 from batchpid import assets
-from batchpid.arrays.array_types import Document
 from batchpid.arrays.elementwise import read_only
-from batchpid.arrays.trees import digest
 from batchpid.checks import file_path, is_name
 from batchpid.errors import RobotError, RobotNotFoundError
+from batchpid.sim.description.mjcf import read_mjcf
+from batchpid.sim.description.tables import DisabledPair, Joint, Settings, Source
+from batchpid.sim.description.urdf import read_urdf
+from batchpid.sim.description.xml import parse_xml
 from batchpid.sim.findings import Finding
-from batchpid.sim.robot.mjcf.reader import read_mjcf
-from batchpid.sim.robot.tables import DisabledPair, Joint, Settings, Source
-from batchpid.sim.robot.urdf import read_urdf
-from batchpid.sim.robot.xml import parse_xml
-
-if TYPE_CHECKING:
-    from batchpid.sim.robot.robot import Robot
 
 ASSETS = Path(assets.__file__).parent
 """Folder of the bundled robots."""
@@ -98,7 +90,7 @@ def with_srdf(source: Source) -> Source:
     reason; a pair without reason gets "User".
 
     Pairs that name a link twice or an unknown link are left out, as in MoveIt, with a finding.
-    Raises RobotError for what :func:`batchpid.sim.robot.xml.parse_xml` refuses.
+    Raises RobotError for what :func:`batchpid.sim.description.xml.parse_xml` refuses.
     """
     path = source.path.with_suffix(".srdf")
     if not os.path.isfile(path):
@@ -142,39 +134,3 @@ def read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings | None:
         rate_hz=float(data["rate_hz"]),
         notes=tuple(data.get("notes", ())),
     )
-
-
-def tuned_file(robot: Robot) -> Path | None:
-    """Return the file of the tuned params that ship with a robot, None without one."""
-    file = robot.path.with_suffix(".tuned.yaml")
-    return file if robot.settings is not None and file.is_file() else None
-
-
-def describe(robot: Robot) -> Document:
-    """Return a description of the simulated robot as plain values, equal for robots of equal
-    content.
-
-    The tables with the collision meshes, the pairs that do not collide, and the settings of a
-    bundled robot are given by digests. The actuators are left out.
-    """
-    source = robot.source
-    return {
-        "robot": robot.name,
-        "content": content(robot),
-        "srdf": digest(source.disabled, source.enabled),
-        "settings": digest(robot.settings, source.start, source.gains),
-        "mjcf": None if robot.mjcf is None else digest(replace(robot.mjcf, path="")),
-        "self_collision": source.self_collision,
-        "dissipation": source.dissipation,
-        "fixed_base": robot.fixed_base,
-        "base_start": source.base_start,
-    }
-
-
-@lru_cache(maxsize=16)
-def content(robot: Robot) -> str:
-    """Return the digest of bodies, joints and shapes, with the content of mesh files in place of
-    their paths.
-    """
-    shapes = [shape._replace(file="") for shape in robot.tables.shapes]
-    return digest(robot.tables.bodies, shapes, robot.joints)

@@ -21,8 +21,7 @@ from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
 from batchpid.motors import make_actuators
-from batchpid.sim.findings import Finding
-from batchpid.sim.robot.mjcf.bodies import (
+from batchpid.sim.description.mjcf_bodies import (
     PLANE,
     RobotInFile,
     TableReader,
@@ -30,8 +29,9 @@ from batchpid.sim.robot.mjcf.bodies import (
     excluded_pairs,
     label,
 )
-from batchpid.sim.robot.mjcf.motors import read_couplings, read_motors
-from batchpid.sim.robot.tables import MjcfFile, Source
+from batchpid.sim.description.mjcf_motors import read_couplings, read_motors
+from batchpid.sim.description.tables import MjcfFile, Source
+from batchpid.sim.findings import Finding
 from batchpid.task_space.rigid_tree import GRAVITY
 
 _PREFIXES = (

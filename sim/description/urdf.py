@@ -13,9 +13,15 @@ from pathlib import Path
 from lxml import etree
 
 from batchpid.errors import RobotError
+from batchpid.sim.description.tables import Body, Source, Tables, breadth_first, unique
+from batchpid.sim.description.urdf_elements import (
+    SHAPES,
+    ElementReader,
+    ends_of,
+    read_origin,
+    text_of,
+)
 from batchpid.sim.findings import Finding
-from batchpid.sim.robot.tables import Body, Source, Tables, breadth_first, unique
-from batchpid.sim.robot.urdf_elements import SHAPES, ElementReader, ends_of, read_origin, text_of
 
 MOST_READ = 4096  # links and joints of a file
 UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}

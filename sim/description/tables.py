@@ -1,10 +1,10 @@
 """Record of a robot: bodies with their joints, and shapes, as rows of arrays and names.
 
-A :class:`Tables` is made once, by the reader of a URDF (:mod:`batchpid.sim.robot.urdf`) or of an
-MJCF file (:mod:`batchpid.sim.robot.mjcf.reader`). Everything else reads it: engines, rigid
+A :class:`Tables` is made once, by the reader of a URDF (:mod:`batchpid.sim.description.urdf`) or of an
+MJCF file (:mod:`batchpid.sim.description.mjcf`). Everything else reads it: engines, rigid
 trees, distances, exports and pictures.
 
-:func:`batchpid.sim.robot.merging.merge_links` makes the tables that engines simulate, with one body
+:func:`batchpid.sim.description.merging.merge_links` makes the tables that engines simulate, with one body
 for all links that fixed joints hold together. :attr:`batchpid.sim.engine.scene_spec.SceneSpec.tables`
 has a row for each link of the file, ``SceneSpec.simulated`` the merged rows.
 
@@ -284,7 +284,7 @@ class MjcfFile:
     """MJCF file that MuJoCo simulates itself, with everything in it besides the robot.
 
     ``is_whole`` says whether all of it is compiled
-    (:func:`batchpid.sim.robot.mjcf.reader.compile_scene`), and ``content`` is the digest of the
+    (:func:`batchpid.sim.description.mjcf.compile_scene`), and ``content`` is the digest of the
     model. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
     other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
     links. ``losses`` are findings of what is lost in an engine that does not simulate the file.

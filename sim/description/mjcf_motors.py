@@ -5,7 +5,7 @@ An actuator with force F and moment arm g on a joint (the gear, times the joint'
 fixed tendon) applies the effort g F; a follower q' = m q adds m g' to the arm on its leader. A
 servo F = k u - kp g q - kv g q' has the gains g^2 kp and g^2 kv of a PID whose setpoint is its
 target in units of the joint. (MuJoCo's documentation, "Computation", actuation model.) MuJoCo's PID
-and its DC motor have the laws that :mod:`batchpid.sim.engine.mujoco.mjcf_export` describes.
+and its DC motor have the laws that :mod:`batchpid.sim.robot.mjcf_export` describes.
 
 Motors, servos, PIDs and DC motors of one joint are read. A finding names every other actuator.
 """
@@ -21,8 +21,8 @@ import mujoco
 import numpy as np
 
 from batchpid.arrays.array_types import MjModel
+from batchpid.sim.description.mjcf_bodies import RobotInFile, label
 from batchpid.sim.findings import Finding
-from batchpid.sim.robot.mjcf.bodies import RobotInFile, label
 
 Couplings = dict[str, tuple[str, float, float]]
 """Leader, multiplier and offset of each follower, as in ``<mimic>``."""
