@@ -23,7 +23,6 @@ from collections.abc import Sequence
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Document
-from batchpid.errors import InvalidArgumentError
 from batchpid.export.differences import Exported, Law, differences, export_law
 from batchpid.io import documents
 from batchpid.law.params import LAW_FIELDS, PIDParams
@@ -107,17 +106,6 @@ def _gains(law: Law, at: int) -> Document:
             gains[key] = LAW_FIELDS[option].neutral
         else:
             gains[key] = documents.plain(leaf[:, at])
-    # The target would refuse the whole file when it starts.
-    if gains["u_clamp_min"] >= gains["u_clamp_max"]:
-        problem = "must be below effort_max for control_toolbox"
-        value = gains["u_clamp_min"]
-        raise InvalidArgumentError(
-            "effort_min",
-            problem,
-            joint=law.joints[at],
-            value=value,
-            remedy="widen the limits",
-        )
     # control_toolbox refuses limits that exclude 0.
     gains["i_clamp_min"] = min(gains["i_clamp_min"], 0.0)
     gains["i_clamp_max"] = max(gains["i_clamp_max"], 0.0)

@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from batchpid.export import Exported
 
 ENDINGS = {
-    "c": "pid.h",
-    "ros2_control": "controllers.yaml",
-    "mjcf": "pid.xml",
-    "urdf": "repaired.urdf",
+    "c": ".h",
+    "ros2_control": ".yaml",
+    "mjcf": ".xml",
+    "urdf": ".urdf",
 }
-"""End of the default file name of each target."""
+"""Suffix of the file of each target."""
 USED = {
     "c": ("gains", "limits", "dynamics", "plan"),
     "ros2_control": ("gains", "limits"),
-    "mjcf": ("gains", "limits"),
+    "mjcf": ("gains",),
     "urdf": (),
 }
 """Flags that have an effect for each target, of those that only some have."""
@@ -121,7 +121,7 @@ class ExportedFile:
 
     def save(self, path: Path) -> None:
         """Write the file, with a comment at its end for each difference that it does not name."""
-        file_path("out", path, (Path(ENDINGS[self.target]).suffix,))
+        file_path("out", path, (ENDINGS[self.target],))
         text, differences = self.make(path.absolute().parent)
         comment = COMMENTS.get(self.target, "# {}")
         for difference in differences:
@@ -160,8 +160,8 @@ def export(
     """Write a robot's gains, or the robot itself, as a file for another program.
 
     Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to
-    batchpid's. "ros2_control" is the YAML of a controller. "mjcf" is the robot with the law in
-    MuJoCo's own actuators, "urdf" the robot with its repairs. Differences between the file and
+    batchpid's. "ros2_control" is the YAML of a controller. "mjcf" is the robot for MuJoCo, with
+    motors, or with servos of the --gains; "urdf" the robot with its repairs. Differences between the file and
     batchpid's law or the robot's file are printed, one line each.
     """
     # A flag without effect is refused by name.
@@ -181,10 +181,11 @@ def export(
         from batchpid.sim.robot.urdf_export import to_urdf
 
         return ExportedFile(to, partial(to_urdf, robot))
-    params = law_gains(robot, gains)
     if to == "mjcf":
-        exported = _mjcf(robot, params, timestep, limits)
-    elif to == "c":
+        exported = _mjcf(robot, gains, timestep)
+        return ExportedFile(to, lambda folder: exported)
+    params = law_gains(robot, gains)
+    if to == "c":
         exported = _c_header(
             robot,
             params,
@@ -267,22 +268,21 @@ def _with_followers(robot: Robot, exported: Exported, place: str) -> Exported:
     return exported._replace(differences=(*exported.differences, text))
 
 
-def _mjcf(
-    robot: Robot,
-    params: bp.PIDParams,
-    dt: float,
-    limits: bool,
-) -> Exported:
-    """Return the MJCF of the robot with its motors."""
+def _mjcf(robot: Robot, gains: str | None, dt: float) -> Exported:
+    """Return the MJCF of the robot with motors, or with servos."""
     from batchpid.sim.engine.protocol import load_engine
 
     load_engine("mujoco")  # raises without MuJoCo
     from batchpid.sim.robot.mjcf_export import to_mjcf
 
-    options: dict[str, Any] = {"actuators": robot.actuators, "inertia": _inertia(robot)}
-    if limits:
-        options["guard"] = robot.guard()
-    return to_mjcf(robot, params, dt, **options)
+    if gains is None:
+        return to_mjcf(robot, None, dt)
+    chosen = gain_set(robot, gains)
+    params = chosen.params
+    if chosen.control == "drive":
+        # An engine's drive acts on its own velocities.
+        params = params.replace(measurement_rate="measured")
+    return to_mjcf(robot, params, dt, inertia=_inertia(robot))
 
 
 def _inertia(robot: Robot) -> np.ndarray:

@@ -1,6 +1,5 @@
-"""Parts of a group of envs: its pack, and params and actuators with the draws of the randomization;
-sensors of links; pushes of bases; and the caller's own controller, called at every sim step with the
-state of the group.
+"""Parts of a group of envs: its pack, pushes of bases, and the caller's own controller, called at
+every sim step with the state of the group.
 """
 
 from __future__ import annotations
@@ -14,17 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import batchpid as bp
 from batchpid.arrays.array_types import Array, Bool, Document, Float64, Rows
 from batchpid.arrays.elementwise import namespace, precision, read_only
 from batchpid.arrays.trees import flatten, unflatten
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.engine.scene_spec import Variation
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws, elements, nominal_values
 from batchpid.sim.randomization.randomization import PHYSICAL
-from batchpid.sim.signals import untouched
 from batchpid.sim.tool_space import OperationalSpace
 
 Int64 = NDArray[np.int64]
@@ -34,69 +31,20 @@ pushes so far.
 """
 
 
-class ActingDraws:
-    """Params and actuators of a group, with the draws of its envs applied.
-
-    Attributes
-    ----------
-    draws
-        Draws of the envs; None before the first reset. A reset, or new params, put them into
-        effect.
-    params, actuators
-        As they were given.
-    acting_params
-        With the draws in effect.
-    acting_actuators
-        With the draws in effect.
-    """
-
-    def __init__(self, options: RunnerOptions, params: bp.PIDParams) -> None:
-        self._options = options
-        self.draws: Draws | None = None
-        self.params = self.acting_params = params
-        self.actuators: bp.Actuators | None = None
-        self.acting_actuators: bp.Actuators | None = None
-
-    @property
-    def has_motors(self) -> bool:
-        """Whether the actuators have an effect on efforts or measurements."""
-        actuators = self.acting_actuators
-        return actuators is not None and (actuators.measures or actuators.delivers)
-
-    def set_params(self, params: bp.PIDParams) -> None:
-        """Put params into effect."""
-        randomization = self._options.randomization
-        robot = self._options.robot
-        self.params = self.acting_params = params
-        if randomization is not None:
-            self.acting_params = randomization.randomized("params", params, self.draws, robot)
-
-    def set_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
-        """Put actuators into effect; return them with the draws applied."""
-        randomization = self._options.randomization
-        robot = self._options.robot
-        self.actuators = actuators
-        if randomization is not None:
-            actuators = randomization.randomized("actuators", actuators, self.draws, robot)
-        self.acting_actuators = actuators
-        return actuators
-
-
 def make_pack(
     options: RunnerOptions,
-    scene: SceneSpec,
     size: int,
     first_env: int,
-    draws: Draws | None,
     workspace: object,
+    draws: Draws | None,
 ) -> EnginePack:
     """Return the pack of ``size`` envs; without ``draws`` all robots equal the model."""
     randomization = options.randomization
     make = options.load_engine().make_pack
     if randomization is None or not randomization.changes_robot:
-        return make(scene, size, first_env, workspace=workspace)
+        return make(options.scene, size, first_env, workspace=workspace)
     links = tuple(elements("link_mass", options.robot))
-    scene = replace(scene, carrier=randomization.carrier(options.robot), varied_links=links)
+    scene = replace(options.scene, carrier=randomization.carrier(options.robot), varied_links=links)
     return make(scene, size, first_env, variation(options, size, draws), workspace)
 
 
@@ -121,37 +69,6 @@ def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variati
         else:
             values[name] = rows
     return Variation(**values)
-
-
-class LinkSensors:
-    """Quantities of ``size`` envs from the sensors of links, averaged over a tick, if ``options`` observe
-    some.
-    """
-
-    def __init__(self, options: RunnerOptions, size: int) -> None:
-        self.values: dict[str, Rows] = untouched(size, options.observed)
-        """Quantities of :class:`batchpid.sim.Observation` in the last tick (size, ...), by name."""
-
-    def begin(self, pack: EnginePack) -> None:
-        """Begin a tick."""
-        if self.values:
-            pack.take_sensed()
-
-    def end(self, pack: EnginePack, substeps: int, failed: Bool) -> None:
-        """Take the means over a tick of ``substeps`` sim steps, 0 for ``failed`` envs (size,)."""
-        sums = pack.take_sensed() if self.values else {}
-        for name, rows in sums.items():
-            values = self.values[name]
-            if values.dtype == bool:
-                values[...] = rows > 0
-            else:
-                values[...] = rows / substeps
-            values[failed] = 0
-
-    def clear(self, mask: Bool) -> None:
-        """Set the values of the envs of ``mask`` (size,) to 0."""
-        for values in self.values.values():
-            values[mask] = 0
 
 
 class Pushes:

@@ -296,6 +296,10 @@ class NoiseBlocks:
         self._first = 0
         self._block: tuple[Array, Array] = (None, None)
 
+    def forget(self) -> None:
+        """Draw the next noise anew, after a change of the arrays of a state."""
+        self._key = None
+
     def __call__(
         self, k: MotorCoefficients, state: ActuatorState, like: Float64
     ) -> tuple[Array, Array]:

@@ -30,6 +30,7 @@ from batchpid.sim.findings import report_shortfalls
 from batchpid.sim.loop.arrays import Snapshot
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.group_control import describe, native_obstacle
+from batchpid.sim.loop.loop import joined
 from batchpid.sim.options.groups import (
     DEFAULT_ENGINE,
     Backend,
@@ -228,7 +229,7 @@ class Runner(SingleOwner):
         self._call.begin()
         try:
             self._call.waits = True
-            self._pool = WorkerPool(options, options.params)
+            self._pool = WorkerPool(options)
             self._pool.open()
         finally:
             self._call.end()
@@ -805,7 +806,7 @@ class Runner(SingleOwner):
 
     def _read(self, request: Request) -> Any:
         """Return the result of a request that reads from the loops of all envs."""
-        return request.join(self._execute(request).results)
+        return joined(request.method, self._execute(request).results)
 
     def _execute(self, request: Request) -> Outcome:
         """Execute a request, or complete the one that was sent; then issue warnings.

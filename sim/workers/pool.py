@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import batchpid as bp
 from batchpid.arrays.array_types import Bool
 from batchpid.errors import ClosedError, SingleOwner
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.loop import Failure, order
+from batchpid.sim.loop.loop import Failure, first
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeInfo, NodeWorker
 from batchpid.sim.workers.requests import BUILD, Request, SharedArrays, Start, split
@@ -131,7 +130,7 @@ class Replay:
 class WorkerPool(SingleOwner):
     """Workers of a runner: processes, or with ``options.workers`` 0 the loop in this process.
 
-    The loops start with ``params``, and the workers with :meth:`open`. With ``options.cluster`` the
+    The workers start with :meth:`open`. With ``options.cluster`` the
     workers are nodes. Each node has a pool for its ``envs`` (default: all) and with requests of
     ``ticks`` at most.
     """
@@ -139,7 +138,6 @@ class WorkerPool(SingleOwner):
     def __init__(
         self,
         options: RunnerOptions,
-        params: bp.PIDParams,
         envs: slice | None = None,
         ticks: int | None = None,
     ) -> None:
@@ -166,11 +164,8 @@ class WorkerPool(SingleOwner):
             most_steps = _MAX_STEPS
         steps = max(_LEAST_STEPS, most_steps * loops // num_envs)
         ticks = ticks or max(1, steps // options.substeps)
-        layout = Arrays.layout(
-            ticks, num_envs, options.robot.dof, options.command.size, options.observed
-        )
-        self._shared = SharedArrays(layout)
-        self.arrays = Arrays.from_fields(self._shared.arrays)
+        self._shared = SharedArrays(Arrays.layout(options, ticks, num_envs))
+        self.arrays = self._shared.arrays
         """Input and output of a request (ticks, envs, ...)."""
         # Views are made once.
         self._at = cache(self.arrays.at)
@@ -184,7 +179,7 @@ class WorkerPool(SingleOwner):
         """Workers in the order of their envs."""
         cores = pinned_cores(len(slices))
         for index, part in enumerate(slices):
-            start = Start(index, part, options, params.for_envs(part), envs.start)
+            start = Start(index, part, options, envs.start)
             if options.cluster is not None:
                 self.workers.append(NodeWorker(start, self._shared, cluster, WorkerPool))
             elif self.is_local:
@@ -265,8 +260,9 @@ class WorkerPool(SingleOwner):
             raise ClosedError(_CLOSED)
         failure, count = None, request.ticks
         if failures:
-            failure = min(failures, key=order)
-            count = failure.ticks if request.counts_ticks else 0
+            failure = first(failures)
+            # Ticks that every env completed before the error are kept.
+            count = failure.ticks if request.method == "run" else 0
         elif request.changes_loop:
             self.replay.append(request)
         if count:

@@ -1,29 +1,29 @@
-"""drive_target: a PD drive with a target moved by the integral is a PID."""
+"""advance_drive: its edges; test_law_conformance.py compares the drive with the law."""
 
 import numpy as np
-from law_cases import DT, ENVS, JOINTS
+import pytest
+from law_cases import DRIVE_LACKS, DT, ENVS, JOINTS
 
 import batchpid as bp
-
-
-def test_a_drive_with_a_moving_target_gives_the_effort_of_the_law(inputs):
-    params = bp.make_params(JOINTS, 40.0, 5.0, 2.0, effort_limit=9.0, anti_windup="conditional")
-    state = other = bp.init(params, inputs.measurement[0])
-    for t in range(20):
-        r, y, v = inputs.setpoint[t], inputs.measurement[t], inputs.measurement_rate[t]
-        state, target = bp.drive_target(params, state, r, y, DT, measurement_rate=v)
-        other, effort = bp.step(params, other, r, y, DT, measurement_rate=v)
-        np.testing.assert_allclose(
-            np.clip(40.0 * (target - y) - 2.0 * v, -9, 9), effort, rtol=1e-12, atol=1e-12
-        )
+from batchpid.errors import InvalidArgumentError
+from batchpid.law.pid import advance_drive
+from batchpid.law.state import check_drive
 
 
 def test_without_stiffness_the_target_is_the_setpoint():
     params = bp.make_params(JOINTS, [0.0, 1.0, 2.0], 5.0)
     y = np.zeros((ENVS, JOINTS))
-    state = bp.init(params, y)
+    k, state = bp.discretise(params, DT), bp.init(params, y)
     for _ in range(3):
-        state, target = bp.drive_target(params, state, y + 1, y, DT)
+        state, target = advance_drive(k, state, y + 1, y)
     assert (target[:, 0] == 1).all()
     assert (target[:, 1:] > 1).all()
     assert np.isfinite(target).all()
+
+
+@pytest.mark.parametrize("name", DRIVE_LACKS)
+def test_a_drive_refuses_options_that_it_does_not_have(name):
+    value = "hold" if name == "non_finite" else 0.3
+    params = bp.make_params(1, 4.0, 1.0, 1.0, **{name: value})
+    with pytest.raises(InvalidArgumentError, match=rf"params.{name}: .*replace\({name}="):
+        check_drive(params)

@@ -13,12 +13,23 @@ import jax
 import numpy as np
 import pytest
 from c_programs import COMPILERS, RESET
-from law_cases import DT, JOINTS, UNITS, advanced, by_c, by_steps, generated_options, made_up_inputs
+from law_cases import (
+    DRIVE_LACKS,
+    DT,
+    JOINTS,
+    UNITS,
+    advanced,
+    by_c,
+    by_steps,
+    generated_options,
+    made_up_inputs,
+)
 from quick_jit import quick_jit
 from scalar_pid import scalar_pids, step_of_robot
 
 import batchpid as bp
 from batchpid.arrays.trees import mapped
+from batchpid.law.pid import advance_drive
 
 GIVEN = [
     (),
@@ -45,7 +56,7 @@ def by_controller(params, inputs, backend="numpy"):
     for at in range(len(inputs.setpoint)):
         row = inputs.at(at, lambda rows: rows.astype(params.dtype))
         if at == RESET:
-            pid.reset(row["measurement"], keep_integral=True)
+            pid.reset(row["measurement"])
         efforts.append(pid(**row))
         overwrite(row.values())
         assert efforts[-1].dtype == params.dtype
@@ -72,6 +83,21 @@ def by_jaxs_controller(params, inputs):
     return by_controller(params, inputs, "jax")
 
 
+def by_drive(params, inputs):
+    """Return the efforts of PD drives whose targets the integral moves."""
+    k = bp.discretise(params, DT)
+
+    def step(params, state, row):
+        state, target = advance_drive(k, state, **row)
+        effort = params.kp * (target - row["measurement"]) + row.get("feedforward", 0.0)
+        if params.kd is not None:
+            effort = effort + params.kd * (row.get("setpoint_rate", 0.0) - row["measurement_rate"])
+        low, high = params.effort_min, params.effort_max
+        return state, np.clip(effort, -np.inf if low is None else low, high)
+
+    return by_steps(params, inputs, step)
+
+
 class Executor(NamedTuple):
     """Function that returns the efforts (steps, envs, joints) of params under inputs, and its
     properties.
@@ -84,20 +110,23 @@ class Executor(NamedTuple):
     """Number of generated params to test, for each of the units."""
     bits: bool = True
     """Whether results are bit-identical to NumPy's."""
+    keeps: bool = True
+    """Whether its reset in between keeps the integral."""
 
 
 ALONE = UNITS[:1]
 EXECUTORS = {
     "numpy": Executor(by_steps, seeds=12),
     "numpy float32": Executor(by_steps, np.float32),
-    "controller": Executor(by_numpys_controller, units=ALONE, seeds=12),
-    "native controller": Executor(by_controller, units=ALONE, seeds=12),
-    "native controller float32": Executor(by_controller, np.float32, ALONE),
+    "controller": Executor(by_numpys_controller, units=ALONE, seeds=12, keeps=False),
+    "native controller": Executor(by_controller, units=ALONE, seeds=12, keeps=False),
+    "native controller float32": Executor(by_controller, np.float32, ALONE, keeps=False),
+    "drive": Executor(by_drive, units=ALONE, seeds=12, bits=False),
     "c": Executor(by_c, seeds=2),
     "c float32": Executor(by_c, np.float32, seeds=2),
     "jax": Executor(by_jax, seeds=2, bits=False),
     "jax float32": Executor(by_jax, np.float32, seeds=1, bits=False),
-    "jax controller": Executor(by_jaxs_controller, np.float32, ALONE, 2, bits=False),
+    "jax controller": Executor(by_jaxs_controller, np.float32, ALONE, 2, bits=False, keeps=False),
 }
 CASES = [
     (name, units, seed)
@@ -107,7 +136,7 @@ CASES = [
 ]
 
 
-def oracle(params, inputs):
+def oracle(params, inputs, keep=True):
     """Return the efforts of scalar controllers, one per env and joint, and the sum of the
     magnitudes of their terms.
     """
@@ -121,7 +150,7 @@ def oracle(params, inputs):
             ]
             if at in (0, RESET):
                 for pid, row in zip(pids, rows, strict=True):
-                    pid.start(row["measurement"], pid.integral if at else 0.0)
+                    pid.start(row["measurement"], pid.integral if at and keep else 0.0)
             if matrix is None:
                 efforts[at, env] = [
                     pid.step(dt=DT, **row) for pid, row in zip(pids, rows, strict=True)
@@ -135,25 +164,30 @@ def oracle(params, inputs):
 
 
 def check(executor, params, inputs):
-    found, expected = executor.run(params, inputs), by_steps(params, inputs)
+    keep = executor.keeps
+    found, expected = executor.run(params, inputs), by_steps(params, inputs, keep=keep)
     envs = found.shape[1]
     if executor.bits:
         np.testing.assert_array_equal(found, expected[:, :envs])
-    expected, sizes = oracle(params, inputs)
+    expected, sizes = oracle(params, inputs, keep)
     error = np.abs(found - expected[:, :envs])
     size = 1 + np.maximum.accumulate(sizes, axis=0)[:, :envs]
     assert (error / size).max() < (1e-12 if executor.dtype == np.float64 else 1e-5)
 
 
 def check_generated(executor, units, seed):
-    params = bp.make_params(JOINTS, **generated_options(seed, units=units), dtype=executor.dtype)
+    options, given = generated_options(seed, units=units), {*GIVEN[seed % len(GIVEN)]}
+    if executor.run is by_drive:
+        options = {name: each for name, each in options.items() if name not in DRIVE_LACKS}
+        given |= {"measurement_rate"}
+    params = bp.make_params(JOINTS, **options, dtype=executor.dtype)
     inputs = made_up_inputs()
     if params.non_finite is not None:
         inputs.measurement[5, 1, 0], inputs.setpoint[9, 0] = np.nan, np.inf
     more = () if units == "effort" else ("mass_matrix",)
     if more and executor.run is not by_c:  # it has no input for an acceleration
         more += ("setpoint_acceleration",)
-    check(executor, params, inputs.given(*GIVEN[seed % len(GIVEN)], *more))
+    check(executor, params, inputs.given(*given, *more))
 
 
 @pytest.mark.parametrize(("name", "units", "seed"), CASES)
@@ -164,6 +198,16 @@ def test_efforts_are_those_of_the_law_on_plain_numbers(name, units, seed, reques
     if executor.run is by_c and not COMPILERS:
         pytest.skip("no C compiler")
     check_generated(executor, units, seed)
+
+
+def test_every_field_of_params_is_tried():
+    """A measured rate that is asked for is an input, and not an effect."""
+    tried = set()
+    for units in UNITS:
+        for seed in range(6):
+            params = bp.make_params(JOINTS, **generated_options(seed, units=units))
+            tried |= {name for name, leaf in params._asdict().items() if leaf is not None}
+    assert tried == {*bp.PIDParams._fields} - {"measurement_rate"}
 
 
 @pytest.mark.parametrize("given", GIVEN, ids=" ".join)

@@ -4,8 +4,7 @@ combination of options.
 Executors are NumPy on read-only arrays, JAX, and native programs, which are bit-identical to NumPy.
 """
 
-from __future__ import annotations
-
+import functools
 import re
 
 import jax
@@ -21,7 +20,7 @@ from batchpid.motors import friction, guard
 from batchpid.native.array_program import ArrayProgram, obstacle
 from batchpid.native.tracing import trace
 
-DT, STEPS, ENVS, JOINTS = 1 / 500, 40, 5, 3
+DT, STEPS, ENVS, JOINTS = 1 / 500, 40, 4, 3
 SHAPE = ENVS, JOINTS
 
 
@@ -70,7 +69,7 @@ class GuardCase:
 
     def __init__(self, rng, dtype):
         self.options = drawn(rng, GUARD, dtype) | {"continuous": rng.random(SHAPE) < 0.4}
-        self.start = rng.uniform(-2, 2, SHAPE).astype(dtype)
+        self.begins = [rng.uniform(-2, 2, SHAPE).astype(dtype)]
         jumps = np.repeat(rng.normal(0, 2.5, (STEPS // 8, *SHAPE)), 8, axis=0)
         motion = DT * rng.normal(0, 3.0, SHAPE) * np.arange(STEPS)[:, None, None]
         self.inputs = [(jumps + motion).astype(dtype)]
@@ -84,7 +83,8 @@ class GuardCase:
         return state, (state.setpoint, changed)
 
     def oracle(self, env, joint):
-        scalar = ScalarGuard(self.start[env, joint].item(), **entry(self.options, env, joint))
+        (start,) = self.begins
+        scalar = ScalarGuard(start[env, joint].item(), **entry(self.options, env, joint))
         for (asked,) in self.rows(env, joint):
             setpoint = scalar.step(asked, DT)
             yield setpoint, setpoint != asked
@@ -104,15 +104,15 @@ class FrictionCase(GuardCase):
         }
         self.options |= drawn(rng, FRICTION, dtype)
         root = rng.normal(size=(ENVS, JOINTS, JOINTS))
-        self.mass = (0.02 * (root @ root.transpose(0, 2, 1) + np.eye(JOINTS))).astype(dtype)
-        self.start = rng.normal(size=SHAPE).astype(dtype)
-        self.load = rng.normal(size=SHAPE).astype(dtype)
+        mass = 0.02 * (root @ root.transpose(0, 2, 1) + np.eye(JOINTS))
+        begins = [rng.normal(size=SHAPE), rng.normal(size=SHAPE), mass]
+        self.begins = [rows.astype(dtype) for rows in begins]
         scale = np.array([3.0, 0.3])[:, None, None, None]
         self.inputs = list((scale * rng.normal(size=(2, STEPS, *SHAPE))).astype(dtype))
         self.model = friction.Friction(**self.options)
 
-    def begin(self, model, start):
-        return friction.init(model, start, 0 * start + self.load, self.mass, DT)
+    def begin(self, model, start, load, mass):
+        return friction.init(model, start, load, mass, DT)
 
     def step(self, model, state, effort, velocity):
         state, total = friction.advance(model, state, effort, velocity)
@@ -121,13 +121,12 @@ class FrictionCase(GuardCase):
     def oracle(self, env, joint):
         own = {name: value[env].astype(float) for name, value in self.options.items()}
         rubs = sum(own.get(name, 0.0) for name in ("coulomb", "static", "load")) > 0
-        mass = self.mass[env].astype(float)
+        start, load, mass = (rows[env].astype(float) for rows in self.begins)
         gains, shares = friction_gains(mass, own.get("viscous", np.zeros(JOINTS)), rubs, DT)
-        begin = self.start[env, joint].item(), self.load[env, joint].item()
         options = entry(self.options, env, joint) | (
             {"slides": True} if "static" not in own else {}
         )
-        scalar = ScalarFriction(*begin, gains[joint], shares[joint], **options)
+        scalar = ScalarFriction(start[joint], load[joint], gains[joint], shares[joint], **options)
         for row in self.rows(env, joint):
             yield (scalar.step(*row),)
             scalar.slides |= "static" not in own
@@ -146,25 +145,23 @@ class MotorCase(GuardCase):
         self.model = bp.make_actuators(JOINTS, **self.options, dtype=dtype)
         velocity = 4 * rng.normal(size=(STEPS, *SHAPE))
         position = np.cumsum(0.1 * rng.normal(size=(STEPS + 1, *SHAPE)), axis=0)
-        self.start = position[0].astype(dtype)
-        self.inputs = [
-            each.astype(dtype)
-            for each in (10 * rng.normal(size=(STEPS, *SHAPE)), position[1:], velocity)
-        ]
-        self.samples = motors.init(self.model, self.start, DT)
+        self.begins = [position[0].astype(dtype)]
+        inputs = 10 * rng.normal(size=(STEPS, *SHAPE)), position[1:], velocity
+        self.inputs = [rows.astype(dtype) for rows in inputs]
+        self.longest = self.model.max_delay
+        self.model = self.model._replace(max_delay=None)
 
     def begin(self, model, start):
-        lengths = [leaf.shape[1] for leaf in self.samples if leaf is not None and leaf.ndim == 3]
-        return motors.init(model, start, DT, samples=lengths[0] if lengths else None)
+        return motors.init(model._replace(max_delay=self.longest), start, DT)
 
-    def step(self, model, state, effort, qpos, qvel, k=None):
-        k = motors.discretise(model, state, DT, ENVS) if k is None else k
-        state, *seen = motors.advance_measurement(k, state, qpos, qvel)
-        state, delivered = motors.advance_effort(k, state, effort, qpos, qvel)
+    def step(self, model, state, effort, qpos, qvel):
+        state, *seen = motors.measure(model, state, qpos, qvel, DT)
+        state, delivered = motors.deliver(model, state, effort, qpos, qvel, DT)
         return state, (*seen, delivered)
 
     def oracle(self, env, joint):
-        scalar = ScalarMotor(self.start[env, joint].item(), **entry(self.options, env, joint))
+        (start,) = self.begins
+        scalar = ScalarMotor(start[env, joint].item(), **entry(self.options, env, joint))
         for effort, qpos, qvel in self.rows(env, joint):
             seen = scalar.measure(qpos, qvel, DT)
             yield (*seen, scalar.deliver(effort, qpos, qvel, DT))
@@ -174,26 +171,46 @@ def by_numpy(case, dtype):
     model = type(case.model)(
         *(leaf if leaf is None else read_only(leaf, leaf.dtype) for leaf in case.model)
     )
-    state, found = case.begin(model, read_only(case.start, dtype)), []
+    state, found = case.begin(model, *(read_only(rows, dtype) for rows in case.begins)), []
     for row in zip(*case.inputs, strict=True):
         state, seen = case.step(model, state, *(read_only(each, dtype) for each in row))
         found.append(seen)
     return found
 
 
-def by_jax(case, dtype):
-    model, step = jax.tree.map(jax.numpy.asarray, case.model), quick_jit(case.step)
-    state, found = quick_jit(case.begin)(model, jax.numpy.asarray(case.start)), []
-    for row in zip(*case.inputs, strict=True):
-        state, seen = step(model, state, *row)
-        assert all(each.dtype in (dtype, bool) for each in seen)
-        found.append(seen)
-    return found
+def by_jax(case, dtype, alone=False):
+    """A scan on devices that share the envs without communicating; ``alone``: of one robot under
+    vmap.
+    """
+
+    def rollout(model, begins, inputs):
+        def step(state, now):
+            return case.step(model, state, *now)
+
+        return jax.lax.scan(step, case.begin(model, *begins), inputs)[1]
+
+    model = case.model
+    if alone and hasattr(model, "for_rank"):  # (1, joints), as made for one robot
+        model = jax.tree.map(lambda rows: rows[:, None], model)
+    arguments = [model, case.begins, case.inputs]
+    assert len(jax.devices()) == 4
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), "envs")
+    places = [jax.sharding.PartitionSpec(*[None] * at, "envs") for at in (0, 0, 1)]
+    shardings = [jax.sharding.NamedSharding(mesh, place) for place in places]
+    arrays = jax.device_put(arguments, shardings)
+    program = jax.vmap(rollout, (0, 0, 1), 1) if alone else rollout
+    compiled = quick_jit(program).lower(*arrays).compile()
+    assert not re.search("all-|collective", compiled.as_text())
+    found = compiled(*arrays)
+    for each in found:
+        assert len(each.sharding.device_set) == 4
+        assert each.dtype in (dtype, bool)
+    return zip(*found, strict=True)
 
 
 def by_programs(case, dtype):
     """Guard and friction, each traced as a whole."""
-    state, found = case.begin(case.model, case.start), []
+    state, found = case.begin(case.model, *case.begins), []
     constants = [leaf for leaf in case.model if leaf is not None]
     kept = [leaf for leaf in state if leaf is not None]
 
@@ -218,7 +235,12 @@ def by_programs(case, dtype):
 
 
 CASES = {"guard": GuardCase, "friction": FrictionCase, "motors": MotorCase}
-EXECUTORS = {"numpy": (by_numpy, 12), "programs": (by_programs, 8), "jax": (by_jax, 1)}
+EXECUTORS = {
+    "numpy": (by_numpy, 12),
+    "programs": (by_programs, 8),
+    "jax": (by_jax, 1),
+    "jax alone": (functools.partial(by_jax, alone=True), 1),
+}
 ROWS = [
     (case, name, seed)
     for case in CASES
@@ -235,7 +257,7 @@ def test_signals_are_those_of_plain_numbers(case, name, seed, request):
     dtype = np.float32 if is_narrow and case != "friction" else np.float64
     if name == "programs" and obstacle():
         pytest.skip("there are no native programs")
-    if name == "jax" and dtype == np.float64:
+    if "jax" in name and dtype == np.float64:
         request.getfixturevalue("x64")
     made = CASES[case](np.random.default_rng(seed), dtype)
     run, _ = EXECUTORS[name]
@@ -258,62 +280,11 @@ def test_signals_are_those_of_plain_numbers(case, name, seed, request):
         np.testing.assert_array_equal(found, signals(by_numpy(made, dtype)))
 
 
-@pytest.mark.parametrize("form", ["one robot under vmap", "rows"])
-def test_robots_do_not_need_each_other(form, x64):
-    """Arrays (joints,) in and out under vmap, or (envs, joints): the same numbers, and devices that
-    share the envs do not communicate.
-    """
-    rng, envs = np.random.default_rng(0), 8
-    options, limits, rubs = (
-        {name: on * rng.uniform(0.2, 1.0, JOINTS) for name, (_, on) in ranges.items()}
-        for ranges in (MOTORS, GUARD, FRICTION)
-    )
-    actuators = bp.make_actuators(
-        JOINTS, **options, continuous=[True, False, True], velocity_noise=0.01
-    )
-    limits = bp.make_guard(JOINTS, **limits)
-    shape = (JOINTS,) if "vmap" in form else (1, JOINTS)
-    rubs = {name: row.reshape(shape) for name, row in rubs.items()}
-    rubs = friction.Friction(coulomb=rng.uniform(0.2, 2.0, shape), **rubs)
-
-    def start(env, qpos):
-        rest = 0 * qpos
-        masses = np.broadcast_to(np.eye(JOINTS), (*qpos.shape, JOINTS))
-        return (
-            guard.init(limits, qpos),
-            motors.init(actuators, qpos, DT, envs=env, samples=9),
-            friction.init(rubs, rest, rest, masses, DT),
-        )
-
-    def step(state, now):
-        guards, motor, rubbing = state
-        asked, qpos, qvel = now
-        guards, _ = guard.advance(limits, guards, asked, DT)
-        motor, *seen = motors.measure(actuators, motor, qpos, qvel, DT)
-        motor, effort = motors.deliver(actuators, motor, guards.setpoint, qpos, qvel, DT)
-        rubbing, total = friction.advance(rubs, rubbing, effort, qvel)
-        return (guards, motor, rubbing), (*seen, effort, total)
-
-    def rollout(env, qpos, inputs):
-        return jax.lax.scan(step, start(env, qpos), inputs)[1]
-
-    inputs = rng.normal(0, 2.0, (STEPS, 3, envs, JOINTS))
-    qpos = rng.normal(size=(envs, JOINTS))
-    state, expected = start(np.arange(envs), qpos), []
-    for row in inputs:
-        state, seen = step(state, row)
-        expected.append(seen)
-
-    program = rollout if form == "rows" else jax.vmap(rollout, (0, 0, 2), 1)
-    mesh = jax.sharding.Mesh(np.array(jax.devices()), "envs")
-    assert mesh.size == 4
-    places = [jax.sharding.PartitionSpec(*[None] * at, "envs") for at in (0, 0, 2)]
-    arrays = [
-        jax.device_put(array, jax.sharding.NamedSharding(mesh, place))
-        for array, place in zip((np.arange(envs), qpos, inputs), places, strict=True)
-    ]
-    compiled = jax.jit(program).lower(*arrays).compile()
-    for ours, theirs in zip(compiled(*arrays), zip(*expected, strict=True), strict=True):
-        np.testing.assert_allclose(ours, np.array(theirs), rtol=1e-9, atol=1e-9)
-        assert len(ours.sharding.device_set) == 4
-    assert not re.search("all-|collective", compiled.as_text())
+def test_every_field_is_tried():
+    """But for noise, whose seed and moments have tests of their own; armature is the simulator's."""
+    fields = {*bp.Guard._fields, *friction.Friction._fields, *bp.Actuators._fields}
+    for case in CASES.values():
+        for seed in range(6):
+            fields -= case(np.random.default_rng(seed), np.float64).options.keys()
+    others = {"armature", "load_friction", "max_delay", "turns"}  # continuous
+    assert fields == {"position_noise", "velocity_noise", "seed"} | others

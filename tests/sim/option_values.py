@@ -35,6 +35,27 @@ def arm(mass, **options):
 SHAPE = '<collision><geometry><box size="0.05 0.05 0.4"/></geometry></collision>'
 ARM, HEAVY = arm(1), arm(2)
 MOTORS = bp.make_actuators(2, coulomb=0.3, armature=0.05)
+SIGNALS = {"command_delay": 2e-3, "lag": 1e-3, "strength": 0.9, "bias": 0.1, "effort_limit": 6.0}
+SENSORS = {
+    "sensor_delay": 1e-3,
+    "position_offset": 0.01,
+    "backlash": 1e-3,
+    "position_resolution": 1e-4,
+}
+NOISE = {"position_noise": 1e-5, "velocity_noise": 1e-3, "velocity_resolution": 1e-3}
+LINE = {
+    "saturation_effort": 8.0,
+    "no_load_speed": 3.0,
+}
+FRICTION = {
+    "coulomb": 0.2,
+    "static": 0.3,
+    "stribeck": 0.05,
+    "load_friction": 0.05,
+    "viscous": 0.1,
+    "armature": 0.02,
+}
+"""Effects of motors and sensors."""
 
 
 @dataclass

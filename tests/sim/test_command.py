@@ -2,11 +2,8 @@
 test_conformance.py runs one on every path.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from identical import assert_identical
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import InvalidArgumentError
@@ -17,7 +14,6 @@ from batchpid.sim import (
     RunInfo,
     Runner,
     RunnerOptions,
-    read_recording,
     write_recording,
 )
 from batchpid.sim.identification import identify
@@ -156,19 +152,6 @@ def rollout(arm):
     setpoints = np.random.default_rng(2).uniform(0.5, 1.1, (12, N, 3))
     with make(arm, Cartesian(command)) as runner:
         return runner.rollout(setpoints)
-
-
-def test_recordings_hold_names_and_units(rollout, tmp_path):
-    read = read_recording(write_recording(rollout, tmp_path / "run.h5"))
-    assert_identical(read, rollout)
-    assert (
-        read.info.command
-        == rollout.info.command
-        == CommandSpec(("x", "z", "gain <b>"), ("m", "m", ""))
-    )
-    assert read.setpoint.shape == (12, N, 3)
-    assert not read.info.sets_positions
-    assert read.for_envs([1, 2]).setpoint.shape == (12, 2, 3)
 
 
 def test_identification_and_metrics_refuse_such_runs(arm, rollout, tmp_path):

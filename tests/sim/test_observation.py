@@ -48,7 +48,9 @@ def with_events(rollout):
     time, tick = rollout.time, rollout.tick
     faults = tuple([Fault(env, 2, time[env], "panda_joint1", "setpoint", "hold") for env in (0, 1)])
     episodes = np.array([[0, 0], [1, 0], [2, 0]])
-    info = dataclasses.replace(rollout.info, faults=faults, draws={}, episodes=episodes)
+    info = dataclasses.replace(
+        rollout.info, faults=faults, draws={"payload": episodes[:, :1]}, episodes=episodes
+    )
     changes = np.zeros(rollout.ok.shape, np.uint8)
     changes[1, 2] = changes[2, 1] = RESET
     feedforward = np.full(rollout.qpos.shape, tick)
@@ -59,6 +61,8 @@ def test_events_of_some_envs_have_their_new_numbers(rollout):
     rollout = with_events(rollout)
     part = rollout.for_envs([2, 1])
     assert [fault.env for fault in part.info.faults] == [1]
+    assert part.info.episodes.tolist() == [[2, 0], [1, 0]]
+    assert part.info.draws["payload"].tolist() == [[2], [1]]
     assert part.changes.tolist()[1:3] == [[RESET, 0], [0, RESET]]
     assert part.feedforward.shape == part.qpos.shape
     assert [fault.env for fault in rollout.for_envs(np.array([False, True, True])).info.faults] == [
@@ -71,7 +75,7 @@ def test_some_ticks_begin_where_those_before_have_ended(rollout):
     first, second = rollout.for_ticks(slice(0, 2)), rollout.for_ticks(slice(2, None))
     np.testing.assert_array_equal(first.info.start, rollout.info.start)
     # An env was reset in between: where it starts, and its draws, are unknown.
-    assert first.info.draws == {}
+    assert first.info.draws == rollout.info.draws
     assert (second.info.start, second.info.draws, second.info.episodes) == (None, None, None)
     np.testing.assert_array_equal(rollout.for_ticks(slice(4, 6)).changes, np.zeros((2, 3)))
     # Of ticks that are left out, the changes stay.

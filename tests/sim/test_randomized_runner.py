@@ -13,10 +13,8 @@ from batchpid.sim import (
     LogUniform,
     Normal,
     Randomization,
-    Recorder,
     Runner,
     Uniform,
-    read_recording,
 )
 
 N, TICKS = 6, 4
@@ -95,21 +93,3 @@ def test_a_fault_that_resets_keeps_the_draws():
         assert_identical(
             runner.rollout(SETPOINTS).for_envs([2]), first.for_envs([2]), skip=["time"]
         )
-
-
-def test_a_recording_holds_the_distributions_and_the_draws(tmp_path):
-    path = tmp_path / "run.h5"
-    with make() as runner:
-        runner.reset()
-        with Recorder(path, runner):
-            runner.rollout(SETPOINTS)
-        draws, order = runner.draws, runner.episodes
-    info = read_recording(path).info
-    assert Randomization.from_dict(info.randomization) == EVERYTHING
-    np.testing.assert_array_equal(info.episodes, order)
-    assert info.draws.keys() == draws.keys()
-    for name, rows in draws.items():
-        np.testing.assert_array_equal(info.draws[name], rows, name)
-    part = info.for_envs(np.array([1]))
-    np.testing.assert_array_equal(part.draws["payload"], draws["payload"][[1]])
-    np.testing.assert_array_equal(part.episodes, [[1, 1]])

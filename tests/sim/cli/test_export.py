@@ -1,7 +1,5 @@
 """``batchpid export``: gains as files for other programs."""
 
-from __future__ import annotations
-
 import yaml
 from tiny_urdf import LIMIT, joint, link, robot, write
 
@@ -32,7 +30,7 @@ def test_the_header_is_that_of_the_function(batchpid, tmp_path):
     )
     assert (status, out.read_text()) == (0, exported.text)
     lines = [
-        "panda: 9 dof, gains tuned",
+        "panda: 9 dof",
         "The file has no differences.",
         f"written: {out}",
     ]
@@ -84,9 +82,14 @@ def test_the_robot_is_written_for_mujoco(batchpid, tmp_path):
     import mujoco
 
     out = tmp_path / "panda.xml"
-    words = ("--gains", "designed", "--timestep", 0.0005, "--limits", "--out", out)
-    status, said, _ = batchpid("export", "panda", "--to", "mjcf", *words)
-    assert (status, "differs: guard" in said) == (0, True)
-    assert "<!-- differs: guard" in out.read_text()
-    model = mujoco.MjModel.from_xml_path(str(out))
-    assert (model.nq, model.nu, model.opt.timestep) == (9, 27, 0.0005)
+    words = ("export", "panda", "--to", "mjcf", "--timestep", 0.0005, "--force", "--out", out)
+    for gains, line, stiffness in (
+        ((), "The file has no differences.", 0),
+        (("--gains", "designed"), "\ndiffers: ki: no integral\n", None),
+        (("--gains", "drive:20,5"), "The file has no differences.", 20),
+    ):
+        status, said, _ = batchpid(*words, *gains)
+        assert (status, line in said) == (0, True), said
+        model = mujoco.MjModel.from_xml_path(str(out))
+        assert (model.nq, model.nu, model.opt.timestep) == (9, 9, 0.0005)
+        assert stiffness in (None, -model.actuator_biasprm[0, 1])

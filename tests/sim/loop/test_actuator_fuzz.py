@@ -2,37 +2,18 @@
 trace.
 """
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np
 import pytest
+from option_values import FRICTION, LINE, NOISE, SENSORS, SIGNALS
 
 import batchpid as bp
 from batchpid.sim import FaultWarning, Runner
 
 ENVS = 10
-SCALES = {
-    "command_delay": 0.01,
-    "sensor_delay": 0.01,
-    "lag": 0.01,
-    "strength": 1.0,
-    "bias": 1.0,
-    "effort_limit": 50.0,
-    "saturation_effort": 80.0,
-    "no_load_speed": 3.0,
-    "coulomb": 0.5,
-    "load_friction": 0.02,
-    "viscous": 1.0,
-    "armature": 0.1,
-    "position_offset": 0.01,
-    "backlash": 0.01,
-    "position_resolution": 1e-3,
-    "velocity_resolution": 1e-2,
-    "position_noise": 1e-3,
-    "velocity_noise": 1e-2,
-}
+SCALES = SIGNALS | SENSORS | NOISE | LINE | FRICTION
+del SCALES["static"], SCALES["stribeck"]
 
 
 def random_actuators(seed, dof):

@@ -1,8 +1,4 @@
-"""Actuators in the loop: independent of workers, company and restores; changed in flight; as the
-models say.
-"""
-
-from __future__ import annotations
+"""Actuators in the loop: changed in flight, delivered and compensated as the models say."""
 
 import dataclasses
 import json
@@ -10,38 +6,13 @@ import json
 import numpy as np
 import pytest
 from identical import assert_identical
+from option_values import FRICTION, SIGNALS
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Robot, Runner, read_recording, write_recording
+from batchpid.sim import Robot, Runner
 
 N = 5
-
-
-def actuators(robot, seed=0, **more):
-    """Return actuators with every effect on, of every env its own."""
-    rng, shape = np.random.default_rng(seed), (N, robot.dof)
-    options = {
-        "command_delay": rng.uniform(0, 0.004, shape),
-        "sensor_delay": rng.uniform(0, 0.003, shape),
-        "lag": rng.uniform(0, 0.002, shape),
-        "strength": rng.uniform(0.8, 1.2, shape),
-        "bias": rng.normal(0, 0.1, shape),
-        "saturation_effort": 80.0,
-        "no_load_speed": rng.uniform(2, 5, shape),
-        "effort_limit": 60.0,
-        "coulomb": rng.uniform(0, 0.2, shape),
-        "viscous": rng.uniform(0, 0.5, shape),
-        "armature": rng.uniform(0, 0.05, shape),
-        "position_resolution": 2 * np.pi / 2**16,
-        "velocity_resolution": 1e-3,
-        "position_noise": 1e-5,
-        "velocity_noise": rng.uniform(0, 1e-3, shape),
-        "backlash": rng.uniform(0, 1e-4, shape),
-        "static": 0.3,
-        "seed": 1,
-    }
-    return bp.make_actuators(robot.dof, **{**options, **more})
 
 
 def commands(robot, ticks, seed=0):
@@ -58,7 +29,7 @@ def test_actuators_that_are_off_change_no_bit(panda):
     ) as runner:
         assert runner.actuators is None
         assert_identical(ideal, runner.rollout(table))
-        runner.actuators = actuators(panda)
+        runner.actuators = bp.make_actuators(panda.dof, **SIGNALS, **FRICTION)
         runner.reset()
         assert not np.array_equal(ideal.qpos, runner.rollout(table).qpos)
         assert runner.actuators.strength is not None
@@ -101,16 +72,6 @@ def test_a_joint_is_saturated_exactly_where_its_motor_is(panda, strength, contro
     np.testing.assert_array_equal(saturated, np.abs(effort) > limit * (1 - 1e-6))
 
 
-def test_drives_take_friction_and_armature_alone(panda):
-    heavy = bp.make_actuators(panda.dof, armature=1.0)
-    with Runner(panda, 1, workers=0, control="drive") as runner:
-        free = runner.rollout(np.tile(panda.settings.target, (5, 1)))
-        runner.actuators = heavy
-        runner.reset()
-        loaded = runner.rollout(np.tile(panda.settings.target, (5, 1)))
-    assert np.abs(loaded.qvel[:, :, :7]).max() < 0.8 * np.abs(free.qvel[:, :, :7]).max()
-
-
 def test_a_robot_has_the_actuators_of_its_file(panda, tmp_path):
     path = tmp_path / "arm.yaml"
     arm = {
@@ -148,12 +109,3 @@ def test_the_controller_knows_the_actuators_of_its_robot(panda):
         errors.append(np.abs(rollout.qpos[:, 0, :7] - panda.settings.target[:7]).sum())
     ideal, compensated, uncompensated = errors
     assert compensated - ideal < 0.3 * (uncompensated - ideal)
-
-
-def test_a_recording_holds_the_actuators(panda, tmp_path):
-    with Runner(panda, N, workers=0, actuators=actuators(panda)) as runner:
-        write_recording(runner.rollout(commands(panda, 2)), tmp_path / "run.h5")
-        expected = runner.actuators
-    loaded = read_recording(tmp_path / "run.h5").info.actuators
-    for mine, other in zip(loaded, expected, strict=True):
-        np.testing.assert_array_equal(mine, other)
