@@ -5,8 +5,6 @@ Wrong values for options of joints come from the declared fields. Other wrong va
 table, by argument.
 """
 
-from __future__ import annotations
-
 import inspect
 import math
 
@@ -139,7 +137,7 @@ COMBINATIONS = {
         {"force_axes": AXIS, "axes": [True] * 6},
         {"posture_stiffness": [1.0] * 3},
         {"effort_min": 1.0, "effort_max": 0.0},
-        {"effort_min": ..., "stiffness": np.ones((3, 6)), "effort_limit": np.ones((2, 2))},
+        {"effort_limit": np.ones((2, 2)), "stiffness": np.ones((3, 6))},
         {"position_error_limit": -1.0},
         {"integral_gain": -1.0},
         {"integral_limit": math.nan, "integral_gain": 1.0},
