@@ -14,10 +14,8 @@ Params say how to control, a state is carried from step to step, and every array
   for loops with constant params; :func:`step_terms` returns all terms of the effort, as
   :func:`advance` does.
 - Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.gains.presets` for the
-  tutorial's; :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`,
-  :func:`load_about`.
+  tutorial's; :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`.
 - Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`.
-- A simulator's drive with integral action: :func:`drive_target`.
 - Limits of setpoints: :func:`make_guard` and :mod:`batchpid.motors.guard`.
 - Chunks of a slow policy: :func:`make_plan` and :mod:`batchpid.plan`.
 - Real motors and sensors: :func:`make_actuators` and :mod:`batchpid.motors`.
@@ -35,18 +33,12 @@ from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependen
 from batchpid.gains import presets
 from batchpid.gains.design import design_gains
 from batchpid.gains.stability import stability_bound
-from batchpid.io.documents import (
-    dumps_params,
-    load_about,
-    load_params,
-    loads_params,
-    save_params,
-)
+from batchpid.io.documents import dumps_params, load_params, loads_params, save_params
 from batchpid.io.files import attributes_of
 from batchpid.law.bumpless import track
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams, make_params
-from batchpid.law.pid import advance, drive_target, init, reset, step, step_terms
+from batchpid.law.pid import advance, init, reset, step, step_terms
 from batchpid.law.state import PIDState, Terms
 from batchpid.motors import Actuators, load_actuators, make_actuators, save_actuators
 from batchpid.motors.guard import Guard, make_guard
@@ -70,10 +62,8 @@ __all__ = [
     "advance",
     "design_gains",
     "discretise",
-    "drive_target",
     "dumps_params",
     "init",
-    "load_about",
     "load_actuators",
     "load_params",
     "load_plan",

@@ -88,8 +88,6 @@ class NumPyBackend:
 class JAXBackend:
     """The law compiled by JAX: once per structure of params and inputs, with the state's buffers
     donated.
-
-    A call costs JAX some 4 us per array, so the params that all envs share travel as one.
     """
 
     native = False
@@ -108,46 +106,13 @@ class JAXBackend:
             new, results = pid.advance(discretise(params, dt), state, *inputs)
             return new, results.effort, results.filled() if terms else None
 
-        self._step = self._compile(step, donate_argnums=3)
-
-    def _compile(self, function: Any, **options: Any) -> Any:
-        """Return a function of params and more, compiled as one of packed params: layout, shared,
-        separate.
-        """
-
-        def packed(
-            layout: Any,
-            shared: Any,
-            separate: Any,
-            *inputs: Array,
-            **named: Any,
-        ) -> Any:
-            tree, is_shared = layout
-            shared = iter(shared)
-            separate = iter(separate)
-            leaves = [next(shared if one else separate) for one in is_shared]
-            return function(self.jax.tree.unflatten(tree, leaves), *inputs, **named)
-
-        return self.jax.jit(
-            packed,
-            static_argnums=0,
-            static_argnames=("dt", "keep_integral"),
-            **options,
-        )
+        self._step = jax.jit(step, donate_argnums=1)
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
         """Take params for (envs, joints) ``shape``."""
-        jnp = self.jax.numpy
-        leaves, tree = self.jax.tree.flatten(params)
-        is_shared = tuple(leaf.shape[0] == 1 for leaf in leaves)
         with precision(self.dtype):
-            shared = [np.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if one]
-            separate = [
-                jnp.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if not one
-            ]
-            stacked = np.stack(shared) if shared else np.empty((0, 1, shape[1]), params.dtype)
-            self.packed = ((tree, is_shared), jnp.asarray(stacked), separate)
-        self.dtype = self.packed[1].dtype
+            self.params = self.jax.tree.map(self.jax.numpy.asarray, params)
+        self.dtype = self.params.kp.dtype
 
     def array(self, value: Array) -> Array:
         """Return ``value`` as an array of this backend."""
@@ -159,21 +124,19 @@ class JAXBackend:
     def call(self, function: Callable[..., PIDState], *inputs: Array, **named: Array) -> PIDState:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
         if function not in self._compiled:
-            self._compiled[function] = self._compile(function)
+            self._compiled[function] = self.jax.jit(function)
         with precision(self.dtype):
-            state: PIDState = self._compiled[function](*self.packed, *inputs, **named)
+            state: PIDState = self._compiled[function](self.params, *inputs, **named)
             return state
 
     def step(
         self,
         state: PIDState,
         out: Array,
-        r: Array,
-        y: Array,
-        *rates: Array,
+        *inputs: Array,
     ) -> tuple[PIDState, Array, Terms | None, Callable[..., Array]]:
         """Return the new state, the effort, the terms if they are kept, and no fast call; ``out``
         is None.
         """
         with precision(self.dtype):
-            return *self._step(*self.packed, state, r, y, *rates), declined
+            return *self._step(self.params, state, *inputs), declined

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from batchpid.backends import JAXBackend, NumPyBackend, declined
 from batchpid.checks import (
     choice,
     env_mask,
-    flag,
     instance,
     integer,
     names,
@@ -83,6 +83,7 @@ class BatchPID:
             self._names = names("joint_names", joint_names, self.num_joints)
         if threads is not None:
             threads = integer("threads", threads, 1, MOST_THREADS)
+        self._track = partial(bumpless.track, dt=self._dt)
         self._engine = BACKENDS[self._backend](self._dt, terms, threads)
         self._state: PIDState | None = None
         self._fast = declined  # fast call of the law on this very state
@@ -231,7 +232,7 @@ class BatchPID:
         self._lent = False
         return effort
 
-    def reset(self, measurement: Array, mask: Array = None, *, keep_integral: bool = False) -> None:
+    def reset(self, measurement: Array, mask: Array = None) -> None:
         """Restart the envs of ``mask`` (envs,) bool, or all, from ``measurement`` (envs,
         joints).
         """
@@ -240,9 +241,8 @@ class BatchPID:
             mask = np.ones(self.num_envs, bool)
         else:
             mask = env_mask("mask", mask, self.num_envs)
-        is_kept = flag("keep_integral", keep_integral)
         self._fast = declined
-        self._state = self._engine.call(pid.reset, self._started(y), y, mask, keep_integral=is_kept)
+        self._state = self._engine.call(pid.reset, self._started(y), y, mask)
 
     def track(
         self,
@@ -266,12 +266,11 @@ class BatchPID:
         )
         self._fast = declined
         self._state = self._engine.call(
-            bumpless.track,
+            self._track,
             self._started(y),
             r,
             y,
             u,
-            dt=self._dt,
             **rest,
         )
 

@@ -180,62 +180,6 @@ def straight_line(
     return Trajectory(s.time, position, s.velocity * move, s.acceleration * move)
 
 
-def _check_sampling(frequency: float, dt: float) -> None:
-    """Raise InvalidArgumentError for a frequency [Hz] of which ticks of ``dt`` [s] show another."""
-    half = 0.5 / positive("dt", dt, "s")
-    if positive("frequency", frequency, "Hz") >= half:
-        problem = f"must be below {half:g} Hz, half the rate of the ticks"
-        remedy = "lower it, or use a smaller dt"
-        raise InvalidArgumentError("frequency", problem, value=frequency, remedy=remedy)
-
-
-def sine(
-    center: ArrayLike,
-    amplitude: ArrayLike,
-    dt: float,
-    *,
-    frequency: float,
-    duration: float,
-    fade: float = 1.0,
-) -> Trajectory:
-    """Return oscillations about ``center`` that grow from rest within ``fade`` [s].
-
-    ``x(t) = center + a(t) sin(2 pi f t)``, where a(t) rises to the amplitude as a minimum-jerk
-    move: the first setpoint has no jump of position, rate or acceleration.
-
-    Parameters
-    ----------
-    center, amplitude
-        (joints,) or (envs, joints) [rad or m].
-    dt, duration
-        Time of a tick and of the trajectory [s].
-    frequency
-        f [Hz], below half the rate of the ticks.
-    """
-    low, move = _move(center, np.add(center, amplitude))
-    time = _ticks(dt, np.array(positive("duration", duration, "s")))
-    growth = minimum_jerk([0.0], [1.0], dt, duration=positive("fade", fade, "s"))
-    growth = growth.hold(duration)
-    a, rate, change = (part[: len(time), 0] for part in growth[1:])
-    _check_sampling(frequency, dt)
-    w = 2 * np.pi * frequency
-    sin = np.sin(w * time)
-    cos = np.cos(w * time)
-    # Products of the growth and the wave, and their derivatives.
-    wave = a * sin
-    wave_rate = rate * sin + w * a * cos
-    wave_acceleration = (change - w**2 * a) * sin + 2 * w * rate * cos
-    # One wave for all joints, scaled by the amplitude of each.
-    axes = (...,) + (None,) * move.ndim
-    shares = [row[axes] for row in (wave, wave_rate, wave_acceleration)]
-    return Trajectory(
-        time,
-        low + shares[0] * move,
-        shares[1] * move,
-        shares[2] * move,
-    )
-
-
 def trapezoidal(
     start: ArrayLike,
     target: ArrayLike,

@@ -39,6 +39,7 @@ from batchpid.sim.loop import env_group
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.randomization.distributions import NOTHING
 from batchpid.sim.workers.requests import SharedArrays
 from batchpid.stages.values import Command
 
@@ -151,23 +152,23 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     """
     share = max(1, workload.num_envs // workload.processes)
     robot = workload.simulated_robot()
-    options = RunnerOptions(robot, share, engine="sapien", physics=workload.physics)
-    layout = Arrays.layout(1, share, robot.dof, robot.dof, options.observed)
-    shared = SharedArrays(layout)
+    params = robot.params()
+    options = RunnerOptions(robot, share, engine="sapien", physics=workload.physics, params=params)
+    shared = SharedArrays(Arrays.layout(options, 1, share))
     # In NumPy, with a call for each phase.
     with patch.object(env_group, "runs_natively", return_value=False):
-        loop = Loop(options, robot.params(), slice(0, share), Arrays.from_fields(shared.arrays))
+        loop = Loop(options, slice(0, share), shared.arrays)
     for group in loop.groups:
-        group._executor._engine._is_native = False
-    loop.reset(
-        np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, robot.dof))
-    )
+        group._executor._is_native = False
+    start = np.tile(workload.start, (share, 1))
+    rest = np.zeros((share, robot.dof))
+    loop.execute("reset", (np.ones(share, bool), start, rest, NOTHING, None))
     loop.arrays.command.setpoint[...] = workload.target
     spent = dict.fromkeys(("read", "control", "passive", "write", "step", "waiting"), 0.0)
     for group in loop.groups:
         _time_calls(group.pack, spent)
     given = Command(workload.target).given
-    total = sum(loop.run(1, workload.substeps, given) for _ in range(workload.ticks))
+    total = sum(loop.execute("run", (1, workload.substeps, given)) for _ in range(workload.ticks))
     loop.close()
     shared.close()
     env_steps = workload.steps * share

@@ -22,7 +22,7 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
 from batchpid.sim.signals import POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec
 from batchpid.task_space.frames import moved, pose_error
-from batchpid.task_space.native_law import BoundOSC
+from batchpid.task_space.native_rows import BoundOSC
 from batchpid.task_space.osc_params import AXES
 from batchpid.task_space.symmetric import gram, solve
 
@@ -265,7 +265,6 @@ class OperationalSpace:
             state._replace(posture=posture),
             dynamics,
             inputs,
-            ("effort", "unsaturated"),
         )
         saturated = terms.effort != terms.unsaturated
         return new._replace(posture=state.posture), terms.effort, saturated

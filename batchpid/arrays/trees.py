@@ -1,8 +1,8 @@
 r"""Trees of arrays: nested tuples, lists, mappings and dataclasses. A leaf is an array, a traced
 symbol, or a placeholder (``...``).
 
-Programs take the leaves of a tree of tuples and dataclasses in order: :func:`leaves`, :func:`mapped`,
-:func:`structure` and :func:`filled`. Numbers and other values are constants there, not leaves.
+Programs take the leaves of a tree of tuples, mappings and dataclasses in order: :func:`leaves`,
+:func:`mapped`, :func:`structure` and :func:`filled`. Numbers and other values are constants there, not leaves.
 Files and snapshots take all values by name: :func:`flatten` and :func:`unflatten`. None is a tree
 without leaves.
 
@@ -33,9 +33,11 @@ def is_leaf(tree: Pytree) -> bool:
 
 
 def leaves(tree: Pytree) -> list[Pytree]:
-    """Return the leaves of a tree of tuples and dataclasses, in order."""
+    """Return the leaves of a tree of tuples, mappings and dataclasses, in order."""
     if is_leaf(tree):
         return [tree]
+    if isinstance(tree, Mapping):
+        tree = tuple(tree.values())
     if isinstance(tree, tuple):
         return [leaf for part in tree for leaf in leaves(part)]
     if is_dataclass(tree):
@@ -44,9 +46,11 @@ def leaves(tree: Pytree) -> list[Pytree]:
 
 
 def mapped(function: Callable[[Pytree], Pytree], tree: Pytree) -> Pytree:
-    """Return a tree of tuples and dataclasses with ``function`` applied to its leaves."""
+    """Return a tree of tuples, mappings and dataclasses with ``function`` applied to its leaves."""
     if is_leaf(tree):
         return function(tree)
+    if isinstance(tree, Mapping):
+        return {name: mapped(function, part) for name, part in tree.items()}
     if isinstance(tree, tuple) and tree:
         return rebuilt_as(tree, [mapped(function, part) for part in tree])
     if is_dataclass(tree):

@@ -135,12 +135,6 @@ class RecordFile(Generic[R]):
         """
         return self._built(str(path), read(path), joint_names)
 
-    def load_about(self, path: str | os.PathLike[str]) -> Document:
-        """Return the ``about`` of a file, or an empty dict. Raises as :meth:`load`."""
-        document = read(path)
-        self._joints(str(path), document)
-        return dict(document.get("about", {}))
-
     def entries(self, options: Document, joint_names: Sequence[str]) -> dict[str, Document]:
         """Return the entry of each joint, from options (1 | envs, joints)."""
         return {
@@ -363,19 +357,7 @@ def _parse_yaml(text: str) -> Any:
     return yaml.load(text, Loader=Loader)  # a SafeLoader: plain data only
 
 
-class _ParamsFile(RecordFile[PIDParams]):
-    def arguments(self, source: str, joints: Mapping[str, Document]) -> Document:
-        """Return the options; a time of back-calculation that only some joints have is an error."""
-        options = super().arguments(source, joints)
-        for joint, entry in joints.items() if "tracking_time" in options else ():
-            tracks = "back_calculation" in str(entry.get("anti_windup"))
-            if tracks and "tracking_time" not in entry:
-                problem = "is missing, but other joints have it"
-                raise error(source, "tracking_time", problem, "give it too", joint)
-        return options
-
-
-PARAMS = _ParamsFile(
+PARAMS = RecordFile(
     "batchpid-params-1",
     PIDParams,
     make_params,
@@ -387,4 +369,3 @@ dumps_params = PARAMS.dumps
 loads_params = PARAMS.loads
 save_params = PARAMS.save
 load_params = PARAMS.load
-load_about = PARAMS.load_about

@@ -10,7 +10,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import discretise
 from batchpid.law.params import PIDParams
 from batchpid.law.pid import origins, proportional, weighted_rate, wrapped_error
-from batchpid.law.state import PIDState, check_alone, checked_inputs, checked_state, needs
+from batchpid.law.state import PIDState, check_alone, check_state, checked_inputs
 
 
 def track(
@@ -49,7 +49,7 @@ def track(
         setpoint_rate=setpoint_rate,
         feedforward=feedforward,
     )
-    checked_state(state, needs(params))
+    check_state(state, params)
     check_alone(params, measurement_rate)
     if params.ki is None:
         raise InvalidArgumentError(

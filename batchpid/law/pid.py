@@ -45,10 +45,9 @@ from batchpid.law.state import (
     PIDState,
     Terms,
     check_alone,
-    check_drive,
+    check_state,
     checked_inputs,
     checked_mask,
-    checked_state,
     needs,
 )
 
@@ -119,18 +118,15 @@ def step(
         params need, or the params have gain_units other than "effort" or ask for a measured rate
         that is not given.
     """
-    inputs = {
-        "measurement_rate": measurement_rate,
-        "setpoint_rate": setpoint_rate,
-        "feedforward": feedforward,
-    }
     state, terms = _step(
         params,
         state,
         setpoint,
         measurement,
         dt,
-        **inputs,
+        measurement_rate=measurement_rate,
+        setpoint_rate=setpoint_rate,
+        feedforward=feedforward,
     )
     return state, terms.effort
 
@@ -166,23 +162,10 @@ def _step(
     **inputs: Array,
 ) -> tuple[PIDState, Terms]:
     """Check the arguments of a step and advance the law."""
-    r, y, inputs = _checked(params, state, setpoint, measurement, inputs)
-    return advance(discretise(params.for_rank(y.ndim), dt), state, r, y, **inputs)
-
-
-def _checked(
-    params: PIDParams,
-    state: PIDState,
-    setpoint: Array,
-    measurement: Array,
-    inputs: dict[str, Array],
-) -> tuple[Array, Array, dict[str, Array]]:
-    """Return setpoint, measurement and inputs of a step as arrays that fit the params and the
-    state.
-    """
     y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
-    checked_state(state, needs(params))
-    return r, y, dict(zip(inputs, rest, strict=True))
+    check_state(state, params)
+    given = dict(zip(inputs, rest, strict=True))
+    return advance(discretise(params.for_rank(y.ndim), dt), state, r, y, **given)
 
 
 def advance(
@@ -325,22 +308,16 @@ def reset(
     state: PIDState,
     measurement: Array,
     mask: Array,
-    *,
-    keep_integral: bool = False,
 ) -> PIDState:
     """Return the state with the envs of ``mask`` (envs,) bool restarted from ``measurement`` (envs,
     joints).
 
-    ``keep_integral`` keeps their integral term, e.g. a learnt load. Raises InvalidArgumentError if
-    a shape does not fit, or the mask is not of bools.
+    Raises InvalidArgumentError if a shape does not fit, or the mask is not of bools.
     """
     (measurement,) = checked_inputs(params, state, measurement)
     mask = checked_mask(mask, state)
     # Every env is started; the rows of the mask are taken.
-    fresh = init(params, measurement)
-    if keep_integral:
-        fresh = fresh._replace(integral=state.integral)
-    return replace_envs(state, fresh, mask)
+    return replace_envs(state, init(params, measurement), mask)
 
 
 def wrapped_error(
@@ -397,12 +374,11 @@ def proportional(
     return k.kp * (error if k.b is None else k.b * error - (1 - k.b) * (y - origin))
 
 
-def drive_target(
-    params: PIDParams,
+def advance_drive(
+    k: Coefficients,
     state: PIDState,
     setpoint: Array,
     measurement: Array,
-    dt: Array,
     **inputs: Array,
 ) -> tuple[PIDState, Array]:
     """Return ``(state, target)``: the position target that makes a PD drive of stiffness kp act as
@@ -413,32 +389,9 @@ def drive_target(
     The drive (SAPIEN's ``set_drive_property(stiffness=kp, damping=kd)``) integrates P and D
     implicitly and is as stable as without I. I evolves as in :func:`batchpid.step`, whose effort
     predicts the drive's effort: ``effort_min`` and ``effort_max`` are the drive's force limit, and
-    anti-windup works against it. Where kp is 0 the target is the setpoint.
-
-    Arrays and the optional ``inputs`` measurement_rate, setpoint_rate and feedforward (an effort
-    added to the drive's, inside the same limit) are as in :func:`batchpid.step`. The idea is from
-    the SAPIEN authors' answer in haosulab/SAPIEN#178.
-
-    Raises InvalidArgumentError as :func:`batchpid.step`, and for options that a drive does not
-    have: setpoint weights, a filter of the derivative, a dead zone, a limit of the effort's rate,
-    and a policy for non-finite inputs.
-    """
-    r, y, inputs = _checked(params, state, setpoint, measurement, inputs)
-    check_drive(params)
-    return advance_drive(discretise(params.for_rank(y.ndim), dt), state, r, y, **inputs)
-
-
-def advance_drive(
-    k: Coefficients,
-    state: PIDState,
-    setpoint: Array,
-    measurement: Array,
-    **inputs: Array,
-) -> tuple[PIDState, Array]:
-    """Return ``(state, target)`` with given coefficients, for loops with constant params; else as
-    :func:`drive_target`.
-
-    It takes the arguments of :func:`advance`.
+    anti-windup works against it. Where kp is 0 the target is the setpoint. The arguments are those
+    of :func:`advance`, with params that pass :func:`batchpid.law.state.check_drive`. The idea is
+    from the SAPIEN authors' answer in haosulab/SAPIEN#178.
     """
     state, terms = advance(k, state, setpoint, measurement, **inputs)
     xp = namespace(*k, terms.i, setpoint)

@@ -199,10 +199,10 @@ def needs(params: PIDParams) -> PIDState:
     )
 
 
-def checked_state(state: PIDState, needed: PIDState) -> PIDState:
-    """Return ``state`` if it has every leaf that is ``needed``."""
-    for name, leaf, need in zip(PIDState._fields, state, needed, strict=True):
-        if need and leaf is None:
+def check_state(state: PIDState, params: PIDParams) -> None:
+    """Raise InvalidArgumentError unless ``state`` has every leaf that the params need."""
+    for name, need in needs(params)._asdict().items():
+        if need and getattr(state, name) is None:
             remedy = (
                 "begin with init(params, measurement), or use state.matched_to(init(params,"
                 " measurement))"
@@ -210,7 +210,6 @@ def checked_state(state: PIDState, needed: PIDState) -> PIDState:
             raise InvalidArgumentError(
                 "state", f"has no {name}, which these params need", remedy=remedy
             )
-    return state
 
 
 def checked_mask(mask: Array, state: PIDState) -> Array:

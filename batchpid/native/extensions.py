@@ -161,7 +161,6 @@ LAW = (
     "posture_kd",
     "limit_kp",
     "limit_kd",
-    "limit_margin",
     "limit_low",
     "limit_high",
     "integral_limit",

@@ -191,7 +191,7 @@ class OSCLaw {
       Lanes const low = given_[LAW_LIMIT_LOW][j] - qpos[j], high = qpos[j] - given_[LAW_LIMIT_HIGH][j];
       Lanes const depth = at_least(low, 0.0) - at_least(high, 0.0), within = absolute(depth);
       if (!any_positive(within)) continue;
-      Lanes const damped = given_[LAW_LIMIT_KD][j] * qvel[j] * within / given_[LAW_LIMIT_MARGIN][j];
+      Lanes const damped = given_[LAW_LIMIT_KD][j] * qvel[j] * within;
       Lanes const pushed = given_[LAW_LIMIT_KP][j] * depth;
       a_s_[j] = where_positive(within, a_s_[j] + given_[LAW_CHAIN][j] * pushed, a_s_[j]);
       a_n_[j] = where_positive(within, a_n_[j] + given_[LAW_CHAIN][j] * (pushed - damped), a_n_[j]);

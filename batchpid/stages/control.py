@@ -62,6 +62,11 @@ class Control(NamedTuple):
         """Whether motors deliver other efforts than the law asks for."""
         return self.actuators is not None and self.actuators.delivers
 
+    @property
+    def has_motors(self) -> bool:
+        """Whether the actuators have an effect on efforts or measurements."""
+        return self.measures or self.delivers
+
     def side(self, fields: Mapping[str, Any]) -> tuple[Actuators, MotorCoefficients]:
         """Return the actuators with the effects ``fields`` alone, and their coefficients."""
         assert self.actuators is not None

@@ -179,7 +179,7 @@ class PID(Stage):
 class Drive(Stage):
     """The engine's drives with stiffness kp and damping kd; qf = f.
 
-    With ki the drive's target moves by the integral over kp (:func:`batchpid.drive_target`), so
+    With ki the drive's target moves by the integral over kp (:func:`batchpid.law.pid.advance_drive`), so
     that the drive acts as a PID whose P and D the engine integrates implicitly. The engine's drives
     do not know whole turns, so the target of a continuous joint is the one next to y, which may
     jump at every sim step.

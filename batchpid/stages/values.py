@@ -84,6 +84,11 @@ class Outputs(NamedTuple):
     """Position target of the engine's drives [rad or m]; None without drives."""
     target_rate: Array = None
 
+    @property
+    def shown(self) -> dict[str, Array]:
+        """Quantities of an observation, by name."""
+        return {"effort": self.motor, "saturated": self.saturated, "guarded": self.guarded}
+
 
 def when(due: Array, function: Callable[[], T], otherwise: T) -> T:
     """Return ``function()`` if ``due``, a bool or an array, has a True entry; else

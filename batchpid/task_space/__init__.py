@@ -9,7 +9,7 @@ from batchpid.task_space.inverse_kinematics import (
     IKResult,
     inverse_kinematics,
 )
-from batchpid.task_space.operational_space import init, osc, reset
+from batchpid.task_space.operational_space import init, osc, reset, task_dynamics
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
 from batchpid.task_space.osc_state import (
     OSCCoefficients,
@@ -19,7 +19,6 @@ from batchpid.task_space.osc_state import (
     TaskDynamics,
     Tool,
     discretise,
-    task_dynamics,
 )
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_quantities import (

@@ -46,7 +46,7 @@ space formulation", IEEE Journal on Robotics and Automation 3 (1987).
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -54,7 +54,7 @@ from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import clip, in_dtype_of, namespace, wrap
 from batchpid.checks import instance
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space import native_law
+from batchpid.task_space import native_rows
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
 from batchpid.task_space.osc_params import MAKE_PARAMS, OSCParams
 from batchpid.task_space.osc_state import (
@@ -64,10 +64,13 @@ from batchpid.task_space.osc_state import (
     OSCTerms,
     TaskDynamics,
     Tool,
-    in_tool_axes,
-    task_dynamics,
 )
-from batchpid.task_space.symmetric import bounded_inverse, gram, product, quiet, whitened
+from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.symmetric import bounded_inverses, gram, product, quiet, whitened
+from batchpid.task_space.tree_quantities import evaluated
+
+SPRING_BOUND = 0.2
+"""Bound s1 of L_s, as a share of the bound s0 of L_n."""
 
 
 def init(params: OSCParams, qpos: Array) -> OSCState:
@@ -106,12 +109,47 @@ def reset(
     )
 
 
+def task_dynamics(
+    tree: RigidTree,
+    qpos: Array,
+    qvel: Array,
+    link: str,
+    *,
+    point: Array = None,
+    bias: Array = None,
+) -> TaskDynamics:
+    """Return the dynamics of ``tree`` with a tool: a ``point`` (3,) [m] of ``link``, default its
+    origin.
+
+    ``qpos`` and ``qvel`` are (envs, dof). A ``bias`` (envs, dof), such as an engine's, takes the
+    place of the tree's.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The link is unknown, or a shape is wrong.
+    """
+    names: tuple[str, ...] = ("pose", "jacobian", "jacobian_rate", "mass_matrix")
+    if bias is None:
+        names = (*names, "bias")
+    results = evaluated(
+        tree,
+        names,
+        qpos,
+        qvel,
+        link,
+        point,
+    )
+    xp = namespace(results["pose"])
+    chain = xp.asarray(tree.chain(link), dtype=results["pose"].dtype)
+    return TaskDynamics(**{"bias": bias, "chain": chain, **results})
+
+
 def osc(
     k: OSCCoefficients,
     state: OSCState,
     dynamics: TaskDynamics | Tool,
     inputs: OSCInputs,
-    wanted: tuple[str, ...] = OSCTerms._fields,
 ) -> tuple[OSCState, OSCTerms]:
     """Advance the law by a time step; return the state and the terms, effort included.
 
@@ -124,8 +162,6 @@ def osc(
     dynamics
         Dynamics at the present state, such as an engine's, or a tool, with whose tree they are
         computed.
-    wanted
-        Names of the terms that the caller uses. Others may be None: native code leaves them out.
 
     Raises
     ------
@@ -133,129 +169,128 @@ def osc(
         The link of the tool is unknown, or an array has a wrong shape.
     """
     try:
-        if (results := native_law.law(k, state, dynamics, inputs, wanted)) is not None:
-            return results
-        _check_shapes(k, inputs)
+        results = native_rows.law(k, state, dynamics, inputs)
     except ValueError:
         _check_shapes(k, inputs)
         raise
+    if results is not None:
+        return results
+    _check_shapes(k, inputs)
     inputs = OSCInputs(*in_dtype_of(k, *inputs))
     if isinstance(dynamics, Tool):
         dynamics = task_dynamics(dynamics.tree, *inputs[1:3], dynamics.link, point=dynamics.point)
     with quiet():
-        # All that follows is in the axes in which the gains are given.
-        task = in_frame(k, dynamics, inputs)
-        # Accelerations of task and posture first, then their efforts, then the limits.
-        a = task_acceleration(k, task)
-        a = a if state.integral is None else a + state.integral
-        a_n, a_s = posture_acceleration(k, dynamics, state.posture, inputs.qpos, inputs.qvel)
-        p = projections(
-            k,
-            task.dynamics,
-            a,
-            a_n,
-            inputs.wrench,
-            inputs.feedforward,
-            a_s,
-        )
-        effort, whole, s1, s2 = _saturated(p, k.effort_min, k.effort_max)
-        if state.integral is not None:
-            held = (p.near_singular | (effort != whole).any(-1))[:, None] & (a * task.near > 0)
-            state = state._replace(integral=_integrated(k, state.integral, task, held))
-    shares = s1[..., 0], s2[..., 0]
-    return state, OSCTerms(
-        task.error,
-        p.force,
-        p.task,
-        p.posture,
-        whole,
-        effort,
-        *shares,
-        p.near_singular,
-    )
+        return _advance(k, state, dynamics, inputs)
 
 
 def _check_shapes(k: OSCCoefficients, inputs: OSCInputs) -> None:
     """Raise InvalidArgumentError for an input that is not (envs, size), and for coefficients of
     other envs.
     """
-    if np.ndim(inputs.qpos) != 2:
-        problem = f"has shape {np.shape(inputs.qpos)}, not (envs, dof)"
-        raise InvalidArgumentError("qpos", problem, remedy="give one row for each env")
-    envs, dof = np.shape(inputs.qpos)
+    shape = np.shape(inputs.qpos)
+    remedy = "give one row for each env"
+    if len(shape) != 2:
+        raise InvalidArgumentError("qpos", f"has shape {shape}, not (envs, dof)", remedy=remedy)
+    envs, dof = shape
     for name, value, size in zip(inputs._fields, inputs, (7, dof, dof, 6, 6, 6, dof), strict=True):
         if value is not None and np.shape(value) not in ((envs, size), (1, size)):
             problem = f"has shape {np.shape(value)}, not ({envs}, {size})"
-            raise InvalidArgumentError(name, problem, remedy="give one row for each env")
+            raise InvalidArgumentError(name, problem, remedy=remedy)
     for name, leaf in zip(k._fields, k[:-1], strict=False):
         if leaf is not None and leaf.shape[0] not in (1, envs):
             problem = f"has rows for {leaf.shape[0]} envs, but qpos for {envs}"
             raise InvalidArgumentError(f"k.{name}", problem, remedy="make params for these envs")
 
 
-class Task(NamedTuple):
-    """Error and motion of the tool, vectors (envs, 6) in the axes of the params' frame."""
-
-    dynamics: TaskDynamics
-    error: Array
-    near: Array
-    """Error with limited norms."""
-    tool_twist: Array
-    """J q'."""
-    twist: Array
-    acceleration: Array
-
-
-def in_frame(k: OSCCoefficients, d: TaskDynamics, inputs: OSCInputs) -> Task:
-    """Return the dynamics, error and motion in the axes of the params' frame."""
+def _advance(
+    k: OSCCoefficients,
+    state: OSCState,
+    d: TaskDynamics,
+    inputs: OSCInputs,
+) -> tuple[OSCState, OSCTerms]:
+    """Return the results of :func:`osc` by the equations."""
     xp = namespace(*k, *d, *inputs)
-    # Position and rotation have limits of their own: a far target does not drown a turn.
-    error = pose_error(inputs.setpoint, d.pose)
-    limits = (k.position_error_limit, k.rotation_error_limit)
-    near = [
-        _shortened(part, limit, xp)
-        for part, limit in zip(
-            (error[..., :3], error[..., 3:]),
-            limits,
-            strict=True,
-        )
+    chain = d.chain
+    m = d.mass_matrix
+    j = d.jacobian
+    # Error and motion of the tool, in the axes in which the gains are given.
+    vectors: list[Array] = [
+        pose_error(inputs.setpoint, d.pose),
+        product(j, inputs.qvel),
+        d.jacobian_rate,
+        inputs.twist,
+        inputs.acceleration,
     ]
-    vectors: tuple[Array, ...] = (
-        error,
-        xp.concatenate(near, axis=-1),
-        product(d.jacobian, inputs.qvel),
-    )
-    vectors += inputs.twist, inputs.acceleration
     if k.frame is not None:
         turn = matrix_of(d.pose[..., 3:])
-        vectors = tuple(
-            [None if x is None else in_axes(turn, x[..., None])[..., 0] for x in vectors]
-        )
-        d = in_tool_axes(d)
-    return Task(d, *vectors)
+        j = in_axes(turn, j)
+        vectors = [None if x is None else in_axes(turn, x[..., None])[..., 0] for x in vectors]
+    error, tool_twist, rate, twist, acceleration = vectors
+    # Position and rotation have limits of their own: a far target does not drown a turn.
+    position = _shortened(error[..., :3], k.position_error_limit, xp)
+    rotation = _shortened(error[..., 3:], k.rotation_error_limit, xp)
+    near = xp.concatenate([position, rotation], axis=-1)
+    # Accelerations of task and posture.
+    a = k.kp * near - k.kd * tool_twist
+    a = a if twist is None else a + k.c * twist
+    a = a if acceleration is None else a + k.acceleration_share * acceleration
+    a = a if state.integral is None else a + state.integral
+    springs, damping = _posture(k, d, state.posture, inputs)
+    # Inertias, with unit inertia of the joints outside of the chain.
+    eye = xp.zeros_like(m) + xp.eye(m.shape[-1], dtype=m.dtype)
+    m_cc = xp.where(chain[:, None] * chain > 0, m, eye)
+    y = whitened(m_cc, xp.concatenate([xp.swapaxes(j, -1, -2), eye], axis=-1))
+    inverse = gram(y[..., 6:], y[..., 6:])
+    task_inertia, null_inertia, spring_inertia, near_singular = _inertias(
+        k, gram(y[..., :6], y[..., :6]), xp
+    )
+    # The wrench that accelerates the tool's inertia, less the acceleration of the motion itself.
+    force = product(task_inertia, a - rate)
+    force = force if inputs.wrench is None else force + inputs.wrench
+    task = gram(j, force[..., None])[..., 0]
+    pull = product(spring_inertia, product(j, springs)) - product(null_inertia, product(j, damping))
+    a_n = springs - damping
+    null = chain * (product(m, chain * a_n) - gram(j, pull[..., None])[..., 0])
+    base = d.bias + product(m, (1 - chain) * a_n)
+    base = base if inputs.feedforward is None else base + inputs.feedforward
 
+    # The task takes the room within the limits first, and the posture what is left of it.
+    low = -math.inf if k.effort_min is None else k.effort_min
+    high = math.inf if k.effort_max is None else k.effort_max
+    able = (base >= low) & (base <= high)
 
-def task_acceleration(k: OSCCoefficients, task: Task) -> Array:
-    """Return a (envs, 6) without I."""
-    a = k.kp * task.near - k.kd * task.tool_twist
-    a = a if task.twist is None else a + k.c * task.twist
-    if task.acceleration is None:
-        return a
-    return a + k.acceleration_share * task.acceleration
+    def share(effort: Array, at: Array) -> Array:
+        room = xp.maximum(xp.where(effort > 0, high - at, at - low), 0.0)
+        size = xp.abs(effort)
+        limited = able & (size > room)
+        shares = xp.where(limited, room / xp.where(limited, size, 1.0), 1.0)
+        return shares.min(axis=-1, keepdims=True)
 
-
-def _integrated(
-    k: OSCCoefficients,
-    integral: Array,
-    task: Task,
-    held: Array,
-) -> Array:
-    """Return the integral after the step; it stays where it is ``held`` (envs, 6)."""
-    xp = namespace(integral, task.near)
-    new = integral + k.ki_dt * task.near
-    if k.ki_dt2 is not None and task.twist is not None:
-        new = new - k.ki_dt2 * task.twist
-    return xp.where(held, integral, clip(new, -k.integral_limit, k.integral_limit, xp))
+    s1 = share(task, base)
+    s2 = share(null, base + s1 * task)
+    # The other joints hold against the acceleration of the chain.
+    within = s1 * task + s2 * null
+    others = (1 - chain) * product(m, product(inverse, within))
+    effort = clip(base + within + others, low, high, xp)
+    whole = base + (task + null) + others
+    if state.integral is not None:
+        integral = state.integral + k.ki_dt * near
+        if k.ki_dt2 is not None and twist is not None:
+            integral = integral - k.ki_dt2 * twist
+        integral = clip(integral, -k.integral_limit, k.integral_limit, xp)
+        held = (near_singular | (effort != whole).any(-1))[:, None] & (a * near > 0)
+        state = state._replace(integral=xp.where(held, state.integral, integral))
+    return state, OSCTerms(
+        error,
+        force,
+        task,
+        null,
+        whole,
+        effort,
+        s1[..., 0],
+        s2[..., 0],
+        near_singular,
+    )
 
 
 def _shortened(vector: Array, limit: Array, xp: ArrayModule) -> Array:
@@ -265,149 +300,24 @@ def _shortened(vector: Array, limit: Array, xp: ArrayModule) -> Array:
     return vector * xp.where(long, limit / xp.where(long, length, 1.0), 1.0)
 
 
-def posture_acceleration(
+def _posture(
     k: OSCCoefficients,
     d: TaskDynamics,
     posture: Array,
-    q: Array,
-    v: Array,
+    inputs: OSCInputs,
 ) -> tuple[Array, Array]:
-    """Return a_n and its part a_s (envs, dof)."""
+    """Return a_s and a_d (envs, dof)."""
+    _, q, v, *_ = inputs
     xp = namespace(posture, q, v)
     springs = k.posture_kp * wrap(posture - q, k.turns, xp)
-    a = springs - k.posture_kd * v
+    damping = k.posture_kd * v
     if k.limit_kp is None:
-        return a, springs
+        return springs, damping
     # Positive below the lower margin, negative above the upper one.
     depth = xp.maximum(k.limit_low - q, 0.0) - xp.maximum(q - k.limit_high, 0.0)
-    pushed = k.limit_kp * depth
     return (
-        a + d.chain * (pushed - k.limit_kd * v * xp.abs(depth) / k.limit_margin),
-        springs + d.chain * pushed,
-    )
-
-
-def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
-    """Return the efforts after and before saturation, s1 and s2, all (envs, dof)."""
-    xp = namespace(*p, low, high)
-    base = p.base
-    task = p.task
-    null = p.posture
-    least = -math.inf if low is None else low
-    most = math.inf if high is None else high
-    able = (base >= least) & (base <= most)
-
-    def share(effort: Array, at: Array) -> Array:
-        room = xp.maximum(xp.where(effort > 0, most - at, at - least), 0.0)
-        size = xp.abs(effort)
-        limited = able & (size > room)
-        return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(
-            axis=-1, keepdims=True
-        )
-
-    # The task takes the room first, and the posture what is left of it.
-    s1 = share(task, base)
-    s2 = share(null, base + s1 * task)
-    others = s1 * p.task_of_others + s2 * p.posture_of_others
-    effort = clip(
-        base + s1 * task + s2 * null + others,
-        low,
-        high,
-        xp,
-    )
-    return effort, base + task + null + others, s1, s2
-
-
-SPRING_BOUND = 0.2
-"""Bound s1 of L_s, as a share of the bound s0 of L_n."""
-
-
-class Projections(NamedTuple):
-    """Efforts before saturation, arrays (envs, dof)."""
-
-    force: Array
-    """Wrench F of the task (envs, 6)."""
-    task: Array
-    """J^T F."""
-    posture: Array
-    """N^T M_cc a_n of the chain: M_cc a_n - J^T (L_n J a_n + (L_s - L_n) J a_s)."""
-    base: Array
-    """h + M a_o + feedforward."""
-    task_of_others: Array
-    """M_oc M_cc^-1 task."""
-    posture_of_others: Array
-    """M_oc M_cc^-1 posture."""
-    near_singular: Array
-    """Whether L or L_n is bounded (envs,)."""
-
-
-def projections(
-    k: OSCCoefficients,
-    d: TaskDynamics,
-    a: Array,
-    a_n: Array,
-    wrench: Array = None,
-    feedforward: Array = None,
-    springs: Array = None,
-) -> Projections:
-    """Return the efforts of the accelerations ``a`` (envs, 6) of the task and ``a_n`` (envs, dof)
-    of the posture.
-
-    ``springs`` (envs, dof) is the part a_s of a_n, all of it if None.
-    """
-    xp = namespace(
-        *k,
-        *d,
-        a,
-        a_n,
-        wrench,
-        feedforward,
-    )
-    j = d.jacobian
-    m = d.mass_matrix
-    chain = d.chain
-    eye = xp.eye(m.shape[-1], dtype=m.dtype)
-    # The other joints apart, with unit inertia.
-    m_cc = xp.where((chain[:, None] * chain) > 0, m, eye)
-    y = whitened(m_cc, xp.concatenate([xp.swapaxes(j, -1, -2), eye + xp.zeros_like(m)], axis=-1))
-    task_inertia, null_inertia, spring_inertia, singular = _inertias(
-        k, gram(y[..., :6], y[..., :6]), xp
-    )
-    # The wrench that accelerates the tool's inertia, less the acceleration of the motion itself.
-    f = product(task_inertia, a - d.jacobian_rate)
-    f = f if wrench is None else f + wrench
-    task = gram(j, f[..., None])[..., 0]
-
-    # Joints outside the chain, such as fingers, are controlled by computed torque.
-    a_c = a_n * chain
-    a_o = a_n * (1 - chain)
-    # The difference is 0 to the bit where neither inertia is bounded.
-    held = product(
-        spring_inertia - null_inertia, product(j, (a_n if springs is None else springs) * chain)
-    )
-    null = (
-        product(m, a_c)
-        - gram(j, (product(null_inertia, product(j, a_c)) + held)[..., None])[..., 0]
-    )
-    null = null * chain
-    base = d.bias + product(m, a_o)
-    base = base if feedforward is None else base + feedforward
-
-    # L^-1 of M_cc, from the same factor: two products replace a solution.
-    inverse_root = y[..., 6:]
-
-    def of_others(effort: Array) -> Array:
-        moved = chain * gram(inverse_root, product(inverse_root, effort)[..., None])[..., 0]
-        return (1 - chain) * product(m, moved)
-
-    return Projections(
-        f,
-        task,
-        null,
-        base,
-        of_others(task),
-        of_others(null),
-        singular,
+        springs + d.chain * (k.limit_kp * depth),
+        damping + d.chain * (k.limit_kd * v * xp.abs(depth)),
     )
 
 
@@ -416,33 +326,32 @@ def _inertias(
 ) -> tuple[Array, Array, Array, Array]:
     """Return L, L_n and L_s of the mobility A (envs, 6, 6), and where any is bounded."""
     # Without axes of force, task and null space need the same inverse, computed once.
-    s0 = k.smallest_eigenvalue[..., 0]
     both = k.axes
     if k.axes is not None and k.force_axes is not None:
         both = xp.maximum(k.axes, k.force_axes)
-    null, springs, near = _selected_inverse(mobility, both, xp, s0, SPRING_BOUND * s0)
+    null, springs, near = _selected_inverses(k, mobility, both, xp)
     if both is k.axes:
         return null, null, springs, near
-    task, bounded = _selected_inverse(mobility, k.axes, xp, s0)
+    task, _, bounded = _selected_inverses(k, mobility, k.axes, xp)
     return task, null, springs, near | bounded
 
 
-def _selected_inverse(
+def _selected_inverses(
+    k: OSCCoefficients,
     mobility: Array,
     axes: Any,
     xp: ArrayModule,
-    smallest: Array,
-    *smooth: Array,
-) -> tuple[Array, ...]:
-    """Return S^T (S A S^T)^-1 S, for each bound, with the selected ``axes`` (1 | envs, 6), and
-    where it is bounded.
+) -> tuple[Array, Array, Array]:
+    """Return S^T (S A S^T)^-1 S for the bounds s0 and s1, with the selected ``axes`` (1 | envs, 6),
+    and where it is bounded.
     """
+    s0 = k.smallest_eigenvalue[..., 0]
     if axes is None:
-        return bounded_inverse(mobility, smallest, *smooth)
+        return bounded_inverses(mobility, s0, SPRING_BOUND * s0)
     both = axes[..., :, None] * axes[..., None, :] > 0
-    free = (1 - axes)[..., None] * xp.eye(6, dtype=mobility.dtype)
     # The other axes get an eigenvalue apart from the selected ones, above the bound by more than
     # rounding.
-    alone = free * xp.maximum(2 * smallest, 1.0)[..., None, None]
-    *inverses, near = bounded_inverse(xp.where(both, mobility, alone), smallest, *smooth)
-    return *[xp.where(both, inverse, xp.zeros_like(inverse)) for inverse in inverses], near
+    free = (1 - axes)[..., None] * xp.eye(6, dtype=mobility.dtype)
+    alone = free * xp.maximum(2 * s0, 1.0)[..., None, None]
+    first, second, near = bounded_inverses(xp.where(both, mobility, alone), s0, SPRING_BOUND * s0)
+    return xp.where(both, first, 0.0), xp.where(both, second, 0.0), near

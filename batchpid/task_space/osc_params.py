@@ -23,7 +23,7 @@ from batchpid.arrays.records import (
 from batchpid.checks import AxisKind, choice, entries, instance, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
-from batchpid.task_space.tree_quantities import check_masses
+from batchpid.task_space.tree_kinematics import check_masses
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Names of the axes of a task."""
@@ -102,9 +102,9 @@ class _OSCParamsFields(NamedTuple):
     """(1 | envs, dof) [1/s^2]."""
     limit_margin: Annotated[Array, Field("rad or m", group="joint")] = None
     """(1 | envs, dof) [rad or m]."""
-    lower: Array = None
-    """Position limits of the tree (1, dof) [rad or m]; None without ``limit_margin``."""
-    upper: Array = None
+    limit_low: Array = None
+    """Positions (1 | envs, dof) from which joints are pushed back: limits less their margins."""
+    limit_high: Array = None
     turns: Array = None
     """1 / (2 pi) for joints of the tree that turn without limits, whose posture is the one next to
     qpos, else 0 (1, dof); None without such joints.
@@ -181,9 +181,9 @@ def make_osc_params(
     position_error_limit, rotation_error_limit
         Largest norm of the error that enters the law [m, rad]; inf for none.
     smallest_eigenvalue
-        s0 > 0 of the bounded inverse (:func:`batchpid.task_space.symmetric.bounded_inverse`): below
-        it, directions near a singularity lose stiffness; below s0/5 the posture pulls the tool
-        there [1/kg, 1/(kg m^2)].
+        s0 > 0 of the bounded inverse (:mod:`batchpid.task_space.operational_space`): below it,
+        directions near a singularity lose stiffness; below s0/5 the posture pulls the tool there
+        [1/kg, 1/(kg m^2)].
     effort_limit, effort_min, effort_max
         Limits of the total effort of the joints [N m or N]: ``effort_limit=x`` is ``effort_min=-x,
         effort_max=x``.
@@ -239,14 +239,16 @@ def make_osc_params(
         rows["limit_stiffness"] = None
     else:
         rows["limit_stiffness"] = rows["limit_stiffness"] * tree.independent
-        rows["limit_margin"] = np.minimum(rows["limit_margin"], (upper - lower) / 4)
-        rows |= {"lower": lower, "upper": upper}
+        rows["limit_margin"] = margin = np.minimum(rows["limit_margin"], (upper - lower) / 4)
+        # A joint with a margin of 0 is pushed from nowhere: its ends lie at infinity.
+        rows["limit_low"] = np.where(margin > 0, lower + margin, -np.inf)
+        rows["limit_high"] = np.where(margin > 0, upper - margin, np.inf)
     endless = np.isinf(lower) & np.isinf(upper) & (tree.bodies.slides[:, 0] == 0)
     if endless.any():
         rows["turns"] = endless / TURN
     for name, chosen in {"frame": frame, "discretization": discretization}.items():
         rows[name] = TASK_CHOICES[name][choice(name, chosen, TASK_CHOICES[name])]
-    return _checked(OSCParams(**{name: rows.get(name) for name in OSCParams._fields}))
+    return frozen(OSCParams(**{name: rows.get(name) for name in OSCParams._fields}))
 
 
 def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...]]) -> Document:
@@ -254,20 +256,22 @@ def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...
 
     Raises InvalidArgumentError for an option that is given, and has no effect.
     """
-    builders = {}
-    for group, names in columns.items():
-        kind: AxisKind = "joint" if group == "joint" else "entry"
-        builders[group] = LeafBuilder(len(names), names, kind=kind)
     rows: Document = {}
+    envs = 1
     for name, field in OSC_FIELDS.items():
+        names = columns[field.group]
+        kind: AxisKind = "joint" if field.group == "joint" else "entry"
+        builder = LeafBuilder(len(names), names, kind=kind)
+        builder.num_envs = envs
         value: Any = options.get(name, field.default)
         if isinstance(field.neutral, bool) and value is not None:
             # Bools as 1.0 and 0.0.
             value = read_array(name, value, "b").astype(float)
             field = Field()
-        if field.group in ("norm", "s0") and np.ndim(value) == 1:  # one number for each env
+        if len(names) == 1 and np.ndim(value) == 1:  # one number for each env
             value = np.reshape(value, (-1, 1))
-        rows[name] = builders[OSC_FIELDS[name].group].array(name, value, field)
+        rows[name] = builder.array(name, value, field)
+        envs = builder.num_envs
     # An option without effect is nearly always a misunderstanding.
     for name, (other, is_given, reason) in WITHOUT_EFFECT.items():
         is_unused = (rows[other] is not None) == is_given
@@ -275,15 +279,3 @@ def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...
             remedy = "leave it out, or correct the other option"
             raise InvalidArgumentError(name, f"has no effect: {reason}", remedy=remedy)
     return rows
-
-
-def _checked(params: OSCParams) -> OSCParams:
-    """Return read-only params.
-
-    Raises InvalidArgumentError if options have rows for different numbers of envs.
-    """
-    for name, leaf in params.leaves().items():
-        if leaf.shape[0] not in (1, params.num_envs):
-            problem = f"has rows for {leaf.shape[0]} envs, but other options for {params.num_envs}"
-            raise InvalidArgumentError(name, problem, remedy="give one row, or one for each env")
-    return frozen(params)

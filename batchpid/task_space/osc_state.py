@@ -27,10 +27,8 @@ from batchpid.arrays.array_types import Array, NamedChoice
 from batchpid.arrays.elementwise import exported, namespace
 from batchpid.arrays.records import array_summary
 from batchpid.checks import check_time_step, instance
-from batchpid.task_space.frames import in_axes, matrix_of
 from batchpid.task_space.osc_params import MAKE_PARAMS, OSCParams
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.tree_quantities import evaluated
 
 
 class OSCCoefficients(NamedTuple):
@@ -47,9 +45,8 @@ class OSCCoefficients(NamedTuple):
     posture_kd: Array
     limit_kp: Array
     limit_kd: Array
-    limit_margin: Array
+    """Damping over margin (1 | envs, dof)."""
     limit_low: Array
-    """Positions (1 | envs, dof) from which joints are pushed back: limits less their margins."""
     limit_high: Array
     integral_limit: Array
     position_error_limit: Array
@@ -73,55 +70,33 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
     """
     instance("params", params, OSCParams, MAKE_PARAMS)
     check_time_step(dt)
-    # Explicit gains first; the implicit law then replaces those that it changes.
     xp = namespace(*params, dt)
+    is_implicit = params.discretization is not None
     kp = params.stiffness
-    kd = params.damping
     ki = params.integral_gain
-    posture_kp = params.posture_stiffness
-    posture_kd = params.posture_damping
+    if is_implicit and ki is not None:
+        kp = kp + dt * ki
+    kp, kd, share = _at_step(params, kp, params.damping, dt)
+    ki_dt = None if ki is None else share * ki * dt
+    ki_dt2 = ki_dt * dt if is_implicit and ki is not None else None
+    posture_kp, posture_kd, _ = _at_step(
+        params, params.posture_stiffness, params.posture_damping, dt
+    )
     limit_kp = params.limit_stiffness
-    margin = params.limit_margin
-    if limit_kp is None:
-        limit_kd = None
-    else:
-        limit_kd = 2 * xp.sqrt(limit_kp)
-    c = kd
-    share = xp.ones_like(kp)
-    ki_dt2 = None
-    if params.discretization is not None:
-        stiffness = kp if ki is None else kp + dt * ki
-        share = 1 / (1 + dt * kd + dt * dt * stiffness)
-        c = kd * share
-        kd = (kd + dt * stiffness) * share
-        kp = stiffness * share
-        if ki is not None:
-            ki = ki * share
-            ki_dt2 = ki * dt * dt
-        # Posture and limits have no integral, and a simpler denominator.
-        posture_kp, posture_kd = _implicit(posture_kp, posture_kd, dt)
-        if limit_kp is not None:
-            limit_kp, limit_kd = _implicit(limit_kp, limit_kd, dt)
+    limit_kd = None
+    if limit_kp is not None:
+        limit_kp, limit_kd, _ = _at_step(params, limit_kp, 2 * xp.sqrt(limit_kp), dt)
+        limit_kd = limit_kd / xp.where(params.limit_margin > 0, params.limit_margin, 1.0)
     same = {
         name: leaf for name, leaf in params._asdict().items() if name in OSCCoefficients._fields
     }
-    # A joint with a margin of 0 is pushed from nowhere: its ends lie at infinity.
-    part = {
-        "limit_margin": None if margin is None else xp.where(margin > 0, margin, 1.0),
-        "limit_low": (
-            None if margin is None else xp.where(margin > 0, params.lower + margin, -xp.inf)
-        ),
-        "limit_high": (
-            None if margin is None else xp.where(margin > 0, params.upper - margin, xp.inf)
-        ),
-    }
     return OSCCoefficients(
-        **same | part,
+        **same,
         kp=kp,
         kd=kd,
-        c=c,
+        c=params.damping * share,
         acceleration_share=share,
-        ki_dt=None if ki is None else ki * dt,
+        ki_dt=ki_dt,
         ki_dt2=ki_dt2,
         posture_kp=posture_kp,
         posture_kd=posture_kd,
@@ -130,10 +105,17 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
     )
 
 
-def _implicit(kp: Array, kd: Array, dt: Array) -> tuple[Array, Array]:
-    """Return kp* and kd* of a law without integral."""
+def _at_step(
+    params: OSCParams,
+    kp: Array,
+    kd: Array,
+    dt: Array,
+) -> tuple[Array, Array, Array]:
+    """Return kp*, kd* and g* of a law without integral."""
+    if params.discretization is None:
+        return kp, kd, namespace(kp).ones_like(kp)
     share = 1 / (1 + dt * kd + dt * dt * kp)
-    return kp * share, (kd + dt * kp) * share
+    return kp * share, (kd + dt * kp) * share, share
 
 
 class Tool(NamedTuple):
@@ -171,7 +153,7 @@ class OSCInputs(NamedTuple):
 
 class TaskDynamics(NamedTuple):
     """Dynamics of a robot and its tool at present positions and velocities, from
-    :func:`task_dynamics` or an engine.
+    :func:`.task_dynamics` or an engine.
     """
 
     pose: Array
@@ -230,46 +212,3 @@ class OSCTerms(NamedTuple):
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")
-
-
-def task_dynamics(
-    tree: RigidTree,
-    qpos: Array,
-    qvel: Array,
-    link: str,
-    *,
-    point: Array = None,
-    bias: Array = None,
-) -> TaskDynamics:
-    """Return the dynamics of ``tree`` with a tool: a ``point`` (3,) [m] of ``link``, default its
-    origin.
-
-    ``qpos`` and ``qvel`` are (envs, dof). A ``bias`` (envs, dof), such as an engine's, takes the
-    place of the tree's.
-
-    Raises
-    ------
-    InvalidArgumentError
-        The link is unknown, or a shape is wrong.
-    """
-    names: tuple[str, ...] = ("pose", "jacobian", "jacobian_rate", "mass_matrix")
-    if bias is None:
-        names = (*names, "bias")
-    results = evaluated(
-        tree,
-        names,
-        qpos,
-        qvel,
-        link,
-        point,
-    )
-    xp = namespace(results["pose"])
-    chain = xp.asarray(tree.chain(link), dtype=results["pose"].dtype)
-    return TaskDynamics(**{"bias": bias, "chain": chain, **results})
-
-
-def in_tool_axes(dynamics: TaskDynamics) -> TaskDynamics:
-    """Return ``dynamics`` with J and J' q' in the axes of the tool."""
-    turn = matrix_of(dynamics.pose[..., 3:])
-    rate = in_axes(turn, dynamics.jacobian_rate[..., None])[..., 0]
-    return dynamics._replace(jacobian=in_axes(turn, dynamics.jacobian), jacobian_rate=rate)

@@ -87,6 +87,21 @@ def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Array], Bodies, Arr
     )
 
 
+def check_masses(tree: RigidTree) -> None:
+    """Raise InvalidArgumentError for a joint that moves no mass and has no armature: its mass
+    matrix is singular.
+    """
+    # A leader moves the masses of its followers, too.
+    moved = tree.bodies.moves.T @ tree.bodies.mass[:, 0] + tree.bodies.armature
+    moved = tree.coupling.of_all(tree.coupling.reduced_damping(moved))
+    for joint, kg in zip(tree.joint_names, moved, strict=True):
+        if not kg > 0:
+            problem = "has a joint that moves no mass and has no armature"
+            raise InvalidArgumentError(
+                "tree", problem, joint=joint, remedy="give one of its links a mass"
+            )
+
+
 _SHIFT = np.array([0.0, 0.0, 0.0, 1.0]).reshape(1, 4, 1)
 """Share of a frame's columns that shift with the frame above."""
 

@@ -40,7 +40,6 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace
-from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import Vector, added, components, crossed, pose_of, scaled
 from batchpid.task_space.rigid_tree import Bodies, RigidTree
@@ -48,6 +47,7 @@ from batchpid.task_space.symmetric import gram, product, quiet, solve
 from batchpid.task_space.tree_kinematics import (
     Motions,
     Velocities,
+    check_masses,
     jacobian_at,
     motions_of,
     prepared,
@@ -57,22 +57,6 @@ from batchpid.task_space.tree_kinematics import (
     tool_frame,
     velocities_of,
 )
-
-
-def check_masses(tree: RigidTree) -> None:
-    """Raise InvalidArgumentError for a joint that moves no mass and has no armature: its mass
-    matrix is singular.
-    """
-    # A leader moves the masses of its followers, too.
-    moved = tree.bodies.moves.T @ tree.bodies.mass[:, 0] + tree.bodies.armature
-    moved = tree.coupling.of_all(tree.coupling.reduced_damping(moved))
-    for joint, kg in zip(tree.joint_names, moved, strict=True):
-        if not kg > 0:
-            problem = "has a joint that moves no mass and has no armature"
-            raise InvalidArgumentError(
-                "tree", problem, joint=joint, remedy="give one of its links a mass"
-            )
-
 
 Inertias = Sequence[Array]
 """Inertias about the origin of the world, in its axes: mass, first moment x, y, z, and entries xx,

@@ -15,7 +15,6 @@ from batchpid.arrays.array_types import Array, Float64, Pytree, Rows
 from batchpid.arrays.elementwise import precision
 from batchpid.arrays.trees import filled, leaves, structure
 from batchpid.sim.engine.native_model import NativeStep
-from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.env_parts import controller_errors
 from batchpid.sim.loop.faults import is_near
 from batchpid.sim.loop.group_control import GroupControl
@@ -28,8 +27,9 @@ tick.
 """
 
 
-class NumPyExecutor:
-    """Executor of the sim steps of the robots of ``setup``, from the states of its stages on.
+class Executor:
+    """Executor of the sim steps of the robots of ``setup``, from the ``states`` of its stages on;
+    this base has the engine's steps.
 
     Attributes
     ----------
@@ -43,23 +43,39 @@ class NumPyExecutor:
         Whether an env may have failed in the last sim step.
     """
 
+    measured: Measured
+    outputs: Outputs
+    before: Rows
+
     def __init__(self, setup: GroupControl, states: States) -> None:
+        pack, control = setup.pack, setup.control
         self.setup = setup
-        self._engine = EngineSteps(setup)
-        self.outputs = Outputs()
-        self.before: Any = None
         self.failed = False
-        self.write_state(states)
-        self.measure()
+        self._states = states
+        self._places = {stage.name: place for place, stage in enumerate(setup.stages)}
+        self._parts = control.gravity, control.coriolis
+        # Otherwise the force is 0, or a stage computes it at the measured state.
+        self._reads_force = control.gravity and not control.measures
+        self._is_native = pack.steps_natively
+        self._native_force = False  # whether the native sim step reads the force
+        if self._is_native and self._reads_force:
+            self._native_force = pack.steps_read_force(*self._parts)
+        self._step: NativeStep
+        self._bound: object = None
 
-    def measure(self) -> None:
-        """Read the robots, after a change of their states between sim steps."""
-        self.measured = self._engine.measure()
+    def state(self, name: str) -> Any:
+        """Return the state of a stage by name; None if it does not apply."""
+        place = self._places.get(name)
+        return None if place is None else self._states[place]
 
-    def qpos(self) -> Float64:
-        """Return the positions of the last reading (M, dof)."""
-        qpos: Float64 = self.measured.qpos
-        return qpos
+    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
+        """Change the state of the stage ``name``, between sim steps, to ``function(stage, state)``,
+        which has the same arrays or others in their place.
+        """
+        states = list(self._states)
+        place = self._places[name]
+        states[place] = function(self.setup.stages[place], states[place])
+        self.write_state(tuple(states))
 
     def read_state(self) -> States:
         """Return the states as NumPy arrays, which the next sim steps do not change."""
@@ -69,19 +85,38 @@ class NumPyExecutor:
         """Replace the states; they have the arrays of the states before."""
         self._states = states
 
-    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
-        """Change the state of the stage ``name``, between sim steps, to ``function(stage, state)``,
-        which has the same arrays or others in their place.
-        """
-        pairs = zip(self.setup.stages, self._states, strict=True)
-        changed = [
-            function(stage, state) if stage.name == name else state for stage, state in pairs
-        ]
-        self._states = tuple(changed)
+    def measure(self) -> None:
+        """Read the robots, after a change of their states between sim steps."""
+        self.measured = self._reading()
 
-    def results(self) -> Outputs:
-        """Return the results of the last sim step as NumPy arrays."""
-        return self.outputs
+    def _reading(self) -> Measured:
+        pack = self.setup.pack
+        qpos = pack.read_qpos()
+        return Measured(qpos, pack.read_qvel(), self._passive_force(qpos))
+
+    def _passive_force(self, like: Float64) -> Float64:
+        if self._reads_force:
+            return self.setup.pack.passive_force(*self._parts)
+        return np.zeros_like(like)
+
+    def compiled(self) -> NativeStep:
+        """Return the native sim step of the present robots."""
+        pack = self.setup.pack
+        if self._bound is not pack.calls:
+            parts = self._parts if self._native_force else (False, False)
+            drives = self.setup.control.mode == "drive"
+            self._bound = pack.calls
+            self._step = pack.compiled_step(*parts, self.setup.options.speed_limit, drives)
+        return self._step
+
+
+class NumPyExecutor(Executor):
+    """Executor in NumPy: the oracle of the native one."""
+
+    def __init__(self, setup: GroupControl, states: States) -> None:
+        super().__init__(setup, states)
+        self.outputs = Outputs()
+        self.measure()
 
     def run(
         self,
@@ -104,8 +139,8 @@ class NumPyExecutor:
         every = moves or setup.moves_drives
         for index in range(begin, end):
             step = Step(index, end, control.left(index, end))
-            self.before = self.measured.qpos  # where a robot that fails now is suspended
             measured = self.measured
+            self.before = measured.qpos  # where a robot that fails now is suspended
             values = Values(
                 command,
                 measured,
@@ -121,7 +156,7 @@ class NumPyExecutor:
                 pack.write_drive_target(outputs.target, outputs.target_rate)
             if not control.coupling.is_identity and index % COUPLING_STEPS == 0:
                 pack.update_constraint()
-            self.measured, self.failed = self._engine.advance(outputs.qf)
+            self._advance(outputs.qf)
             if self.failed:
                 return index + 1
         return end
@@ -131,68 +166,26 @@ class NumPyExecutor:
         self._states, values = stepped(self.setup.stages, self._states, values)
         return values
 
-
-class EngineSteps:
-    """Sim steps of the engine for the robots of ``setup``, and their readings: one native call
-    each where the engine has it, else calls of Python.
-    """
-
-    def __init__(self, setup: GroupControl) -> None:
-        self._setup = setup
-        self._pack: EnginePack = setup.pack
-        control = setup.control
-        self.reads_force = control.gravity and not control.measures
-        """Whether a reading has the passive force, which is otherwise 0."""
-        self._parts = control.gravity, control.coriolis
-        self._is_native = setup.pack.steps_natively
-        self.native_force = False
-        """Whether the native sim step reads the passive force."""
-        if self._is_native:
-            self.native_force = self.reads_force and setup.pack.steps_read_force(*self._parts)
-        self._step: NativeStep | None = None
-        self._bound: object = None
-
-    def measure(self) -> Measured:
-        """Return a reading of the robots."""
-        qpos = self._pack.read_qpos()
-        qvel = self._pack.read_qvel()
-        return Measured(qpos, qvel, self._passive_force(qpos))
-
-    def advance(self, qf: Rows) -> tuple[Measured, bool]:
-        """Do a sim step with the efforts ``qf`` (M, dof); return the reading after it, and whether
-        an env may have failed.
+    def _advance(self, qf: Rows) -> None:
+        """Do a sim step of the engine with the efforts ``qf`` (M, dof), in one native call where it
+        has it, and read the robots.
         """
+        pack = self.setup.pack
         if not self._is_native:
-            self._pack.write_qf(qf)
-            self._pack.step()
-            measured = self.measure()
-            limit = self._setup.options.speed_limit
-            is_slow = limit is None or bool((np.abs(measured.qvel) <= limit).all())
-            return measured, not (is_near(measured.qpos) and is_slow)
+            pack.write_qf(qf)
+            pack.step()
+            self.measure()
+            limit = self.setup.options.speed_limit
+            is_slow = limit is None or bool((np.abs(self.measured.qvel) <= limit).all())
+            self.failed = not (is_near(self.measured.qpos) and is_slow)
+            return
         step = self.compiled()
         qpos, qvel, passive = np.empty((3, *qf.shape))
         status = step(np.ascontiguousarray(qf, np.float64), qpos, qvel, passive)
-        if not self.native_force:
+        if not self._native_force:
             passive = self._passive_force(qpos)
-        return Measured(qpos, qvel, passive), step.may_have_failed(status)
-
-    def compiled(self) -> NativeStep:
-        """Return the native sim step of the present robots."""
-        pack = self._pack
-        if self._step is None or self._bound is not pack.calls:
-            if self.native_force:
-                parts = self._parts
-            else:
-                parts = (False, False)
-            drives = self._setup.control.mode == "drive"
-            self._bound = pack.calls
-            self._step = pack.compiled_step(*parts, self._setup.options.speed_limit, drives)
-        return self._step
-
-    def _passive_force(self, like: Float64) -> Float64:
-        if self.reads_force:
-            return self._pack.passive_force(*self._parts)
-        return np.zeros_like(like)
+        self.measured = Measured(qpos, qvel, passive)
+        self.failed = step.may_have_failed(status)
 
 
 ROWS = 16
@@ -215,14 +208,14 @@ class JAXExecutor(NumPyExecutor):
 
     def __init__(self, setup: GroupControl, states: States) -> None:
         super().__init__(setup, states)
-        self._parts = list[tuple[slice, Any]]()
+        self._programs = list[tuple[slice, Any]]()
         first = 0
         for calls_model, group in groupby(setup.stages, _calls_model):
             part = running(group)
             program = None
             if not calls_model:
                 program = partial(_compiled(structure(part)), self._constants(part))
-            self._parts.append((slice(first, first + len(part)), program))
+            self._programs.append((slice(first, first + len(part)), program))
             first += len(part)
 
     def _constants(self, part: Any) -> list[Any]:
@@ -251,7 +244,7 @@ class JAXExecutor(NumPyExecutor):
         values = recalled(stages, states, values)
         new = list[Pytree]()
         with precision("float64"):
-            for part, program in self._parts:
+            for part, program in self._programs:
                 if program is None:
                     changed, values = stepped(stages[part], states[part], values)
                 else:

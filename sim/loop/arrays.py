@@ -27,7 +27,8 @@ from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks import file_path, integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.sim.signals import Observation, Quantity
+from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.signals import Observation
 from batchpid.stages.values import Command
 
 Layout = dict[str, tuple[tuple[int, ...], Any]]
@@ -57,24 +58,14 @@ class Arrays(NamedTuple):
     fault: FaultArrays
 
     @staticmethod
-    def layout(
-        ticks: int,
-        num_envs: int,
-        dof: int,
-        command_size: int,
-        observed: Mapping[str, Quantity],
-    ) -> Layout:
-        """Return the layout of all fields, for :meth:`from_fields`; a setpoint has ``command_size``
-        numbers.
-        """
+    def layout(options: RunnerOptions, ticks: int, num_envs: int) -> Layout:
+        """Return the layout of all fields, for :meth:`from_fields`."""
         row = (ticks, num_envs)
-        table = (ticks, num_envs, dof)
-        setpoint = (*row, command_size)
-        sizes = Command(setpoint, setpoint, setpoint, table)
-        layout: Layout = {
-            f"command.{name}": (shape, np.float64) for name, shape in sizes._asdict().items()
-        }
-        for name, quantity in observed.items():
+        table = (*row, options.robot.dof)
+        setpoint = (*row, options.command.size)
+        layout: Layout = {f"command.{name}": (setpoint, np.float64) for name in Command._fields}
+        layout["command.feedforward"] = (table, np.float64)
+        for name, quantity in options.observed.items():
             layout[f"observation.{name}"] = (quantity.shape(table), quantity.dtype)
         return layout | {f"fault.{name}": (row, np.int64) for name in FaultArrays._fields}
 
@@ -101,7 +92,7 @@ class Arrays(NamedTuple):
         )
 
 
-_FORMAT = 17
+_FORMAT = 18
 _SAME_CONTENT = "take one with the same build=, and keep each env's number where it depends on it"
 
 

@@ -1,4 +1,4 @@
-"""Group of envs that advance together: one pack, its control, and the parts that hold their state.
+"""Group of envs that advance together: one pack, its control, and what both show and remember.
 
 An executor runs the sim steps. The group handles what happens between them: a possible failure, a
 command that is not finite, a push, the sensors of links, a reset, new params or actuators.
@@ -6,8 +6,7 @@ command that is not finite, a push, the sensors of links, a reset, new params or
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -17,15 +16,15 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.arrays.elementwise import clip
 from batchpid.arrays.trees import flatten, leaves, structure, unflatten
-from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.array_executors import JAXExecutor, NumPyExecutor
-from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.env_parts import ActingDraws, LinkSensors, OwnController, Pushes, variation
+from batchpid.sim.loop.arrays import Arrays, Snapshot
+from batchpid.sim.loop.env_parts import OwnController, Pushes, make_pack, variation
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
 from batchpid.sim.loop.group_control import GroupControl
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
+from batchpid.sim.signals import untouched
 from batchpid.stages.stage import States, adopted, by_name, placed, started
 from batchpid.stages.values import Command, Measured, Values
 
@@ -33,55 +32,88 @@ from batchpid.stages.values import Command, Measured, Values
 class EnvGroup:
     """One pack and its control; runs the sim steps of ticks, and suspends or resets envs that fail.
 
-    ``envs`` are its rows in the loop's arrays, ``params`` the params of these envs, and ``arrays``
-    their input and output. ``controller`` is the caller's own, or None.
+    Parameters
+    ----------
+    options
+        Options of the runner.
+    envs, rows
+        Rows of the envs among those of the runner, and in the arrays of the loop.
+    controller
+        The caller's own, or None.
+    arrays
+        Input and output (ticks, envs, ...) of these envs.
+    workspace
+        Working memory of the engine, which the groups of a loop share.
+
+    Attributes
+    ----------
+    tick
+        First tick of the run that is not complete.
+    steps
+        Sim steps before the run.
     """
 
     def __init__(
         self,
-        pack: EnginePack,
-        envs: slice,
-        params: bp.PIDParams,
         options: RunnerOptions,
+        envs: slice,
+        rows: slice,
         controller: OwnController | None,
         arrays: Arrays,
+        workspace: object,
     ) -> None:
-        self.pack = pack
-        self.envs = envs
-        self.tick = 0
-        """First tick of the run that is not complete."""
-        self._step = 0  # sim steps of it that are done
-        self._steps = 0  # sim steps before the run
+        self.rows = rows
+        self.tick = self.steps = 0
+        self._step = 0  # sim steps of the tick that are done
         self._moves = False  # whether the run gives rates of setpoints
         self._runs_whole = False  # whether the native code runs whole ticks
         self._options = options
         self._controller = controller
         self._arrays = arrays
         self._at = cache(arrays.at)  # views at a tick
-        self.acting = ActingDraws(options, params)
-        self._faults = FaultContainment(pack.size, pack.dof, options.on_fault)
-        self._sensors = LinkSensors(options, pack.size)
-        self._pushes = Pushes(options, pack.size)
-        self._episode = np.zeros(pack.size, np.int64)
+        size = envs.stop - envs.start
+        first_env = options.first_env + envs.start
+        self._make_pack = partial(make_pack, options, size, first_env, workspace)
+        self.pack = self._make_pack(None)
+        # As they are given; the control has them with the draws of the randomization.
+        self._params = options.params.for_envs(envs)
+        actuators = options.actuators
+        self._actuators = None if actuators is None else actuators.for_envs(envs)
+        self._draws: Draws | None = None
+        self._faults = FaultContainment(size, self.pack.dof, options.on_fault)
+        self._pushes = Pushes(options, size)
+        self._episode = np.zeros(size, np.int64)
         # Results of the last sim step, which outlive executors: native code writes them in each tick.
-        shape = (pack.size, pack.dof)
-        self._last: dict[str, Rows] = {
+        shape = (size, self.pack.dof)
+        links = untouched(size, options.observed)
+        self._sensed = bool(links)
+        self._shown: dict[str, Rows] = {
             "effort": np.zeros(shape, np.float32),
             "saturated": np.zeros(shape, bool),
             "guarded": np.zeros(shape, bool),
-        }
-        reads_base = "base_state" in options.load_engine().capabilities and pack.spec.mjcf is None
-        is_read = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
-        has_parts = bool(self._sensors.values or self._pushes.counts)
-        self._observes_natively = is_read and not has_parts
-        setup = self._setup()
-        self._prepare(setup, started(setup.stages, self._values(setup)))
+        } | links
+        spec = self.pack.spec
+        reads_base = "base_state" in options.load_engine().capabilities and spec.mjcf is None
+        is_read = spec.is_alone or (reads_base and not spec.fixed_base)
+        # A native controller takes setpoints from Python.
+        needs_python = self._sensed or self._pushes.counts or controller is not None
+        self._observes_natively = is_read and not needs_python
+        if actuators is not None:
+            self._write_joints()
+        self._start_control()
+
+    def _acting(self) -> tuple[bp.PIDParams, bp.Actuators | None]:
+        """Return params and actuators with the draws of the randomization."""
+        randomization, robot = self._options.randomization, self._options.robot
+        params, actuators = self._params, self._actuators
+        if randomization is not None:
+            params = randomization.randomized("params", params, self._draws, robot)
+            actuators = randomization.randomized("actuators", actuators, self._draws, robot)
+        return params, actuators
 
     def _setup(self) -> GroupControl:
         """Return the control of the present robots, params and actuators."""
-        acting = self.acting
-        inputs = acting.acting_params, acting.acting_actuators, self._controller
-        return GroupControl.of(self._options, self.pack, *inputs)
+        return GroupControl.of(self._options, self.pack, *self._acting(), self._controller)
 
     def _values(self, setup: GroupControl) -> Values:
         """Return the values in which stages start, at the present state of the robots."""
@@ -93,16 +125,26 @@ class EnvGroup:
         model = setup.model._replace(episode=self._episode)
         return Values(Command(None), measured, measured, control.timestep, model=model)
 
+    def _start_control(self) -> None:
+        """Start the control of the present robots, params and actuators."""
+        setup = self._setup()
+        self._prepare(setup, started(setup.stages, self._values(setup)))
+
     def _adopt(self) -> None:
         """Make the stages of the present robots, params and actuators, which go on from the states
         so far.
         """
         executor = self._executor
-        stages = executor.setup.stages
-        pairs = zip(stages, executor.read_state(), strict=True)
-        before = {stage.name: (stage, state) for stage, state in pairs}
+        before = executor.setup
+        states = executor.read_state()
+        pairs = {
+            stage.name: (stage, state) for stage, state in zip(before.stages, states, strict=True)
+        }
         setup = self._setup()
-        self._prepare(setup, adopted(setup.stages, before, self._values(setup)))
+        # New motors begin the streams of their noise again.
+        if setup.control.has_motors and not before.control.has_motors:
+            self._episode[:] = 0
+        self._prepare(setup, adopted(setup.stages, pairs, self._values(setup)))
 
     def _prepare(self, setup: GroupControl, states: States) -> None:
         """Make the executor, which goes on from the states, and set the engine's drives."""
@@ -113,13 +155,14 @@ class EnvGroup:
             self._executor = JAXExecutor(setup, states)
         elif self.pack.steps_natively and runs_natively(setup):
             self._executor = NativeExecutor(
-                setup, states, self._arrays, self._last, self._faults.rows
+                setup, states, self._arrays, self._shown, self._faults.rows
             )
         else:
             self._executor = NumPyExecutor(setup, states)
-        if self._options.control == "drive":
-            damping, stiffness = setup.control.drive
-            limit = self.acting.acting_params.effort_max
+        control = setup.control
+        if control.mode == "drive":
+            damping, stiffness = control.drive
+            limit = control.params.effort_max
             if limit is None:
                 limit = np.full_like(stiffness, np.inf)
             self.pack.write_drive(stiffness, damping, limit)
@@ -128,49 +171,58 @@ class EnvGroup:
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state carries on."""
-        self.acting.set_params(params)
+        self._params = params
         self._adopt()
 
     def set_actuators(self, actuators: bp.Actuators | None) -> None:
         """Change the actuators in flight; their state carries on."""
-        if actuators is not None or self.acting.actuators is not None:
-            self._put_actuators(actuators)
+        before, self._actuators = self._actuators, actuators
+        if actuators is not None or before is not None:
+            self._write_joints()
             self._adopt()
 
     def add_chunk(self, chunk: Float64, latency: Float64) -> None:
         """Add a chunk (M, rows, dof) that is ``latency`` (M,) [s] old to the plan."""
         self._executor.change("plan", lambda stage, state: stage.add(state, chunk, latency))
 
-    def _put_actuators(self, actuators: bp.Actuators | None, rows: list[int] | None = None) -> None:
-        """Put actuators into effect, for the robots ``rows`` or all."""
-        had_motors = self.acting.has_motors
-        # Friction and armature behind the gear belong to the engine's joints.
-        self.pack.write_joints(self.acting.set_actuators(actuators), rows)
-        # New motors begin the streams of their noise again.
-        if self.acting.has_motors and not had_motors:
-            self._episode[:] = 0
+    def _write_joints(self, rows: list[int] | None = None) -> None:
+        """Put friction and armature behind the gear, which belong to the engine's joints, into
+        effect, for the robots ``rows`` or all.
+        """
+        _, actuators = self._acting()
+        self.pack.write_joints(actuators, rows)
 
     def reset(
         self,
         mask: NDArray[np.bool_],
         qpos: Float64,
         qvel: Float64,
-        steps: int,
-        base: Float64 | None = None,
+        draws: Draws,
+        base: Float64 | None,
     ) -> None:
-        """Place the envs of ``mask`` (M,), with a fresh controller state, after ``steps`` sim
-        steps.
+        """Place the envs of ``mask`` (M,) at ``qpos`` and ``qvel`` (M, dof), with a fresh
+        controller state.
 
-        Floating bases are placed at ``base`` (M, 13).
+        Floating bases are placed at ``base`` (M, 13): pose and twist. ``draws`` apply to all envs
+        from now on; they differ from the previous draws in these envs alone.
 
-        An env whose ``qpos`` or ``qvel`` (M, dof) is not finite returns to its last start, and has
-        failed.
+        An env whose ``qpos`` or ``qvel`` is not finite returns to its last start, and has failed.
         """
-        if not mask.any():  # a reset of other envs
-            return
+        self._draws = draws
+        if mask.any():
+            self._faults.clear(mask)
+            self._vary(mask, draws)
+            self._restart(mask, qpos, qvel, base)
+        self.observe(self._at(0))
+
+    def _restart(
+        self,
+        mask: NDArray[np.bool_],
+        qpos: Float64,
+        qvel: Float64,
+        base: Float64 | None,
+    ) -> None:
         faults = self._faults
-        faults.clear(mask)
-        self._vary(mask)
         bad = {
             cause: mask[:, None] & ~np.isfinite(rows)
             for cause, rows in (("qpos", qpos), ("qvel", qvel))
@@ -181,34 +233,30 @@ class EnvGroup:
         if base is not None:
             faults.start_base[good] = base[good]
         self._place(mask, faults.start_qpos, faults.start_qvel)
-        self._sensors.clear(mask)
         for cause, entries in bad.items():
-            faults.fail(entries, cause, steps, faults.start_qpos)
+            faults.fail(entries, cause, self.steps, faults.start_qpos)
         self._place_failed()
 
-    def _vary(self, mask: NDArray[np.bool_]) -> None:
+    def _vary(self, mask: NDArray[np.bool_], draws: Draws) -> None:
         """Put the draws of the envs of ``mask`` (M,) into effect, before these envs are placed."""
         randomization = self._options.randomization
-        acting = self.acting
-        if randomization is None or acting.draws is None:
+        if randomization is None:
             return
         rows = np.flatnonzero(mask).tolist()
         # The robots first: friction and inertia of the motors add to theirs.
         if randomization.changes_robot:
-            self.pack.vary(rows, variation(self._options, len(rows), acting.draws.for_envs(rows)))
-        self._put_actuators(acting.actuators, rows)
-        acting.set_params(acting.params)
+            self.pack.vary(rows, variation(self._options, len(rows), draws.for_envs(rows)))
+        self._write_joints(rows)
         self._adopt()
 
     # -- ticks
 
-    def start(self, moves: bool, steps: int) -> list[NativeExecutor]:
-        """Start a run after ``steps`` sim steps, at tick 0; return the executor if native code runs
-        whole ticks.
+    def start(self, moves: bool) -> list[NativeExecutor]:
+        """Start a run at tick 0; return the executor if native code runs whole ticks.
 
         ``moves`` says whether the commands give rates of setpoints.
         """
-        self.tick, self._steps = 0, steps
+        self.tick = 0
         self._moves = moves and self._options.sets_positions
         return self._start()
 
@@ -221,7 +269,7 @@ class EnvGroup:
         self._runs_whole = False
         if not isinstance(executor, NativeExecutor):
             return []
-        if not (is_quiet and self._observes_natively and executor.runs_whole_ticks):
+        if not (is_quiet and self._observes_natively):
             return []
         self._runs_whole = True
         executor.start(self._moves, 0, self.tick)
@@ -232,32 +280,35 @@ class EnvGroup:
         whole ticks.
         """
         while True:
+            # A native call has ended at the last tick, or at an event within a tick.
             if self._runs_whole:
-                self._complete()
+                assert isinstance(self._executor, NativeExecutor)
+                self._runs_whole = False
+                self.tick, self._step = self._executor.complete()
             if self.tick == ticks:
-                return
+                break
             with np.errstate(all="ignore"):  # overflow and invalid values become faults
                 self._run_tick(substeps)
             self.tick += 1
             if self.tick < ticks:
                 run_ticks(self._start(), ticks, substeps)
-
-    def _complete(self) -> None:
-        """Complete the ticks of a native call: they are observed, up to an event within a tick."""
-        assert isinstance(self._executor, NativeExecutor)
-        self._runs_whole = False
-        self.tick, self._step = self._executor.complete()
+        self.steps += ticks * substeps
 
     def _run_tick(self, substeps: int) -> None:
         """Run the present tick, or the rest of it, and observe it."""
         executor = self._executor
         rows = self._at(self.tick)
         done = self._step
-        before = self._steps + self.tick * substeps
+        before = self.steps + self.tick * substeps
         command = rows.command
         if done == 0:
-            self._push(substeps)
-            self._sensors.begin(self.pack)
+            if self._pushes.counts:
+                assert self._draws is not None
+                inputs = self._faults.suspended, self._draws.episodes, substeps
+                if self._pushes.push(self.pack, *inputs):
+                    executor.measure()
+            if self._sensed:
+                self.pack.take_sensed()  # those of the ticks before
             if self._faults.suspended.any() or not are_finite(*command):
                 command = self._without_faults(command, before + 1)
         # An event may come at each sim step, the last one included.
@@ -265,56 +316,45 @@ class EnvGroup:
             if done == substeps:
                 self._take_results()
             if executor.failed:
-                self._contain(before + done, executor.before, executor.results().returned)
+                self._contain(before + done, executor.before, executor.outputs.returned)
             if done == substeps:
                 break
             done = executor.run(command, self._moves, done, substeps)
         # The executors look at positions alone, since each look at a sim step costs time.
         strays = not self.pack.spec.is_alone and self.pack.strays().any()
-        if strays or not (is_near(executor.qpos()) and are_finite(self.pack.read_qvel())):
-            self._contain(before + done, executor.qpos(), None)
-        self._sensors.end(self.pack, substeps, self._faults.failed)
+        if strays or not (is_near(executor.measured.qpos) and are_finite(self.pack.read_qvel())):
+            self._contain(before + done, executor.measured.qpos, None)
+        if self._sensed:
+            self._take_means(substeps)
         self.observe(rows)
 
     def _take_results(self) -> None:
-        outputs = self._executor.results()
-        results = outputs.motor, outputs.saturated, outputs.guarded
-        for last, rows in zip(self._last.values(), results, strict=True):
-            last[...] = False if rows is None else rows
+        for name, rows in self._executor.outputs.shown.items():
+            self._shown[name][...] = False if rows is None else rows
 
-    def _push(self, substeps: int) -> None:
-        """Push the bases that are due before a tick of ``substeps`` sim steps."""
-        pushes, draws = self._pushes, self.acting.draws
-        if not pushes.counts:
-            return
-        assert draws is not None
-        rows, twists = pushes.due(self._faults.suspended, draws.episodes)
-        if rows:
-            self.pack.push(rows, twists)
-            self._executor.measure()
-        pushes.counts["steps"] += substeps
+    def _take_means(self, substeps: int) -> None:
+        """Take the means of the link sensors over a tick of ``substeps`` sim steps, 0 for envs that
+        failed.
+        """
+        for name, sums in self.pack.take_sensed().items():
+            shown = self._shown[name]
+            shown[...] = sums > 0 if shown.dtype == bool else sums / substeps
+            shown[self._faults.failed] = 0
 
     def observe(self, rows: Arrays) -> None:
         """Write observation and faults into these envs' rows."""
         observation = rows.observation
-        observation.qpos[...] = self._executor.qpos()
+        observation.qpos[...] = self._executor.measured.qpos
         observation.qvel[...] = self.pack.read_qvel()
-        for name, last in self._last.items():
-            getattr(observation, name)[...] = last
+        for name, shown in self._shown.items():
+            getattr(observation, name)[...] = shown
         if observation.base_pose is not None and observation.base_twist is not None:
             pose, twist = np.split(self.pack.read_base(), [7], axis=1)
             observation.base_pose[...] = pose
             observation.base_twist[...] = twist
         if observation.starved is not None:
-            stages, states = self._executor.setup.stages, self._executor.read_state()
-            observation.starved[...] = by_name(stages, states)["plan"].starved[:, 0]
-        for name, values in self._sensors.values.items():
-            getattr(observation, name)[...] = values
+            observation.starved[...] = self._executor.state("plan").starved[:, 0]
         self._faults.observe(rows)
-
-    def observe_first(self) -> None:
-        """Write observation and faults into the first tick, after a change between runs."""
-        self.observe(self._at(0))
 
     # -- snapshots
 
@@ -331,61 +371,76 @@ class EnvGroup:
 
     def _parts(self) -> Document:
         """Return the arrays outside engine and control that a snapshot holds: results of the last
-        sim step, episodes of the motors' noise, those of faults, sensors and pushes, and the
-        digests of the user's content.
+        tick, episodes of the motors' noise, those of faults and pushes, and the digests of the
+        user's content.
         """
-        return self._last | {
+        return self._shown | {
             "episode": self._episode,
             "containment": self._faults.state,
-            "sensors": self._sensors.values,
             "pushes": self._pushes.counts,
             "content": {"digest": self.pack.content} if self.pack.content.size else {},
         }
 
-    def write(
+    def snapshot(self) -> dict[str, Rows]:
+        """Return the state as :meth:`read` does. It is a barrier: these envs go on as if restored
+        from it.
+        """
+        rows = self.read()
+        self._resume(rows, self._params, self._actuators, self._draws)
+        return rows
+
+    def restore(self, snapshot: Snapshot, draws: Draws) -> None:
+        """Put these envs into the state of ``snapshot``, with its params and ``draws``."""
+        self.steps = snapshot.steps
+        self._resume(snapshot.rows, snapshot.params, snapshot.actuators, draws)
+        self.observe(self._at(0))
+
+    def _resume(
         self,
-        pack: EnginePack,
-        rows: Mapping[str, Rows],
+        rows: dict[str, Rows],
         params: bp.PIDParams,
         actuators: bp.Actuators | None,
         draws: Draws | None,
     ) -> None:
-        """Continue with ``pack`` in a state that :meth:`read` returned, with the params, actuators
-        and draws of a snapshot.
-        """
-        acting = self.acting
-        is_custom = self._controller is not None
-        # The control step stays where nothing of it can have changed, since a new one takes time.
-        stays = pack is self.pack and not is_custom and self._options.randomization is None
-        stays = stays and _are_equal((params, actuators), (acting.params, acting.actuators))
-        self.pack = pack
-        acting.draws = draws
-        # Params and actuators come before the state: they say which arrays it has.
-        if not stays:
-            acting.set_params(params)
-            if actuators is not None or acting.actuators is not None:
-                self._put_actuators(actuators)
+        """Go on from a state that :meth:`read` returned."""
+        randomization = self._options.randomization
+        before = self._params, self._actuators
+        has_actuators = before[1] is not None or actuators is not None
+        # The control stays where nothing of it can have changed, since a new one takes time.
+        stays = self._controller is None and randomization is None
+        stays = stays and _are_equal((params, actuators), before)
+        self._params, self._actuators, self._draws = params, actuators, draws
+        # The contact caches of some engines, and the order in which they solve contacts, depend on
+        # the past. A new world has no past.
+        varies = randomization is not None and randomization.changes_robot
+        if varies or "complete_state" not in self._options.load_engine().capabilities:
+            self.pack.close()
+            self.pack = self._make_pack(draws)
+            stays = False
+        # Actuators come before the state: they say which arrays it has.
+        if has_actuators and not stays:
+            self._write_joints()
         # Placing robots clears efforts and suspension, so these follow.
-        pack.write_state_rows(rows["engine"])
+        self.pack.write_state_rows(rows["engine"])
         for name, array in flatten(self._parts()).items():
             array[...] = rows[name]
-        pack.suspend(self._faults.suspended)
-        pack.write_qf(self._last["effort"])
+        self.pack.suspend(self._faults.suspended)
+        self.pack.write_qf(self._shown["effort"])
+        if not stays:
+            self._start_control()
         executor = self._executor
-        if stays:
-            setup, like = executor.setup, executor.read_state()
-        else:
-            setup = self._setup()
-            like = started(setup.stages, self._values(setup))
-        control = unflatten(by_name(setup.stages, like), rows, name="control")
-        pairs = zip(setup.stages, like, strict=True)
-        states = tuple([control.get(stage.name, state) for stage, state in pairs])
-        if stays:
-            executor.failed = False
-            executor.measure()
-            executor.write_state(states)
-        else:
-            self._prepare(setup, states)
+        executor.failed = False
+        executor.measure()
+        stages, like = executor.setup.stages, executor.read_state()
+        control = unflatten(by_name(stages, like), rows, name="control")
+        pairs = zip(stages, like, strict=True)
+        executor.write_state(tuple([control.get(stage.name, state) for stage, state in pairs]))
+
+    def poses(self, names: tuple[str, ...] | None = None) -> list[Rows]:
+        """Return the poses of the entities that ``build`` returned for each env, or of bodies
+        ``names``, (..., 7).
+        """
+        return self.pack.read_poses(names)
 
     # -- envs that fail
 
@@ -398,7 +453,7 @@ class EnvGroup:
         # The fault is handled here, and the tick goes on.
         self._executor.failed = False
         if returned is not None:
-            params = self.acting.acting_params
+            params = self._executor.setup.control.params
             returned = clip(returned, params.effort_min, params.effort_max, np)
         limit = self._options.speed_limit
         self._faults.fail_state(self.pack, step, before, returned, limit)
@@ -410,9 +465,11 @@ class EnvGroup:
         """
         faults, options = self._faults, self._options
         for cause, rows in command._asdict().items():
-            faults.fail(~np.isfinite(rows), cause, step, self._executor.qpos())
+            faults.fail(~np.isfinite(rows), cause, step, self._executor.measured.qpos)
         self._place_failed()
-        setpoint = self._executor.qpos() if options.sets_positions else options.command.neutral
+        setpoint = (
+            self._executor.measured.qpos if options.sets_positions else options.command.neutral
+        )
         failed = faults.failed[:, None]
         neutral = Command(setpoint, 0.0, 0.0, 0.0)
         return Command(*map(np.where, [failed] * len(neutral), neutral, command))
@@ -432,19 +489,18 @@ class EnvGroup:
     def _place(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64) -> None:
         """Place the envs of ``mask`` (M,), and restart their control."""
         pack = self.pack
-        acting = self.acting
         executor = self._executor
         setup = executor.setup
         rows = np.flatnonzero(mask)
         base = None if pack.spec.fixed_base else self._faults.start_base[rows]
         pack.write_state(rows.tolist(), qpos[rows], qvel[rows], base)
         pack.suspend(self._faults.suspended)
-        for last in self._last.values():
-            last[mask] = 0
-        if acting.draws is not None:
-            self._pushes.begin(mask, acting.draws.episodes)
+        for shown in self._shown.values():
+            shown[mask] = 0
+        if self._draws is not None:
+            self._pushes.begin(mask, self._draws.episodes)
         executor.measure()
-        if acting.has_motors:
+        if setup.control.has_motors:
             self._episode[mask] += 1
         states = placed(setup.stages, executor.read_state(), self._values(setup), mask)
         executor.write_state(states)

@@ -1,12 +1,11 @@
-"""Parts of a group of envs: its pack, and params and actuators with the draws of the randomization;
-sensors of links; pushes of bases; and the caller's own controller, called at every sim step with the
-state of the group.
+"""Parts of a group of envs: its pack, pushes of bases, and the caller's own controller, called at
+every sim step with the state of the group.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -14,17 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import batchpid as bp
 from batchpid.arrays.array_types import Array, Bool, Document, Float64, Rows
 from batchpid.arrays.elementwise import namespace, precision, read_only
 from batchpid.arrays.trees import flatten, unflatten
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.engine.scene_spec import Variation
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws, elements, nominal_values
 from batchpid.sim.randomization.randomization import PHYSICAL
-from batchpid.sim.signals import untouched
 from batchpid.sim.tool_space import OperationalSpace
 
 Int64 = NDArray[np.int64]
@@ -34,69 +31,20 @@ pushes so far.
 """
 
 
-class ActingDraws:
-    """Params and actuators of a group, with the draws of its envs applied.
-
-    Attributes
-    ----------
-    draws
-        Draws of the envs; None before the first reset. A reset, or new params, put them into
-        effect.
-    params, actuators
-        As they were given.
-    acting_params
-        With the draws in effect.
-    acting_actuators
-        With the draws in effect.
-    """
-
-    def __init__(self, options: RunnerOptions, params: bp.PIDParams) -> None:
-        self._options = options
-        self.draws: Draws | None = None
-        self.params = self.acting_params = params
-        self.actuators: bp.Actuators | None = None
-        self.acting_actuators: bp.Actuators | None = None
-
-    @property
-    def has_motors(self) -> bool:
-        """Whether the actuators have an effect on efforts or measurements."""
-        actuators = self.acting_actuators
-        return actuators is not None and (actuators.measures or actuators.delivers)
-
-    def set_params(self, params: bp.PIDParams) -> None:
-        """Put params into effect."""
-        randomization = self._options.randomization
-        robot = self._options.robot
-        self.params = self.acting_params = params
-        if randomization is not None:
-            self.acting_params = randomization.randomized("params", params, self.draws, robot)
-
-    def set_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
-        """Put actuators into effect; return them with the draws applied."""
-        randomization = self._options.randomization
-        robot = self._options.robot
-        self.actuators = actuators
-        if randomization is not None:
-            actuators = randomization.randomized("actuators", actuators, self.draws, robot)
-        self.acting_actuators = actuators
-        return actuators
-
-
 def make_pack(
     options: RunnerOptions,
-    scene: SceneSpec,
     size: int,
     first_env: int,
-    draws: Draws | None,
     workspace: object,
+    draws: Draws | None,
 ) -> EnginePack:
     """Return the pack of ``size`` envs; without ``draws`` all robots equal the model."""
     randomization = options.randomization
     make = options.load_engine().make_pack
     if randomization is None or not randomization.changes_robot:
-        return make(scene, size, first_env, workspace=workspace)
+        return make(options.scene, size, first_env, workspace=workspace)
     links = tuple(elements("link_mass", options.robot))
-    scene = replace(scene, carrier=randomization.carrier(options.robot), varied_links=links)
+    scene = replace(options.scene, carrier=randomization.carrier(options.robot), varied_links=links)
     return make(scene, size, first_env, variation(options, size, draws), workspace)
 
 
@@ -123,37 +71,6 @@ def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variati
     return Variation(**values)
 
 
-class LinkSensors:
-    """Quantities of ``size`` envs from the sensors of links, averaged over a tick, if ``options`` observe
-    some.
-    """
-
-    def __init__(self, options: RunnerOptions, size: int) -> None:
-        self.values: dict[str, Rows] = untouched(size, options.observed)
-        """Quantities of :class:`batchpid.sim.Observation` in the last tick (size, ...), by name."""
-
-    def begin(self, pack: EnginePack) -> None:
-        """Begin a tick."""
-        if self.values:
-            pack.take_sensed()
-
-    def end(self, pack: EnginePack, substeps: int, failed: Bool) -> None:
-        """Take the means over a tick of ``substeps`` sim steps, 0 for ``failed`` envs (size,)."""
-        sums = pack.take_sensed() if self.values else {}
-        for name, rows in sums.items():
-            values = self.values[name]
-            if values.dtype == bool:
-                values[...] = rows > 0
-            else:
-                values[...] = rows / substeps
-            values[failed] = 0
-
-    def clear(self, mask: Bool) -> None:
-        """Set the values of the envs of ``mask`` (size,) to 0."""
-        for values in self.values.values():
-            values[mask] = 0
-
-
 class Pushes:
     """Pushes of ``size`` envs at random times, if the randomization of ``options`` has some.
 
@@ -172,16 +89,23 @@ class Pushes:
             counts[mask] = 0
         self._take(np.flatnonzero(mask), episodes)
 
-    def due(self, suspended: Bool, episodes: Int64) -> tuple[list[int], Float64]:
-        """Return the envs that are pushed now, and the changes of their twists (n, 6)."""
+    def push(
+        self,
+        pack: EnginePack,
+        suspended: Bool,
+        episodes: Int64,
+        substeps: int,
+    ) -> bool:
+        """Push the bases that are due before a tick of ``substeps`` sim steps; return whether there
+        are some.
+        """
         rows = np.flatnonzero((self.counts["steps"] >= self.counts["due"]) & ~suspended)
         if rows.size:
-            twists = self._draw("push", rows, episodes)
-        else:
-            twists = np.zeros((0, 6))
-        self.counts["number"][rows] += 1
-        self._take(rows, episodes)
-        return rows.tolist(), twists
+            pack.push(rows.tolist(), self._draw("push", rows, episodes))
+            self.counts["number"][rows] += 1
+            self._take(rows, episodes)
+        self.counts["steps"] += substeps
+        return bool(rows.size)
 
     def _take(self, rows: NDArray[np.intp], episodes: Int64) -> None:
         """Set the time of the next push of envs ``rows``."""
@@ -229,8 +153,7 @@ class OwnController:
             self._first = self._begun(envs)
             return self._first
         with controller_errors(self):
-            like = {name: leaf[:1].repeat(envs, 0) for name, leaf in self._first.items()}
-            return _like(like, self._begun(envs))
+            return _like(self._first, self._begun(envs), envs)
 
     def _begun(self, envs: int) -> dict[str, Rows]:
         # The structure stays the same; between sim steps only its arrays are kept, by name.
@@ -256,38 +179,34 @@ class OwnController:
         Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape
         or dtype, or JAX cannot trace it.
         """
-        if namespace(*inputs[1:3]) is not np:
-            return self._traced(state, *inputs)
-        # The controller may keep them, but not write to them.
-        copies = (read_only(np.array(rows)) for rows in inputs)
-        new, returned, *limited = self._called(unflatten(self._structure, state), *copies)
-        # Copies again: the controller may change its own arrays at any time.
-        leaves = _like(state, flatten(new, read=np.array))
-        effort = _like({"effort": inputs[1]}, {"effort": np.array(returned, np.float64)})["effort"]
-        return leaves, effort, *limited
-
-    def _called(self, *arguments: Any) -> tuple[Array, ...]:
-        if self._reporting is not None:
-            return self._reporting(*arguments)
-        state, effort = self._controller(*arguments[:-1])
-        return state, effort
-
-    def _traced(self, leaves: Document, *inputs: Array) -> tuple[Array, ...]:
-        """Call the controller within a JAX program."""
+        xp = namespace(*inputs[1:3])
+        if xp is np:
+            # The controller may keep them, but not write to them.
+            return self._checked(state, [read_only(np.array(rows)) for rows in inputs], xp)
         import jax
 
-        qpos = inputs[1]
         try:
-            state, returned, *limited = self._called(unflatten(self._structure, leaves), *inputs)
-            new = _like(leaves, flatten(state, read=jax.numpy.asarray))
-            efforts = {"effort": jax.numpy.asarray(returned, qpos.dtype)}
+            return self._checked(state, inputs, xp)
         except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
             raise InvalidArgumentError(
                 "control",
                 f"cannot be traced by JAX: {str(error).splitlines()[0]}",
                 remedy="write it in jax.numpy, or use backend='numpy'",
             ) from error
-        return new, _like({"effort": qpos}, efforts)["effort"], *limited
+
+    def _checked(self, state: Document, inputs: Sequence[Array], xp: Any) -> tuple[Array, ...]:
+        new, returned, *limited = self._called(unflatten(self._structure, state), *inputs)
+        qpos = inputs[1]
+        # Copies: the controller may change its own arrays at any time.
+        leaves = _like(state, flatten(new, read=xp.array), len(qpos))
+        effort = _like({"effort": qpos}, {"effort": xp.array(returned, qpos.dtype)}, len(qpos))
+        return leaves, effort["effort"], *limited
+
+    def _called(self, *arguments: Any) -> tuple[Array, ...]:
+        if self._reporting is not None:
+            return self._reporting(*arguments)
+        state, effort = self._controller(*arguments[:-1])
+        return state, effort
 
 
 @contextmanager
@@ -321,15 +240,16 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
         return unflatten(state, flatten(state))
 
 
-def _like(before: Document, leaves: Document) -> Document:
-    """Return the arrays that a controller returned in the dtypes of ``before``.
+def _like(before: Document, leaves: Document, envs: int) -> Document:
+    """Return the arrays that a controller returned for ``envs`` envs in the dtypes of ``before``.
 
     Raises InvalidArgumentError if names or shapes differ, or a dtype cannot be cast.
     """
     for name in {**before, **leaves}:
         old: Any = before.get(name)
         new: Any = leaves.get(name)
-        is_fit = old is not None and new is not None and new.shape == old.shape
+        is_there = old is not None and new is not None
+        is_fit = is_there and new.shape == (envs, *old.shape[1:])
         if is_fit and np.can_cast(new.dtype, old.dtype, "same_kind"):
             continue
         # Without the number of envs, which is that of a group.

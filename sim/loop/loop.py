@@ -9,63 +9,38 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable
+from itertools import chain
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-import batchpid as bp
-from batchpid.arrays.array_types import Rows
 from batchpid.errors import BatchPIDError, ControllerError, WorkerError
-from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.array_executors import ROWS
-from batchpid.sim.loop.arrays import Arrays, Snapshot, join_rows
+from batchpid.sim.loop.arrays import Arrays, join_rows
 from batchpid.sim.loop.env_group import EnvGroup
-from batchpid.sim.loop.env_parts import OwnController, make_pack
+from batchpid.sim.loop.env_parts import OwnController
 from batchpid.sim.loop.group_control import native_obstacle
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.randomization.distributions import NOTHING, Draws
 
 
-class Failure(Exception):
+class Failure(NamedTuple):
     """Error of a loop during a request. Whole ticks before it are valid; the state of the loop
     after it is undefined.
 
-    It does not depend on how envs are divided among workers: of several failures, the first by
-    :func:`order` is reported.
-
-    Attributes
-    ----------
-    step
-        Sim step since the start of the runner; the first one of the tick if it is not known.
-    env
-        First env of the group that failed.
-    ticks
-        Ticks of the request that were completed before the error.
-    error
-        The error.
+    It does not depend on how envs are divided among workers: of several failures, the
+    :func:`first` is reported.
     """
 
-    def __init__(
-        self,
-        step: int,
-        env: int,
-        ticks: int,
-        error: Exception,
-    ) -> None:
-        super().__init__(step, env, ticks, error)
-        self.step = step
-        self.env = env
-        self.ticks = ticks
-        self.error = error
-
-    @classmethod
-    def of(cls, error: Exception) -> Failure:
-        """Return ``error`` if it is a Failure, else a Failure at step 0 with it."""
-        if isinstance(error, Failure):
-            return error
-        return cls(0, 0, 0, error)
+    step: int
+    """Sim step since the start of the runner; the first one of the tick if it is not known."""
+    env: int
+    """First env of the group that failed."""
+    ticks: int
+    """Ticks of the request that were completed before the error."""
+    error: Exception
 
     def portable(self) -> Failure:
         """Return the failure with an error class of this project, which another process can raise,
@@ -81,22 +56,55 @@ class Failure(Exception):
                 error.add_note(text)
         elif not isinstance(error, BatchPIDError):
             error = WorkerError(f"raised:\n{text}")
-        return Failure(self.step, self.env, self.ticks, error)
+        return self._replace(error=error)
 
     def of_worker(self, name: str) -> Failure:
         """Return the failure with the name of its worker in front of the message of a
         WorkerError.
         """
         if type(self.error) is WorkerError:
-            self.error = WorkerError(f"{name} {self.error}")
+            return self._replace(error=WorkerError(f"{name} {self.error}"))
         return self
 
 
-def order(failure: Failure) -> tuple[int, int]:
-    """Return the key by which failures are sorted: the earliest sim step first, then the lowest
-    env.
+def failed(error: Exception) -> Failure:
+    """Return the failure of a request that has no sim steps."""
+    return Failure(0, 0, 0, error)
+
+
+def first(failures: list[Failure]) -> Failure:
+    """Return the failure at the earliest sim step, in the lowest env."""
+    return min(failures, key=itemgetter(0, 1))
+
+
+JOINED: dict[str, Callable[[list[Any]], Any]] = {
+    "run": max,
+    "read": join_rows,
+    "snapshot": join_rows,
+    "poses": lambda results: [*chain.from_iterable(results)],
+}
+"""Functions of the results for parts of the envs, by the method of a request; others have no
+result.
+"""
+
+
+def joined(method: str, results: list[Any]) -> Any:
+    """Return the result of a request for all envs, from those for parts of them."""
+    return JOINED[method](results) if method in JOINED else None
+
+
+def part_of(arguments: tuple[Any, ...], envs: slice) -> tuple[Any, ...]:
+    """Return the part of the arguments of a request for some envs: arrays (envs, ...) and objects
+    with ``for_envs`` are divided, others are the same for all envs.
     """
-    return failure.step, failure.env
+    parts = []
+    for value in arguments:
+        if isinstance(value, np.ndarray):
+            value = value[envs]
+        elif hasattr(value, "for_envs"):
+            value = value.for_envs(envs)
+        parts.append(value)
+    return tuple(parts)
 
 
 class Loop:
@@ -106,112 +114,51 @@ class Loop:
     ----------
     options
         Options of the runner.
-    params
-        PID parameters of these envs: one row, or one row each.
     envs
         Rows of the runner's envs.
     arrays
-        Input and output (ticks, envs, ...) of these envs, for the ticks of a :meth:`run`. The other
-        methods write to the first tick.
+        Input and output (ticks, envs, ...) of these envs, for the ticks of a :meth:`run`. Other
+        requests write to the first tick.
     """
 
-    def __init__(
-        self,
-        options: RunnerOptions,
-        params: bp.PIDParams,
-        envs: slice,
-        arrays: Arrays,
-    ) -> None:
-        self.options, self.arrays = options, arrays
-        self._first_env = envs.start
-        self._scene = options.scene
-        self._steps = 0
+    def __init__(self, options: RunnerOptions, envs: slice, arrays: Arrays) -> None:
+        self.arrays = arrays
+        self._options = options
         self._given: tuple[bool, ...] = ()
-        self._workspace: dict[object, object] = {}
-        if isinstance(options.control, str):
-            controller = None
-        else:
-            controller = OwnController(options)
-        count = envs.stop - envs.start
+        workspace: dict[object, object] = {}
+        controller = None if isinstance(options.control, str) else OwnController(options)
         size = group_size(options)
         self.groups = list[EnvGroup]()
         # Each group has its own scenes; nothing else in the loop depends on the grouping.
-        for first in range(0, count, size):
-            rows = slice(first, min(first + size, count))
+        for start in range(envs.start, envs.stop, size):
+            group = slice(start, min(start + size, envs.stop))
+            rows = slice(group.start - envs.start, group.stop - envs.start)
             part = arrays.at((slice(None), rows))
-            own_params = params.for_envs(rows)
-            group = EnvGroup(
-                self._build(rows),
-                rows,
-                own_params,
-                options,
-                controller,
-                part,
-            )
-            self.groups.append(group)
-        self.set_actuators(None if options.actuators is None else options.actuators.for_envs(envs))
+            self.groups.append(EnvGroup(options, group, rows, controller, part, workspace))
         # Packs that share working memory cannot run in one native call.
-        if self._workspace:
-            self._batches = [[group] for group in self.groups]
-        else:
-            self._batches = [self.groups]
+        self._batches = [[group] for group in self.groups] if workspace else [self.groups]
 
-    def _build(self, envs: slice, draws: Draws | None = None) -> EnginePack:
-        first = self.options.first_env + self._first_env + envs.start
-        return make_pack(
-            self.options,
-            self._scene,
-            envs.stop - envs.start,
-            first,
-            draws,
-            self._workspace,
-        )
-
-    def reset(
-        self,
-        mask: NDArray[np.bool_],
-        qpos: NDArray[np.float64],
-        qvel: NDArray[np.float64],
-        draws: Draws = NOTHING,
-        base: NDArray[np.float64] | None = None,
-    ) -> None:
-        """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh
-        controller state.
-
-        Floating bases are placed at ``base`` (envs, 13): pose and twist. None is the origin.
-        ``draws`` apply to all envs from now on; they differ from the previous draws in these envs
-        alone.
+    def execute(self, method: str, arguments: tuple[Any, ...]) -> Any:
+        """Return the result of a request: of :meth:`run`, or of the method of each group for its
+        part of the arguments; a Failure if it raised an error.
         """
-        for group in self.groups:
-            rows = group.envs
-            group.acting.draws = draws.for_envs(rows)
-            start = None if base is None else base[rows]
-            group.reset(mask[rows], qpos[rows], qvel[rows], self._steps, start)
-            group.observe_first()
+        try:
+            if method == "run":
+                return self.run(*arguments)
+            calls = [
+                getattr(group, method)(*part_of(arguments, group.rows)) for group in self.groups
+            ]
+            return joined(method, calls)
+        except Exception as error:
+            return failed(error)
 
-    def set_params(self, params: bp.PIDParams) -> None:
-        """Change gains, limits and times in flight; the controller's state is kept."""
-        for group in self.groups:
-            group.set_params(params.for_envs(group.envs))
-
-    def set_actuators(self, actuators: bp.Actuators | None) -> None:
-        """Change the actuators in flight; their state is kept."""
-        for group in self.groups:
-            group.set_actuators(None if actuators is None else actuators.for_envs(group.envs))
-
-    def add_chunk(self, chunk: NDArray[np.float64], latency: NDArray[np.float64]) -> None:
-        """Add a chunk (envs, rows, dof) that is ``latency`` (envs,) [s] old to the plans."""
-        for group in self.groups:
-            group.add_chunk(chunk[group.envs], latency[group.envs])
-
-    def run(self, ticks: int, substeps: int, given: tuple[bool, ...]) -> float:
+    def run(self, ticks: int, substeps: int, given: tuple[bool, ...]) -> float | Failure:
         """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the
-        seconds it took.
+        seconds it took, or a Failure if a group failed. The other groups complete the run, so that
+        the first failure does not depend on grouping.
 
         ``given`` says which arrays of the commands are given
-        (:attr:`batchpid.sim.loop.arrays.Command.given`); the others are set to 0. Raises Failure
-        if a group failed. The other groups complete the run, so that the first failure does not
-        depend on grouping.
+        (:attr:`batchpid.sim.loop.arrays.Command.given`); the others are set to 0.
         """
         began = time.perf_counter()
         if given != self._given:
@@ -224,7 +171,7 @@ class Loop:
         for groups in self._batches:
             executors = list[NativeExecutor]()
             for group in groups:
-                executors += group.start(given[1], self._steps)
+                executors += group.start(given[1])
             # First whole ticks of all groups in one native call, then the rest of each group.
             run_ticks(executors, ticks, substeps)
             for group in groups:
@@ -232,68 +179,16 @@ class Loop:
                     group.finish(ticks, substeps)
                 except Exception as error:  # of a controller, or of the engine
                     failures.append(self._failure(error, group, substeps))
-        if failures:
-            raise min(failures, key=order)
-        self._steps += ticks * substeps
-        return time.perf_counter() - began
+        return first(failures) if failures else time.perf_counter() - began
 
     def _failure(self, error: Exception, group: EnvGroup, substeps: int) -> Failure:
         """Return the failure of a group in a run of ticks of ``substeps``."""
-        steps = self._steps + group.tick * substeps
+        steps = group.steps + group.tick * substeps
         step = steps + 1
         if isinstance(error, ControllerError):
             step = steps + error.step
-            error = error.at(step, self.options.timestep)
-        return Failure(step, self._first_env + group.envs.start, group.tick, error)
-
-    def snapshot(self) -> dict[str, Rows]:
-        """Return the state of every env, arrays by name. It is a barrier: the loop goes on as if
-        restored from it.
-        """
-        parts = [group.read() for group in self.groups]
-        for group, rows in zip(self.groups, parts, strict=True):
-            acting = group.acting
-            self._restore(group, rows, acting.params, acting.actuators, acting.draws)
-        return join_rows(parts)
-
-    def restore(self, snapshot: Snapshot, draws: Draws) -> None:
-        """Put every env into its state in ``snapshot``, with its params and ``draws``."""
-        self._steps = snapshot.steps
-        for group in self.groups:
-            envs, motors = group.envs, snapshot.actuators
-            motors = None if motors is None else motors.for_envs(envs)
-            params = snapshot.params.for_envs(envs)
-            rows = {name: array[envs] for name, array in snapshot.rows.items()}
-            self._restore(group, rows, params, motors, draws.for_envs(envs))
-            group.observe_first()
-
-    def _restore(
-        self,
-        group: EnvGroup,
-        rows: dict[str, Rows],
-        params: bp.PIDParams,
-        actuators: bp.Actuators | None,
-        draws: Draws | None,
-    ) -> None:
-        # The contact caches of some engines, and the order in which they solve contacts, depend on
-        # the past. A new world has no past.
-        randomization = self.options.randomization
-        pack = group.pack
-        varies = randomization is not None and randomization.changes_robot
-        if varies or "complete_state" not in self.options.load_engine().capabilities:
-            pack.close()
-            pack = self._build(group.envs, draws)
-        group.write(pack, rows, params, actuators, draws)
-
-    def read(self) -> dict[str, Rows]:
-        """Return the state of every env, arrays by name."""
-        return join_rows([group.read() for group in self.groups])
-
-    def poses(self, names: Sequence[str] | None = None) -> list[Rows]:
-        """Return the poses of the entities that ``build`` returned for each env, or of bodies
-        ``names``, (..., 7).
-        """
-        return [rows for group in self.groups for rows in group.pack.read_poses(names)]
+            error = error.at(step, self._options.timestep)
+        return Failure(step, group.pack.first_env, group.tick, error)
 
     def close(self) -> None:
         """Free the scenes."""

@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import DType, Float64, Pytree, Rows
-from batchpid.arrays.trees import flatten, leaves, mapped, rebuilt_as
-from batchpid.motors import ActuatorState
+from batchpid.arrays.array_types import DType, Pytree, Rows
+from batchpid.arrays.trees import leaves, mapped
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import number, structure
-from batchpid.sim.loop.array_executors import COUPLING_STEPS, EngineSteps
+from batchpid.sim.loop.array_executors import COUPLING_STEPS, Executor
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.loop.group_control import GroupControl, native_obstacle
 from batchpid.stages.stage import States, bind_stages, recalled, running
@@ -266,13 +265,12 @@ def _row_size(array: Rows) -> int:
     return size
 
 
-class NativeExecutor:
-    """Executor of the sim steps of the robots of ``setup`` in native code.
+class NativeExecutor(Executor):
+    """Executor in native code.
 
-    It has the methods of :class:`batchpid.sim.loop.array_executors.NumPyExecutor`. With
-    :func:`run_ticks` it also runs whole ticks, with their commands and observations in ``arrays``
-    (ticks, envs, ...); it writes the results of the last one to ``last`` (envs, dof), by name, and
-    reads the ``faults`` of the envs.
+    With :func:`run_ticks` it also runs whole ticks, with their commands and observations in
+    ``arrays`` (ticks, envs, ...); it writes the results of the last one to ``shown`` (envs, dof), by
+    name, and reads the ``faults`` of the envs.
     """
 
     def __init__(
@@ -280,87 +278,38 @@ class NativeExecutor:
         setup: GroupControl,
         states: States,
         arrays: Arrays,
-        last: Mapping[str, Rows],
+        shown: Mapping[str, Rows],
         faults: FaultArrays,
     ) -> None:
-        self.setup = setup
-        self._tables = arrays, last, faults
-        self._engine = EngineSteps(setup)
+        super().__init__(setup, _copied(states))
+        self._tables = arrays, shown, faults
         shape = setup.pack.size, setup.pack.dof
         command = Command(*np.zeros((4, *shape)))
         if setup.control.mode == "custom":  # it has its own copy of setpoints, of any size
             command = Command(None, feedforward=command.feedforward)
-        measured = Measured(*np.zeros((3, *shape)))
-        self._buffers = Buffers(_copied(states), command, measured, np.zeros(shape))
-        self._places = {stage.name: place for place, stage in enumerate(setup.stages)}
+        self._command = command
+        # Native code changes these arrays in place.
+        self.measured = Measured(*np.zeros((3, *shape)))
+        self.before = np.zeros(shape)
         self._programs: dict[bool, TickProgram] = {}
-        self._program: TickProgram | None = None
-        self.failed = False
+        self._program: TickProgram
         self.measure()
 
-    @property
-    def runs_whole_ticks(self) -> bool:
-        """Whether :func:`run_ticks` can be used: a native controller takes setpoints from
-        Python.
-        """
-        return self.setup.control.mode != "custom"
-
-    @property
-    def before(self) -> Rows:
-        """Positions before the last sim step (M, dof)."""
-        return self._buffers.before
-
     def measure(self) -> None:
-        """Read the robots, after a change of their states between sim steps."""
-        for array, rows in zip(self._buffers.measured, self._engine.measure(), strict=True):
+        """Read the robots, in place."""
+        for array, rows in zip(self.measured, self._reading(), strict=True):
             array[...] = rows
-
-    def qpos(self) -> Float64:
-        """Return the positions of the last reading (M, dof)."""
-        qpos: Float64 = self._buffers.measured.qpos
-        return qpos
 
     def read_state(self) -> States:
-        """Return the states as new NumPy arrays."""
-        return tuple(map(_copied, self._buffers.states))
+        """Return the states as new arrays."""
+        return _copied(self._states)
 
     def write_state(self, states: States) -> None:
-        """Replace the states; they have the arrays of the states before."""
-        for array, rows in zip(_arrays(self._buffers.states), _arrays(states), strict=True):
-            array[...] = rows
-        sensors = self._sensors()
-        if sensors is not None:  # the noise is drawn anew for another object as the key
-            key = states[self._places["sensors"]].key
-            self._replace("sensors", sensors._replace(key=key))
-
-    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
-        """Change the state of a stage:
-        :meth:`batchpid.sim.loop.array_executors.NumPyExecutor.change`.
-        """
-        before = self._buffers.states[self._places[name]]
-        after = function(self.setup.stage(name), before)
-        for array, rows in zip(leaves(before), leaves(after), strict=True):
+        """Replace the states in place."""
+        for array, rows in zip(leaves(self._states), leaves(states), strict=True):
             if rows is not array:
                 array[...] = rows
-
-    def _sensors(self) -> ActuatorState | None:
-        """Return the state of the sensors, if there are some."""
-        place = self._places.get("sensors")
-        if place is None:
-            return None
-        state: ActuatorState = self._buffers.states[place]
-        return state
-
-    def _replace(self, name: str, state: Pytree) -> None:
-        """Replace the state of a stage by one with other arrays."""
-        states = list(self._buffers.states)
-        states[self._places[name]] = state
-        self._buffers = self._buffers._replace(states=tuple(states))
-
-    def results(self) -> Outputs:
-        """Return the results of the last sim step."""
-        assert self._program is not None
-        return self._program.outputs
+        self.setup.model.noise.forget()
 
     def run(
         self,
@@ -371,12 +320,11 @@ class NativeExecutor:
     ) -> int:
         """Run sim steps of a tick: :meth:`batchpid.sim.loop.array_executors.NumPyExecutor.run`."""
         # The tables of ticks are not used here, since the command may differ from theirs.
-        # A program for each kind of tick is made once, at the first such tick.
         self.start(moves, begin)
-        control = self._programs[moves].control
+        control = self._program.control
         if control is not None:
             control.load(command.setpoint)
-        for array, rows in zip(self._buffers.command, command, strict=True):
+        for array, rows in zip(self._command, command, strict=True):
             if array is not None:
                 array[...] = rows
         run_ticks([self], 1, end, whole=False)
@@ -385,27 +333,32 @@ class NativeExecutor:
 
     def start(self, moves: bool, step: int = 0, tick: int = 0) -> None:
         """Prepare the next ticks, from sim step ``step`` of ``tick`` on."""
+        # A program for each kind of tick is made once, at the first such tick.
         if moves not in self._programs:
             noise = mapped(lambda block: block[0].copy(), self._noise())
-            self._programs[moves] = program = TickProgram(
+            buffers = Buffers(self._states, self._command, self.measured, self.before)
+            program = TickProgram(
                 self.setup,
-                self._buffers,
+                buffers,
                 self._copies,
                 noise,
-                self._engine.native_force,
+                self._native_force,
                 moves,
             )
+            self._programs[moves] = program
             # A native controller has arrays of its own for its state.
             if program.control is not None:
-                self._replace("law", program.control.state)
+                states = list(self._states)
+                states[self._places["law"]] = program.control.state
+                self._states = tuple(states)
         self._program = program = self._programs[moves]
+        self.outputs = program.outputs
         program.tick.tick, program.tick.step = tick, step
 
     def _copies(self, program: TickProgram) -> list[tuple[Rows, Rows]]:
         """Return the copies between the tables of the ticks and the arrays of a sim step."""
-        (command, seen, fault), last, faults = self._tables
-        outputs = program.outputs
-        measured = self._buffers.measured
+        (command, seen, fault), shown, faults = self._tables
+        measured = self.measured
         none = np.zeros(measured.qpos.shape, bool)
         copies: list[tuple[Rows, Rows]] = [
             (seen.qpos, measured.qpos),
@@ -413,19 +366,18 @@ class NativeExecutor:
             (seen.ok, np.ones(len(none), bool)),
             *zip(fault, faults, strict=True),
         ]
-        results = outputs.motor, outputs.saturated, outputs.guarded
-        for (name, row), rows in zip(last.items(), results, strict=True):
+        for name, rows in program.outputs.shown.items():
             rows = none if rows is None else rows
             # Each tick overwrites the one row of the last.
-            copies += (getattr(seen, name), rows), (row[None], rows)
+            copies += (getattr(seen, name), rows), (shown[name][None], rows)
         if seen.base_pose is not None and seen.base_twist is not None:
             pose = np.zeros((len(none), 7))
             twist = np.zeros((len(none), 6))
             program.place(base_pose=pose, base_twist=twist)
             copies += (seen.base_pose, pose), (seen.base_twist, twist)
         if seen.starved is not None:
-            copies.append((seen.starved, self._buffers.states[self._places["plan"]].starved))
-        pairs = zip(command, self._buffers.command, strict=True)
+            copies.append((seen.starved, self.state("plan").starved))
+        pairs = zip(command, self._command, strict=True)
         return copies + [(rows, row) for rows, row in pairs if row is not None]
 
     def complete(self) -> tuple[int, int]:
@@ -434,18 +386,16 @@ class NativeExecutor:
 
         RuntimeError if the engine has failed.
         """
-        assert self._program is not None
         tick = self._program.tick
-        self.failed = self._engine.compiled().may_have_failed(tick.status)
+        self.failed = self.compiled().may_have_failed(tick.status)
         return tick.tick, tick.step
 
     def prepare(self) -> object:
         """Return the program for the extension, with robots and noise prepared."""
-        assert self._program is not None
         tick = self._program.tick
         # The address changes when the engine's robots are built again.
-        tick.group = self._engine.compiled().prepare()
-        noise = leaves(self._noise()) if "sensors" in self._places else []
+        tick.group = self.compiled().prepare()
+        noise = leaves(self._noise())
         tick.drawn = min(map(len, noise), default=-1)
         for place, block in enumerate(noise):
             tick.noise[place] = block.ctypes.data
@@ -453,9 +403,8 @@ class NativeExecutor:
 
     def count_steps(self) -> bool:
         """Count the sim steps that ran; return whether the others wait for noise."""
-        assert self._program is not None
         tick = self._program.tick
-        sensors = self._sensors()
+        sensors = self.state("sensors")
         if sensors is None:
             return False
         if sensors.step is not None:
@@ -463,11 +412,12 @@ class NativeExecutor:
         return bool(tick.status & number("Status", "NO_NOISE"))
 
     def _noise(self) -> Any:
-        """Return the noise of positions and velocities in the next sim steps (steps, M, dof)."""
-        sensors = self._sensors()
+        """Return the noise of positions and velocities in the next sim steps (steps, M, dof); None
+        without sensors.
+        """
+        sensors, setup = self.state("sensors"), self.setup
         if sensors is None:
-            return ()
-        setup = self.setup
+            return None
         return setup.model.noise.from_step(setup.stage("sensors").k, sensors, self.before)
 
 
@@ -497,15 +447,7 @@ def runs_natively(setup: GroupControl) -> bool:
     return is_double and not native_obstacle(setup.options)
 
 
-def _copied(state: Pytree) -> Any:
-    """Return a tree of arrays with new arrays."""
-    if isinstance(state, dict):
-        return {name: np.array(leaf) for name, leaf in state.items()}
-    if isinstance(state, tuple):
-        return rebuilt_as(state, list(map(_copied, state)))
-    return None if state is None else np.array(state, order="C")
-
-
-def _arrays(state: Pytree) -> list[Rows]:
-    """Return all arrays of a tree."""
-    return list(flatten(state).values())
+def _copied(states: States) -> States:
+    """Return states with new arrays."""
+    copies: States = mapped(lambda leaf: np.array(leaf, order="C"), states)
+    return copies

@@ -13,10 +13,8 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import PolyCollection
-from matplotlib.figure import Figure
-from matplotlib.transforms import IdentityTransform
+from matplotlib.backends.backend_agg import RendererAgg
+from matplotlib.transforms import Bbox, IdentityTransform
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, Progress, Rows
@@ -31,9 +29,8 @@ from batchpid.task_space.frames import matrix_of, rotate
 
 LIGHT = np.array([0.5, 0.2, 0.84])
 """Direction to the light."""
-_FLOOR = "#bdc6d3"
-_GRID = "#d5dae2"
-_BACKGROUND = "#f4f6f9"
+_TILES = np.array([[0.74, 0.78, 0.83], [0.79, 0.82, 0.87]])
+"""Colours of the tiles of the floor, like a chess board's."""
 _NEAREST = 0.05
 """Distance from the camera below which nothing is drawn [m]."""
 _FARTHEST_POINT = 100.0
@@ -45,10 +42,7 @@ _NEARER = 0.85
 
 
 class Painter:
-    """Camera of ``size`` (width, height) [pixels] on a scene of ``count`` robots.
-
-    Scene, floor and canvas are made once; a picture draws the robots' triangles over the floor.
-    """
+    """Camera of ``size`` (width, height) [pixels] on a scene of ``count`` robots."""
 
     def __init__(
         self,
@@ -57,7 +51,7 @@ class Painter:
         ground: bool,
         size: tuple[int, int],
     ) -> None:
-        self._scene = scene = RobotScene(robot, count, ground, deviation=8e-3)
+        self._scene = scene = RobotScene(robot, count, ground, segments=12)
         self._size = size
         self._eye = scene.target + _NEARER * (scene.eye - scene.target)
         distance = float(np.linalg.norm(scene.target - self._eye))
@@ -69,16 +63,27 @@ class Painter:
         counts = [len(surface.faces) for surface in self._surfaces]
         colours = np.repeat([surface.rgba[:3] for surface in self._surfaces], counts, axis=0)
         self._colours = np.tile(colours, (count, 1))
-        self._canvas = self._draw_floor()
-        self._renderer: Any = self._canvas.get_renderer()
-        self._floor = self._renderer.copy_from_bbox(self._canvas.figure.bbox)
+        self._renderer: Any = RendererAgg(*size, 100)
+        self._draw(*self._floor())
+        self._background = self._renderer.copy_from_bbox(Bbox.from_bounds(0, 0, *size))
 
     def picture(self, qpos: Rows, base_pose: Rows | None = None) -> NDArray[np.uint8]:
         """Return the picture (height, width, 3) in RGB of robots in poses as for
         :meth:`RobotScene.place`.
         """
-        corners = self._corners(self._scene.place(qpos, base_pose))
-        places, depth = self._project(corners)
+        self._renderer.restore_region(self._background)
+        self._draw(self._corners(self._scene.place(qpos, base_pose)), self._colours)
+        return np.asarray(self._renderer.buffer_rgba())[..., :3].copy()
+
+    def _draw(self, corners: Float64, colours: Float64) -> None:
+        """Draw triangles, ``corners`` (triangles, 3, 3) [m] and ``colours`` (triangles, 3), over the
+        picture.
+        """
+        seen = (corners - self._eye) @ self._axes.T
+        depth = seen[..., 2]
+        scale = math.tan(FIELD_OF_VIEW / 2) * np.maximum(depth, _NEAREST)
+        # Places in a picture whose upper edge is at 1.
+        places = seen[..., :2] / scale[..., None]
         # A triangle far outside the picture, or of a pose that is not a number, is not drawn.
         near = (np.abs(places) < _FARTHEST_POINT).all(axis=(1, 2))
         visible = np.flatnonzero(near & (depth > _NEAREST).all(axis=1))
@@ -88,44 +93,25 @@ class Painter:
         brightness = 0.55 + 0.45 * np.clip(normals @ LIGHT, 0, 1)
         # One colour at the three corners of a triangle.
         shades = np.ones((len(order), 3, 4))
-        shades[..., :3] = np.clip(self._colours * brightness[:, None], 0, 1)[order, None]
+        shades[..., :3] = np.clip(colours * brightness[:, None], 0, 1)[order, None]
         width, height = self._size
         points = places[order] * height / 2 + [width / 2, height / 2]
-        self._renderer.restore_region(self._floor)
         context = self._renderer.new_gc()
         self._renderer.draw_gouraud_triangles(context, points, shades, IdentityTransform())
-        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _draw_floor(self) -> FigureCanvasAgg:
-        """Return a canvas with the floor: tiles with edges, filled where there is a ground."""
+    def _floor(self) -> tuple[Float64, Float64]:
+        """Return corners and colours of the floor's triangles: without a ground, of every second
+        tile.
+        """
         scene = self._scene
-        half_x, half_y = scene.half_floor
-        x, y = np.meshgrid(np.arange(-half_x, half_x, TILE), np.arange(-half_y, half_y, TILE))
-        corners = np.stack([x, y, np.full_like(x, scene.floor)], axis=-1).reshape(-1, 1, 3)
-        edges = TILE * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-        places, depth = self._project(corners + edges)
-        width, height = self._size
-        figure = Figure(
-            figsize=(width / 100, height / 100),
-            dpi=100,
-            facecolor=_BACKGROUND,
-        )
-        axes = figure.add_axes((0, 0, 1, 1))
-        axes.set(xlim=(-width / height, width / height), ylim=(-1, 1))
-        axes.axis("off")
-        tiles = list(places[(depth > _NEAREST).all(axis=1)])
-        face = _FLOOR if scene.ground else "none"
-        axes.add_collection(
-            PolyCollection(
-                tiles,
-                facecolors=face,
-                edgecolors=_GRID,
-                linewidths=0.8,
-            )
-        )
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        return canvas
+        counts = np.rint(2 * scene.half_floor / TILE).astype(int)
+        tiles = np.argwhere(np.ones(counts.tolist()))
+        if not scene.ground:
+            tiles = tiles[tiles.sum(1) % 2 == 0]
+        places = np.insert(TILE * tiles - scene.half_floor, 2, scene.floor, axis=1)
+        halves = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[1, 1, 0], [0, 1, 0], [0, 0, 0]]])
+        corners = (places[:, None, None] + TILE * halves).reshape(-1, 3, 3)
+        return corners, _TILES[tiles.sum(1) % 2].repeat(2, axis=0)
 
     def _corners(self, poses: Float64) -> Float64:
         """Return the corners (triangles, 3, 3) [m] of all robots for the ``poses`` of their
@@ -136,13 +122,6 @@ class Painter:
             vertices = rotate(matrix_of(pose[:, None, 3:]), surface.vertices) + pose[:, None, :3]
             parts.append(vertices[:, surface.faces])
         return np.concatenate(parts, axis=1).reshape(-1, 3, 3)
-
-    def _project(self, points: Float64) -> tuple[Float64, Float64]:
-        """Return places (..., 2) in a picture whose upper edge is at 1, and depths (...) [m]."""
-        seen = (points - self._eye) @ self._axes.T
-        depth = seen[..., 2]
-        scale = math.tan(FIELD_OF_VIEW / 2) * np.maximum(depth, _NEAREST)
-        return seen[..., :2] / scale[..., None], depth
 
 
 def coarse(surface: Surface, cell: float) -> Surface:

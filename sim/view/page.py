@@ -87,7 +87,7 @@ class View(AbstractContextManager["View"]):
             self._server = gate.start(make)
 
         # Controls on the right, a chart on the left, the scene between them.
-        gui = self._server.gui
+        gui: Any = self._server.gui
         gui.configure_theme(
             show_logo=False,
             show_share_button=False,
@@ -98,12 +98,21 @@ class View(AbstractContextManager["View"]):
         gui.main_panel.set_width(330)
         left = gui.add_panel()
         with left.add_tab("Chart"):
-            self._chart = _add_chart(gui)
+            flat = (np.array([-HISTORY_SECONDS, 0.0]), np.zeros(2), np.zeros(2))
+            self._chart = gui.add_uplot(
+                flat,
+                ({"label": "s"}, CURVE, SETPOINT_CURVE),
+                scales=SCALES,
+                legend={"show": True, "live": False},
+                height=220,
+                axes=({"size": 30, "stroke": "#6b7280"}, {"size": 56, "stroke": "#6b7280"}),
+                padding=(4, 14, 0, 0),
+            )
         left.dock_left()
         left.set_width(380)
-        # A browser without a GPU transforms every vertex in software: the more robots, the coarser.
-        deviation = min(6e-3, 2.5e-4 + 1.25e-4 * data.num_envs)
-        self._scene = RobotScene(data.robot, data.num_envs, data.ground, deviation)
+        # A browser without a GPU transforms every vertex in software.
+        segments = 24 if data.num_envs < 9 else 12
+        self._scene = RobotScene(data.robot, data.num_envs, data.ground, segments)
         self.findings = summary(self._scene.findings)
         """Sentences on meshes that cannot be read."""
         self._nodes = self._add_robots()
@@ -114,22 +123,20 @@ class View(AbstractContextManager["View"]):
         panel = self.panel
         began = deadline = lap = time.monotonic()
         count = 0
-        rate = 0.0
-        self._show(True, rate)
+        self._show_robots()
         while not self._stopped and (seconds is None or time.monotonic() - began < seconds):
             requested = panel.run_requests()
-            running = panel.frames_left > 0
-            if running:
-                panel.frames_left -= 1
+            if panel.running:
                 data.advance()
-                count += 1
+            if requested or panel.running:
+                self._show_robots()
             now = time.monotonic()
-            due = running and count % CHART_FRAMES == 0
-            if due:
-                rate = CHART_FRAMES / (now - lap)
+            count += 1
+            # Also while the page is paused, where another joint may be chosen.
+            if count % CHART_FRAMES == 0:
+                self._draw_chart()
+                panel.update_status(data.frame(), CHART_FRAMES / (now - lap))
                 lap = now
-            if running or requested:
-                self._show(requested or due, rate)
             # A late frame is not caught up, which would only hurry the next ones.
             deadline = max(deadline + data.period / panel.speed, now)
             time.sleep(deadline - now)
@@ -148,10 +155,8 @@ class View(AbstractContextManager["View"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _show(self, chart: bool, rate: float) -> None:
-        """Send the present frame to the pages, and with ``chart`` that and the status: ``rate`` is
-        the number of frames per second of wall time.
-        """
+    def _show_robots(self) -> None:
+        """Send the poses of the present frame to the pages."""
         frame = self.data.frame()
         base = None if frame.base_pose is None else frame.base_pose[0]
         poses = self._scene.place(frame.qpos[0], base).astype(np.float32).swapaxes(0, 1)
@@ -159,9 +164,6 @@ class View(AbstractContextManager["View"]):
             for node, pose in zip(self._nodes, poses, strict=True):
                 node.batched_positions = np.ascontiguousarray(pose[:, :3])
                 node.batched_wxyzs = np.ascontiguousarray(pose[:, 3:])
-        if chart:
-            self._draw_chart()
-            self.panel.update_status(frame, rate)
 
     def _add_robots(self) -> list[Any]:
         """Add the scene to the page; return a node for each surface, which is placed once for each
@@ -189,7 +191,7 @@ class View(AbstractContextManager["View"]):
         for index, surface in enumerate(scene.surfaces):
             colour = np.round(255 * np.asarray(surface.rgba)).astype(np.uint8)
             alpha = surface.rgba[3]
-            node: Any = api.add_batched_meshes_simple(
+            node = api.add_batched_meshes_simple(
                 f"/robots/{index}",
                 surface.vertices.astype(np.float32),
                 surface.faces.astype(np.uint32),
@@ -199,7 +201,6 @@ class View(AbstractContextManager["View"]):
                 opacity=alpha if alpha < 1 else None,
                 lod="off",
             )
-            node.on_click(lambda event: self.panel.select(event.instance_index))
             nodes.append(node)
         camera = self._server.initial_camera
         camera.position = tuple(scene.eye)
@@ -298,17 +299,3 @@ class Gate:
             server.stop()
             raise BatchPIDError("this version of viser cannot be guarded; install version 1.1")
         return server
-
-
-def _add_chart(gui: Any) -> Any:
-    """Return a new chart over the past, flat until the first update."""
-    flat = (np.array([-HISTORY_SECONDS, 0.0]), np.zeros(2), np.zeros(2))
-    return gui.add_uplot(
-        flat,
-        ({"label": "s"}, CURVE, SETPOINT_CURVE),
-        scales=SCALES,
-        legend={"show": True, "live": False},
-        height=220,
-        axes=({"size": 30, "stroke": "#6b7280"}, {"size": 56, "stroke": "#6b7280"}),
-        padding=(4, 14, 0, 0),
-    )

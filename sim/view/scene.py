@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64, Rows
+from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import imported
 from batchpid.sim.description.tables import Visual
 from batchpid.sim.findings import Finding
@@ -38,9 +39,6 @@ _REMEDY = (
     ", or set ROS_PACKAGE_PATH"
 )
 
-DEVIATION = 2e-3  # default distance allowed between a chord and its arc [m]
-FEWEST, MOST = 6, 48  # bounds of the number of segments of a circle
-_ROD = 0.08  # thickness of a rod, as a share of the longest one
 _PALETTE = ((0.62, 0.65, 0.70, 1.0), (0.42, 0.46, 0.53, 1.0), (0.80, 0.81, 0.83, 1.0))
 _CYLINDER = (
     (0.0, -0.5),
@@ -67,7 +65,8 @@ class RobotScene:
     """``count`` robots in a square around the origin, on a floor.
 
     The floor is at height 0 if physics has a ``ground``, otherwise at the lowest point of the start
-    pose. ``deviation`` [m] is the largest distance of a triangle from a round surface.
+    pose. Round shapes have ``segments`` to a circle. Raises InvalidArgumentError if no shape of the
+    robot can be drawn.
     """
 
     def __init__(
@@ -75,16 +74,19 @@ class RobotScene:
         robot: Robot,
         count: int,
         ground: bool,
-        deviation: float,
+        segments: int,
     ) -> None:
         self._tree = link_tree(robot)
         self.ground = ground
-        self.findings: list[Finding] = []
-        """Meshes that cannot be read. Their links are drawn by the collision shapes, or not at
-        all.
+        self.surfaces, self.findings = surfaces(robot, segments)
+        """Coloured triangles of one robot, and meshes that cannot be read: their links are drawn by
+        the collision shapes, or not at all.
         """
-        self.surfaces = surfaces(robot, deviation, self.findings)
-        """Coloured triangles of one robot."""
+        if not self.surfaces:
+            problem = f"{robot.name!r} has no shape that can be drawn"
+            raise InvalidArgumentError(
+                "robot", problem, remedy=f"give its links visuals; {_REMEDY}"
+            )
         self._links = [self._tree.index(surface.link) for surface in self.surfaces]
         # The 95th percentile over seeded poses: a single stretched pose should not push all robots
         # apart.
@@ -129,79 +131,38 @@ class RobotScene:
         return poses
 
 
-def surfaces(
-    robot: Robot, deviation: float = DEVIATION, findings: list[Finding] | None = None
-) -> list[Surface]:
-    """Return the surfaces of ``robot``, one for each link and colour; ``deviation`` [m] as in
-    :func:`segments_of`.
+def surfaces(robot: Robot, segments: int = 24) -> tuple[list[Surface], list[Finding]]:
+    """Return the surfaces of ``robot``, one for each link and colour, with ``segments`` to a circle,
+    and findings on shapes that cannot be read.
 
     A link is drawn by its visuals; where it has none, or one of them cannot be read, by its
-    collision shapes. A robot of which nothing can be drawn is drawn by rods between its joints.
-    Shapes that cannot be read are appended to ``findings``.
-
-    Vertices are not shared across sharp edges, so that averaged normals shade correctly.
+    collision shapes. Vertices are not shared across sharp edges, so that averaged normals shade
+    correctly.
     """
-    result = []
+    drawn: list[Surface] = []
+    findings: list[Finding] = []
     for name in robot.tables.links:
         solid = [Visual(shape) for shape in robot.tables.shapes_of(name)]
         for visuals in (robot.tables.visuals.get(name, ()), solid):
-            colours = [visual.rgba or _default_colour(name) for visual in visuals]
+            parts: dict[Rgba, list[Any]] = {}
             try:
-                meshes = [_mesh(visual, robot, deviation) for visual in visuals]
+                for visual in visuals:
+                    mesh = _mesh(visual, robot, segments)
+                    parts.setdefault(visual.rgba or _default_colour(name), []).append(mesh)
             except OSError as error:
                 shape, reason = error.args
                 text = f"cannot be drawn ({reason}): collision shapes are drawn, if any"
-                finding = Finding("missing-mesh", text, _REMEDY, link=name, detail=repr(shape))
-                if findings is not None:
-                    findings.append(finding)
-                continue
-            for rgba in dict.fromkeys(colours):
-                parts = [
-                    mesh for mesh, colour in zip(meshes, colours, strict=True) if colour == rgba
-                ]
-                joined: Any = imported("trimesh.util").concatenate(parts)
-                vertices = np.asarray(joined.vertices)
-                result.append(Surface(name, rgba, vertices, np.asarray(joined.faces)))
-            if meshes:
-                break
-    return result or _rods(robot)
-
-
-def _rods(robot: Robot) -> list[Surface]:
-    """Return a rod from the frame of each link to each joint on it, from the last links to their
-    centers of mass.
-    """
-    creation = imported("trimesh.creation")
-
-    tree = link_tree(robot)
-    ends = [(parent, tree.position[link]) for link, parent in enumerate(tree.parent) if parent >= 0]
-    ends += [
-        (link, tree.center[link]) for link in range(len(tree.links)) if link not in tree.parent
-    ]
-    lengths = [float(np.linalg.norm(end)) for _, end in ends]
-    thickness = _ROD * max(lengths)
-    rods = []
-    for (link, end), length in zip(ends, lengths, strict=True):
-        if length > thickness:
-            name = tree.links[link]
-            rod: Any = creation.cylinder(thickness / 2, segment=[np.zeros(3), end], sections=FEWEST)
-            rods.append(
-                Surface(
-                    name, _default_colour(name), np.asarray(rod.vertices), np.asarray(rod.faces)
+                findings.append(
+                    Finding("missing-mesh", text, _REMEDY, link=name, detail=repr(shape))
                 )
-            )
-    return rods
-
-
-def segments_of(radius: float, deviation: float) -> int:
-    """Return how many chords, within FEWEST and MOST, keep a circle within ``deviation`` [m] of its
-    arc.
-
-    A chord over the angle 2a is r (1 - cos a) away from the arc.
-    """
-    if radius <= deviation:
-        return FEWEST
-    return min(MOST, max(FEWEST, math.ceil(math.pi / math.acos(1 - deviation / radius))))
+                continue
+            for rgba, meshes in parts.items():
+                joined: Any = imported("trimesh.util").concatenate(meshes)
+                surface = Surface(name, rgba, np.asarray(joined.vertices), np.asarray(joined.faces))
+                drawn.append(surface)
+            if parts:
+                break
+    return drawn, findings
 
 
 def _read_mesh(name: str, robot: Robot) -> Any:
@@ -220,7 +181,7 @@ def _read_mesh(name: str, robot: Robot) -> Any:
     return loaded
 
 
-def _mesh(visual: Visual, robot: Robot, deviation: float) -> Any:
+def _mesh(visual: Visual, robot: Robot, segments: int) -> Any:
     """Return the ``trimesh.Trimesh`` of a shape in its link's frame.
 
     Raises OSError with the name of a shape that cannot be read, and the reason.
@@ -243,7 +204,6 @@ def _mesh(visual: Visual, robot: Robot, deviation: float) -> Any:
     else:
         radius = shape.size[0]
         length = 2 * sum(shape.size[1:])
-        segments = segments_of(radius, deviation)
         # Made with radius 1 and scaled: trimesh drops triangles smaller than 1e-8 m^2.
         if shape.kind == "cylinder":
             mesh = creation.revolve(_CYLINDER, sections=segments, process=False)

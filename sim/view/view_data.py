@@ -246,26 +246,21 @@ class Panel:
         self._gui = gui
         self._data = data
         self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
-        self.frames_left = math.inf
-        """Frames to run before the next pause."""
+        self.running = True
+        """Whether frames follow each other, or the page is paused."""
         self._problem = ""
         self._status = gui.add_markdown("starting ...")
-        buttons = gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset"))
-        self._connect(buttons, self._control_motion)
+        self._connect(gui.add_button_group("Motion", ("Run", "Pause", "Reset")), self._control)
         self._speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
-        # The watched robot and joint; a change shows at the next frame.
-        self._robot = gui.add_slider("Robot", 0, max(1, data.num_envs - 1), 1, 0)
-        self._robot.disabled = data.num_envs == 1
-        self._connect(self._robot, lambda _: None)
+        self._robot = gui.add_dropdown("Robot", [str(env) for env in range(data.num_envs)])
         self._joint = gui.add_dropdown("Joint", data.robot.joint_names)
-        self._connect(self._joint, lambda _: None)
         if isinstance(data, LiveSimulation):
             self._add_setpoints(data)
 
     @property
     def env(self) -> int:
         """Watched robot."""
-        return min(int(self._robot.value), self._data.num_envs - 1)
+        return int(self._robot.value)
 
     @property
     def joint(self) -> int:
@@ -276,10 +271,6 @@ class Panel:
     def speed(self) -> float:
         """Requested real-time factor."""
         return float(self._speed.value)
-
-    def select(self, robot: int) -> None:
-        """Request to watch a robot. Safe to call from any thread."""
-        self._requests.put(partial(setattr, self._robot, "value", robot))
 
     def run_requests(self) -> bool:
         """Carry out the requests of the pages; return whether there were any. The status names one
@@ -299,55 +290,46 @@ class Panel:
         saturate.
         """
         data = self._data
-        time = float(frame.time[0])
-        factor = rate * data.period
-        pace = f"t = {time:.2f} s · {factor:.2f} x real time · {rate:.0f} frames/s"
+        pace = f"{rate * data.period:.2f} x real time · {rate:.0f} frames/s"
         saturated = int(frame.saturated.any(-1).sum())
         diverged = int((~frame.ok).sum())
         lines = [
             f"**{data.num_envs} x {_plain(data.robot.name)}**",
-            pace if self.frames_left else "paused",
+            f"t = {frame.time[0]:.2f} s · {pace if self.running else 'paused'}",
             f"{saturated} saturated, {diverged} diverged",
             self._problem,
         ]
         self._status.content = "  \n".join(lines)
 
-    def _connect(self, handle: Any, action: Callable[[Any], object]) -> Any:
-        """Request ``action(value)`` whenever a page, and not this program, changes a control;
-        return its handle.
-        """
+    def _connect(self, handle: Any, action: Callable[[Any], object]) -> None:
+        """Request ``action(value)`` whenever a page, and not this program, changes a control."""
 
         # A coroutine, so that the changes stay in order.
         async def changed(event: Any) -> None:
             if event.client is not None:
                 self._requests.put(partial(action, handle.value))
 
-        if hasattr(handle, "on_click"):
-            register = handle.on_click
-        else:
-            register = handle.on_update
+        register = handle.on_click if hasattr(handle, "on_click") else handle.on_update
         register(changed)
-        return handle
 
-    def _control_motion(self, button: str) -> None:
+    def _control(self, button: str) -> None:
         """Carry out a button of the motion."""
         if button == "Reset":
             self._data.reset()
         else:
-            self.frames_left = {"Run": math.inf, "Pause": 0, "Step": 1}[button]
+            self.running = button == "Run"
 
     def _add_setpoints(self, live: LiveSimulation) -> None:
         """Add a slider for each joint, and buttons for poses."""
         gui = self._gui
         robot = live.robot
-        poses = {"start": robot.start, "target": robot.target}
         sliders: dict[int, Any] = {}
 
         def go_to(pose: str) -> None:
             if pose == "random":
                 live.randomize_setpoints()
             else:
-                live.set_setpoint(poses[pose])
+                live.set_setpoint({"start": robot.start, "target": robot.target}[pose])
             for joint, slider in sliders.items():
                 position = live.setpoint[self.env, joint]
                 slider.value = float(np.clip(position, slider.min, slider.max))
@@ -355,7 +337,7 @@ class Panel:
         def move(joint: int, position: float) -> None:
             live.set_setpoint(position, joint=joint)
 
-        self._connect(gui.add_button_group("Go to", (*poses, "random")), go_to)
+        self._connect(gui.add_button_group("Go to", ("start", "target", "random")), go_to)
         # Followers move with their leaders.
         for index in np.flatnonzero(robot.independent).tolist():
             joint = robot.joints[index]
@@ -364,4 +346,5 @@ class Panel:
             high = math.floor(1e3 * min(joint.upper, 2 * math.pi)) / 1e3
             value = float(np.clip(live.setpoint[0, index], low, high))
             slider = gui.add_slider(f"{joint.name} [{joint.unit}]", low, high, 1e-3, value)
-            sliders[index] = self._connect(slider, partial(move, index))
+            sliders[index] = slider
+            self._connect(slider, partial(move, index))

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.loop import Failure
+from batchpid.sim.loop.loop import Failure, failed
 from batchpid.sim.options.groups import Ray
 from batchpid.sim.workers.requests import Request, SharedArrays, Start, split
 from batchpid.sim.workers.worker import Worker, WorkerLost, pickled
@@ -60,7 +60,7 @@ class Node:
         try:
             pool_type, start, ticks = pickle.loads(message)
             options = start.options.changed(workers=workers, cluster=None)
-            self._pool = pool_type(options, start.params, start.envs, ticks)
+            self._pool = pool_type(options, start.envs, ticks)
             # The caller replaces a node that has lost a worker: it keeps the requests to replay.
             self._pool.max_losses = 1
             self._pool.open()
@@ -82,14 +82,14 @@ class Node:
             arrays = self._pool.arrays.at(slice(outcome.num_ticks))
         if outcome.failure is not None:
             return outcome.failure.portable(), arrays
-        return request.join(outcome.results), arrays
+        return outcome.result, arrays
 
 
 def _failure(error: Exception) -> Failure:
     """Return an error of the pool for the caller, whose own words follow the cause of a loss."""
     if isinstance(error, WorkerLost):
         error = WorkerLost(str(error.__cause__))
-    return Failure.of(error).portable()
+    return failed(error).portable()
 
 
 class Cluster:
@@ -157,8 +157,7 @@ class NodeWorker(Worker):
     ) -> None:
         super().__init__(start, shared)
         self._cluster = cluster
-        self._arrays = Arrays.from_fields(shared.arrays)
-        ticks = len(self._arrays.observation.ok)
+        ticks = len(shared.arrays.observation.ok)
         self._message = pickled((pool_type, start, ticks))
         self._actor: Any = None
         self._cpus = cluster.workers
@@ -176,8 +175,7 @@ class NodeWorker(Worker):
         self._cpus, self.info = 0, None
 
     def send(self, request: Request) -> None:
-        limit = self._step_limit * (request.ticks or 1) * request.substeps
-        self._limit = limit + self._timeout + request.patience
+        self._seconds = self._limit(request)
         if request.method == "build":
             self._call = self._actor.start.remote(self._message, self._cluster.workers)
         else:
@@ -186,14 +184,14 @@ class NodeWorker(Worker):
     def receive(self) -> object:
         exceptions = self._cluster.ray.exceptions
         try:
-            result, arrays = self._cluster.ray.get(self._call, timeout=self._limit)
+            result, arrays = self._cluster.ray.get(self._call, timeout=self._seconds)
         except exceptions.GetTimeoutError as error:
             raise self._lost("is stuck: no answer in time") from error
         except exceptions.RayError as error:
             raise self._lost(f"died ({type(error).__name__}: {error})") from error
         if arrays is not None:
             ticks = slice(len(arrays.observation.ok))
-            part = self._arrays.at((ticks, self.envs))
+            part = self._shared.arrays.at((ticks, self.envs))
             # The caller has the command.
             for ours, theirs in zip(part[1:], arrays[1:], strict=True):
                 tables: Any = zip(ours, theirs, strict=True)

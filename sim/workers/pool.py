@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import batchpid as bp
 from batchpid.arrays.array_types import Bool
 from batchpid.errors import ClosedError, SingleOwner
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.loop import Failure, order
+from batchpid.sim.loop.loop import Failure, first, joined
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeInfo, NodeWorker
 from batchpid.sim.workers.requests import BUILD, Request, SharedArrays, Start, split
@@ -53,6 +52,7 @@ class RecoveryWarning(UserWarning):
 class Outcome(NamedTuple):
     """Outcome of a request in all workers."""
 
+    request: Request
     results: list[Any]
     """Result of each worker; None of one that failed."""
     failure: Failure | None
@@ -63,6 +63,11 @@ class Outcome(NamedTuple):
     """Input and output of all ticks."""
     at: Callable[[int], Arrays]
     """Function that returns views of the arrays at a tick."""
+
+    @property
+    def result(self) -> Any:
+        """Result for all envs."""
+        return joined(self.request.method, self.results)
 
     @property
     def completed(self) -> list[Arrays]:
@@ -131,7 +136,7 @@ class Replay:
 class WorkerPool(SingleOwner):
     """Workers of a runner: processes, or with ``options.workers`` 0 the loop in this process.
 
-    The loops start with ``params``, and the workers with :meth:`open`. With ``options.cluster`` the
+    The workers start with :meth:`open`. With ``options.cluster`` the
     workers are nodes. Each node has a pool for its ``envs`` (default: all) and with requests of
     ``ticks`` at most.
     """
@@ -139,7 +144,6 @@ class WorkerPool(SingleOwner):
     def __init__(
         self,
         options: RunnerOptions,
-        params: bp.PIDParams,
         envs: slice | None = None,
         ticks: int | None = None,
     ) -> None:
@@ -166,11 +170,8 @@ class WorkerPool(SingleOwner):
             most_steps = _MAX_STEPS
         steps = max(_LEAST_STEPS, most_steps * loops // num_envs)
         ticks = ticks or max(1, steps // options.substeps)
-        layout = Arrays.layout(
-            ticks, num_envs, options.robot.dof, options.command.size, options.observed
-        )
-        self._shared = SharedArrays(layout)
-        self.arrays = Arrays.from_fields(self._shared.arrays)
+        self._shared = SharedArrays(Arrays.layout(options, ticks, num_envs))
+        self.arrays = self._shared.arrays
         """Input and output of a request (ticks, envs, ...)."""
         # Views are made once.
         self._at = cache(self.arrays.at)
@@ -184,7 +185,7 @@ class WorkerPool(SingleOwner):
         """Workers in the order of their envs."""
         cores = pinned_cores(len(slices))
         for index, part in enumerate(slices):
-            start = Start(index, part, options, params.for_envs(part), envs.start)
+            start = Start(index, part, options, envs.start)
             if options.cluster is not None:
                 self.workers.append(NodeWorker(start, self._shared, cluster, WorkerPool))
             elif self.is_local:
@@ -265,13 +266,14 @@ class WorkerPool(SingleOwner):
             raise ClosedError(_CLOSED)
         failure, count = None, request.ticks
         if failures:
-            failure = min(failures, key=order)
-            count = failure.ticks if request.counts_ticks else 0
+            failure = first(failures)
+            # Ticks that every env completed before the error are kept.
+            count = failure.ticks if request.method == "run" else 0
         elif request.changes_loop:
             self.replay.append(request)
         if count:
             self.present = self._at(count - 1)
-        return Outcome(results, failure, count, self.arrays, self._at)
+        return Outcome(request, results, failure, count, self.arrays, self._at)
 
     def close(self) -> None:
         """End all workers at once. May be called again, as after an interrupt."""

@@ -12,11 +12,9 @@ from __future__ import annotations
 import _signal
 import mmap
 import os
-import pickle
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import chain, pairwise
+from itertools import pairwise
 from operator import itemgetter
 from signal import SIGINT
 from types import FrameType
@@ -24,12 +22,11 @@ from typing import Any, Self
 
 import numpy as np
 
-import batchpid as bp
 from batchpid.arrays.array_types import Rows
 from batchpid.errors import InUseError, SingleOwner
 from batchpid.io.files import standard_streams_occupied
-from batchpid.sim.loop.arrays import Arrays, Layout, join_rows
-from batchpid.sim.loop.loop import Loop
+from batchpid.sim.loop.arrays import Arrays, Layout
+from batchpid.sim.loop.loop import Loop, part_of
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.stages.values import Command
 
@@ -37,7 +34,7 @@ _ALIGN = 64  # a cache line, so that two workers never write to the same one
 
 
 class SharedArrays(SingleOwner):
-    """Named arrays in one block of shared memory: a new one, or the existing one with file
+    """Arrays in one block of shared memory: a new one, or the existing one with file
     descriptor ``fd``.
     """
 
@@ -53,42 +50,34 @@ class SharedArrays(SingleOwner):
             self.fd = os.memfd_create("batchpid") if fd is None else fd
             os.ftruncate(self.fd, max(size, 1))
             memory = mmap.mmap(self.fd, max(size, 1))  # duplicates the descriptor
-        self.arrays: dict[str, Rows] = {
+        fields: dict[str, Rows] = {
             name: np.ndarray(shape, dtype, buffer=memory, offset=offsets[name])
             for name, (shape, dtype) in layout.items()
         }
+        self.arrays = Arrays.from_fields(fields)
 
     def close(self) -> None:
         """Close the descriptor. The memory is freed when no array refers to it."""
         fd = self.fd
         self.fd = -1
-        self.arrays = {}
+        vars(self).pop("arrays", None)
         if fd >= 0:
             os.close(fd)
 
 
 NO_COMMAND = Command(None)
-JOINED: dict[str, Callable[[list[Any]], Any]] = {
-    "run": max,
-    "read": join_rows,
-    "snapshot": join_rows,
-    "poses": lambda results: [*chain.from_iterable(results)],
-}
-"""Functions of the results of all workers, by the method of the request; others have no result."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """Call of a method of the loops of all envs of a pool."""
+    """Request to the loops of all envs of a pool: :meth:`batchpid.sim.loop.loop.Loop.execute`."""
 
     method: str
-    """Name of the method of :class:`batchpid.sim.loop.loop.Loop`; "build" for its constructor, with
-    the :class:`Start` of each worker.
+    """"run", or the name of a method of :class:`batchpid.sim.loop.env_group.EnvGroup`; "build" to
+    make the loop from the :class:`Start` of each worker.
     """
     arguments: tuple[Any, ...] = ()
-    """Arguments for all envs. Arrays (envs, ...) and objects with ``for_envs`` are divided, others
-    are the same for all workers.
-    """
+    """Arguments for all envs, which :func:`batchpid.sim.loop.loop.part_of` divides."""
     ticks: int = 0
     """Ticks of the arrays that hold observations afterwards; 0: the observation does not change."""
     substeps: int = 10
@@ -100,46 +89,16 @@ class Request:
     pool.
     """
 
-    @property
-    def counts_ticks(self) -> bool:
-        """Whether the ticks that every env completed before an error are kept."""
-        return self.method == "run"
-
-    @property
-    def patience(self) -> float:
-        """Further time that the request may take [s]."""
-        # Mostly for imports, from a disk that may be slow.
-        return 60.0 if self.method == "build" else 0.0
-
-    def arguments_for(self, envs: slice) -> tuple[Any, ...]:
-        """Return the arguments for some envs."""
-
-        def part(value: Any) -> Any:
-            if isinstance(value, np.ndarray):
-                return value[envs]
-            return value.for_envs(envs) if hasattr(value, "for_envs") else value
-
-        return tuple(map(part, self.arguments))
-
     def for_envs(self, envs: slice) -> Self:
         """Return the request for some envs."""
         command = self.command.map(itemgetter((slice(None), envs)))
-        return replace(self, arguments=self.arguments_for(envs), command=command)
+        return replace(self, arguments=part_of(self.arguments, envs), command=command)
 
     def write(self, arrays: Arrays, envs: slice) -> None:
         """Write the commands of some envs to the shared arrays (ticks, envs, ...)."""
         for table, rows in zip(arrays.command, self.command, strict=True):
             if rows is not None:
                 table[: self.ticks, envs] = rows[:, envs]
-
-    def encode(self, envs: slice) -> bytes:
-        """Return the message for a worker, pickled: method and arguments for its envs."""
-        return pickle.dumps((self.method, self.arguments_for(envs)))
-
-    def join(self, results: list[Any]) -> Any:
-        """Return the result for all envs from the results of their parts."""
-        joined = JOINED.get(self.method)
-        return None if joined is None else joined(results)
 
 
 BUILD = Request("build", changes_loop=False)
@@ -155,8 +114,6 @@ class Start:
     envs: slice
     """Rows in the arrays of the pool."""
     options: RunnerOptions
-    params: bp.PIDParams
-    """Params of these envs."""
     first_env: int = 0
     """Number of the pool's first env within the runner; each node of a cluster has a pool for some
     of the envs.
@@ -165,7 +122,7 @@ class Start:
     def build(self, arrays: Arrays) -> Loop:
         """Return the loop, with the shared arrays (ticks, envs, ...) of the pool's envs."""
         envs = slice(self.first_env + self.envs.start, self.first_env + self.envs.stop)
-        return Loop(self.options, self.params, envs, arrays.at((slice(None), self.envs)))
+        return Loop(self.options, envs, arrays.at((slice(None), self.envs)))
 
 
 def split(num_envs: int, parts: int) -> list[slice]:

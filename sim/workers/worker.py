@@ -32,8 +32,7 @@ import cloudpickle
 from batchpid.errors import InvalidArgumentError, SingleOwner, WorkerError
 from batchpid.io.files import standard_streams_occupied
 from batchpid.sim.engine import native
-from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.loop import Failure, Loop
+from batchpid.sim.loop.loop import Failure, Loop, failed, part_of
 from batchpid.sim.workers.requests import Request, SharedArrays, Start
 
 ONE_THREAD = dict.fromkeys(
@@ -95,6 +94,14 @@ class Worker(SingleOwner, ABC):
         too.
         """
 
+    def _limit(self, request: Request) -> float:
+        """Return the time after which a worker counts as stuck in a request [s]."""
+        # Mostly for imports, from a disk that may be slow.
+        patience = 60.0 if request.method == "build" else 0.0
+        steps = (request.ticks or 1) * request.substeps
+        limit: float = self._step_limit * steps + self._timeout + patience
+        return limit
+
     @property
     def label(self) -> str:
         """Number, process and envs, for messages."""
@@ -115,11 +122,11 @@ class LocalWorker(Worker):
     def send(self, request: Request) -> None:
         try:
             if self._loop is None:
-                self._loop = self._start.build(Arrays.from_fields(self._shared.arrays))
+                self._loop = self._start.build(self._shared.arrays)
             else:
-                self._result = getattr(self._loop, request.method)(*request.arguments)
+                self._result = self._loop.execute(request.method, request.arguments)
         except Exception as error:
-            self._result = Failure.of(error)
+            self._result = failed(error)
 
     def receive(self) -> object:
         return self._result
@@ -182,13 +189,13 @@ class ProcessWorker(Worker):
                 os.sched_setaffinity(self.pid, {self._core})
 
     def send(self, request: Request) -> None:
-        # Time after which the worker counts as stuck.
-        limit = self._step_limit * (request.ticks or 1) * request.substeps
-        limit += self._timeout + request.patience
+        limit = self._limit(request)
         self._deadline = time.monotonic() + limit
         self._socket.settimeout(limit)
         try:
-            message = self._message if request.method == "build" else request.encode(self.envs)
+            message = self._message
+            if request.method != "build":
+                message = pickle.dumps((request.method, part_of(request.arguments, self.envs)))
             # A worker that has died is an error here, where SIGPIPE would end the process.
             self._socket.sendall(message, socket.MSG_NOSIGNAL)
         except OSError as error:
@@ -311,9 +318,9 @@ def _serve(connection: socket.socket, memory: int) -> None:
     requests = connection.makefile("rb")
     start, layout = pickle.load(requests)
     try:
-        loop = start.build(Arrays.from_fields(SharedArrays(layout, memory).arrays))
+        loop: Loop = start.build(SharedArrays(layout, memory).arrays)
     except Exception as error:
-        connection.sendall(pickle.dumps(Failure.of(error).portable()))
+        connection.sendall(pickle.dumps(failed(error).portable()))
         return
     connection.sendall(pickle.dumps(None))
     # The hot loop makes no reference cycles, so that collections would only cost time.
@@ -326,11 +333,7 @@ def _serve(connection: socket.socket, memory: int) -> None:
         spin_end = time.perf_counter() + _SPIN_SECONDS
         while not poller.poll(0) and time.perf_counter() < spin_end:
             os.sched_yield()
-        connection.sendall(pickle.dumps(_result(loop, *pickle.load(requests))))
-
-
-def _result(loop: Loop, method: str, arguments: tuple[Any, ...]) -> Any:
-    try:
-        return getattr(loop, method)(*arguments)
-    except Exception as error:
-        return Failure.of(error).portable()
+        result = loop.execute(*pickle.load(requests))
+        if isinstance(result, Failure):
+            result = result.portable()
+        connection.sendall(pickle.dumps(result))

@@ -42,7 +42,7 @@ def test_jax_compiles_once_and_donates_the_state_but_no_input(inputs, x64, caplo
 ACTS = [
     lambda pid, y: None,
     lambda pid, y: setattr(pid, "params", PARAMS),  # options may be switched on in flight
-    lambda pid, y: pid.reset(y[3], np.arange(ENVS) < 2, keep_integral=True),
+    lambda pid, y: pid.reset(y[3], np.arange(ENVS) < 2),
     lambda pid, y: pid.reset(y[4], np.arange(ENVS) > 1),
     lambda pid, y: pid.track(1.0, y[5], 0.5, y[6, :1]),
     lambda pid, y: setattr(pid, "params", PARAMS.replace(effort_rate_limit=300.0)),
@@ -75,10 +75,8 @@ def test_reset_and_track(inputs):
     for t in range(6):
         pid(inputs.setpoint[t], y[t])
     integral, mask = pid.state.integral, np.array([True, False, True, False])
-    pid.reset(y[9], mask, keep_integral=True)
-    np.testing.assert_array_equal(pid.state.integral, integral)
-    np.testing.assert_array_equal(pid.state.measurement[mask], y[9][mask])
     pid.reset(y[9], mask)
+    np.testing.assert_array_equal(pid.state.measurement[mask], y[9][mask])
     np.testing.assert_array_equal(pid.state.integral, np.where(mask[:, None], 0, integral))
     pid.track(1.0, y[9], 0.5, feedforward=0.2)
     np.testing.assert_allclose(pid(1.0, y[9], feedforward=0.2), 0.5, atol=1e-6)

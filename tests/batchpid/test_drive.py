@@ -1,4 +1,4 @@
-"""drive_target: its edges; test_law_conformance.py compares the drive with the law."""
+"""advance_drive: its edges; test_law_conformance.py compares the drive with the law."""
 
 import numpy as np
 import pytest
@@ -6,14 +6,16 @@ from law_cases import DRIVE_LACKS, DT, ENVS, JOINTS
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
+from batchpid.law.pid import advance_drive
+from batchpid.law.state import check_drive
 
 
 def test_without_stiffness_the_target_is_the_setpoint():
     params = bp.make_params(JOINTS, [0.0, 1.0, 2.0], 5.0)
     y = np.zeros((ENVS, JOINTS))
-    state = bp.init(params, y)
+    k, state = bp.discretise(params, DT), bp.init(params, y)
     for _ in range(3):
-        state, target = bp.drive_target(params, state, y + 1, y, DT)
+        state, target = advance_drive(k, state, y + 1, y)
     assert (target[:, 0] == 1).all()
     assert (target[:, 1:] > 1).all()
     assert np.isfinite(target).all()
@@ -22,6 +24,6 @@ def test_without_stiffness_the_target_is_the_setpoint():
 @pytest.mark.parametrize("name", DRIVE_LACKS)
 def test_a_drive_refuses_options_that_it_does_not_have(name):
     value = "hold" if name == "non_finite" else 0.3
-    params, y = bp.make_params(1, 4.0, 1.0, 1.0, **{name: value}), np.zeros((1, 1))
+    params = bp.make_params(1, 4.0, 1.0, 1.0, **{name: value})
     with pytest.raises(InvalidArgumentError, match=rf"params.{name}: .*replace\({name}="):
-        bp.drive_target(params, bp.init(params, y), y, y, DT)
+        check_drive(params)

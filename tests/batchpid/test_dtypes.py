@@ -1,7 +1,5 @@
 """States and results have the params' dtype, whatever the dtype of the inputs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +10,7 @@ from trees import tree_of
 import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.law import convert_integral
+from batchpid.law.pid import advance_drive
 from batchpid.motors import guard as guards
 
 OTHERS = (np.longdouble, np.float32, np.float16, np.int32)
@@ -47,7 +46,8 @@ def run_of(xp, dtype, seed, own):
             state, params.replace(ki=1.0), PLAIN.replace(dtype=own), row["mass_matrix"]
         )
     drive = bp.make_params(JOINTS, 4.0, 2.0, 1.0, dtype=own)
-    yield from bp.drive_target(drive, bp.init(drive, y), row["setpoint"], y, DT)
+    own_rows = (rows.astype(own) for rows in (row["setpoint"], y))  # as the Runner's are
+    yield from advance_drive(bp.discretise(drive, DT), bp.init(drive, y), *own_rows)
     limits = bp.make_guard(JOINTS, rate=1.0, acceleration=5.0, dtype=own)
     yield (guarded := guards.init(limits, y))
     yield guards.advance(limits, guarded, row["setpoint"], DT)[0]

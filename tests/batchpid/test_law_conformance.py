@@ -29,6 +29,7 @@ from scalar_pid import scalar_pids, step_of_robot
 
 import batchpid as bp
 from batchpid.arrays.trees import mapped
+from batchpid.law.pid import advance_drive
 
 GIVEN = [
     (),
@@ -55,7 +56,7 @@ def by_controller(params, inputs, backend="numpy"):
     for at in range(len(inputs.setpoint)):
         row = inputs.at(at, lambda rows: rows.astype(params.dtype))
         if at == RESET:
-            pid.reset(row["measurement"], keep_integral=True)
+            pid.reset(row["measurement"])
         efforts.append(pid(**row))
         overwrite(row.values())
         assert efforts[-1].dtype == params.dtype
@@ -84,9 +85,10 @@ def by_jaxs_controller(params, inputs):
 
 def by_drive(params, inputs):
     """Return the efforts of PD drives whose targets the integral moves."""
+    k = bp.discretise(params, DT)
 
     def step(params, state, row):
-        state, target = bp.drive_target(params, state, dt=DT, **row)
+        state, target = advance_drive(k, state, **row)
         effort = params.kp * (target - row["measurement"]) + row.get("feedforward", 0.0)
         if params.kd is not None:
             effort = effort + params.kd * (row.get("setpoint_rate", 0.0) - row["measurement_rate"])
@@ -108,21 +110,23 @@ class Executor(NamedTuple):
     """Number of generated params to test, for each of the units."""
     bits: bool = True
     """Whether results are bit-identical to NumPy's."""
+    keeps: bool = True
+    """Whether its reset in between keeps the integral."""
 
 
 ALONE = UNITS[:1]
 EXECUTORS = {
     "numpy": Executor(by_steps, seeds=12),
     "numpy float32": Executor(by_steps, np.float32),
-    "controller": Executor(by_numpys_controller, units=ALONE, seeds=12),
-    "native controller": Executor(by_controller, units=ALONE, seeds=12),
-    "native controller float32": Executor(by_controller, np.float32, ALONE),
+    "controller": Executor(by_numpys_controller, units=ALONE, seeds=12, keeps=False),
+    "native controller": Executor(by_controller, units=ALONE, seeds=12, keeps=False),
+    "native controller float32": Executor(by_controller, np.float32, ALONE, keeps=False),
     "drive": Executor(by_drive, units=ALONE, seeds=12, bits=False),
     "c": Executor(by_c, seeds=2),
     "c float32": Executor(by_c, np.float32, seeds=2),
     "jax": Executor(by_jax, seeds=2, bits=False),
     "jax float32": Executor(by_jax, np.float32, seeds=1, bits=False),
-    "jax controller": Executor(by_jaxs_controller, np.float32, ALONE, 2, bits=False),
+    "jax controller": Executor(by_jaxs_controller, np.float32, ALONE, 2, bits=False, keeps=False),
 }
 CASES = [
     (name, units, seed)
@@ -132,7 +136,7 @@ CASES = [
 ]
 
 
-def oracle(params, inputs):
+def oracle(params, inputs, keep=True):
     """Return the efforts of scalar controllers, one per env and joint, and the sum of the
     magnitudes of their terms.
     """
@@ -146,7 +150,7 @@ def oracle(params, inputs):
             ]
             if at in (0, RESET):
                 for pid, row in zip(pids, rows, strict=True):
-                    pid.start(row["measurement"], pid.integral if at else 0.0)
+                    pid.start(row["measurement"], pid.integral if at and keep else 0.0)
             if matrix is None:
                 efforts[at, env] = [
                     pid.step(dt=DT, **row) for pid, row in zip(pids, rows, strict=True)
@@ -160,11 +164,12 @@ def oracle(params, inputs):
 
 
 def check(executor, params, inputs):
-    found, expected = executor.run(params, inputs), by_steps(params, inputs)
+    keep = executor.keeps
+    found, expected = executor.run(params, inputs), by_steps(params, inputs, keep=keep)
     envs = found.shape[1]
     if executor.bits:
         np.testing.assert_array_equal(found, expected[:, :envs])
-    expected, sizes = oracle(params, inputs)
+    expected, sizes = oracle(params, inputs, keep)
     error = np.abs(found - expected[:, :envs])
     size = 1 + np.maximum.accumulate(sizes, axis=0)[:, :envs]
     assert (error / size).max() < (1e-12 if executor.dtype == np.float64 else 1e-5)

@@ -8,6 +8,7 @@ from hypothesis.extra import numpy as npst
 from law_cases import JOINTS
 
 import batchpid as bp
+from batchpid.io import documents
 
 NAMES = ["shoulder", "elbow", "no"]  # "no" is a bool to careless YAML
 
@@ -124,8 +125,8 @@ def test_about_survives_and_does_not_affect_the_params(tmp_path, suffix):
     with_about, without = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
     bp.save_params(with_about, params, ["x", "y"], about)
     bp.save_params(without, params, ["x", "y"])
-    assert bp.load_about(with_about) == about
-    assert bp.load_about(without) == {}
+    assert documents.read(with_about)["about"] == about
+    assert "about" not in documents.read(without)
     assert all(same(bp.load_params(path)[0], params) for path in (with_about, without))
 
 

@@ -6,13 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from batchpid.task_space.frames import matrix_of, rotate
-from batchpid.trajectories import (
-    Trajectory,
-    minimum_jerk,
-    sine,
-    straight_line,
-    trapezoidal,
-)
+from batchpid.trajectories import minimum_jerk, straight_line, trapezoidal
 
 DT = 0.004
 LIMITS = {"max_velocity": [1.0, 2.0, np.inf], "max_acceleration": [3.0, 8.0, 5.0]}
@@ -29,7 +23,7 @@ MOVES = {
 each_move = pytest.mark.parametrize("move", MOVES.values(), ids=MOVES)
 
 
-def with_start(trajectory: Trajectory, start: np.ndarray) -> np.ndarray:
+def with_start(trajectory, start):
     return np.concatenate(
         [np.broadcast_to(start, trajectory.position.shape[1:])[None], trajectory.position]
     )
@@ -129,16 +123,6 @@ def test_the_end_of_a_trajectory_can_be_held():
     np.testing.assert_allclose(t.time, DT * np.arange(1, 31))
     assert (t.position[25:] == [1.0, 2.0]).all()
     assert not t.velocity[25:].any()
-
-
-def test_a_sine_grows_from_rest_to_its_amplitude():
-    wave = sine([0.5, -1.0], [0.2, 0.1], DT, frequency=0.5, duration=5.0, fade=1.5)
-    steps = np.diff(wave.position, axis=0) / DT
-    np.testing.assert_allclose(steps, wave.velocity[1:], atol=2 * DT)
-    np.testing.assert_allclose(np.diff(wave.velocity, axis=0) / DT, wave.acceleration[1:], atol=0.1)
-    np.testing.assert_allclose(wave.position[0], [0.5, -1.0], atol=1e-6)
-    late = wave.position[wave.time > 2.0] - [0.5, -1.0]
-    np.testing.assert_allclose(np.abs(late).max(0), [0.2, 0.1], rtol=1e-3)
 
 
 @pytest.mark.parametrize("sign", [1, -1])

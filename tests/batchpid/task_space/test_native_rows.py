@@ -133,10 +133,7 @@ def test_the_law(name, rows, seed, axes, forces, frame, smallest, extras, limit,
         ts.OSCInputs(goal, qpos, qvel, **given),
     )
     (new, found), (plain, wanted) = both(lambda: ts.osc(*inputs))
-    after, alone = ts.osc(*inputs, wanted=("effort",))
-    np.testing.assert_array_equal(alone.effort, found.effort)
     if learns:
-        np.testing.assert_array_equal(after.integral, new.integral)
         assert_same(new.integral, plain.integral, 1e-12)
     np.testing.assert_array_equal(found.near_singular, wanted.near_singular)
     # The inverse amplifies the rounding of A, which is relative to its norm, by 1/s0 at most.

@@ -1,15 +1,11 @@
-"""Solutions, bounded inverses and eigenvalues of small symmetric matrices against numpy.linalg, row
-by row.
-"""
+"""Solutions and bounded inverses of small symmetric matrices against numpy.linalg, row by row."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import symmetric
 
 
@@ -49,7 +45,7 @@ def test_the_bounded_inverse_changes_small_eigenvalues_only(seed, singular):
         values[:, 0] = 0.0
         matrix = (axes * values[:, None]) @ axes.transpose(0, 2, 1)
     s0 = 0.3
-    found, near = symmetric.bounded_inverse(matrix, s0)
+    found, _, near = symmetric.bounded_inverses(matrix, np.array(s0), np.array(s0))
     values, axes = np.linalg.eigh(matrix)
     bounded = np.where(values >= s0, 1 / np.maximum(values, s0), np.maximum(values, 0) / s0**2)
     np.testing.assert_allclose(
@@ -63,9 +59,8 @@ def test_the_bounded_inverse_changes_small_eigenvalues_only(seed, singular):
 @given(seed=st.integers(0, 2**31))
 def test_the_smooth_bounded_inverse_has_a_continuous_derivative(seed):
     matrix, _ = matrices(seed, 6, 6)
-    s0, s1 = 0.5, 0.2
-    first, found, near = symmetric.bounded_inverse(matrix, s0, s1)
-    np.testing.assert_array_equal(first, symmetric.bounded_inverse(matrix, s0)[0])
+    s0, s1 = np.array(0.5), np.array(0.2)
+    first, found, near = symmetric.bounded_inverses(matrix, s0, s1)
     np.testing.assert_array_equal(found[~near], first[~near])
     values, axes = np.linalg.eigh(matrix)
     smooth = np.where(
@@ -74,10 +69,15 @@ def test_the_smooth_bounded_inverse_has_a_continuous_derivative(seed):
     np.testing.assert_allclose(found, (axes * smooth[:, None]) @ axes.transpose(0, 2, 1), atol=1e-9)
     step = 1e-5
     around = s1 * np.array([1 - 2 * step, 1 - step, 1, 1 + step, 1 + 2 * step])
-    along = symmetric.bounded_inverse(around[:, None, None], s0, s1)[1][:, 0, 0]
+    along = symmetric.bounded_inverses(around[:, None, None], s0, s1)[1][:, 0, 0]
     np.testing.assert_allclose(np.diff(along) / (s1 * step), -1 / s1**2, rtol=1e-3)
 
 
-def test_a_matrix_that_is_not_square_is_refused():
-    with pytest.raises(InvalidArgumentError, match="square"):
-        symmetric.solve(np.zeros((2, 3)), np.zeros((2, 1)))
+def test_a_matrix_that_is_not_positive_definite_or_not_finite_is_nan_alone():
+    matrix = np.tile(np.eye(3), (4, 1, 1))
+    matrix[1, 2, 2], matrix[2, 0, 1] = 0.0, np.nan
+    found = symmetric.solve(matrix, np.ones((4, 3, 1)))
+    np.testing.assert_array_equal(np.isnan(found).any((1, 2)), [False, True, True, False])
+    np.testing.assert_array_equal(found[[0, 3]], 1.0)
+    bounded, *_ = symmetric.bounded_inverses(matrix, np.array(0.1), np.array(0.1))
+    np.testing.assert_array_equal(np.isnan(bounded).any((1, 2)), [False, False, True, False])

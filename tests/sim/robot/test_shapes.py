@@ -11,8 +11,9 @@ import trimesh
 from robots import load_bundled
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
-from batchpid.sim.view.scene import surfaces
+from batchpid.sim.view.scene import RobotScene, surfaces
 
 RED = '<material name="red"><color rgba="1 0 0 0.5"/></material>'
 BOX = '<box size="0.1 0.2 0.4"/>'
@@ -55,7 +56,7 @@ def volume(vertices, faces):
     ],
 )
 def test_primitives_face_out_and_have_their_size(geometry, size, expected, share, tmp_path):
-    (surface,) = surfaces(load(tmp_path, a=visual(geometry)))
+    ((surface,), _) = surfaces(load(tmp_path, a=visual(geometry)))
     vertices, faces = surface.vertices, surface.faces
     assert volume(vertices, faces) == pytest.approx(expected, rel=share)
     np.testing.assert_allclose(np.ptp(vertices, axis=0), size, atol=2 * 2e-3)
@@ -65,7 +66,7 @@ def test_primitives_face_out_and_have_their_size(geometry, size, expected, share
     ("geometry", "angle"), [(BOX, 1), ('<cylinder radius="0.2" length="0.5"/>', 45)]
 )
 def test_no_vertex_is_shared_across_a_sharp_edge(geometry, angle, tmp_path):
-    (surface,) = surfaces(load(tmp_path, a=visual(geometry)))
+    ((surface,), _) = surfaces(load(tmp_path, a=visual(geometry)))
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -77,7 +78,8 @@ def test_no_vertex_is_shared_across_a_sharp_edge(geometry, angle, tmp_path):
 @pytest.mark.parametrize("name", Robot.bundled())
 def test_every_link_of_a_bundled_robot_is_drawn(name):
     bundled = load_bundled(name)
-    drawn = surfaces(bundled)
+    drawn, findings = surfaces(bundled)
+    assert findings == []
     assert {surface.link for surface in drawn} == set(bundled.tables.links)
     for surface in drawn:
         assert surface.faces.max() < len(surface.vertices)
@@ -88,7 +90,7 @@ def test_every_link_of_a_bundled_robot_is_drawn(name):
 def test_shapes_of_one_colour_are_joined_at_their_origins(tmp_path):
     green = '<material name="x"><color rgba="0 1 0 1"/></material>'
     red = visual(BOX, 0.5, '<material name="red"/>')
-    first, second = surfaces(load(tmp_path, a=red + visual(BOX, 0.0, green) + red))
+    (first, second), _ = surfaces(load(tmp_path, a=red + visual(BOX, 0.0, green) + red))
     assert first.rgba == (1, 0, 0, 0.5)
     assert second.rgba == (0, 1, 0, 1)
     assert len(first.vertices) == 2 * len(second.vertices)
@@ -96,28 +98,17 @@ def test_shapes_of_one_colour_are_joined_at_their_origins(tmp_path):
     np.testing.assert_allclose(first.vertices.max(0), [0.2, 0.1, 0.55], atol=1e-12)
 
 
-def test_a_robot_without_shapes_is_drawn_by_rods_between_its_joints(tmp_path):
-    tip = INERTIAL.replace("<mass", '<origin xyz="0.5 0 0"/><mass')
-    parts = (
-        link("a"),
-        link("b"),
-        link("c", tip),
-        joint("j", "a", "b"),
-        joint("k", "b", "c", origin="0 -2 0"),
-    )
-    drawn = surfaces(Robot.load(write(tmp_path, robot(*parts))))
-    assert [surface.link for surface in drawn] == ["a", "b", "c"]
-    for surface, end in zip(drawn, ([0, 0, 1], [0, -2, 0], [0.5, 0, 0]), strict=True):
-        assert volume(surface.vertices, surface.faces) > 0
-        lowest, highest = np.minimum(end, 0), np.maximum(end, 0)
-        np.testing.assert_allclose(surface.vertices.min(0), lowest, atol=0.1)
-        np.testing.assert_allclose(surface.vertices.max(0), highest, atol=0.1)
+def test_a_robot_without_shapes_is_refused_with_a_remedy(tmp_path):
+    with pytest.raises(
+        InvalidArgumentError, match="no shape that can be drawn; give its links visuals"
+    ):
+        RobotScene(load(tmp_path), 1, True, 24)
 
 
 @pytest.mark.parametrize("mirror", [1, -1])
 def test_a_mesh_file_is_read_and_scaled(mirror, tmp_path):
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.stl")
-    (cube,) = surfaces(
+    (cube,), _ = surfaces(
         load(tmp_path, b=visual(f'<mesh filename="cube.stl" scale="0.1 {0.2 * mirror} 0.3"/>'))
     )
     assert cube.link == "b"
@@ -133,8 +124,7 @@ def test_a_mesh_file_is_read_and_scaled(mirror, tmp_path):
 def test_a_collada_file_is_read_in_its_unit(unit, factor, tmp_path):
     text = trimesh.creation.box((1, 2, 3)).export(file_type="dae").decode()
     (tmp_path / "box.dae").write_text(text.replace("<up_axis>", f"{unit}<up_axis>"))
-    findings = []
-    (drawn,) = surfaces(load(tmp_path, b=visual('<mesh filename="box.dae"/>')), findings=findings)
+    (drawn,), findings = surfaces(load(tmp_path, b=visual('<mesh filename="box.dae"/>')))
     assert findings == []
     np.testing.assert_allclose(
         np.ptp(drawn.vertices, axis=0), np.array([3, 2, 1]) * factor, rtol=1e-6
@@ -150,11 +140,8 @@ def test_meshes_that_cannot_be_read_are_reported_with_link_file_and_remedy(tmp_p
         ("box.dae", r"cannot be drawn \(", "repair the file"),
     ):
         for shape in ("", visual(BOX, kind="collision")):
-            findings = []
-            surfaces(
-                load(tmp_path, b=visual(f'<mesh filename="{name}"/>') + shape), findings=findings
-            )
-            (finding,) = findings
+            seen = visual(f'<mesh filename="{name}"/>') + shape
+            _, (finding,) = surfaces(load(tmp_path, b=seen))
             assert (finding.code, finding.link, finding.detail) == ("missing-mesh", "b", repr(name))
             assert re.search(
                 f"{reason}.*: collision shapes are drawn.*; .*{remedy}", str(finding)
@@ -166,19 +153,15 @@ def test_visuals_are_looked_up_in_package_dirs(tmp_path):
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "elsewhere" / "pack" / "cube.stl")
     seen = link("b", INERTIAL + visual('<mesh filename="package://pack/cube.stl"/>'))
     path = write(tmp_path, robot(link("a"), seen, joint("j", "a", "b")))
-    assert [surface.link for surface in surfaces(Robot.load(path))] == ["a"]  # a rod to the joint
-    assert [
-        surface.link
-        for surface in surfaces(Robot.load(path, package_dirs=[tmp_path / "elsewhere"]))
-    ] == ["b"]
+    _, (lost,) = surfaces(Robot.load(path))
+    assert lost.link == "b"
+    (drawn,), _ = surfaces(Robot.load(path, package_dirs=[tmp_path / "elsewhere"]))
+    assert drawn.link == "b"
 
 
 def test_a_malformed_visual_is_reported_and_drawn_as_the_collision_shape(tmp_path):
     shape = visual(BOX, kind="collision")
-    findings = []
-    (drawn,) = surfaces(
-        load(tmp_path, a=visual('<sphere radius="big"/>') + shape), findings=findings
-    )
+    (drawn,), findings = surfaces(load(tmp_path, a=visual('<sphere radius="big"/>') + shape))
     assert np.ptp(drawn.vertices, axis=0) == pytest.approx((0.4, 0.2, 0.1))
     assert "link 'a' ('<visual>'): cannot be drawn (<sphere radius='big'>" in str(findings[0])
 
@@ -199,6 +182,6 @@ def test_what_was_repaired_is_drawn(tmp_path):
     path = write(tmp_path, text)
     loaded = Robot.load(path)
     path.unlink()  # a file is read once
-    (surface,) = surfaces(pickle.loads(pickle.dumps(loaded)))
+    (surface,), _ = surfaces(pickle.loads(pickle.dumps(loaded)))
     assert surface.link == "b"
     np.testing.assert_allclose(np.ptp(surface.vertices, axis=0), (0.4, 0.2, 0.1), atol=1e-9)

@@ -68,7 +68,7 @@ def live(panda):
 @pytest.fixture
 def view(live, serve):
     view = serve(live)
-    view.panel.frames_left = 0  # a paused page answers at once
+    view.panel.running = False  # a paused page answers at once
     return view
 
 
@@ -90,15 +90,13 @@ def test_robots_are_drawn_and_a_slider_moves_them(live, view, open_page, until):
     )
 
 
-def test_pause_step_and_reset(live, view, open_page, until):
+def test_run_pause_and_reset(live, view, open_page, until):
     page = open_page(view.url)
     until(lambda: "saturated" in page.page_source, what="loading")
-    press(page, "Step")
-    until(lambda: live.frame().time[0] == pytest.approx(live.period), what="one step")
     press(page, "Run")
     until(lambda: live.frame().time[0] > 0.5, what="the run")
     press(page, "Pause")
-    until(lambda: view.panel.frames_left == 0, what="the pause")
+    until(lambda: not view.panel.running, what="the pause")
     press(page, "Reset")
     until(lambda: live.frame().time[0] == 0.0, what="the reset")
     np.testing.assert_allclose(live.frame().qpos[0], live.start, atol=1e-6)
@@ -106,7 +104,7 @@ def test_pause_step_and_reset(live, view, open_page, until):
 
 def test_a_chart_draws_the_watched_joint(live, view, open_page, until):
     live.set_setpoint(live.robot.target)
-    view.panel.frames_left = 10
+    view.panel.running = True
     page = open_page(view.url)
     until(lambda: "panda_joint1 [rad]" in page.page_source, what="the chart's title")
 

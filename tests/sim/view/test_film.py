@@ -114,7 +114,7 @@ def test_meshes_of_many_triangles_are_coarser(tmp_path):
         joint("hinge", "base", "ball", origin="0 0 0"),
     ]
     described = Robot.load(write(tmp_path, robot(*parts)))
-    (surface,) = RobotScene(described, 1, True, 8e-3).surfaces
+    (surface,) = RobotScene(described, 1, True, 12).surfaces
     painter = film.Painter(described, 1, True, (160, 90))
     cell = 0.05
     coarse = film.coarse(surface, cell)

@@ -28,7 +28,7 @@ def hanging(tmp_path):
 
 def test_the_floor_is_the_ground_or_at_the_lowest_link(panda, hanging):
     for described, height in ((panda, 0.0), (hanging, -0.5)):
-        with_ground, without = (RobotScene(described, 2, ground, 1e-2) for ground in (True, False))
+        with_ground, without = (RobotScene(described, 2, ground, 12) for ground in (True, False))
         assert with_ground.floor == 0.0
         assert without.floor == pytest.approx(height, abs=1e-3)
         for point, lower in ((with_ground.target, without.target), (with_ground.eye, without.eye)):
@@ -48,7 +48,7 @@ def test_the_ground_is_that_of_the_run(options, ground, hanging):
 
 def test_robots_stand_in_their_places_and_stay_there_without_a_finite_pose():
     quadruped = Robot.load("quadruped", fixed_base=False)
-    scene = RobotScene(quadruped, 5, True, 1e-2)
+    scene = RobotScene(quadruped, 5, True, 12)
     gaps = np.linalg.norm(scene.positions[:, None] - scene.positions, axis=-1)[
         ~np.eye(5, dtype=bool)
     ]
