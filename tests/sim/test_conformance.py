@@ -41,9 +41,10 @@ from batchpid.sim import (
 )
 from batchpid.sim.options.options import OPTIONS
 
-N, TICKS, SPLIT, FAILING = 5, 5, 3, 2
+N, TICKS, SPLIT, FAILING = 5, 5, 3, 3
 """Envs and ticks of the program, ticks before its snapshot, and the env that fails."""
-RESET = np.arange(N) % 2 == 0
+RESET = np.arange(N) > 2
+"""Envs of the reset: none of the first worker, and a part of the first group in this process."""
 ENGINES = ("sapien", "mujoco")
 pytestmark = [
     pytest.mark.usefixtures("small_groups"),
@@ -352,7 +353,8 @@ def program(runner, case, rollout=None, disturb=None):
     rollout = rollout or (lambda runner, given: runner.rollout(**given))
     given = commands(case, runner)
     first = rollout(runner, part(given, slice(SPLIT)))
-    placed = runner.reset(mask=RESET[: runner.num_envs])
+    assert_identical(runner.reset(mask=np.zeros(runner.num_envs, bool)), runner.observe())
+    placed = runner.reset(mask=RESET[-runner.num_envs :])
     snapshot = runner.snapshot()
     if disturb is not None:
         disturb(runner)
