@@ -78,6 +78,9 @@ def test_it_holds_faults_params_and_time():
         other.restore(snapshot)
         assert (other.time, other.params.kp.max(), other.faults) == (time, 30.0, ())
         seen = other.step(GOAL)
+        for envs in ([N], [0.0]):
+            with pytest.raises(IndexError):
+                snapshot.for_envs(envs)
     assert seen.ok.tolist() == [True, False]
     assert_identical(seen, expected)
 
