@@ -75,11 +75,9 @@ def test_reset_and_track_are_those_of_the_law(inputs):
     for t in range(6):
         pid(inputs.setpoint[t], y[t])
     mask, forward = np.array([True, False, True, False]), {"feedforward": 0.2}
-    for keep in (True, False):
-        expected = bp.reset(PARAMS, pid.state, y[9], mask)
-        expected = expected._replace(integral=pid.state.integral) if keep else expected
-        pid.reset(y[9], mask, keep_integral=keep)
-        jax.tree.map(np.testing.assert_array_equal, pid.state, expected)
+    expected = bp.reset(PARAMS, pid.state, y[9], mask)
+    pid.reset(y[9], mask)
+    jax.tree.map(np.testing.assert_array_equal, pid.state, expected)
     expected = bp.track(PARAMS, pid.state, 1.0, y[9], 0.5, dt=DT, **forward)
     pid.track(1.0, y[9], 0.5, **forward)
     jax.tree.map(np.testing.assert_array_equal, pid.state, expected)
