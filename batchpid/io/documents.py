@@ -181,6 +181,8 @@ class RecordFile(Generic[R]):
         # Names and types first: their errors name a key, where a constructor could not.
         for key in document:
             choice(f"{source}: key", key, ("format", "about", *self.head, "joints"))
+        if not isinstance(document.get("about", {}), dict):
+            raise error(source, "about", "must be a mapping", "use 'key: value', or leave it out")
         choice(f"{source}: dtype", document.get("dtype", "float64"), ("float32", "float64"))
         joints = document.get("joints")
         if not isinstance(joints, dict) or not all(isinstance(name, str) for name in joints or [0]):
