@@ -259,7 +259,8 @@ def moved_matrix(matrix: Float64, place: Float64) -> Float64:
     back = place[:3, :3].T
     zero = np.zeros((3, 3))
     turn = np.block([[back, -back @ cross_matrix(place[:3, 3])], [zero, back]])
-    return turn.T @ matrix @ turn
+    moved: Float64 = turn.T @ matrix @ turn
+    return moved
 
 
 def inertia_rows(matrices: Float64) -> Float64:
