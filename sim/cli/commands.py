@@ -10,7 +10,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +25,6 @@ from batchpid.sim.cli.gains import ENDINGS, compare, export, tune
 from batchpid.sim.cli.identify import excite_joints, identify_logs
 from batchpid.sim.cli.inspect import inspect_robot, plot, view
 from batchpid.sim.cli.rollout import demo, rollout
-from batchpid.sim.robot.robot_options import tuned_file
 
 PICTURES = (".png", ".svg")
 DOCUMENTS = (".yaml", ".yml", ".json")
@@ -34,8 +33,6 @@ FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
 FIRST_SECONDS, LINE_SECONDS = 1.0, 10.0
 """Time before the first line about the progress of a command, and between lines [s]."""
-SHOWN_FLAGS = ("base", "engine", "control", "gains")
-"""Flags in the first line that a command prints."""
 FIXED: dict[str | None, bool] = {"fixed": True, "free": False}
 """Values of the flag ``--base``."""
 
@@ -46,87 +43,72 @@ class Output(NamedTuple):
     content: str
     suffixes: tuple[str, ...]
     default: str = ""
-    """Default name with stems of other files and with words, as in :func:`_default_path`; "" for
-    none.
-    """
+    """Default name, with the values of flags in braces; "" for none."""
 
     @property
     def help(self) -> str:
         """Help of the flag."""
-        text = f"{self.content} to write: {' or '.join(self.suffixes)}."
-        if self.default:
-            text += f" Default: {self.default.replace('{', '').replace('}', '')}."
-        return text
+        default = f" Default: {self.default}." if self.default else ""
+        return f"{self.content} to write: {' or '.join(self.suffixes)}.{default}"
 
 
 class CommandFunction(NamedTuple):
     """Function that is a command."""
 
     function: Callable[..., Any]
-    outputs: dict[str, Output]
-    options: tuple[str, ...] = ()
-    """Options of a Runner that are flags."""
+    outputs: Mapping[str, Output] = {}
     loading: tuple[str, ...] = ()
     """Options of :meth:`Robot.load` that are flags."""
 
     def record(self) -> type:
         """Return the record of the flags."""
         outputs = {name: output.help for name, output in self.outputs.items()}
-        return flags.record_of(self.function, self.options, self.loading, outputs)
+        return flags.record_of(self.function, self.loading, outputs)
 
 
 PICTURE = Output("Picture", PICTURES)
 COMMANDS = {
-    "demo": CommandFunction(
-        demo,
-        {"picture": PICTURE._replace(default="out/{ROBOT}-demo.png")},
-        ("engine",),
-        (),
-    ),
+    "demo": CommandFunction(demo, {"picture": PICTURE._replace(default="out/{robot}-demo.png")}),
     "rollout": CommandFunction(
         rollout,
         {"out": Output("Recording", (".h5",)), "picture": PICTURE},
-        ("engine", "workers"),
         ("base", "actuators"),
     ),
     "tune": CommandFunction(
         tune,
-        {
-            "out": Output("Params file", DOCUMENTS, "out/{ROBOT}.tuned.yaml"),
-            "picture": PICTURE._replace(default="{NAME}-tune.png"),
-        },
-        loading=("base", "actuators"),
+        {"out": Output("Params file", DOCUMENTS, "out/{robot}.tuned.yaml"), "picture": PICTURE},
+        ("base", "actuators"),
     ),
-    "compare": CommandFunction(compare, {"picture": PICTURE}, loading=("base", "actuators")),
+    "compare": CommandFunction(compare, {"picture": PICTURE}, ("base", "actuators")),
     "excite": CommandFunction(
-        excite_joints, {"out": Output("Setpoints", (".csv",), "out/{ROBOT}.excite.csv")}
+        excite_joints, {"out": Output("Setpoints", (".csv",), "out/{robot}.excite.csv")}
     ),
     "identify": CommandFunction(
         identify_logs,
         {
-            "out": Output("Actuators file", DOCUMENTS, "out/{ROBOT}.actuators.yaml"),
-            "picture": PICTURE._replace(default="{NAME}-fit.png"),
+            "out": Output("Actuators file", DOCUMENTS, "out/{robot}.actuators.yaml"),
+            "picture": PICTURE,
             "corrected_urdf": Output("URDF with the identified masses", (".urdf",)),
         },
-        loading=("base",),
+        ("base",),
     ),
     "export": CommandFunction(
         export,
-        {"out": Output("File", (".h", ".yaml", ".xml", ".urdf"), "out/{ROBOT}-{ENDING}")},
-        loading=("actuators",),
+        {"out": Output("File", (".h", ".yaml", ".xml", ".urdf"), "out/{robot}-{to}")},
+        ("actuators",),
     ),
-    "inspect": CommandFunction(inspect_robot, {}, loading=("base",)),
+    "inspect": CommandFunction(inspect_robot, loading=("base",)),
     "plot": CommandFunction(
         plot,
         {
             "picture": Output(
                 "Picture, or film of the first 16 envs,",
                 (*PICTURES, ".mp4", ".gif"),
-                "{NAME}-{KIND}.png",
+                "{recording}-{kind}.png",
             )
         },
     ),
-    "view": CommandFunction(view, {}, ("engine", "workers"), ("base", "actuators")),
+    "view": CommandFunction(view, loading=("base", "actuators")),
 }
 
 
@@ -159,11 +141,15 @@ def _output_paths(command: CommandFunction, values: Document) -> dict[str, Path]
             names = value if isinstance(value, tuple) else (value,)
             inputs += [Path(text) for text in names if isinstance(text, str | Path)]
     inputs = [path for path in inputs if path.is_file()]
+    # Defaults are named after the robot, or stand beside the recording.
+    words = values | {"robot": Path(values.get("robot") or DEFAULT_ROBOT).stem}
+    if "recording" in values:
+        words["recording"] = values["recording"].parent / values["recording"].stem
     paths: dict[str, Path] = {}
     for name, output in command.outputs.items():
         path = values[name]
         if path is None and output.default:
-            path = _default_path(output.default, values | paths)
+            path = Path(output.default.format_map(words) + ENDINGS.get(values.get("to", ""), ""))
         if path is not None:
             file_path(name, path, output.suffixes)
             check_output(name, path, inputs, values["force"])
@@ -171,54 +157,26 @@ def _output_paths(command: CommandFunction, values: Document) -> dict[str, Path]
     return paths
 
 
-def _default_path(template: str, values: Document) -> Path:
-    """Return the default path of an output file."""
-    words = {"KIND": values.get("kind"), "ENDING": ENDINGS.get(values.get("to", ""))}
-    words["ROBOT"] = Path(values["robot"] or DEFAULT_ROBOT).stem
-    # A picture has the name of the file that it shows.
-    for name in ("out", "recording"):
-        if values.get(name) is not None:
-            words["NAME"] = values[name].parent / values[name].stem
-    return Path(template.format_map(words))
-
-
 def _arguments(name: str, values: Document) -> Document:
     """Return the arguments of a command's function, with a bar in place of ``progress``, after a
-    line about them.
+    line about the robot.
     """
-    command = COMMANDS[name]
-    accepted = inspect.signature(command.function).parameters
-    # Output files and --force are for execute(), but identify also takes --force.
+    accepted = inspect.signature(COMMANDS[name].function).parameters
+    # Output files and --force are for run(), but identify also takes --force.
     arguments = {name: value for name, value in values.items() if name in accepted}
-    arguments |= {name: values[name] for name in command.options}
     # A recording has a robot already.
     is_recorded = values.get("recording", values.get("play")) is not None
     if "robot" in values and (values["robot"] or not is_recorded):
-        robot = Robot.load(
+        arguments["robot"] = robot = Robot.load(
             values["robot"] or DEFAULT_ROBOT,
             fixed_base=FIXED.get(values.get("base")),
             actuators=values.get("actuators"),
         )
-        arguments["robot"] = robot
         if not is_recorded:
-            print(_settings(robot, values), flush=True)
+            print(f"{robot.name}: {robot.dof} dof", flush=True)
     if "progress" in accepted:
         arguments["progress"] = bar(name)
     return arguments
-
-
-def _settings(robot: Robot, values: Document) -> str:
-    """Return the first line: the robot, the flags that say how it is run, and its default gains."""
-    words = [f"{robot.name}: {robot.dof} dof"]
-    for name in SHOWN_FLAGS:
-        value = values.get(name)
-        if value:
-            words.append(f"{name} {value if isinstance(value, str) else ' '.join(value)}")
-    if "num_envs" in values:
-        if not values.get("gains") and values.get("control", "pid") == "pid":
-            words.append(f"gains {'designed' if tuned_file(robot) is None else 'tuned'}")
-        words.append(f"{values['num_envs']} robots")
-    return ", ".join(words)
 
 
 def _write(name: str, result: Any, path: Path) -> None:

@@ -8,16 +8,16 @@ Python.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
-from dataclasses import MISSING, field, fields, make_dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import tyro
 
-from batchpid.arrays.array_types import Document
 from batchpid.arrays.field_tables import Field, declared, plain
-from batchpid.sim.options.options import OPTION_TYPES, OPTIONS, RunnerKeywords
+from batchpid.sim.options.groups import EngineName
+from batchpid.sim.options.options import OPTIONS, RunnerKeywords
 from batchpid.sim.robot.robot import Robot
 
 
@@ -49,6 +49,8 @@ GAINS_FLAG = flag(
     "NAME|FILE",
 )
 Gains = Annotated[str | None, GAINS_FLAG]
+Engine = Annotated[EngineName, flag(OPTIONS["engine"].flag)]
+Workers = Annotated[int | None, BOUNDS["workers"], flag(OPTIONS["workers"].flag)]
 Randomize = Annotated[
     Path | None,
     flag(
@@ -83,15 +85,12 @@ LOADING = {
 
 
 def record_of(
-    function: Callable[..., object],
-    options: Sequence[str] = (),
-    loading: Sequence[str] = (),
-    outputs: Document | None = None,
+    function: Callable[..., object], loading: Sequence[str], outputs: Mapping[str, str]
 ) -> type:
     """Return a frozen dataclass whose fields are the flags of ``function``, for tyro.
 
-    ``options`` are options of a Runner, and ``loading`` arguments of :meth:`Robot.load`, that have
-    flags too; ``outputs`` are the output files with their help.
+    ``loading`` are arguments of :meth:`Robot.load` that have flags too; ``outputs`` are the output
+    files with their help.
     """
     hints = get_type_hints(function, include_extras=True)
     rows: list[tuple[str, Any, Any]] = []
@@ -99,24 +98,19 @@ def record_of(
         kind = hints[name]
         notes = get_args(kind)
         if Robot in (kind, *notes):
-            rows.append(("robot", ROBOT, field(default=None)))
+            rows.append(("robot", ROBOT, None))
         elif any(isinstance(note, type(GAINS_FLAG)) for note in notes):
-            default = parameter.default
-            is_required = default is inspect.Parameter.empty
-            rows.append((name, kind, field() if is_required else field(default=default)))
-    for name in options:
-        kind = get_args(OPTION_TYPES[name])[0]
-        kind = Annotated[kind, BOUNDS.get(name), flag(OPTIONS[name].flag)]
-        rows.append((name, kind, field(default=getattr(RunnerKeywords, name))))
-    rows += [(name, LOADING[name], field(default=None)) for name in loading]
-    for name, text in (outputs or {}).items():
-        rows.append((name, Annotated[Path | None, flag(text, "FILE")], field(default=None)))
+            rows.append((name, kind, parameter.default))
+    rows += [(name, LOADING[name], None) for name in loading]
+    rows += [
+        (name, Annotated[Path | None, flag(text, "FILE")], None) for name, text in outputs.items()
+    ]
     if outputs:
-        force = Annotated[bool, flag("Replace output files that exist.")]
-        rows.append(("force", force, field(default=False)))
-    # A field without a default stands first.
-    rows.sort(key=lambda row: row[2].default is not MISSING)
-    record = make_dataclass("Flags", rows, frozen=True)
+        rows.append(("force", Annotated[bool, flag("Replace output files that exist.")], False))
+    # A flag without a default stands first.
+    rows.sort(key=lambda row: row[2] is not inspect.Parameter.empty)
+    parts = [row[:2] if row[2] is inspect.Parameter.empty else row for row in rows]
+    record = make_dataclass("Flags", parts, frozen=True)
     record.__doc__ = (inspect.getdoc(function) or "").replace("``", "`")
     return record
 

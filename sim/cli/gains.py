@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from batchpid.export import Exported
 
 ENDINGS = {
-    "c": "pid.h",
-    "ros2_control": "controllers.yaml",
-    "mjcf": "pid.xml",
-    "urdf": "repaired.urdf",
+    "c": ".h",
+    "ros2_control": ".yaml",
+    "mjcf": ".xml",
+    "urdf": ".urdf",
 }
-"""End of the default file name of each target."""
+"""Suffix of the file of each target."""
 USED = {
     "c": ("gains", "limits", "dynamics", "plan"),
     "ros2_control": ("gains", "limits"),
@@ -121,7 +121,7 @@ class ExportedFile:
 
     def save(self, path: Path) -> None:
         """Write the file, with a comment at its end for each difference that it does not name."""
-        file_path("out", path, (Path(ENDINGS[self.target]).suffix,))
+        file_path("out", path, (ENDINGS[self.target],))
         text, differences = self.make(path.absolute().parent)
         comment = COMMENTS.get(self.target, "# {}")
         for difference in differences:

@@ -40,26 +40,23 @@ class Excitation(NamedTuple):
 
     def report(self) -> str:
         """Return the range and the largest speed of each joint."""
-        names = self.robot.joint_names
-        units = self.robot.units
-        low = self.motion.position.min(0)
-        high = self.motion.position.max(0)
-        speed = np.abs(self.motion.velocity).max(0)
-        rows = []
-        still = []
-        for joint, (name, unit) in enumerate(zip(names, units, strict=True)):
-            span = f"{low[joint]:.3f} to {high[joint]:.3f} {unit}"
-            rows.append([name, span, f"{speed[joint]:.3g} {unit}/s"])
-            if low[joint] == high[joint]:
-                still.append(name)
+        motion = self.motion
+        low = motion.position.min(0)
+        high = motion.position.max(0)
+        speed = np.abs(motion.velocity).max(0)
+        joints = zip(self.robot.joint_names, self.robot.units, low, high, speed, strict=True)
+        rows = [
+            [name, f"{least:.3f} to {most:.3f} {unit}", f"{fastest:.3g} {unit}/s"]
+            for name, unit, least, most, fastest in joints
+        ]
         lines = [table(rows, ["joint", "moves from ... to", "fastest"], "lrr")]
-        if still:
+        still = np.array(self.robot.joint_names)[low == high]
+        if still.size:
             lines.append(
                 f"\nToo weak for their friction and gravity, so they stay still: {', '.join(still)}."
             )
         lines.append(
-            f"\n{self.motion.ticks} rows of {self.motion.time[0]:g} s; the robot starts at rest at"
-            " the first row"
+            f"\n{motion.ticks} rows of {motion.time[0]:g} s; the robot starts at rest at the first row"
         )
         return "\n".join(lines)
 
@@ -116,7 +113,7 @@ def identify_logs(
         Field("s", low=1e-5, high=0.01),
         flag(
             "Time step of the control that drove the robot [s]. Default: as the recordings say, else"
-            " the period of the rows up to 2.5 ms, or a part of a longer one of at most 1 ms."
+            " the period of the rows up to 2.5 ms, or a part of a longer one of at most 0.5 ms."
         ),
     ] = None,
     hold: Annotated[

@@ -13,21 +13,21 @@ from collections.abc import Iterable
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from batchpid.arrays.array_types import Document, Progress
+from batchpid.arrays.array_types import Progress
 from batchpid.arrays.field_tables import Field
-from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Finding, Robot, Rollout, read_recording
-from batchpid.sim.cli.flags import Gains, flag
+from batchpid.sim.cli.flags import Engine, Gains, Workers, flag
 from batchpid.sim.cli.gains import law_gains
 from batchpid.sim.description.merging import link_inertias
 from batchpid.sim.description.tables import Body, Joint
 from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.findings import summary
 from batchpid.sim.geometry.shapes import DENSITY
+from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.robot.robot_options import tuned_file
 from batchpid.sim.tuning.gain_sets import GainSet, gain_set, gain_table
 
@@ -243,16 +243,7 @@ def plot(
     The recording may be complete, cut short by a kill, or still being written. A film draws
     the robot of the recording, or the one that is named.
     """
-    return Recording(recording, _read(recording), robot, kind)
-
-
-def _read(path: Path) -> Rollout:
-    """Return the run in a file. Raises InvalidArgumentError for one without ticks."""
-    rollout = read_recording(path)
-    if not len(rollout.time):
-        remedy = "its run was cut short: run it again"
-        raise InvalidArgumentError("recording", f"{path} holds no tick", remedy=remedy)
-    return rollout
+    return Recording(recording, read_recording(recording), robot, kind)
 
 
 def recording_line(path: Path, rollout: Rollout) -> str:
@@ -272,21 +263,23 @@ def view(
     time_limit: Annotated[
         float | None, Field("s"), flag("Stop after this wall-clock time [s]. Default: none.")
     ] = None,
-    **options: Any,
+    engine: Engine = DEFAULT_ENGINE,
+    workers: Workers = None,
 ) -> None:
     """Show moving robots in the browser: sliders for setpoints, and a chart of a joint.
 
     The page is served on localhost only; from another machine, use ``ssh -L``. With ``--play`` it
     shows a recorded run, of the robot in the recording, or of the one that is named.
     """
-    from batchpid.sim.view import View
+    from batchpid.sim.view import LiveSimulation, View
 
-    if play is None:
-        source: LiveSimulation | Playback = _live(
-            robot or Robot.load("panda"), num_envs, gains, options
-        )
+    if play is not None:
+        source: LiveSimulation | Playback = _recorded(play, robot)
     else:
-        source = _recorded(play, robot)
+        robot = robot or Robot.load("panda")
+        # Without gains the Runner has its own default, which knows the loops of an MJCF file.
+        params = None if gains is None else law_gains(robot, gains)
+        source = LiveSimulation(robot, num_envs, engine=engine, workers=workers, params=params)
     with closing(source), View(source, port=port) as page:
         for finding in page.findings:
             print(f"batchpid: {finding}", file=sys.stderr)
@@ -296,27 +289,12 @@ def view(
             page.run(time_limit)
 
 
-def _live(
-    robot: Robot,
-    num_envs: int,
-    gains: str | None,
-    options: Document,
-) -> LiveSimulation:
-    """Return the running robots."""
-    from batchpid.sim.view import LiveSimulation
-
-    # Without gains the Runner has its own default, which knows the loops of an MJCF file.
-    if gains is not None:
-        options["params"] = law_gains(robot, gains)
-    return LiveSimulation(robot, num_envs, **options)
-
-
 def _recorded(path: Path, robot: Robot | None) -> Playback:
     """Return the run in the file; of many envs those that fit on the page."""
     from batchpid.sim.view import Playback
     from batchpid.sim.view.scene import MAX_ROBOTS
 
-    rollout = _read(path)
+    rollout = read_recording(path)
     print(recording_line(path, rollout))
     if rollout.num_envs > MAX_ROBOTS:
         print(f"showing the first {MAX_ROBOTS} of {rollout.num_envs} envs")

@@ -21,7 +21,7 @@ from batchpid.checks import array
 from batchpid.errors import InvalidArgumentError
 from batchpid.plan import make_plan
 from batchpid.sim import OperationalSpace, Robot, Rollout, write_recording
-from batchpid.sim.cli.flags import BOUNDS, Gains, NumEnvs, Randomize, flag
+from batchpid.sim.cli.flags import BOUNDS, Engine, Gains, NumEnvs, Randomize, Workers, flag
 from batchpid.sim.diagnosis.causes import (
     cause_lines,
     median_and_worst,
@@ -29,6 +29,7 @@ from batchpid.sim.diagnosis.causes import (
     settled_envs,
     table,
 )
+from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.tuning.evaluation import (
     following_error,
     load_randomization,
@@ -83,9 +84,9 @@ Seconds = Annotated[
 def demo(
     robot: Robot,
     num_envs: NumEnvs = 64,
+    engine: Engine = DEFAULT_ENGINE,
     seconds: Seconds = None,
     progress: Progress[int] | None = None,
-    **options: Any,
 ) -> RunReport:
     """Move 64 arms to a setpoint; print a table of the joints and draw a picture.
 
@@ -95,15 +96,17 @@ def demo(
     return rollout(
         robot,
         num_envs,
+        engine=engine,
         seconds=seconds,
         progress=progress,
-        **options,
     )
 
 
 def rollout(
     robot: Robot,
     num_envs: NumEnvs = 64,
+    engine: Engine = DEFAULT_ENGINE,
+    workers: Workers = None,
     gains: Gains = None,
     control: Annotated[
         Literal["pid", "drive", "osc"],
@@ -146,7 +149,6 @@ def rollout(
     ] = 1 / 2000,
     randomize: Randomize = None,
     progress: Progress[int] | None = None,
-    **options: Any,
 ) -> RunReport:
     """Move N of any robot to a setpoint or along a trajectory; print a table.
 
@@ -158,7 +160,14 @@ def rollout(
     from batchpid.sim.runner.runner import Runner
 
     randomization = load_randomization(randomize, robot)
-    options |= {"timestep": timestep, "randomization": randomization, "control": control}
+    options: Document = {
+        "engine": engine,
+        "workers": workers,
+        "timestep": timestep,
+        "substeps": SETPOINT_SUBSTEPS,
+        "randomization": randomization,
+        "control": control,
+    }
     # Gains, or the controller of a tool.
     center: Rows = robot.start
     goal: ArrayLike = robot.target
@@ -171,69 +180,60 @@ def rollout(
         columns = operational.command.names
         goal = operational.tool_pose(robot.target)
         center = robot.target
-    else:
+    elif gains is not None:
         # Without gains the Runner has its own default, which knows the loops of an MJCF file.
-        if gains is not None:
-            chosen = gain_set(robot, gains)
-            options["params"] = chosen.params
-            if chosen.control == "drive":
-                options["control"] = "drive"
+        chosen = gain_set(robot, gains)
+        options["params"] = chosen.params
+        if chosen.control == "drive":
+            options["control"] = "drive"
 
-    # Setpoints: of a file, or one that is held.
+    # Setpoints: one that is held, or the rows of a file.
     notes: list[str] = []
-    further = Document()
+    inputs = Document()
     meant: Rows | None = None
-    if trajectory is None and by_plan:
-        raise InvalidArgumentError(
-            "by_plan", "is for a trajectory", remedy="give --trajectory FILE"
-        )
-    if by_plan and not rates:
-        raise InvalidArgumentError("by_plan", "makes the rates", remedy="leave --no-rates out")
-    if trajectory is not None and by_plan:
-        from batchpid.sim.recording.setpoint_files import read_setpoints
-
-        _refuse("setpoint", setpoint, "is given by the trajectory")
-        _refuse("seconds", seconds, "is given by the trajectory")
-        motion = read_setpoints(robot, trajectory, None)
-        center = center if motion.start is None else motion.start
-        options["substeps"] = SETPOINT_SUBSTEPS
-        options["plan"] = make_plan(
-            robot.dof, period=motion.period, horizon=CHUNK_ROWS, blend="newest"
-        )
-        knots = np.vstack([center, motion.position])
-        tick = timestep * SETPOINT_SUBSTEPS
-        setpoints, ages, meant = _chunks(knots, motion.period, tick, num_envs)
-        further = {"latency": ages}
-        notes.append(f"Rows every {1000 * motion.period:.4g} ms, executed by a plan.")
-    elif trajectory is not None:
-        from batchpid.sim.recording.setpoint_files import read_setpoints
-
-        _refuse("setpoint", setpoint, "is given by the trajectory")
-        _refuse("seconds", seconds, "is given by the trajectory")
-        motion = read_setpoints(robot, trajectory, timestep)
-        setpoints = motion.position
-        options["substeps"] = motion.substeps
-        center = center if motion.start is None else motion.start
-        if rates:
-            further = {"setpoint_rates": motion.rate, "setpoint_accelerations": motion.acceleration}
-        if motion.has_rates:
-            source = "from the file"
-        else:
-            source = "central differences of the rows"
-        notes.append(f"Rates of the setpoints: {source if rates else 'not given'}.")
-        if motion.steps and rates:
-            notes.append(
-                f"{motion.steps} steps of the setpoints exceed the velocity limits; their rate is 0."
-            )
-    else:
+    if trajectory is None:
+        if by_plan:
+            _refuse("by_plan", True, "is for a trajectory")
         goal = goal if setpoint is None else setpoint
         row = array("setpoint", goal, (1, len(columns)), columns, kind="entry")[0]
-        options["substeps"] = SETPOINT_SUBSTEPS
         # The metrics of a step need two ticks.
         ticks = max(2, round((seconds or 2.0) / (timestep * SETPOINT_SUBSTEPS)))
         setpoints = np.tile(row, (ticks, 1))
         if robot.settings is not None and setpoint is None:
             notes += robot.settings.notes
+    else:
+        from batchpid.sim.recording.setpoint_files import read_setpoints
+
+        _refuse("setpoint", setpoint, "is given by the trajectory")
+        _refuse("seconds", seconds, "is given by the trajectory")
+        motion = read_setpoints(robot, trajectory, None if by_plan else timestep)
+        setpoints = motion.position
+        center = center if motion.start is None else motion.start
+        if by_plan:
+            _refuse("by_plan", None if rates else True, "makes the rates, and excludes --no-rates")
+            options["plan"] = make_plan(
+                robot.dof, period=motion.period, horizon=CHUNK_ROWS, blend="newest"
+            )
+            tick = timestep * SETPOINT_SUBSTEPS
+            knots = np.vstack([center, motion.position])
+            setpoints, ages, meant = _chunks(knots, motion.period, tick)
+            inputs = {"latency": np.repeat(ages[:, None], num_envs, 1)}
+            notes.append(f"Rows every {1000 * motion.period:.4g} ms, executed by a plan.")
+        else:
+            options["substeps"] = motion.substeps
+            source = "central differences of the rows"
+            if motion.has_rates:
+                source = "from the file"
+            notes.append(f"Rates of the setpoints: {source if rates else 'not given'}.")
+            if rates:
+                inputs = {
+                    "setpoint_rates": motion.rate,
+                    "setpoint_accelerations": motion.acceleration,
+                }
+            if rates and motion.steps:
+                notes.append(
+                    f"{motion.steps} steps of the setpoints exceed the velocity limits; their rate is 0."
+                )
 
     with Runner(robot, num_envs, **options) as runner:
         # The speed is that of the run alone, without the start of processes.
@@ -241,7 +241,7 @@ def rollout(
         # A start off the trajectory would count as an error of following.
         start = start_poses(robot, num_envs, START_SPREAD if trajectory is None else 0.0, center)
         runner.reset(start, seed=None if randomization is None else 0)
-        result = runner.rollout(setpoints, progress=progress, **further)
+        result = runner.rollout(setpoints, progress=progress, **inputs)
         wall = time.perf_counter() - began
         backend = runner.backend
     if meant is not None:
@@ -257,9 +257,9 @@ def rollout(
     )
 
 
-def _chunks(knots: Rows, period: float, tick: float, num_envs: int) -> tuple[Rows, Float64, Rows]:
-    """Return the chunks (ticks, 1, rows, dof) of ``knots`` (n + 1, dof), the first one at time 0, their
-    ages (ticks, envs) [s], infinite without a chunk, and the setpoints at the ends of ticks.
+def _chunks(knots: Rows, period: float, tick: float) -> tuple[Rows, Float64, Rows]:
+    """Return the chunks (ticks, 1, rows, dof) of ``knots`` (n + 1, dof), the first one at time 0,
+    their ages (ticks,) [s], infinite without a chunk, and the setpoints at the ends of ticks.
     """
     count = len(knots) - 1
     times = tick * np.arange(max(2, math.ceil(count * period / tick)))
@@ -271,7 +271,7 @@ def _chunks(knots: Rows, period: float, tick: float, num_envs: int) -> tuple[Row
     ages = np.where(is_new, times - step * numbers * period, np.inf)
     places = period * np.arange(count + 1)
     meant = np.stack([np.interp(times + tick, places, column) for column in knots.T], 1)
-    return knots[rows][:, None], np.repeat(ages[:, None], num_envs, 1), meant
+    return knots[rows][:, None], ages, meant
 
 
 def start_poses(

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -34,7 +32,16 @@ def test_tune_writes_the_better_gains_with_settings(batchpid, tmp_path, monkeypa
     robot = Robot.load(write(tmp_path, one_joint(), "my arm.urdf"))
     Path("payload.yaml").write_text("payload: {uniform: [0, 0.5]}")
     bp.save_actuators("motors.yaml", bp.make_actuators(1, command_delay=0.001), robot.joint_names)
-    flags = ("--actuators", "motors.yaml", "--randomize", "payload.yaml", "--out", "gains.yaml")
+    flags = (
+        "--actuators",
+        "motors.yaml",
+        "--randomize",
+        "payload.yaml",
+        "--out",
+        "gains.yaml",
+        "--picture",
+        "tune.png",
+    )
     status, said, error = batchpid("tune", "my arm.urdf", "--generations", 1, *flags)
     assert status == 0, error
     about = documents.read("gains.yaml")["about"]
@@ -43,7 +50,7 @@ def test_tune_writes_the_better_gains_with_settings(batchpid, tmp_path, monkeypa
     assert ("The designed gains are the result" in said) == ("rejected" in about)
     assert "gains at the start pose" in said
     assert not [name for name, value in about.items() if value in ("True", "False", "None")]
-    assert (tmp_path / "gains-tune.png").stat().st_size > 5_000
+    assert (tmp_path / "tune.png").stat().st_size > 5_000
 
 
 @pytest.mark.parametrize("drawn", [False, pytest.param(True, marks=pytest.mark.slow)])
