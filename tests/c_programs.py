@@ -1,10 +1,7 @@
 """C programs around exported headers."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 
@@ -28,18 +25,14 @@ int main(void) {{
 """Mass matrix, bias and gravity of ``n`` joints of type ``t`` at states from stdin."""
 
 
-def compiled(
-    folder: Path, text: str, *flags: str, compiler: str = COMPILERS[0] if COMPILERS else ""
-) -> Path:
+def compiled(folder, text, *flags, compiler=COMPILERS[0] if COMPILERS else ""):
     source, binary = folder / "law.c", folder / "law"
     source.write_text(text)
     subprocess.run([compiler, *STRICT, *flags, str(source), "-o", str(binary), "-lm"], check=True)
     return binary
 
 
-def law_program(
-    header: str, inputs: list[tuple[str, int]], prefix: str, kind: str, joints: int
-) -> str:
+def law_program(header, inputs, prefix, kind, joints):
     """Return a program that reads steps from stdin and writes their efforts to stdout; step RESET is
     after a reset.
     """

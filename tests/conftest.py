@@ -1,7 +1,6 @@
 """Settings of every test, and fixtures of tests in several folders."""
 
 import signal
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def undrawn(monkeypatch):
     """Pictures are not drawn: that takes longer than the robots."""
     for name in ("step_responses", "comparison", "fit_errors"):
         monkeypatch.setattr(f"batchpid.sim.plots.{name}", lambda *_, **__: None)
@@ -26,7 +25,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def quick_compilation() -> Iterator[None]:
+def quick_compilation():
     """Make JAX compile with few optimisations."""
     jax = pytest.importorskip("jax")
     jax.config.update("jax_disable_most_optimizations", True)
@@ -36,11 +35,11 @@ def quick_compilation() -> Iterator[None]:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Make most rows of tests with ``quick_rows`` slow, and give each slow test hours, to end only
     one that hangs.
     """
-    rows: dict[tuple[str, int], list[pytest.Item]] = {}
+    rows = {}
     for item in items:
         if (quick := item.get_closest_marker("quick_rows")) is not None and item.get_closest_marker(
             "slow"

@@ -1,7 +1,5 @@
 """Code blocks of the pages, and what makes them short."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import shlex
@@ -30,11 +28,11 @@ SHORTER_CODE = {
 TWO_JOINTS = robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", "c"))
 
 
-def blocks(page: Path, *languages: str) -> list[re.Match]:
+def blocks(page, *languages):
     return [match for match in BLOCK.finditer(page.read_text()) if match["language"] in languages]
 
 
-def shell_lines(page: Path) -> list[list[str]]:
+def shell_lines(page):
     """Return the words of each command that can be run here: in shell blocks, and after "$ " in
     blocks that show what commands print.
     """
@@ -44,6 +42,6 @@ def shell_lines(page: Path) -> list[list[str]]:
     return [words for line in code.splitlines() if (words := shlex.split(line, comments=True))]
 
 
-def missing(match: re.Match) -> list[str]:
+def missing(match):
     needed = re.findall(r"[\w.]+", match["needs"] or "")
     return [name for name in needed if importlib.util.find_spec(name) is None]

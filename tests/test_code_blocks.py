@@ -8,8 +8,6 @@ take minutes or wait for a person are cut short or only parsed, and so are comma
 C blocks compile next to the files that the commands of their page write.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import shlex
@@ -52,11 +50,11 @@ RARE = {
 ONLY_PARSED = ("tune", "identify")
 
 
-def name(page: Path) -> str:
+def name(page):
     return str(page.relative_to(ROOT))
 
 
-def pages_with(language: str) -> list:
+def pages_with(language):
     """Return the pages with blocks in ``language``, the rare ones marked as slow."""
     marks = {page: [pytest.mark.slow] if name(page) in RARE[language] else [] for page in PAGES}
     return [pytest.param(page, marks=marks[page]) for page in PAGES if blocks(page, language)]
@@ -94,7 +92,7 @@ SOURCES = [
     *("assets/*", "Makefile", "pyproject.toml", "setup.py", ".ci/*"),
 ]
 FOREIGN = """
-ActuatorCfg DCMotorCfg PDJointPosControllerConfig max_effort slewmax mjDSBL_CONSTRAINT
+ActuatorCfg DCMotorCfg PDJointPosControllerConfig max_effort mjDSBL_CONSTRAINT
 first_robot zero_qpos pid_qf get_joints viewer sim_freq control_freq pd_joint_pos pd_joint_delta_pos
 _load_scene balance_passive_force proportional_on_measurement error_map set_auto_mode last_output
 gym_env_vectorize_mode impratio noslip_iterations auth verifies ulimit jax_numpy_rank_promotion
@@ -160,7 +158,7 @@ def test_python_blocks_run(page, tmp_path, monkeypatch, capsys, request):
     if page.name != "README.md":
         monkeypatch.setattr(batchpid.sim, "Runner", partial(Runner, workers=0))
     shorter = SHORTER_CODE | ({'"panda"': '"two.urdf"'} if name(page) in ON_TWO_JOINTS else {})
-    namespace: dict = {"__name__": "__main__"}
+    namespace = {"__name__": "__main__"}
     for match in blocks(page, "python"):
         if missing(match):
             continue
@@ -216,7 +214,7 @@ def test_c_blocks_compile_with_the_files_that_the_commands_write(
             subprocess.run(["cc", *flags, "block.c"], check=True)
 
 
-def write_files() -> None:
+def write_files():
     """Write the files that the commands of all pages may read."""
     panda = Robot.load("panda")
     shutil.copy(panda.path, "arm.urdf")
@@ -228,7 +226,7 @@ def write_files() -> None:
     )
 
 
-def run(words: list[str]) -> None:
+def run(words):
     while re.fullmatch(r"[A-Z_]+=\S*", words[0]):  # a variable of the environment
         words = words[1:]
     program, *rest = words
@@ -252,7 +250,7 @@ def run(words: list[str]) -> None:
         command(*rest)
 
 
-def command(name: str, *flags: str) -> None:
+def command(name, *flags):
     assert name in COMMANDS
     if name in ONLY_PARSED:
         parse([name, *flags])

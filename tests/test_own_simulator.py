@@ -2,8 +2,6 @@
 page says.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from pages import ROOT, blocks
@@ -17,8 +15,8 @@ LONGEST = 30
 
 
 @pytest.fixture
-def namespace() -> dict:
-    values: dict = {"__name__": "__main__"}
+def namespace():
+    values = {"__name__": "__main__"}
     exec(MODEL, values)
     exec(PLAIN.split("pid = ")[0], values)
     return values

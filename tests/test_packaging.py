@@ -1,7 +1,5 @@
 """The distribution: every package and data file is in it, every extra exists."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

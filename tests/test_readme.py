@@ -1,7 +1,5 @@
 """The README: short, with one picture and one program, and with figures that were measured."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

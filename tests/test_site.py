@@ -2,8 +2,6 @@
 target.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import sys
@@ -35,7 +33,7 @@ def test_the_packages_with_public_names_are_found():
     assert {"batchpid", *(f"batchpid.{room}" for room in rooms)} <= set(PACKAGES)
 
 
-def places(package: str, name: str) -> set[str]:
+def places(package, name):
     """Return the entries of the reference that would show a public name: its own, its package's, or
     its module's.
     """

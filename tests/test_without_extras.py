@@ -2,14 +2,11 @@
 that it needs.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
@@ -49,7 +46,7 @@ print(json.dumps(results))
 """
 
 
-def modules_of_extras() -> list[str]:
+def modules_of_extras():
     """Return the modules of all packages of the users' extras."""
     packages = {Requirement(need).name for extra in FOR_USERS for need in EXTRAS[extra]} - {
         "batchpid"
@@ -70,7 +67,7 @@ def test_the_base_contains_no_package_of_an_extra():
 
 
 @pytest.mark.slow
-def test_each_command_and_program_runs_or_names_its_extra(tmp_path: Path):
+def test_each_command_and_program_runs_or_names_its_extra(tmp_path):
     lines = [
         words[1:]
         for page in (README, INDEX)

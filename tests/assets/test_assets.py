@@ -2,12 +2,8 @@
 touch each other.
 """
 
-from __future__ import annotations
-
 import importlib.resources
 import warnings
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,13 +28,13 @@ GAINS = {
 }
 
 
-def xml(name: str) -> etree._Element:
+def xml(name):
     return etree.fromstring(
         (importlib.resources.files("batchpid.assets") / f"{name}.urdf").read_bytes()
     )
 
 
-def settings(name: str) -> dict:
+def settings(name):
     return yaml.safe_load(
         (importlib.resources.files("batchpid.assets") / f"{name}.yaml").read_text()
     )
@@ -47,7 +43,7 @@ def settings(name: str) -> dict:
 class World:
     """Scene of one robot, built without its visuals."""
 
-    def __init__(self, root: etree._Element, folder: Path) -> None:
+    def __init__(self, root, folder):
         for visual in list(root.iter("visual")):
             visual.getparent().remove(visual)
         path = folder / "robot.urdf"
@@ -58,12 +54,12 @@ class World:
         self.robot = self.scene.create_urdf_loader().load(str(path))
         self.joints = self.robot.get_active_joints()
 
-    def passive(self, qpos: list[float], qvel: list[float]) -> np.ndarray:
+    def passive(self, qpos, qvel):
         self.robot.set_qpos(np.array(qpos, np.float32))
         self.robot.set_qvel(np.array(qvel, np.float32))
         return self.robot.compute_passive_force()
 
-    def touching(self, qpos: np.ndarray) -> set[tuple[str, ...]]:
+    def touching(self, qpos):
         """Return the pairs of bodies whose shapes overlap at ``qpos``."""
         self.robot.set_qpos(np.asarray(qpos, np.float32))
         self.robot.set_qvel(np.zeros(self.robot.dof, np.float32))
@@ -76,16 +72,16 @@ class World:
 
 
 @pytest.fixture(params=ROBOTS)
-def name(request: pytest.FixtureRequest) -> str:
+def name(request):
     return request.param
 
 
 @pytest.fixture
-def world(name: str, tmp_path: Path) -> Iterator[World]:
+def world(name, tmp_path):
     return World(xml(name), tmp_path)
 
 
-def test_shapes_are_primitives_and_materials_exist(name: str) -> None:
+def test_shapes_are_primitives_and_materials_exist(name):
     root = xml(name)
     shapes = [shape for geometry in root.iter("geometry") for shape in geometry]
     assert {shape.tag for shape in shapes} <= {"box", "cylinder", "sphere"}
@@ -95,7 +91,7 @@ def test_shapes_are_primitives_and_materials_exist(name: str) -> None:
     assert {material.get("name") for material in root.iterfind("link/visual/material")} == defined
 
 
-def test_every_link_has_a_material_a_collision_shape_and_a_possible_inertia(name: str) -> None:
+def test_every_link_has_a_material_a_collision_shape_and_a_possible_inertia(name):
     for link in xml(name).findall("link"):
         assert link.find("visual/material") is not None
         assert link.find("collision") is not None
@@ -110,15 +106,13 @@ def test_every_link_has_a_material_a_collision_shape_and_a_possible_inertia(name
         assert small + middle >= large, "no solid has these moments"
 
 
-def test_the_total_mass_is_that_of_the_source_and_no_link_is_massless(
-    name: str, world: World
-) -> None:
+def test_the_total_mass_is_that_of_the_source_and_no_link_is_massless(name, world):
     masses = [link.mass for link in world.robot.links]
     assert sum(masses) == pytest.approx(MASS[name], abs=1e-6)
     assert min(masses) == pytest.approx(0.01 if name == "jaco2" else 0.015)
 
 
-def test_panda_passive_force_is_that_of_the_source(tmp_path: Path) -> None:
+def test_panda_passive_force_is_that_of_the_source(tmp_path):
     # Expected values: SAPIEN 3.0.3 on the source description, without mimic and meshes.
     passive = World(xml("panda"), tmp_path).passive(
         [0.3, -0.4, 0.5, -1.6, 0.7, 1.8, -0.9, 0.01, 0.03],
@@ -138,7 +132,7 @@ def test_panda_passive_force_is_that_of_the_source(tmp_path: Path) -> None:
     np.testing.assert_allclose(passive, expected, atol=5e-5)
 
 
-def test_jaco2_passive_force_without_the_additions_is_that_of_the_source(tmp_path: Path) -> None:
+def test_jaco2_passive_force_without_the_additions_is_that_of_the_source(tmp_path):
     # Expected values: SAPIEN 3.0.3 on the source description, which has neither finger 2 nor moving
     # tips.
     root = xml("jaco2")
@@ -166,14 +160,14 @@ def test_jaco2_passive_force_without_the_additions_is_that_of_the_source(tmp_pat
     np.testing.assert_allclose(passive, expected, atol=5e-5)
 
 
-def test_no_links_touch_at_start_or_target_or_between(name: str, world: World) -> None:
+def test_no_links_touch_at_start_or_target_or_between(name, world):
     rows = settings(name)["joints"].values()
     start, target = (np.array([row[key] for row in rows]) for key in ("start", "target"))
     for share in np.linspace(0, 1, 21):
         assert not world.touching(start + share * (target - start))
 
 
-def test_settings_are_the_tutorials_and_within_limits(name: str, world: World) -> None:
+def test_settings_are_the_tutorials_and_within_limits(name, world):
     data = settings(name)
     rows = data["joints"].values()
     assert data["drive"] == {"stiffness": 20, "damping": 5}

@@ -1,7 +1,6 @@
 """Cases that the tests of the law share: every option, a made-up run, and its efforts."""
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -19,7 +18,7 @@ UNITS = ("effort", "mass_matrix", "implicit")
 
 GAINS = {"kp": [40.0, 20.0, 0.5], "ki": [5.0, 50.0, 0.0], "kd": [2.0, 0.3, 0.02]}
 LIMITED = GAINS | {"effort_limit": [30.0, 8.0, 1.0]}
-OPTIONS: dict[str, dict[str, Any]] = {
+OPTIONS = {
     "p": {"kp": 3.0},
     "pd": {"kp": 3.0, "kd": 0.4},
     "pid": GAINS,
@@ -90,14 +89,12 @@ DRIVE_LACKS = (
 """Options of the law that a drive does not have."""
 
 
-def generated_options(
-    seed: int, envs: int = ENVS, joints: int = JOINTS, units: str = "effort"
-) -> dict[str, Any]:
+def generated_options(seed, envs=ENVS, joints=JOINTS, units="effort"):
     """Return arguments of make_params of any combination, with an entry for each env and joint,
     some of them off. ``units`` are the gain_units; "implicit" is the law of that name.
     """
     rng, shape = np.random.default_rng(seed), (envs, joints)
-    options: dict[str, Any] = {"kp": rng.uniform(0.5, 40, shape)}
+    options = {"kp": rng.uniform(0.5, 40, shape)}
     for name, (off, on) in NUMBERS.items():
         if rng.random() < 0.6:
             options[name] = np.where(
@@ -119,7 +116,7 @@ def generated_options(
     return options | {"gain_units": "effort" if units == "effort" else "mass_matrix"}
 
 
-def read_only(value: Any, dtype: Any = np.float64) -> Any:
+def read_only(value, dtype=np.float64):
     array = np.array(value, dtype=dtype)
     array.setflags(write=False)
     return array
@@ -138,18 +135,18 @@ class Inputs(NamedTuple):
     mass_matrix: Any = None
     """(steps, envs, joints, joints), for gains per mass matrix."""
 
-    def given(self, *names: str) -> Any:
+    def given(self, *names):
         """Return these inputs with the optional ones of ``names`` alone."""
         return Inputs(*self[:2], **{name: getattr(self, name) for name in names})
 
-    def at(self, step: int, array: Callable[..., Any] = np.asarray) -> dict[str, Any]:
+    def at(self, step, array=np.asarray):
         """Return the given inputs of a step, by name."""
         return {
             name: array(rows[step]) for name, rows in self._asdict().items() if rows is not None
         }
 
 
-def made_up_inputs(envs: int = ENVS, joints: int = JOINTS, count: int = 30) -> Inputs:
+def made_up_inputs(envs=ENVS, joints=JOINTS, count=30):
     """Return ``count`` steps that saturate, wrap and reverse; float32 numbers, so that every executor gets the
     same.
     """
@@ -166,7 +163,7 @@ def made_up_inputs(envs: int = ENVS, joints: int = JOINTS, count: int = 30) -> I
     return Inputs(*(np.asarray(each, np.float32).astype(float) for each in arrays))
 
 
-def advanced(params: bp.PIDParams, state: bp.PIDState, row: dict[str, Any]) -> tuple[Any, Any]:
+def advanced(params, state, row):
     """Return state and effort of the pure functions after a step with the inputs ``row``."""
     if "mass_matrix" not in row:
         return bp.step(params, state, dt=DT, **row)
@@ -175,12 +172,12 @@ def advanced(params: bp.PIDParams, state: bp.PIDState, row: dict[str, Any]) -> t
 
 
 def by_steps(
-    params: bp.PIDParams,
-    inputs: Inputs,
-    step: Callable[..., Any] = advanced,
-    array: Callable[..., Any] = read_only,
-    keep: bool = True,
-) -> np.ndarray:
+    params,
+    inputs,
+    step=advanced,
+    array=read_only,
+    keep=True,
+):
     """Return the efforts (steps, envs, joints) of ``step``; ``array`` makes its arrays, by default
     read-only ones. Without ``keep`` the reset takes the integral, too.
     """
@@ -200,12 +197,12 @@ def by_steps(
 
 
 def by_c(
-    params: bp.PIDParams,
-    inputs: Inputs,
-    *flags: str,
-    compiler: str | None = None,
-    guard: bp.Guard | None = None,
-) -> np.ndarray:
+    params,
+    inputs,
+    *flags,
+    compiler=None,
+    guard=None,
+):
     """Return the efforts (steps, 1, joints) of the header for the first env."""
     params = params.for_envs(slice(1))
     columns = {

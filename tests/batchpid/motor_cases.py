@@ -1,7 +1,5 @@
 """Options of motors that tests share: every effect at once, and random ones."""
 
-from __future__ import annotations
-
 ALL = {
     "command_delay": 0.0017,
     "sensor_delay": [[0.0008, 0.002, 0.0, 0.0013]],

@@ -1,7 +1,5 @@
 """The sampled loop of the law and a chain of rigid bodies, exactly: one matrix for a time step."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

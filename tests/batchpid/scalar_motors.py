@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 
-def difference(a: float, b: float, continuous: bool) -> float:
+def difference(a, b, continuous):
     """Return a - b, the short way round on a continuous joint."""
     return math.remainder(a - b, 2 * math.pi) if continuous else a - b
 
 
-def within(value: float, low: float, high: float) -> float:
+def within(value, low, high):
     return min(max(value, low), high)
 
 
@@ -32,7 +32,7 @@ class ScalarGuard:
     speed: float = 0.0
     requested: float | None = None
 
-    def step(self, asked: float, dt: float) -> float:
+    def step(self, asked, dt):
         target = asked if self.continuous else within(asked, self.lower, self.upper)
         last = self.setpoint if self.requested is None else self.requested
         wanted = difference(target, self.setpoint, self.continuous) / dt
@@ -48,7 +48,7 @@ class ScalarGuard:
         self.speed, self.requested = speed, target
         return self.setpoint
 
-    def stop(self, distance: float, dt: float) -> float:
+    def stop(self, distance, dt):
         change = self.acceleration * dt
         steps = 1
         while math.isfinite(distance) and change * dt * steps * (steps + 1) / 2 < distance:
@@ -73,11 +73,11 @@ class ScalarFriction:
     load: float = 0.0
     slides: bool = False
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         held = max(self.coulomb, self.static) + self.load * abs(self.effort)
         self.slides |= self.gain * abs(self.velocity) > held
 
-    def step(self, effort: float, velocity: float) -> float:
+    def step(self, effort, velocity):
         bound, rest = self.coulomb, max(self.coulomb, self.static)
         if not self.slides:
             bound = rest
@@ -90,9 +90,7 @@ class ScalarFriction:
         return self.effort - self.viscous * velocity
 
 
-def friction_gains(
-    mass: np.ndarray, viscous: np.ndarray, rubs: np.ndarray, dt: float
-) -> tuple[list, list]:
+def friction_gains(mass, viscous, rubs, dt):
     """Return K and w of the joints of one robot with a ``mass`` matrix; ``rubs`` says which joints
     have friction.
     """
@@ -128,7 +126,7 @@ class ScalarMotor:
     measured: list = field(default_factory=list)
     delivered: float | None = None
 
-    def ends(self, position: float, velocity: float) -> tuple[float, float]:
+    def ends(self, position, velocity):
         """Return the least and the largest effort that the motor delivers."""
         limit = self.effort_limit
         if math.isinf(self.saturation_effort):
@@ -137,7 +135,7 @@ class ScalarMotor:
         stall = self.saturation_effort
         return within(-stall - lost, -limit, limit), within(stall - lost, -limit, limit)
 
-    def deliver(self, effort: float, position: float, velocity: float, dt: float) -> float:
+    def deliver(self, effort, position, velocity, dt):
         low, high = self.ends(position, velocity)
         if self.delivered is None:
             self.delivered = within(self.bias, *self.ends(self.start, 0.0))
@@ -151,7 +149,7 @@ class ScalarMotor:
         self.delivered = motor
         return motor
 
-    def measure(self, position: float, velocity: float, dt: float) -> tuple[float, float]:
+    def measure(self, position, velocity, dt):
         if self.backlash > 0:
             behind = difference(
                 self.measured[-1][0] if self.measured else self.start, position, self.continuous
@@ -170,7 +168,7 @@ class ScalarMotor:
             rounded(velocity, self.velocity_resolution),
         )
 
-    def late(self, values: list, steps: float, before: float, less) -> float:
+    def late(self, values, steps, before, less):
         """Return the last of ``values`` as it was ``steps`` ago, interpolated; ``before`` the first
         it was that.
         """
@@ -180,5 +178,5 @@ class ScalarMotor:
         return near if share < 1e-5 else near + share * less(far, near)
 
 
-def rounded(value: float, step: float) -> float:
+def rounded(value, step):
     return round(value / step) * step if step else value

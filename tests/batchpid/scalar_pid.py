@@ -6,12 +6,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any
-
-from batchpid import PIDParams
 
 
-def within(value: float, low: float, high: float) -> float:
+def within(value, low, high):
     return min(max(value, low), high)
 
 
@@ -39,14 +36,14 @@ class ScalarPID:
     non_finite: str = "propagate"
     discretization: str = "explicit"
 
-    def start(self, measurement: float, integral: float = 0.0) -> None:
+    def start(self, measurement, integral=0.0):
         """Forget the past; the next step is the first after this measurement."""
         self.integral = within(integral, self.integral_min, self.integral_max)
         self.measurement = self.origin = measurement
         self.derivative = self.effort = self.size = 0.0
-        self.setpoint: float | None = None
+        self.setpoint = None
 
-    def step(self, setpoint: float, measurement: float, dt: float, **optional: float) -> float:
+    def step(self, setpoint, measurement, dt, **optional):
         """Return the effort after ``dt`` more seconds."""
         if self.non_finite != "propagate" and not all(
             map(math.isfinite, (setpoint, measurement, *optional.values()))
@@ -64,13 +61,13 @@ class ScalarPID:
 
     def total(
         self,
-        setpoint: float,
-        measurement: float,
-        dt: float,
-        measurement_rate: float | None = None,
-        setpoint_rate: float | None = None,
-        feedforward: float = 0.0,
-    ) -> float:
+        setpoint,
+        measurement,
+        dt,
+        measurement_rate=None,
+        setpoint_rate=None,
+        feedforward=0.0,
+    ):
         """Return the sum of the terms, without the limits of the effort."""
         error = self.difference(setpoint, measurement)
         self.error = error = math.copysign(max(abs(error) - self.deadband, 0.0), error)
@@ -95,7 +92,7 @@ class ScalarPID:
         self.origin += late
         if self.discretization == "implicit":
 
-            def law(acceleration: float) -> float:
+            def law(acceleration):
                 """Return the terms at the end of the step, but for the integral so far."""
                 ahead = dt * (velocity + dt * acceleration)
                 weighted = self.weighted(error - ahead, measurement + ahead)
@@ -111,12 +108,12 @@ class ScalarPID:
         self.measurement, self.setpoint = measurement, setpoint
         return sum(terms)
 
-    def weighted(self, error: float, measurement: float) -> float:
+    def weighted(self, error, measurement):
         """Return the error with the weight of the setpoint."""
         weight = self.setpoint_weight
         return weight * error - (1 - weight) * (measurement - self.origin)
 
-    def settle(self, effort: float, deeper: bool) -> None:
+    def settle(self, effort, deeper):
         """Finish a step that has given ``effort``; ``deeper`` says whether the integral would
         saturate it more.
         """
@@ -125,12 +122,12 @@ class ScalarPID:
         self.integral = within(self.integral, self.integral_min, self.integral_max)
         self.effort = effort
 
-    def difference(self, a: float, b: float) -> float:
+    def difference(self, a, b):
         """Return a - b, the short way round on a continuous joint."""
         return math.remainder(a - b, 2 * math.pi) if self.continuous else a - b
 
 
-def step_of_robot(pids: list[ScalarPID], dt: float, mass_matrix: Any, inputs: Any) -> list[float]:
+def step_of_robot(pids, dt, mass_matrix, inputs):
     """Return the efforts of the joints of one robot whose gains are per mass matrix; ``inputs``
     are numbers by name, for each joint.
     """
@@ -167,14 +164,14 @@ def step_of_robot(pids: list[ScalarPID], dt: float, mass_matrix: Any, inputs: An
     return efforts
 
 
-def scalar_pids(params: PIDParams, num_envs: int) -> list[list[ScalarPID]]:
+def scalar_pids(params, num_envs):
     """Return one :class:`ScalarPID` per env and joint with the options of ``params``."""
     known = {field.name for field in fields(ScalarPID)}
     if params.ki is None:  # without an integral there is nothing to limit
         known -= {"integral_min", "integral_max", "anti_windup", "tracking_time"}
     options = {name: value for name, value in params.options().items() if name in known}
 
-    def pick(value: Any, env: int, joint: int) -> Any:
+    def pick(value, env, joint):
         if isinstance(value, str):
             return value
         return value.tolist()[env if value.shape[0] > 1 else 0][joint]

@@ -23,7 +23,7 @@ def couplings(draw):
     return Coupling.of(joints, followers), followers
 
 
-def arrays(joints: int, seed: int = 0) -> tuple[np.ndarray, ...]:
+def arrays(joints, seed=0):
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(3, joints, joints))
     return (

@@ -1,7 +1,5 @@
 """Designed gains: the equations, the poles, and the stability bound, on robots made of arrays."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """States and results have the params' dtype, whatever the dtype of the inputs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

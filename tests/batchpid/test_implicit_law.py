@@ -2,8 +2,6 @@
 it with its equation, solved numerically.
 """
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Metrics against closed-form second-order responses, and their behaviour at the edges."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -4,8 +4,6 @@ combination of options.
 Executors are NumPy on read-only arrays, JAX, and native programs, which are bit-identical to NumPy.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 

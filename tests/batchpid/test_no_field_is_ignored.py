@@ -2,8 +2,6 @@
 params changes the result; the other fields have oracles in the tables of conformance.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ctrl-C while a package is imported is not lost."""
 
-from __future__ import annotations
-
 import pytest
 
 from batchpid.io.files import imported, uninterrupted

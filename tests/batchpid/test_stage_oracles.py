@@ -3,8 +3,6 @@ numbers of steps. Law, guard, motors and friction have their oracles in test_law
 test_motor_conformance.py.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from batchpid.task_space.frames import matrix_of, rotate
-from batchpid.trajectories import Trajectory, minimum_jerk, straight_line, trapezoidal
+from batchpid.trajectories import minimum_jerk, straight_line, trapezoidal
 
 DT = 0.004
 LIMITS = {"max_velocity": [1.0, 2.0, np.inf], "max_acceleration": [3.0, 8.0, 5.0]}
@@ -23,7 +23,7 @@ MOVES = {
 each_move = pytest.mark.parametrize("move", MOVES.values(), ids=MOVES)
 
 
-def with_start(trajectory: Trajectory, start: np.ndarray) -> np.ndarray:
+def with_start(trajectory, start):
     return np.concatenate(
         [np.broadcast_to(start, trajectory.position.shape[1:])[None], trajectory.position]
     )

@@ -5,8 +5,6 @@ Wrong values for options of joints come from the declared fields. Other wrong va
 table, by argument.
 """
 
-from __future__ import annotations
-
 import inspect
 import math
 

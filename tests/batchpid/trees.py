@@ -1,7 +1,5 @@
 """Kinematic trees for tests: bundled robots, random trees, and a planar arm of two links."""
 
-from __future__ import annotations
-
 import functools
 import tempfile
 from pathlib import Path
@@ -18,7 +16,7 @@ NAMES = ["panda", "jaco2", 0, 1, 2]
 
 
 @functools.cache
-def robot_of(name: str | int) -> Robot:
+def robot_of(name):
     if isinstance(name, str):
         return load_bundled(name)
     folder = Path(tempfile.mkdtemp())  # kept, since an export reads the file again
@@ -26,11 +24,11 @@ def robot_of(name: str | int) -> Robot:
 
 
 @functools.cache
-def tree_of(name: str | int) -> RigidTree:
+def tree_of(name):
     return robot_of(name).kinematic_tree()
 
 
-def tool_of(name: str | int) -> str:
+def tool_of(name):
     """Return a link at the end of the longest chain of joints."""
     tree = tree_of(name)
     return (
@@ -43,15 +41,13 @@ def tool_of(name: str | int) -> str:
 TOOLS = {"panda": "panda_hand", "jaco2": "j2s7s300_link_7"}
 
 
-def states(tree: RigidTree, rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def states(tree, rows, seed=0):
     rng = np.random.default_rng(seed)
     low, high = np.maximum(tree.lower, -2.5), np.minimum(tree.upper, 2.5)
     return rng.uniform(low, high, (rows, tree.dof)), rng.normal(size=(rows, tree.dof))
 
 
-def planar(
-    lengths: tuple[float, ...] = (1.0, 1.0), gravity: tuple[float, ...] = (0.0, 0.0, 0.0)
-) -> RigidTree:
+def planar(lengths=(1.0, 1.0), gravity=(0.0, 0.0, 0.0)):
     """Return an arm in the plane: links along x with their mass of 1 kg in the middle, joints about
     z.
     """

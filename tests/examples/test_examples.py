@@ -38,7 +38,7 @@ def one_process(monkeypatch):
     monkeypatch.setattr(batchpid.sim, "Runner", partial(Runner, workers=0))
 
 
-def errors(table: str) -> dict[str, float]:
+def errors(table):
     """Joint -> error of env 0, from the table of drive_robot.py."""
     return {row.split()[0]: float(row.split()[4]) for row in table.splitlines()[2:]}
 

@@ -1,28 +1,24 @@
 """Fixtures shared by the tests of sim."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import pytest
 from robots import load_bundled
 
-from batchpid.sim import Robot, Runner, RunnerOptions
+from batchpid.sim import Runner, RunnerOptions
 from batchpid.sim.engine.protocol import load_engine
 
 
 @pytest.fixture(params=["sapien", "mujoco"])
-def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+def engine(request, monkeypatch):
     """Engine of the runners that this test makes without naming one.
 
     In MuJoCo they have small groups in this process, which share their working memory.
     """
-    name: str = request.param
+    name = request.param
     if name == "mujoco":
         monkeypatch.setattr(load_engine("mujoco"), "group_size", 4)
     original = RunnerOptions.__init__
 
-    def init(options: RunnerOptions, *args: Any, **given: Any) -> None:
+    def init(options, *args, **given):
         original(options, *args, **{"engine": name, **given})
 
     monkeypatch.setattr(RunnerOptions, "__init__", init)
@@ -31,25 +27,25 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 
 
 @pytest.fixture
-def needs_jax() -> None:
+def needs_jax():
     """Skip a test of Runners with backend "jax" where JAX is missing."""
     pytest.importorskip("jax")
 
 
 @pytest.fixture
-def small_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_groups(monkeypatch):
     """Give runners in this process several groups of envs."""
     for name in ("sapien", "mujoco"):
         monkeypatch.setattr(load_engine(name), "group_size", 3)
 
 
 @pytest.fixture(scope="session")
-def panda() -> Robot:
+def panda():
     """The bundled panda: 7 joints and 2 fingers."""
     return load_bundled("panda")
 
 
 @pytest.fixture(scope="session")
-def jaco2() -> Robot:
+def jaco2():
     """The bundled jaco2: 7 joints, 3 fingers and 3 finger tips, all revolute."""
     return load_bundled("jaco2")

@@ -1,7 +1,5 @@
 """Cases that the tests of exports share: random params of any options, as comparable values."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

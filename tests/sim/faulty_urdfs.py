@@ -1,7 +1,5 @@
 """Faults of published URDFs that are repaired."""
 
-from __future__ import annotations
-
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot
 
 BASE, ARM, TIP = link("base"), link("arm"), link("tip")
@@ -19,22 +17,22 @@ TENSOR = (
 )
 
 
-def moved(mimic: str, kind: str = "revolute") -> str:
+def moved(mimic, kind="revolute"):
     """Two joints in a row, the second with a ``<mimic>``."""
     return robot(BASE, ARM, TIP, HINGE, joint("tip_joint", "arm", "tip", kind, LIMIT + mimic))
 
 
-def limited(**attributes: str) -> str:
+def limited(**attributes):
     return one_joint(
         "<limit {}/>".format(" ".join(f'{key}="{value}"' for key, value in attributes.items()))
     )
 
 
-def mass(value: str) -> str:
+def mass(value):
     return one_joint(arm=INERTIAL.replace('mass value="1"', f'mass value="{value}"'))
 
 
-def shaped(shape: str) -> str:
+def shaped(shape):
     return one_joint(arm=INERTIAL + SHAPE.format(shape))
 
 

@@ -2,8 +2,6 @@
 floating base.
 """
 
-from __future__ import annotations
-
 import functools
 import tempfile
 from pathlib import Path
@@ -21,7 +19,7 @@ TURNED = 6.1
 positions wrap.
 """
 
-FEATURES: dict[str, dict] = {
+FEATURES = {
     "mimic": {"mimics": {3: (1, -0.5, 0.1)}},
     "chain of mimics": {"mimics": {3: (1, 2.0, 0.0), 5: (3, -0.25, 0.2)}},
     "sliding mimic": {"types": {3: "prismatic"}, "mimics": {3: (1, 0.2, -0.05)}},
@@ -45,19 +43,19 @@ mass, ...
 """
 
 
-def joints_of(feature: str) -> set[int]:
+def joints_of(feature):
     types, mimics = (FEATURES[feature].get(name, {}) for name in ("types", "mimics"))
     return {*types, *mimics, *(leader for leader, *_ in mimics.values())}
 
 
-def inertial(kg: float, moment: float, x: float = 0.0) -> str:
+def inertial(kg, moment, x=0.0):
     moments = " ".join(f'{key}="{moment}"' for key in ("ixx", "iyy", "izz"))
     tensor = f'<inertia {moments} ixy="0" ixz="0" iyz="0"/>'
     return f'<inertial><mass value="{kg}"/><origin xyz="{x} 0 0"/>{tensor}</inertial>'
 
 
 @functools.cache
-def robot_with(*features: str, folder: Path | None = None) -> Robot:
+def robot_with(*features, folder=None):
     """Return an arm of nine joints with these features, and keep its file in ``folder``."""
     chosen = [FEATURES[feature] for feature in features]
     types, mimics = (
@@ -80,7 +78,7 @@ def robot_with(*features: str, folder: Path | None = None) -> Robot:
         parts.append(f'<joint name="j{k}" type="{types.get(k, "revolute")}">{ends}</joint>')
         above = f"l{k}"
     armature = max(feature.get("armature", 0.0) for feature in chosen)
-    options: dict = {"fixed_base": all(feature.get("fixed_base", True) for feature in chosen)}
+    options = {"fixed_base": all(feature.get("fixed_base", True) for feature in chosen)}
     if armature:
         options["actuators"] = bp.make_actuators(len(AXES), armature=armature)
     text = f'<robot name="featured">{"".join(parts)}</robot>'
@@ -90,7 +88,7 @@ def robot_with(*features: str, folder: Path | None = None) -> Robot:
         return Robot.load(write(Path(passing), text), **options)
 
 
-def poses(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+def poses(robot):
     """Return the joint positions of a start and a goal (dof,)."""
     bent = np.where(robot.continuous, TURNED, [0.2, 0.7, 0.6, 0.9, -0.8, 0.6, 1.1, 0.7, 0.6])
     ends = bent, bent + 0.3 * np.array([1, 1, -1, 1, 1, -1, 1, 1, -1])

@@ -1,18 +1,11 @@
 """Bit-identity of results."""
 
-from __future__ import annotations
-
-from collections.abc import Collection
-from typing import Any
-
 import numpy as np
 
 from batchpid.sim import Observation
 
 
-def assert_identical(
-    first: Any, second: Any, envs: Any = slice(None), skip: Collection[str] = ()
-) -> None:
+def assert_identical(first, second, envs=slice(None), skip=()):
     """Raise AssertionError unless the fields of ``second`` are bit-identical in ``first``.
 
     Both are observations, rollouts or recordings. ``envs`` selects the envs to compare, ``skip``

@@ -1,7 +1,5 @@
 """An arm of six joints, and a regular pose of the panda."""
 
-from __future__ import annotations
-
 import numpy as np
 from tiny_urdf import joint, link, robot, write
 

@@ -1,11 +1,8 @@
 """Processes of tests: children, and waiting for an end."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import time
-from collections.abc import Iterable
 
 import psutil
 
@@ -13,13 +10,13 @@ PATIENCE = 200.0
 """Timeout [s] of events that should happen soon; long enough for a busy machine."""
 
 
-def send(pid: int, number: int) -> None:
+def send(pid, number):
     """Send a signal to a process, if it still runs."""
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, number)
 
 
-def have_ended(pids: Iterable[int], seconds: float = PATIENCE) -> bool:
+def have_ended(pids, seconds=PATIENCE):
     """Wait for processes to end, so long at most; return whether they have."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
@@ -29,7 +26,7 @@ def have_ended(pids: Iterable[int], seconds: float = PATIENCE) -> bool:
     return False
 
 
-def _runs(pid: int) -> bool:
+def _runs(pid):
     try:
         return psutil.Process(pid).status() != "zombie"
     except psutil.NoSuchProcess:

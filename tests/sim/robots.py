@@ -2,8 +2,6 @@
 these objects.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import sysconfig
@@ -17,7 +15,7 @@ RUBBING = "panda with friction"
 
 
 @functools.cache
-def load_bundled(name: str) -> Robot:
+def load_bundled(name):
     """Return the bundled robot of that name, loaded once per process; RUBBING is a panda with
     friction and damping.
     """
@@ -35,7 +33,7 @@ def load_bundled(name: str) -> Robot:
 PUBLISHED = Path(sysconfig.get_path("purelib")) / "cmeel.prefix/share/example-robot-data/robots"
 
 
-def load_published(name: str) -> Robot:
+def load_published(name):
     """Return a bundled robot, or one of the package example-robot-data without joint friction:
     these files give a torque, PhysX takes a dimensionless coefficient.
     """

@@ -2,8 +2,6 @@
 test_conformance.py runs one on every path.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tiny_urdf import INERTIAL, joint, link, robot, write

@@ -14,7 +14,6 @@ import functools
 import os
 import signal
 import tempfile
-from collections.abc import Iterator
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -35,7 +34,6 @@ from batchpid.sim import (
     Randomization,
     Recorder,
     Robot,
-    RunInfo,
     Runner,
     Snapshot,
     Uniform,
@@ -61,10 +59,10 @@ class Damped:
     of its sim steps.
     """
 
-    def init(self, robot: Any, num_envs: int, timestep: float) -> Any:
+    def init(self, robot, num_envs, timestep):
         return {"steps": np.zeros(num_envs), "last": (np.zeros((num_envs, robot.dof)), None)}
 
-    def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:
+    def __call__(self, state, setpoint, qpos, qvel, passive):
         steps = state["steps"] + 1
         effort = (
             passive
@@ -80,7 +78,7 @@ class Polar(Damped):
 
     command = CommandSpec(("distance", "angle"), ("m", "rad"), neutral=(1.0, 0.0))
 
-    def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:
+    def __call__(self, state, setpoint, qpos, qvel, passive):
         xp = setpoint.__array_namespace__()
         elbow = xp.arccos(xp.clip(setpoint[:, 0], -1.0, 1.0))
         goal = xp.stack([setpoint[:, 1] - elbow / 2, elbow], -1)
@@ -149,7 +147,7 @@ PLAN = bp.make_plan(2, period=0.02, horizon=4, blend="average", acceleration=30.
 SAPIEN, MUJOCO = ENGINES[:1], ENGINES[1:]
 
 
-def motors(*effects: dict[str, Any], joints: int = 2) -> dict[str, Any]:
+def motors(*effects, joints=2):
     return {
         "actuators": bp.make_actuators(
             joints, **{name: value for each in effects for name, value in each.items()}
@@ -157,11 +155,11 @@ def motors(*effects: dict[str, Any], joints: int = 2) -> dict[str, Any]:
     }
 
 
-def osc(**options: Any) -> dict[str, Any]:
+def osc(**options):
     return {"control": OperationalSpace(ARM, "hand", **options)}
 
 
-FEATURES: dict[str, Feature] = {
+FEATURES = {
     "default gains": Feature(),
     "accelerations": Feature(accelerations=True),
     "gains in efforts": Feature(params=EFFORTS, exact=True),
@@ -232,7 +230,7 @@ FEATURES: dict[str, Feature] = {
 }
 
 
-def random_feature(seed: int) -> Feature:
+def random_feature(seed):
     """Return a control with about half of the effects of motors and sensors, and other options at
     random.
     """
@@ -255,7 +253,7 @@ FEATURES |= {f"random options {seed}": random_feature(seed) for seed in range(9)
 
 
 @functools.cache
-def robot_of(name: str) -> Robot:
+def robot_of(name):
     """Return a robot by its name in the features; "arm" has two joints, and links with shapes."""
     if name == "arm":
         return ARM
@@ -264,7 +262,7 @@ def robot_of(name: str) -> Robot:
     return load_bundled(name) if name in Robot.bundled() else robot_with(name)
 
 
-def make(case: tuple[str, str], num_envs: int = N, **more: Any) -> Runner:
+def make(case, num_envs=N, **more):
     """Return a runner of a case; ``more`` are further options."""
     feature = FEATURES[case[0]]
     options = {
@@ -287,7 +285,7 @@ def make(case: tuple[str, str], num_envs: int = N, **more: Any) -> Runner:
     return Runner(robot, num_envs, **options)
 
 
-def commands(case: tuple[str, str], runner: Runner) -> dict[str, np.ndarray]:
+def commands(case, runner):
     """Return the commands of a rollout (TICKS, envs, ...), which are the same for an env in any
     number of envs.
     """
@@ -321,7 +319,7 @@ def commands(case: tuple[str, str], runner: Runner) -> dict[str, np.ndarray]:
     return given
 
 
-def part(given: dict[str, np.ndarray], ticks: slice) -> dict[str, np.ndarray]:
+def part(given, ticks):
     return {name: rows[ticks] for name, rows in given.items()}
 
 
@@ -341,15 +339,13 @@ class Result(NamedTuple):
     """Poses of the user's content."""
 
 
-def second_half(runner: Runner, given: dict[str, np.ndarray], rollout: Any) -> tuple[Any, ...]:
+def second_half(runner, given, rollout):
     second = rollout(runner, part(given, slice(SPLIT, None)))
     poses = None if runner.options.build is None else runner.poses()
     return second, runner.snapshot(), runner.faults, poses
 
 
-def program(
-    runner: Runner, case: tuple[str, str], rollout: Any = None, disturb: Any = None
-) -> Result:
+def program(runner, case, rollout=None, disturb=None):
     """Run the program; ``disturb`` is called with the runner between the snapshot and the second
     rollout.
     """
@@ -364,7 +360,7 @@ def program(
 
 
 @functools.cache
-def reference(case: tuple[str, str], backend: str = "numpy") -> Result:
+def reference(case, backend="numpy"):
     """Return the results in this process, with native code."""
     with make(case, backend=backend) as runner:
         result = program(runner, case)
@@ -374,7 +370,7 @@ def reference(case: tuple[str, str], backend: str = "numpy") -> Result:
     return result
 
 
-def leaves(value: Any, path: str = "") -> Any:
+def leaves(value, path=""):
     """Yield the arrays and numbers of a result with their paths in it; of a snapshot, states,
     params and steps.
     """
@@ -390,7 +386,7 @@ def leaves(value: Any, path: str = "") -> Any:
         )
 
 
-def check_equal(ours: Result, theirs: Result) -> None:
+def check_equal(ours, theirs):
     """Raise AssertionError unless two results are bit-identical."""
     for name in ("first", "placed", "second"):
         assert_identical(getattr(ours, name), getattr(theirs, name))
@@ -401,7 +397,7 @@ def check_equal(ours: Result, theirs: Result) -> None:
             np.testing.assert_array_equal(mine, other, f"{name}{path}")
 
 
-def check_close(ours: Result, theirs: Result, atol: float) -> None:
+def check_close(ours, theirs, atol):
     """Raise AssertionError unless two results are close, and report the same faults."""
     for name in ("first", "second"):
         mine, other = getattr(ours, name), getattr(theirs, name)
@@ -415,7 +411,7 @@ def check_close(ours: Result, theirs: Result, atol: float) -> None:
 # --------------------------------------------------------------------------------------------------
 
 
-def in_python(case: tuple[str, str]) -> None:
+def in_python(case):
     """Without native code: NumPy computes the law and its models, and Python calls the engine."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("BATCHPID_NATIVE", "0")
@@ -430,7 +426,7 @@ def in_python(case: tuple[str, str]) -> None:
         check_close(reference(case), result, 1e-7 if feature.exact else 1e-6)
 
 
-def in_numpy(case: tuple[str, str]) -> None:
+def in_numpy(case):
     """The NumPy executor, with mass matrices and passive forces from native code: bit-identical."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("batchpid.sim.loop.env_group.runs_natively", lambda setup: False)
@@ -438,17 +434,17 @@ def in_numpy(case: tuple[str, str]) -> None:
             check_equal(program(runner, case), reference(case))
 
 
-def overwrite(arrays: dict[str, np.ndarray]) -> None:
+def overwrite(arrays):
     for rows in arrays.values():
         rows[...] = 77.0
 
 
-def tick_by_tick(case: tuple[str, str]) -> None:
+def tick_by_tick(case):
     """Single ticks, by step and by send and recv in turn, are bit-identical to a rollout; arrays of
     the caller are overwritten after each call.
     """
 
-    def rollout(runner: Runner, given: dict[str, np.ndarray]) -> Any:
+    def rollout(runner, given):
         seen = []
         for tick in range(len(given["setpoints"])):
             row = {name.removesuffix("s"): rows[tick] for name, rows in given.items()}
@@ -468,7 +464,7 @@ def tick_by_tick(case: tuple[str, str]) -> None:
     )
 
 
-def alone(case: tuple[str, str]) -> None:
+def alone(case):
     """A runner of the last env alone is bit-identical to that env among others."""
     with make(case, num_envs=1, first_env=N - 1) as runner:
         result = program(runner, case)
@@ -477,7 +473,7 @@ def alone(case: tuple[str, str]) -> None:
         assert_identical(getattr(result, name), expected)
 
 
-def restored(case: tuple[str, str]) -> None:
+def restored(case):
     """Another runner continues from the file of a snapshot, bit-identically."""
     expected = reference(case)
     with make(case) as runner, tempfile.TemporaryDirectory() as folder:
@@ -491,15 +487,15 @@ def restored(case: tuple[str, str]) -> None:
     check_equal(expected._replace(second=second, end=end, poses=poses), expected)
 
 
-def recorded(case: tuple[str, str]) -> None:
+def recorded(case):
     """A recording has the rows of its rollout, and what it was made with."""
 
-    def content(info: RunInfo) -> list:
+    def content(info):
         # A file has no neutral values, which draws may change.
         skipped = {"begun", "urdf", "description", "actuators" if info.draws else ""}
         return [*leaves({name: part for name, part in vars(info).items() if name not in skipped})]
 
-    def rollout(runner: Runner, given: dict[str, np.ndarray]) -> Any:
+    def rollout(runner, given):
         draws, episodes = runner.draws, runner.episodes
         with tempfile.TemporaryDirectory() as folder:
             with Recorder(path := f"{folder}/run.h5", runner):
@@ -518,7 +514,7 @@ def recorded(case: tuple[str, str]) -> None:
         check_equal(program(runner, case, rollout), reference(case))
 
 
-def again(case: tuple[str, str]) -> None:
+def again(case):
     """A second episode is bit-identical to the first."""
     with make(case) as runner:
         given = commands(case, runner)
@@ -530,17 +526,17 @@ def again(case: tuple[str, str]) -> None:
     assert_identical(*episodes, skip={"time"})
 
 
-def in_workers(case: tuple[str, str]) -> None:
+def in_workers(case):
     """Two workers, one of which is killed and replaced; its replay does not see later writes to the
     caller's arrays.
     """
 
-    def rollout(runner: Runner, given: dict[str, np.ndarray]) -> Any:
+    def rollout(runner, given):
         seen = runner.rollout(**given)
         overwrite(given)
         return seen
 
-    def kill(runner: Runner) -> None:
+    def kill(runner):
         os.kill(runner.pids[1], signal.SIGKILL)
 
     with make(case, workers=2) as runner:
@@ -549,14 +545,14 @@ def in_workers(case: tuple[str, str]) -> None:
     check_equal(result, reference(case))
 
 
-def in_jax(case: tuple[str, str]) -> None:
+def in_jax(case):
     """The control in JAX is close to NumPy, and bit-identical in a worker."""
     check_close(reference(case, "jax"), reference(case), 1e-5)
     with make(case, workers=1, backend="jax") as runner:
         check_equal(program(runner, case), reference(case, "jax"))
 
 
-def in_the_other_engine(case: tuple[str, str]) -> None:
+def in_the_other_engine(case):
     """The engines agree within 1e-3 rad, without contact."""
     check_close(reference(case), reference((case[0], "sapien")), 1e-3)
 
@@ -579,7 +575,7 @@ one engine, quick.
 """
 
 
-def rows() -> Iterator[Any]:
+def rows():
     for path_number, path in enumerate(PATHS):
         for number, (name, feature) in enumerate(FEATURES.items()):
             for engine in feature.engines:
@@ -600,11 +596,11 @@ def rows() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("path", "case"), [*rows()])
-def test_every_feature_is_the_same_on_every_path(path: Any, case: tuple[str, str]) -> None:
+def test_every_feature_is_the_same_on_every_path(path, case):
     path(case)
 
 
-def test_every_option_has_a_row() -> None:
+def test_every_option_has_a_row():
     """A new option needs a row in FEATURES, unless paths or programs use it."""
     of_paths = {
         "num_envs",

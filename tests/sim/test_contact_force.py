@@ -2,46 +2,18 @@
 snapshots.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from identical import assert_identical
+from legged import FEET, GAINS, GRAVITY, STOOL, WEIGHT, load
 
-from batchpid.sim import Robot, Runner
-
-GRAVITY = 9.81
-BALL = '<collision><origin xyz="0 0 -0.3"/><geometry><sphere radius="0.03"/></geometry></collision>'
-LEG = """
-  <link name="leg{0}"><inertial><origin xyz="0 0 -0.15"/><mass value="0.2"/>
-    <inertia ixx="2e-3" iyy="2e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>
-  <joint name="slide{0}" type="prismatic"><parent link="trunk"/><child link="leg{0}"/><origin xyz="{1} {2} -0.05"/>
-    <axis xyz="0 0 1"/><limit lower="-0.1" upper="0.1" effort="200" velocity="5"/></joint>
-  <link name="foot{0}"><inertial><origin xyz="0 0 -0.3"/><mass value="0.1"/>
-    <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>{3}</link>
-  <joint name="ankle{0}" type="fixed"><parent link="leg{0}"/><child link="foot{0}"/><origin rpy="0 0 0.5"/></joint>"""
-PLACES = ((0.2, 0.15), (0.2, -0.15), (-0.2, 0.15), (-0.2, -0.15))
-STOOL = f"""<robot name="stool">
-  <link name="trunk"><inertial><origin xyz="0.02 0 0.01"/><mass value="10"/>
-    <inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0" ixz="0" iyz="0"/></inertial>
-    <collision><geometry><box size="0.5 0.3 0.1"/></geometry></collision></link>
-  {"".join(LEG.format(number, *place, BALL) for number, place in enumerate(PLACES))}
-</robot>"""
-WEIGHT = (10.0 + 4 * 0.3) * GRAVITY
-FEET = [f"foot{number}" for number in range(4)]
-GAINS = {"gain_units": "effort", "kp": 2e4, "ki": 0.0, "kd": 400.0}
+from batchpid.sim import Runner
 
 
 @pytest.fixture
 def stool(tmp_path):
     """A trunk of 10 kg on four legs that slide, with balls as feet that a fixed joint holds."""
     return load(tmp_path)
-
-
-def load(folder, **options):
-    path = folder / "stool.urdf"
-    path.write_text(STOOL)
-    return Robot.load(path, fixed_base=False, **options)
 
 
 def make_runner(robot, num_envs=1, **options):
@@ -56,6 +28,8 @@ def stand(robot, ticks=60, **options):
 
 def test_contact_forces_of_a_standing_robot_carry_its_weight(stool, engine):
     rollout = stand(stool)
+    np.testing.assert_allclose(rollout.base_pose[-1, 0, :4], [0, 0, 0.38, 1], atol=5e-3)
+    assert np.abs(rollout.base_twist[-1]).max() < 0.01
     forces = rollout.contact_force[-1, 0]
     np.testing.assert_allclose(forces[:, 2].sum(), WEIGHT, rtol=5e-3)
     assert np.abs(forces[:, :2].sum(0)).max() < 5e-3 * WEIGHT
@@ -70,9 +44,7 @@ def test_a_link_senses_its_own_contacts_and_not_those_of_the_links_beside_it(tmp
       </inertial><collision><geometry><sphere radius="0.02"/></geometry></collision></link>
       <joint name="t" type="fixed"><parent link="foot0"/><child link="toe"/><origin xyz="0.1 0 0.1"/></joint>
       <link name="imu"/><joint name="i" type="fixed"><parent link="trunk"/><child link="imu"/></joint>"""
-    path = tmp_path / "stool.urdf"
-    path.write_text(STOOL.replace("</robot>", f"{toe}</robot>"))
-    robot = Robot.load(path, fixed_base=False)
+    robot = load(tmp_path, STOOL.replace("</robot>", f"{toe}</robot>"))
     rollout = stand(robot, contacts=["toe", "foot0", "imu"])
     assert rollout.touching[-1, 0].tolist() == [False, True, False]
     assert not rollout.contact_force[-1, 0, [0, 2]].any()

@@ -2,8 +2,6 @@
 or changes a copy; objects that own processes, scenes or files refuse to be copied, and go on.
 """
 
-from __future__ import annotations
-
 import copy
 import pickle
 import re

@@ -16,7 +16,7 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ class Kind(NamedTuple):
     """Function that returns the value of a file."""
 
 
-def write_table(path: Path, quantity: str = "qpos") -> None:
+def write_table(path, quantity="qpos"):
     """Write a CSV file of a slow motion: setpoints and another ``quantity`` of both joints."""
     time = 0.01 * np.arange(60)
     wave = ARM.start + 0.1 * np.sin(3 * time)[:, None]
@@ -62,7 +62,7 @@ def write_table(path: Path, quantity: str = "qpos") -> None:
     np.savetxt(path, table, "%.6g", ",", header=",".join(names), comments="")
 
 
-def write_run(path: Path) -> None:
+def write_run(path):
     """Write a snapshot of two arms."""
     with Runner(ARM, 2, params=PARAMS, **SHORT) as runner:
         runner.rollout(np.tile(ARM.start + 0.1, (3, 1)))
@@ -70,12 +70,12 @@ def write_run(path: Path) -> None:
 
 
 @functools.cache
-def runner() -> Runner:
+def runner():
     """Return a runner that is given every snapshot."""
     return Runner(ARM, 2, params=PARAMS, **SHORT)
 
 
-def restored(path: Path) -> Snapshot:
+def restored(path):
     """Return the snapshot of a file, which the runner takes or refuses."""
     snapshot = Snapshot.load(path)
     with contextlib.suppress(InvalidArgumentError):
@@ -156,7 +156,7 @@ CELLS = ["", "nan", "inf", "-5", "0.123", "1e999", "x", "1 rad", '"', "time"]
 NUMBERS = [np.nan, np.inf, -np.inf, 0.0, 0.123, 1e38, -1.0, 2.0**31 - 1]
 
 
-def plain(value: Any) -> Any:
+def plain(value):
     """Return a value as nested dicts and lists of texts, with all digits of its numbers."""
     if isinstance(value, np.ndarray):
         return repr((str(value.dtype), value.shape, value.tolist()))
@@ -172,7 +172,7 @@ def plain(value: Any) -> Any:
     return [plain(each) for each in value] if isinstance(value, tuple | list) else repr(value)
 
 
-def decoded(suffix: str, content: bytes) -> Any:
+def decoded(suffix, content):
     """Return the content of a file as a tree of mappings, lists, arrays, numbers and texts."""
     if suffix == ".npz":
         with np.load(io.BytesIO(content)) as file:
@@ -187,14 +187,14 @@ def decoded(suffix: str, content: bytes) -> Any:
     return yaml.safe_load(content) if suffix == ".yaml" else json.loads(content)
 
 
-def _number(cell: str) -> float | str:
+def _number(cell):
     try:
         return float(cell)
     except ValueError:
         return cell
 
 
-def encoded(suffix: str, tree: Any) -> bytes:
+def encoded(suffix, tree):
     """Return the content of a file that holds ``tree``: the inverse of :func:`decoded`."""
     if suffix == ".npz":
         np.savez(file := io.BytesIO(), **tree)
@@ -207,7 +207,7 @@ def encoded(suffix: str, tree: Any) -> bytes:
 
 
 @st.composite
-def changed_bytes(draw: st.DrawFn, content: bytes) -> bytes:
+def changed_bytes(draw, content):
     """Draw a copy of the content with a flipped bit, or a part replaced, repeated, removed or cut
     off.
     """
@@ -234,12 +234,12 @@ def changed_bytes(draw: st.DrawFn, content: bytes) -> bytes:
             return before
 
 
-def cast(value: Any, dtype: Any) -> Any:
+def cast(value, dtype):
     with np.errstate(invalid="ignore", over="ignore"):
         return np.asarray(value).astype(dtype)
 
 
-def holds(part: Any, whole: Any) -> bool:
+def holds(part, whole):
     """Return whether ``part`` equals ``whole`` except for missing keys."""
     if isinstance(part, dict) and isinstance(whole, dict):
         return part.keys() <= whole.keys() and all(
@@ -251,7 +251,7 @@ def holds(part: Any, whole: Any) -> bool:
 
 
 @st.composite
-def changed_tree(draw: st.DrawFn, tree: Any, leaves: list) -> Any:
+def changed_tree(draw, tree, leaves):
     """Draw a copy of the tree with a changed key, value or length somewhere."""
     if isinstance(tree, np.ndarray) and tree.size:
         match draw(st.sampled_from(["entry", "dtype", "shorter", "longer"])):
@@ -299,14 +299,14 @@ def good(request, tmp_path):
     return kind, path, path.read_bytes(), plain(kind.read(path))
 
 
-def repeats(here: list, there: list) -> bool:
+def repeats(here, there):
     """Return whether a table is another one with rows repeated, which a log leaves out with a
     warning.
     """
     return [row for at, row in enumerate(here) if at == 0 or row != here[at - 1]] == there
 
 
-def check(good, content: bytes) -> None:
+def check(good, content):
     """Check that a file with ``content`` is refused with its name in the error, or read with the
     right value.
     """
@@ -353,7 +353,7 @@ def test_bytes(good, data):
 
 
 @st.composite
-def encoded_changes(draw: st.DrawFn, suffix: str, content: bytes) -> bytes:
+def encoded_changes(draw, suffix, content):
     """Draw the content of a file with a changed key, value or length."""
     leaves = CELLS if suffix == ".csv" else LEAVES
     return encoded(suffix, draw(changed_tree(decoded(suffix, content), leaves)))

@@ -2,8 +2,6 @@
 or closed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os
@@ -14,9 +12,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 import psutil
@@ -35,29 +31,29 @@ PROGRAMS = int(os.environ.get("BATCHPID_SOAK_PROGRAMS", "20"))
 DISTURBANCES = ("none", "none", "kill", "kill all", "stop", "ctrl-c")
 
 
-def make(workers: int, **options: Any) -> Runner:
+def make(workers, **options):
     return Runner(
         ROBOT, N, workers=workers, params=ROBOT.params(), substeps=SUBSTEPS, timeout=3.0, **options
     )
 
 
-def exchange(runner: Runner, setpoints: Any) -> Any:
+def exchange(runner, setpoints):
     runner.send(setpoints[0])
     return runner.recv()
 
 
-def change_params(runner: Runner, setpoints: Any) -> Any:
+def change_params(runner, setpoints):
     runner.params = ROBOT.params(kp=20.0 + 10 * abs(setpoints[0, 0, 0]))
     return runner.observe()
 
 
-def go_back(runner: Runner, setpoints: Any) -> Any:
+def go_back(runner, setpoints):
     snapshot = runner.snapshot()
     runner.rollout(setpoints[:2])
     return runner.restore(snapshot)
 
 
-COMMANDS: dict[str, Callable[[Runner, Any], Any]] = {
+COMMANDS = {
     "step": lambda runner, setpoints: runner.step(
         setpoints[0], feedforward=setpoints[1], substeps=7
     ),
@@ -72,7 +68,7 @@ INTERRUPTED = ("step", "reset", "change params")
 
 
 @contextlib.contextmanager
-def later(seconds: float, act: Callable[[], object]):
+def later(seconds, act):
     """Call ``act`` in a thread after ``seconds``."""
     timer = threading.Timer(seconds, act)
     timer.start()
@@ -82,9 +78,7 @@ def later(seconds: float, act: Callable[[], object]):
         timer.join()
 
 
-def run_interrupted(
-    runner: Runner, model: Runner, command: Callable[[Runner], Any], seconds: float
-) -> None:
+def run_interrupted(runner, model, command, seconds):
     """Run a command under Ctrl-C: afterwards it is done, or nothing has changed."""
     before, copy = runner.snapshot(), model.snapshot()
     with (
@@ -104,7 +98,7 @@ def run_interrupted(
     assert_identical(runner.observe(), model.observe())
 
 
-def run_program(seed: int, length: int, engine: Any) -> None:
+def run_program(seed, length, engine):
     """Run random commands, each of them disturbed or not, and compare with a runner in this
     process.
     """
@@ -137,7 +131,7 @@ def run_program(seed: int, length: int, engine: Any) -> None:
     assert have_ended(pids)
 
 
-def count_open() -> tuple[int, int]:
+def count_open():
     """Return the numbers of descriptors and of children of this process."""
     gc.collect()  # an mmap keeps its descriptor until the arrays on it are collected
     me = psutil.Process()
@@ -161,23 +155,23 @@ def test_commands_in_any_order_under_disturbances(seed, length, monkeypatch):
 class Acts:
     """Controller of the passive force that calls ``act`` with the number of each sim step."""
 
-    def __init__(self, act: Callable[[int], object]) -> None:
+    def __init__(self, act):
         self.act = act
 
-    def init(self, robot: Any, num_envs: int, timestep: float) -> Any:
+    def init(self, robot, num_envs, timestep):
         return np.zeros(num_envs, int)
 
-    def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:
+    def __call__(self, state, setpoint, qpos, qvel, passive):
         self.act(int(state[0]))
         return state + 1, passive
 
 
-def acting(act: Callable[[int], object], workers: int, **options: Any) -> Runner:
+def acting(act, workers, **options):
     options = {"control": Acts(act), "substeps": SUBSTEPS, "workers": workers, **options}
     return Runner(ROBOT, 2, **options)
 
 
-def test_a_lost_worker_is_named_and_the_others_stay() -> None:
+def test_a_lost_worker_is_named_and_the_others_stay():
     with make(2) as runner:
         lost, other = runner.pids
         send(lost, signal.SIGKILL)
@@ -220,17 +214,17 @@ time.sleep(600)
 """
 
 
-def start(program: str) -> subprocess.Popen[str]:
+def start(program):
     command = [sys.executable, "-c", program]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
-def test_a_dead_worker_does_not_end_a_caller_with_sigpipe_at_its_default() -> None:
+def test_a_dead_worker_does_not_end_a_caller_with_sigpipe_at_its_default():
     with start(WITH_SIGPIPE) as process:
         assert process.communicate()[0].split() == ["1"]
 
 
-def test_a_forked_child_does_not_keep_the_workers_of_a_killed_caller() -> None:
+def test_a_forked_child_does_not_keep_the_workers_of_a_killed_caller():
     with start(WITH_CHILD) as process:
         assert process.stdout is not None
         child, *workers = map(int, process.stdout.readline().split())
@@ -241,17 +235,17 @@ def test_a_forked_child_does_not_keep_the_workers_of_a_killed_caller() -> None:
         os.kill(child, signal.SIGKILL)
 
 
-def test_closing_does_not_wait_for_a_worker_that_is_stopped_in_a_tick() -> None:
+def test_closing_does_not_wait_for_a_worker_that_is_stopped_in_a_tick():
     # The time limit of a test is shorter than that of the request.
     with Runner(ROBOT, N, workers=2, timeout=3600.0) as runner:
         send(runner.pids[0], signal.SIGSTOP)
         runner.send(NEAR)
 
 
-def test_a_worker_without_an_answer_is_stuck_after_the_timeout(capfd, monkeypatch) -> None:
+def test_a_worker_without_an_answer_is_stuck_after_the_timeout(capfd, monkeypatch):
     monkeypatch.setattr("batchpid.sim.workers.pool.MAX_LOSSES", 1)
 
-    def work_for_ever(step: int) -> None:
+    def work_for_ever(step):
         while True:
             pass
 
@@ -263,10 +257,10 @@ def test_a_worker_without_an_answer_is_stuck_after_the_timeout(capfd, monkeypatc
     assert "work_for_ever" in capfd.readouterr().err  # its stack
 
 
-def test_a_request_that_kills_every_worker_is_given_up(monkeypatch, tmp_path) -> None:
+def test_a_request_that_kills_every_worker_is_given_up(monkeypatch, tmp_path):
     monkeypatch.setattr("batchpid.sim.workers.pool.MAX_LOSSES", 2)
 
-    def crash(step: int) -> None:
+    def crash(step):
         (tmp_path / str(os.getpid())).touch()
         os.kill(os.getpid(), signal.SIGSEGV)
 
@@ -290,11 +284,11 @@ def test_a_request_that_kills_every_worker_is_given_up(monkeypatch, tmp_path) ->
 )
 def test_only_the_requests_since_the_last_checkpoint_are_replayed(
     tmp_path, monkeypatch, engine, resets, replayed
-) -> None:
+):
     monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 20)
     path = tmp_path / "steps"
 
-    def write_a_dot(step: int) -> None:
+    def write_a_dot(step):
         with path.open("ab") as file:
             file.write(b".")
 
@@ -316,7 +310,7 @@ WALK = DOG.start + 0.15 * np.sin(np.arange(24))[:, None, None] * np.ones((1, 3, 
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
-def test_a_replay_from_resets_of_some_envs_in_contact(engine, monkeypatch) -> None:
+def test_a_replay_from_resets_of_some_envs_in_contact(engine, monkeypatch):
     monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 60)
     masks = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 1], [0, 0, 0]], bool)
     with (
@@ -332,7 +326,7 @@ def test_a_replay_from_resets_of_some_envs_in_contact(engine, monkeypatch) -> No
             assert_identical(runner.rollout(WALK[part]), model.rollout(WALK[part]))
 
 
-def test_a_run_whose_commands_are_too_many_cannot_be_replayed(monkeypatch) -> None:
+def test_a_run_whose_commands_are_too_many_cannot_be_replayed(monkeypatch):
     monkeypatch.setattr("batchpid.sim.workers.pool.MOST_BYTES", 4 * 8 * N * ROBOT.dof * 8)
     with make(1, engine="sapien") as runner:
         runner.rollout(np.tile(NEAR, (20, 1)))
@@ -349,14 +343,14 @@ def test_a_run_whose_commands_are_too_many_cannot_be_replayed(monkeypatch) -> No
 # -- Ctrl-C and other signals
 
 
-def interrupting(*steps: int) -> Callable[[int], None]:
+def interrupting(*steps):
     """Return an act that sends SIGINT to the process of the test in some sim steps."""
     pid = os.getpid()
     return lambda step: os.kill(pid, signal.SIGINT) if step in steps else None
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_ctrl_c_waits_for_the_request_in_progress(workers, tmp_path) -> None:
+def test_ctrl_c_waits_for_the_request_in_progress(workers, tmp_path):
     before = signal.getsignal(signal.SIGINT)
     with (
         acting(interrupting(SUBSTEPS + 2, 3 * SUBSTEPS), workers) as runner,
@@ -381,10 +375,10 @@ def test_ctrl_c_waits_for_the_request_in_progress(workers, tmp_path) -> None:
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_a_second_ctrl_c_ends_the_tick_and_closes_the_runner(workers) -> None:
+def test_a_second_ctrl_c_ends_the_tick_and_closes_the_runner(workers):
     pid = os.getpid()
 
-    def hang(step: int) -> None:
+    def hang(step):
         while step == SUBSTEPS + 1:
             time.sleep(0.05)
             os.kill(pid, signal.SIGINT)
@@ -403,7 +397,7 @@ def test_a_second_ctrl_c_ends_the_tick_and_closes_the_runner(workers) -> None:
 
 
 @contextlib.contextmanager
-def handler(number: int, act: Callable[..., object]):
+def handler(number, act):
     """Let ``act`` handle a signal; one of SIGALRM comes 0.2 s later."""
     before = signal.signal(number, act)
     signal.setitimer(signal.ITIMER_REAL, 0.2 if number == signal.SIGALRM else 0)
@@ -414,7 +408,7 @@ def handler(number: int, act: Callable[..., object]):
         signal.signal(number, before)
 
 
-def test_a_handler_of_the_callers_own_is_called_when_the_tick_is_done() -> None:
+def test_a_handler_of_the_callers_own_is_called_when_the_tick_is_done():
     times = []
     with acting(interrupting(2), 1) as runner:
         with handler(signal.SIGINT, lambda *_: times.append(runner.time)):
@@ -423,12 +417,12 @@ def test_a_handler_of_the_callers_own_is_called_when_the_tick_is_done() -> None:
 
 
 @pytest.mark.parametrize("sensors", [False, True])
-def test_an_exception_of_another_signal_handler_closes_the_runner(sensors) -> None:
+def test_an_exception_of_another_signal_handler_closes_the_runner(sensors):
     """Between requests to workers, and between sim steps in this process, where Python reads the
     sensors of SAPIEN.
     """
 
-    def fail(*_: Any) -> None:
+    def fail(*_):
         raise TimeoutError
 
     robot = Robot.load("quadruped", fixed_base=False) if sensors else ROBOT
@@ -443,7 +437,7 @@ def test_an_exception_of_another_signal_handler_closes_the_runner(sensors) -> No
     assert runner.time == 0
 
 
-def test_calls_in_another_thread_leave_ctrl_c_to_the_main_thread() -> None:
+def test_calls_in_another_thread_leave_ctrl_c_to_the_main_thread():
     seen = []
     with make(0) as runner:
         work = lambda: seen.append((runner.step(NEAR), signal.getsignal(signal.SIGINT)))  # noqa: E731

@@ -2,8 +2,6 @@
 name.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import subprocess
@@ -34,10 +32,10 @@ REFUSED = {"floating base": {"osc"}}
 """Controls that refuse a feature; all others have to reach their goal."""
 
 
-def reach(robot: Robot, control: str, engine: str) -> None:
+def reach(robot, control, engine):
     """Assert that the robot reaches its goal, within a turn of each continuous joint."""
     start, goal = poses(robot)
-    options: dict = {"control": control}
+    options = {"control": control}
     setpoint, ticks, error = goal, 250, 0.02
     if control == "osc":
         options = {"control": OperationalSpace(robot, "l8", posture=goal)}
@@ -71,14 +69,14 @@ def reach(robot: Robot, control: str, engine: str) -> None:
     np.testing.assert_allclose(last[still], robot.coupling.positions(last)[still], atol=1e-4)
 
 
-def off(robot: Robot, qpos: np.ndarray, goal: np.ndarray) -> np.ndarray:
+def off(robot, qpos, goal):
     """Return the errors of the independent joints, within a turn of each continuous joint."""
     left = qpos - goal
     left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
     return left[..., robot.independent]
 
 
-def check(features: tuple[str, ...], command: str, engine: str) -> None:
+def check(features, command, engine):
     refuses = any(command in REFUSED.get(feature, ()) for feature in features)
     try:
         reach(robot_with(*features), command, engine)

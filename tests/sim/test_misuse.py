@@ -2,13 +2,9 @@
 error that says so, and change nothing.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import threading
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,21 +20,21 @@ PARAMS = ARM.params(kp=20.0, ki=1.0, kd=2.0)
 TABLE = np.random.default_rng(0).uniform(-0.2, 0.2, (4, N, ARM.dof))
 
 
-def make(workers: int = 0) -> Runner:
+def make(workers=0):
     return Runner(ARM, N, params=PARAMS, workers=workers, substeps=5)
 
 
 @pytest.fixture(params=[0, 1])
-def runner(request: pytest.FixtureRequest) -> Any:
+def runner(request):
     with make(request.param) as made:
         yield made
 
 
 @pytest.fixture
-def on_alarm() -> Any:
+def on_alarm():
     """Function that makes another one the handler of a signal that arrives 0.1 s later."""
 
-    def on_alarm(act: Callable[[], object]) -> None:
+    def on_alarm(act):
         signal.signal(signal.SIGALRM, lambda *_: act())
         signal.setitimer(signal.ITIMER_REAL, 0.1)
 
@@ -48,7 +44,7 @@ def on_alarm() -> Any:
     signal.signal(signal.SIGALRM, before)
 
 
-def test_calls_out_of_order_are_named(runner: Runner) -> None:
+def test_calls_out_of_order_are_named(runner):
     snapshot = runner.snapshot()
     with pytest.raises(CallOrderError, match="send"):
         runner.recv()
@@ -56,7 +52,7 @@ def test_calls_out_of_order_are_named(runner: Runner) -> None:
         runner.send(np.nan)
     runner.send(TABLE[0])
     time = runner.time
-    others: dict[str, tuple[Any, ...]] = {"step": (TABLE[1],), "reset": (TABLE[2],)}
+    others = {"step": (TABLE[1],), "reset": (TABLE[2],)}
     others |= {"rollout": (TABLE[:3],), "restore": (snapshot,), "send": (TABLE[1],)}
     for name, arguments in (others | {"observe": (), "snapshot": (), "poses": ()}).items():
         with pytest.raises(CallOrderError, match="recv"):
@@ -80,10 +76,10 @@ def test_calls_out_of_order_are_named(runner: Runner) -> None:
 # -- threads, signal handlers, children
 
 
-def test_a_call_from_another_thread_raises(runner: Runner) -> None:
+def test_a_call_from_another_thread_raises(runner):
     done = threading.Event()
 
-    def work() -> None:
+    def work():
         while not done.is_set():
             runner.step(TABLE[0], substeps=200)
 
@@ -99,10 +95,10 @@ def test_a_call_from_another_thread_raises(runner: Runner) -> None:
     assert runner.step(TABLE[0]).ok.all(), "they may take turns"
 
 
-def test_a_call_from_a_signal_handler_raises(runner: Runner, on_alarm: Any) -> None:
+def test_a_call_from_a_signal_handler_raises(runner, on_alarm):
     raised = []
 
-    def handler() -> None:
+    def handler():
         for _ in range(2):  # the first error does not end the call that is in progress
             with pytest.raises(InUseError, match="that this one interrupted"):
                 runner.step(TABLE[0])
@@ -115,7 +111,7 @@ def test_a_call_from_a_signal_handler_raises(runner: Runner, on_alarm: Any) -> N
     assert seen.ok.all()
 
 
-def test_a_signal_handler_may_close_the_runner(runner: Runner, on_alarm: Any) -> None:
+def test_a_signal_handler_may_close_the_runner(runner, on_alarm):
     on_alarm(runner.close)
     with pytest.raises(ClosedError):  # noqa: PT012
         while True:
@@ -124,7 +120,7 @@ def test_a_signal_handler_may_close_the_runner(runner: Runner, on_alarm: Any) ->
         runner.observe()
 
 
-def test_another_thread_may_close_the_runner() -> None:
+def test_another_thread_may_close_the_runner():
     with make(1) as runner:
         pids = runner.pids
         timer = threading.Timer(0.2, runner.close)
@@ -138,7 +134,7 @@ def test_another_thread_may_close_the_runner() -> None:
 
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # of JAX, if other tests loaded it
-def test_a_call_from_a_forked_child_raises(runner: Runner) -> None:
+def test_a_call_from_a_forked_child_raises(runner):
     before = runner.step(TABLE[0])
     read, write = os.pipe()
     if (child := os.fork()) == 0:

@@ -1,7 +1,5 @@
 """Options of a Runner: names, defaults, checked values, and the places that keep them."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import inspect

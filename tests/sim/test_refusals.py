@@ -1,15 +1,10 @@
 """Tables of wrong calls: each raises an error that names the argument, and changes nothing."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
-from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
 from itertools import product
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -62,7 +57,7 @@ ROW, ROWS, NAN = np.zeros(DOF), np.zeros((N, DOF)), np.array([[0.0, 0.0], [np.na
 class Odd:
     """Object that cannot be converted to an array."""
 
-    def __array__(self, *_: Any, **__: Any) -> Any:
+    def __array__(self, *_, **__):
         raise RuntimeError("cannot be an array")
 
 
@@ -71,17 +66,17 @@ class Hold:
     ``command``.
     """
 
-    def __init__(self, **more: Any) -> None:
+    def __init__(self, **more):
         vars(self).update(more)
 
-    def init(self, robot: Any, num_envs: int, timestep: float) -> Any:
+    def init(self, robot, num_envs, timestep):
         return None
 
-    def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:
+    def __call__(self, state, setpoint, qpos, qvel, passive):
         return None, passive
 
 
-def named(call: Callable[[], Any]) -> str:
+def named(call):
     """Return the name of the argument in the InvalidArgumentError of ``call``."""
     with pytest.raises(InvalidArgumentError) as caught:
         call()
@@ -98,7 +93,7 @@ ODD += (None, "", (), np.zeros((0, DOF)))
 PARAMS = ARM.params(kp=9.0, ki=1.0, kd=2.0)
 PID = bp.BatchPID(PARAMS, N, 1e-3)
 SAMPLE = {"measurement": ROWS, "setpoint": ROWS}
-ENTRIES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
+ENTRIES = {
     "BatchPID.__call__": (PID.__call__, SAMPLE),
     "BatchPID.reset": (PID.reset, {"measurement": ROWS}),
     "BatchPID.track": (PID.track, SAMPLE | {"effort": ROWS}),
@@ -115,9 +110,7 @@ ENTRIES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("entry", ENTRIES)
-def test_a_value_of_any_kind_is_accepted_or_refused_by_name(
-    entry: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_value_of_any_kind_is_accepted_or_refused_by_name(entry, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     function, good = ENTRIES[entry]
     bp.save_params("none.yaml", PARAMS, ARM.joint_names)
@@ -137,7 +130,7 @@ def test_a_value_of_any_kind_is_accepted_or_refused_by_name(
 
 
 @pytest.mark.parametrize("name", [*OPTIONS])
-def test_values_of_no_use_are_refused_for_every_option(name: str) -> None:
+def test_values_of_no_use_are_refused_for_every_option(name):
     options = {"robot": ARM, "num_envs": N, "workers": 0}
     if name in ("tool", "cluster"):
         options |= {"tool": {"control": "osc"}, "cluster": {"workers": None}}[name]
@@ -153,12 +146,12 @@ def test_values_of_no_use_are_refused_for_every_option(name: str) -> None:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("contain", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_a_call_with_any_value_changes_nothing_if_it_is_refused(contain: bool) -> None:
+def test_a_call_with_any_value_changes_nothing_if_it_is_refused(contain):
     options = {"on_invalid_input": "contain"} if contain else {}
     command = {"setpoint": ROW, "setpoint_rate": ROW, "feedforward": ROW, "substeps": 2}
     table = {f"{name}s": command[name][None] for name in [*command][:3]}
     with Runner(ARM, N, workers=0, substeps=2, params=PARAMS, **options) as runner:
-        calls: dict[str, dict[str, Any]] = {
+        calls = {
             "step": command,
             "send": command,
             "rollout": table,
@@ -179,7 +172,7 @@ def test_a_call_with_any_value_changes_nothing_if_it_is_refused(contain: bool) -
                 assert runner.step(ROW).ok.all()
 
 
-def act(runner: Runner, name: str, arguments: dict[str, Any]) -> None:
+def act(runner, name, arguments):
     """Call a method, or set a property."""
     method = getattr(runner, name)
     if not callable(method):
@@ -190,7 +183,7 @@ def act(runner: Runner, name: str, arguments: dict[str, Any]) -> None:
         runner.recv()
 
 
-def is_refused(runner: Runner, call: Callable[[], Any], name: str) -> bool:
+def is_refused(runner, call, name):
     """Make a call: if it is refused by ``name``, it changes nothing."""
     before, time = runner.observe(), runner.time
     try:
@@ -208,7 +201,7 @@ def is_refused(runner: Runner, call: Callable[[], Any], name: str) -> bool:
 MOTORS = bp.make_actuators(DOF, strength=0.9)
 PUSH = {"push": Uniform(0, 1)}
 FREE_PUSHED = {"randomization": Randomization(**PUSH), "robot": FREE}
-REFUSED: dict[Callable[..., Any], list[dict[str, Any]]] = {
+REFUSED = {
     Runner: [
         {"worker": 1},
         {"stages": [Thermal(1.0, 1.0), Thermal(1.0, 1.0)]},
@@ -275,7 +268,7 @@ REFUSED: dict[Callable[..., Any], list[dict[str, Any]]] = {
     OperationalSpace: [{"link": "foot"}],
 }
 """By constructor, options of which the first is wrong; ``...`` is a part of an option after it."""
-GOOD: dict[Callable[..., Any], dict[str, Any]] = {
+GOOD = {
     Runner: {"robot": ARM, "num_envs": N, "workers": 0},
     CommandSpec: {"names": ("x", "y")},
     Robot.load: {"name_or_path": "panda"},
@@ -286,9 +279,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
 @pytest.mark.parametrize(
     ("make", "row"), [(make, row) for make, rows in REFUSED.items() for row in rows], ids=label
 )
-def test_refused_constructors_name_their_argument(
-    make: Callable[..., Any], row: dict[str, Any]
-) -> None:
+def test_refused_constructors_name_their_argument(make, row):
     options = {name: value for name, value in row.items() if value is not ...}
     assert next(iter(row)) in named(lambda: make(**GOOD.get(make, {}) | options))
 
@@ -300,7 +291,7 @@ UNUSED = [
     ("step", ACCELERATED),
     ("rollout", {f"{name}s": row[None] for name, row in ACCELERATED.items()}),
 ]
-CALLS: list[tuple[dict[str, Any], list[tuple[str, dict[str, Any]]]]] = [
+CALLS = [
     (
         {},
         [
@@ -348,9 +339,7 @@ CALLS: list[tuple[dict[str, Any], list[tuple[str, dict[str, Any]]]]] = [
 
 
 @pytest.mark.parametrize(("options", "calls"), CALLS)
-def test_a_refused_call_names_its_argument_and_changes_nothing(
-    options: dict[str, Any], calls: list[tuple[str, dict[str, Any]]]
-) -> None:
+def test_a_refused_call_names_its_argument_and_changes_nothing(options, calls):
     with Runner(**GOOD[Runner] | options) as runner:
         start = runner.observe()
         for name, arguments in calls:
@@ -360,7 +349,7 @@ def test_a_refused_call_names_its_argument_and_changes_nothing(
 
 
 @pytest.mark.parametrize("arguments", [("run.txt",), (3,), ("run.h5", None)])
-def test_a_recorder_that_is_refused_is_not_attached(arguments: Any) -> None:
+def test_a_recorder_that_is_refused_is_not_attached(arguments):
     with Runner(**GOOD[Runner]) as runner:
         with pytest.raises(BatchPIDError):
             Recorder(*(*arguments, runner)[:2])

@@ -1,7 +1,5 @@
 """Runner: its options, its params where none are given, and its repr."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tiny_urdf

@@ -1,7 +1,5 @@
 """Hours of simulated time: memory stays flat."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

@@ -2,8 +2,6 @@
 never imports it.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from batchpid.stages import Stage, Told, Values
+from batchpid.stages import Stage
 
 
 @dataclass(frozen=True)
@@ -18,10 +18,10 @@ class Thermal(Stage):
     name = "thermal"
     after = "limits"
 
-    def init(self, values: Values) -> Told:
+    def init(self, values):
         return 0.0 * values.measured.qpos, values
 
-    def step(self, heat: Any, values: Values) -> Told:
+    def step(self, heat, values):
         xp = heat.__array_namespace__()
         load = values.last.motor / self.effort
         heat = heat + (values.timestep / self.time) * (load * load - heat)

@@ -1,9 +1,5 @@
 """Small URDFs for tests: links and joints, with the oddities that a test asks for."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
 INERTIAL = (
@@ -13,33 +9,33 @@ INERTIAL = (
 LIMIT = '<limit lower="-1" upper="1" effort="10" velocity="2"/>'
 
 
-def link(name: str, inner: str = INERTIAL) -> str:
+def link(name, inner=INERTIAL):
     return f'<link name="{name}">{inner}</link>'
 
 
 def joint(
-    name: str,
-    parent: str,
-    child: str,
-    kind: str = "revolute",
-    inner: str = LIMIT,
-    origin: str = "0 0 1",
-) -> str:
+    name,
+    parent,
+    child,
+    kind="revolute",
+    inner=LIMIT,
+    origin="0 0 1",
+):
     return (
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
         f'<origin xyz="{origin}"/><axis xyz="0 1 0"/>{inner}</joint>'
     )
 
 
-def robot(*parts: str, head: str = "") -> str:
+def robot(*parts, head=""):
     return f'<?xml version="1.0"?>{head}<robot name="test">{"".join(parts)}</robot>'
 
 
-def one_joint(inner: str = LIMIT, kind: str = "revolute", arm: str = INERTIAL) -> str:
+def one_joint(inner=LIMIT, kind="revolute", arm=INERTIAL):
     return robot(link("base"), link("arm", arm), joint("hinge", "base", "arm", kind, inner))
 
 
-def gripper(*parts: str) -> str:
+def gripper(*parts):
     """Return a robot whose joint ``right`` follows its joint ``left``, with further parts."""
     follower = LIMIT + '<mimic joint="left" multiplier="-0.5"/>'
     fingers = (
@@ -49,12 +45,12 @@ def gripper(*parts: str) -> str:
     return robot(*map(link, ("base", "l", "r")), *fingers, *parts)
 
 
-def random_tree(rng: np.random.Generator, links: int) -> list[str]:
+def random_tree(rng, links):
     """Return the parts of a robot with ``links`` links, named l0, l1, ..., random joints, half of
     them fixed.
     """
 
-    def text(values: np.ndarray) -> str:
+    def text(values):
         return " ".join(map(str, values))
 
     parts = [link("l0")]
@@ -83,7 +79,7 @@ def random_tree(rng: np.random.Generator, links: int) -> list[str]:
     return parts
 
 
-def write(folder: Path, text: str, name: str = "test.urdf") -> Path:
+def write(folder, text, name="test.urdf"):
     path = folder / name
     path.write_text(text)
     return path

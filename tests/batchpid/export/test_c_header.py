@@ -2,13 +2,10 @@
 test_law_conformance.py compares its law with NumPy, bit by bit.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import shutil
 import subprocess
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +34,7 @@ pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 SANITIZED = ("-std=c99", "-O0", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
-def made(seed: int, units: str, dtype: Any = np.float64, count: int = 30) -> Any:
+def made(seed, units, dtype=np.float64, count=30):
     """Return params of one env and of any combination of options, and inputs."""
     joints = 1 + seed % 9
     params = bp.make_params(joints, **generated_options(seed, 1, joints, units), dtype=dtype)

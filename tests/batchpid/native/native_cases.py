@@ -1,7 +1,5 @@
 """Numbers of all kinds, and comparison to the last bit."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -2,8 +2,6 @@
 threads.
 """
 
-from __future__ import annotations
-
 from unittest import mock
 
 import numpy as np

@@ -2,8 +2,6 @@
 of threads.
 """
 
-from __future__ import annotations
-
 import copy
 import pickle
 from pathlib import Path

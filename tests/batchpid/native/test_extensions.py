@@ -1,7 +1,5 @@
 """A native extension that was built from other sources is refused, with one message."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Inverse kinematics: reachable poses are reached within the limits, others are reported."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -2,8 +2,6 @@
 loops.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from trees import TOOLS, planar, states, tree_of

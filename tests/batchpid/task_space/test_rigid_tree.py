@@ -1,7 +1,5 @@
 """Kinematic trees: against MuJoCo, against finite differences, and errors of arguments."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

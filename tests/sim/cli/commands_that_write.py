@@ -1,7 +1,5 @@
 """Commands that write files, with words that make them short and their flags for outputs."""
 
-from __future__ import annotations
-
 from batchpid.sim.cli.commands import COMMANDS
 
 SHORT = ("--num-envs", 1, "--seconds", 0.02)
@@ -20,7 +18,7 @@ SUFFIXES = {"picture": ".png", "out": ".yaml"}
 OUT = {"rollout": ".h5", "excite": ".csv", "export": ".h"}
 
 
-def output_flags() -> list[tuple[str, str]]:
+def output_flags():
     """Return every flag of every command that names an output file."""
     return [
         (name, flag)
@@ -30,6 +28,6 @@ def output_flags() -> list[tuple[str, str]]:
     ]
 
 
-def output(command: str, flag: str, stem: str = "new") -> str:
+def output(command, flag, stem="new"):
     """Return a name that a command may write at a flag."""
     return stem + (OUT.get(command, SUFFIXES[flag]) if flag == "out" else SUFFIXES[flag])

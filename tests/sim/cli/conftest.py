@@ -1,7 +1,3 @@
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from tiny_urdf import one_joint, write
@@ -11,9 +7,7 @@ from batchpid.sim.cli import main
 
 
 @pytest.fixture(autouse=True)
-def working_folder(
-    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def working_folder(tmp_path_factory, monkeypatch):
     """Run each test in an empty folder, so that it neither uses nor adds files of the checkout,
     such as out/.
     """
@@ -21,12 +15,12 @@ def working_folder(
 
 
 @pytest.fixture
-def batchpid(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+def batchpid(capsys):
     """Function that runs a command line in this process and returns (exit status, stdout,
     stderr).
     """
 
-    def run(*arguments: object) -> tuple[int, str, str]:
+    def run(*arguments):
         try:
             status = main([str(argument) for argument in arguments])
         except SystemExit as exit:  # tyro, for --help and bad flags

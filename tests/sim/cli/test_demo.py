@@ -1,7 +1,5 @@
 """batchpid demo: a run, its report and its picture."""
 
-from __future__ import annotations
-
 import pytest
 from robots import load_bundled
 

@@ -1,7 +1,5 @@
 """``batchpid export``: gains as files for other programs."""
 
-from __future__ import annotations
-
 import yaml
 from tiny_urdf import LIMIT, joint, link, robot, write
 

@@ -2,9 +2,6 @@
 the command.
 """
 
-from __future__ import annotations
-
-import argparse
 import io
 import itertools
 import sys
@@ -24,7 +21,7 @@ SEVERAL = {("compare", "--gains"), ("compare", "--engine")}
 
 
 @cache
-def actions(command: str) -> list[argparse.Action]:
+def actions(command):
     """Return the declared arguments of a command."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -34,14 +31,14 @@ def actions(command: str) -> list[argparse.Action]:
     return parser._actions
 
 
-def flags(command: str) -> dict[str, str]:
+def flags(command):
     """Return the flags of a command, with the kind of value that each takes."""
     return {
         name: str(action.metavar) for action in actions(command) for name in action.option_strings
     }
 
 
-def choices(command: str) -> set[str]:
+def choices(command):
     """Return the flags of a command that take one of several words."""
     return {name for action in actions(command) if action.choices for name in action.option_strings}
 
@@ -93,7 +90,7 @@ SHORT = {
 """Words of commands, where they are other ones than in WORDS."""
 
 
-def bad_values(command: str) -> list[tuple[str, str, str]]:
+def bad_values(command):
     """Return each flag of a command with a bad value; the command names the flag."""
     found = []
     for flag, kind in flags(command).items():
@@ -124,7 +121,7 @@ def test_a_bad_value_is_answered_by_the_name_of_its_flag(
     assert written(files) == before
 
 
-def written(folder: Path) -> set[Path]:
+def written(folder):
     """Return the files and folders below a folder."""
     return {*folder.rglob("*")}
 

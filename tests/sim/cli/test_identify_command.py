@@ -1,13 +1,8 @@
-from __future__ import annotations
-
 import pytest
 
 import batchpid as bp
 from batchpid.sim import Robot, Runner, write_recording
 from batchpid.sim.identification import excite
-
-pytest.importorskip("scipy")
-
 
 PENDULUM = """<robot name="pendulum"><link name="base"/>
 <link name="bob"><inertial><origin xyz="0 0 -0.3"/><mass value="2"/>

@@ -1,7 +1,5 @@
 """batchpid inspect: the findings, the joints in the order of qpos, the masses of the links."""
 
-from __future__ import annotations
-
 import pytest
 from tiny_urdf import INERTIAL, joint, link, robot, write
 

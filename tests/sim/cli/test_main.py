@@ -29,7 +29,7 @@ class Result(NamedTuple):
 
     status: int
 
-    def report(self) -> str:
+    def report(self):
         """Return a text."""
         return "done"
 

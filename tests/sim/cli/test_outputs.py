@@ -1,7 +1,5 @@
 """Output files: no command replaces one without --force, and default names describe the content."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import re

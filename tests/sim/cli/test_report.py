@@ -1,7 +1,5 @@
 """The report at the end of a run: its speed, a table of the joints, and what went wrong."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from batchpid.sim import Observation, Rollout, RunInfo

@@ -1,7 +1,5 @@
 """batchpid rollout: the flags reach the runner, and the file holds its rollout."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Trajectories under the default gains: robots follow them with rates."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import load_bundled

@@ -1,7 +1,5 @@
 """Preflight findings: oddities of a robot, and of running it with given params from a given pose."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -13,7 +11,7 @@ from test_unsettled import CASES as RUNS
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 import batchpid as bp
-from batchpid.sim import Finding, Robot
+from batchpid.sim import Robot
 from batchpid.sim.findings import FINDING_KINDS, SEVERITIES
 
 BOX = '<collision><geometry><box size="{0} {0} {0}"/></geometry></collision>'
@@ -30,7 +28,7 @@ BESIDE = robot(
 """Two links at the same place."""
 
 
-def mjcf(inner: str = '<joint name="j"/>', rest: str = "") -> str:
+def mjcf(inner='<joint name="j"/>', rest=""):
     body = f'<body name="b"><geom size=".1"/>{inner}</body>'
     return f"<mujoco><worldbody>{body}</worldbody>{rest}</mujoco>"
 
@@ -147,7 +145,7 @@ ODDITIES = {
 }
 
 
-def codes(findings: list[Finding]) -> dict[str, Finding]:
+def codes(findings):
     return {finding.code: finding for finding in findings}
 
 

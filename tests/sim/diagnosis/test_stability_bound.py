@@ -1,7 +1,5 @@
 """Stability bound against the engine: in closed form, and within 5 % for motors that are late."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -2,8 +2,6 @@
 by how much.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 

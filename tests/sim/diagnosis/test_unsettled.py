@@ -19,7 +19,6 @@ from batchpid.sim import (
     FaultWarning,
     Randomization,
     Robot,
-    Rollout,
     Runner,
     Uniform,
     read_recording,
@@ -31,7 +30,7 @@ pytestmark = pytest.mark.filterwarnings(
 )
 
 
-def bar(length: float, mass: float = 1.0) -> str:
+def bar(length, mass=1.0):
     """Return the contents of a link: a bar along x, with its mass and its shape."""
     moments = f'ixx="0.001" iyy="{mass * length**2 / 12:.6f}" izz="{mass * length**2 / 12:.6f}"'
     place = f'<origin xyz="{length / 2} 0 0"/>'
@@ -42,9 +41,7 @@ def bar(length: float, mass: float = 1.0) -> str:
     )
 
 
-def arm(
-    axis: str = "0 1 0", effort: float = 60.0, friction: float = 0.0, fixed_base: bool = True
-) -> Robot:
+def arm(axis="0 1 0", effort=60.0, friction=0.0, fixed_base=True):
     """Return an arm of three bars, 0.3 m each, that turn about y, 0.5 m above its base; ``axis`` is
     the elbow's.
     """
@@ -140,7 +137,7 @@ CASES = {
 ENGINES = ("sapien", "mujoco")
 
 
-def run(case: Case, engine: str, envs: int = 1) -> Rollout:
+def run(case, engine, envs=1):
     """Return the run of a case: setpoints held, or for one that still moves a ramp."""
     robot = arm(**case.robot)
     params = robot.params(**case.gains) if case.gains else robot.designed()

@@ -1,7 +1,5 @@
 """Coupled joints against the coupled dynamics, worked out by hand or by reduction."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tiny_urdf import write
@@ -11,21 +9,21 @@ from batchpid.sim import Robot, Runner
 FREE_LIMIT = '<limit lower="-3" upper="3" effort="200" velocity="10"/>'
 
 
-def body(name: str, mass: float, at: str = "0 0 0.1", shape: str = "") -> str:
+def body(name, mass, at="0 0 0.1", shape=""):
     moments = " ".join(f'{key}="{mass * 0.01}"' for key in ("ixx", "iyy", "izz"))
     inertia = f'<mass value="{mass}"/><inertia {moments} ixy="0" ixz="0" iyz="0"/>'
     return f'<link name="{name}"><inertial><origin xyz="{at}"/>{inertia}</inertial>{shape}</link>'
 
 
 def hinge(
-    name: str,
-    parent: str,
-    child: str,
-    axis: str,
-    origin: str,
-    inner: str = FREE_LIMIT,
-    kind: str = "revolute",
-) -> str:
+    name,
+    parent,
+    child,
+    axis,
+    origin,
+    inner=FREE_LIMIT,
+    kind="revolute",
+):
     ends = (
         f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{origin}"/><axis'
         f' xyz="{axis}"/>'
@@ -33,7 +31,7 @@ def hinge(
     return f'<joint name="{name}" type="{kind}">{ends}{inner}</joint>'
 
 
-def arm(folder, joints: int, finger: float = 0.02) -> Robot:
+def arm(folder, joints, finger=0.02):
     """Return an arm with two sliding fingers and a claw on the first, all moved by the first
     finger.
     """
@@ -57,7 +55,7 @@ def arm(folder, joints: int, finger: float = 0.02) -> Robot:
     return Robot.load(write(folder, f'<robot name="arm">{"".join(parts)}</robot>'))
 
 
-def constraint_error(robot: Robot, qpos: np.ndarray) -> float:
+def constraint_error(robot, qpos):
     return float(np.abs(qpos - robot.coupling.positions(qpos)).max())
 
 

@@ -1,7 +1,5 @@
 """Rows and masks that select no env change nothing, in both engines."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from identical import assert_identical

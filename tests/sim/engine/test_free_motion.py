@@ -2,8 +2,6 @@
 native code.
 """
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

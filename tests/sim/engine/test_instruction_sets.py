@@ -1,7 +1,5 @@
 """Vectors of robots have the same bits with each instruction set of the processor."""
 
-from __future__ import annotations
-
 import platform
 import shutil
 import subprocess

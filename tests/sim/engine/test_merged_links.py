@@ -2,8 +2,6 @@
 name.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
@@ -20,7 +18,7 @@ BOX = (
 CAPSULE = '<collision><geometry><capsule radius="0.05" length="0.2"/></geometry></collision>'
 
 
-def arm(tool: str = INERTIAL) -> str:
+def arm(tool=INERTIAL):
     """Return an arm with a camera on a bent bracket, and a tool whose mass ``tool`` gives."""
     return robot(
         *(
@@ -39,16 +37,16 @@ def arm(tool: str = INERTIAL) -> str:
     )
 
 
-def load(folder, text: str) -> Robot:
+def load(folder, text):
     return Robot.load(write(folder, text))
 
 
-def fixed_links(of: Robot) -> list[str]:
+def fixed_links(of):
     """Return the links that fixed joints hold; with wrenches measured, they are not merged."""
     return [each.child_link for each in of.tables.joints if not each.moves]
 
 
-def motion(of: Robot, ticks: int = 30, **options) -> np.ndarray:
+def motion(of, ticks=30, **options):
     efforts = 0.5 * np.sin(0.2 * np.arange(ticks)[:, None] + np.arange(of.dof))
     options = {"control": "effort", "compensate": "none", "ground": False, "workers": 0, **options}
     with Runner(of, 1, **options) as runner:

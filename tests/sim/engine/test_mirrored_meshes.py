@@ -2,8 +2,6 @@
 two of them touch.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tiny_urdf import joint, link, robot, write
@@ -18,7 +16,7 @@ MESH = (
 )
 
 
-def arms(mesh: str, scale: object) -> str:
+def arms(mesh, scale):
     parts = [link(name, MESH.format(mesh, *scale)) for name in ("left", "right")]
     joints = [
         joint("a", "base", "left", origin="0 0 1"),

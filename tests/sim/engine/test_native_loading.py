@@ -2,8 +2,6 @@
 the work.
 """
 
-from __future__ import annotations
-
 import ctypes
 import re
 

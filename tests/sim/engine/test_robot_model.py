@@ -2,8 +2,6 @@
 engines obey them.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from xml.etree import ElementTree
 

@@ -1,7 +1,5 @@
 """Continuous joints, whose positions jump in SAPIEN, against hand calculation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tiny_urdf import one_joint, write
@@ -9,7 +7,7 @@ from tiny_urdf import one_joint, write
 from batchpid.sim import Robot, Runner
 
 
-def wheel(folder, kind: str = "", multiplier: float = 0.0) -> Robot:
+def wheel(folder, kind="", multiplier=0.0):
     """Return a wheel of 0.02 kg m^2, with a body of 0.2 kg or 0.002 kg m^2 that follows it."""
     moments = '<inertia ixx="{0}" iyy="{0}" izz="{0}" ixy="0" ixz="0" iyz="0"/>'
     parts = ['<link name="base"/>']

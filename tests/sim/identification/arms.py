@@ -1,14 +1,12 @@
 """A two-joint arm in the vertical plane, and logs of it from a Runner with known motors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
 import batchpid as bp
 from batchpid.sim import Robot, Runner
-from batchpid.sim.identification import Log, logs_of_rollout
+from batchpid.sim.identification import logs_of_rollout
 
 URDF = """<robot name="arm"><link name="base"/>
 <link name="upper"><inertial><origin xyz="0 0 0.2"/><mass value="2"/>
@@ -33,14 +31,14 @@ STEPS = 5
 OPTIONS = {"workers": 0, "timestep": DT, "substeps": STEPS, "engine": "mujoco"}
 
 
-def load(folder, text: str = URDF) -> Robot:
+def load(folder, text=URDF):
     """Return the arm."""
     path = folder / "arm.urdf"
     path.write_text(text)
     return Robot.load(path)
 
 
-def motion(seconds: float = 3.0, seed: int = 0) -> np.ndarray:
+def motion(seconds=3.0, seed=0):
     """Return setpoints (ticks, 2) that begin at rest."""
     time, rng = np.arange(0, seconds, STEPS * DT)[:, None], np.random.default_rng(seed)
     frequency, phase = np.array([0.4, 0.9, 2.1]), rng.uniform(0, 6, (2, 3))
@@ -48,14 +46,12 @@ def motion(seconds: float = 3.0, seed: int = 0) -> np.ndarray:
     return waves * np.minimum(1.0, time / 0.5) ** 2
 
 
-def gains() -> bp.PIDParams:
+def gains():
     """Return the gains of the arm."""
     return bp.make_params(2, [120.0, 40.0], kd=[8.0, 2.0])
 
 
-def run(
-    robot: Robot, setpoints: np.ndarray, control: str = "pid", compensate: str = "none", **options
-):
+def run(robot, setpoints, control="pid", compensate="none", **options):
     """Return the rollout of a runner that begins at the first setpoint, or at FALLING for
     efforts.
     """
@@ -67,14 +63,14 @@ def run(
         return runner.rollout(setpoints)
 
 
-def log_of(robot: Robot, rollout, noise: float = 0.0, **settings) -> Log:
+def log_of(robot, rollout, noise=0.0, **settings):
     """Return the log of a rollout, with noise of its positions and other settings."""
     (log,) = logs_of_rollout(robot, rollout)
     shaken = log.qpos + noise * np.random.default_rng(1).standard_normal(log.qpos.shape)
     return replace(log, qpos=shaken, **settings)
 
 
-def effort_run(robot: Robot, driven: tuple[float, float] = (1.0, 1.0)):
+def effort_run(robot, driven=(1.0, 1.0)):
     """Return the rollout of efforts that follow :func:`motion` in a loop at the rate of the
     ticks.
     """

@@ -1,7 +1,5 @@
 """Logs from files: columns, units, checks, recordings and bags."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from arms import gains, load, motion, run
@@ -20,7 +18,7 @@ def robot(tmp_path):
     return load(tmp_path)
 
 
-def table(kind: str = "setpoint", **changes) -> dict:
+def table(kind="setpoint", **changes):
     """Return the columns of a log, the joints in another order than the robot's."""
     columns = {"time": TIME}
     for number, joint in enumerate(reversed(JOINTS)):

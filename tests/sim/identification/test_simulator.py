@@ -1,7 +1,5 @@
 """The simulation of a fit is the Runner's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from arms import DT, FALLING, STEPS, TRUTH, gains, load, motion, run
@@ -23,14 +21,14 @@ MOTORS = {
 }
 
 
-def control(params=None, compensate="none") -> Control:
+def control(params=None, compensate="none"):
     """Return the control of a log of setpoints, or without params of efforts."""
     mode = "effort" if params is None else "pid"
     parts = {"gravity": "gravity" in compensate, "coriolis": "coriolis" in compensate}
     return Control(DT, 1, Coupling.of(2), params or bp.PIDParams(kp=None), mode, **parts)
 
 
-def candidates(count=1, law=None, delay=0.0, payload=None, mass=None, **actuators) -> Candidates:
+def candidates(count=1, law=None, delay=0.0, payload=None, mass=None, **actuators):
     """Return equal candidates."""
     options = {name: value for name, value in actuators.items() if value is not None}
     made = bp.make_actuators(2, **options)
@@ -41,14 +39,14 @@ def candidates(count=1, law=None, delay=0.0, payload=None, mass=None, **actuator
     return Candidates(bp.Actuators(**spread), law or {}, late, 0 * late, payload or {}, mass or {})
 
 
-def stretch_of(commands, start) -> Stretch:
+def stretch_of(commands, start):
     """Return a stretch whose rows are the ends of ticks."""
     table = np.repeat(commands, STEPS, axis=0)
     ends = np.arange(STEPS - 1, len(table), STEPS)
     return Stretch(start, np.zeros(2), table, 0, ends, np.zeros(len(ends)))
 
 
-def simulated(robot, commands, drive, made, start) -> np.ndarray:
+def simulated(robot, commands, drive, made, start):
     plant, states = LogPlant(robot, (0, 1)), np.zeros((1, 2, 2))
     return simulate(plant, drive, made, states, [stretch_of(commands, start)])[0][0]
 

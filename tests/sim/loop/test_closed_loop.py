@@ -1,7 +1,5 @@
 """Closed loops as pure functions: the motions of a Runner in MuJoCo, and gradients."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -2,8 +2,6 @@
 bit-identical.
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import warnings

@@ -1,9 +1,5 @@
 """A snapshot of one env restored in many: each copy goes on as the original, bit by bit."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from identical import assert_identical
@@ -15,7 +11,7 @@ from batchpid.sim import Randomization, Runner, Uniform
 
 MOTORS = bp.make_actuators(ARM.dof, command_delay=2e-3, lag=1e-3, coulomb=0.1, position_noise=1e-3)
 SETPOINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (6, ARM.dof))
-CASES: list[dict[str, Any]] = [
+CASES = [
     {},
     {"actuators": MOTORS},
     {"guard": True, "contacts": ["hand"]},
@@ -23,7 +19,7 @@ CASES: list[dict[str, Any]] = [
 ]
 
 
-def moved(runner: Runner, ticks: slice) -> Any:
+def moved(runner, ticks):
     """Return a rollout in which all envs have the same setpoints."""
     setpoints = SETPOINTS[ticks, None]
     return runner.rollout(np.broadcast_to(setpoints, (len(setpoints), runner.num_envs, ARM.dof)))
@@ -32,7 +28,7 @@ def moved(runner: Runner, ticks: slice) -> Any:
 @pytest.mark.quick_rows(6)
 @pytest.mark.parametrize("options", CASES, ids=label)
 @pytest.mark.parametrize("workers", [0, 2])
-def test_copies_go_on_as_the_original(engine: str, workers: int, options: dict[str, Any]) -> None:
+def test_copies_go_on_as_the_original(engine, workers, options):
     with Runner(ARM, 3, workers=0, **options) as runner:
         moved(runner, slice(0, 3))
         snapshot = runner.snapshot()
@@ -46,7 +42,7 @@ def test_copies_go_on_as_the_original(engine: str, workers: int, options: dict[s
     assert np.ptp(copies.qpos[:, 0], axis=0).max() > 1e-4
 
 
-def test_a_runner_of_another_number_of_envs_or_control_refuses_it() -> None:
+def test_a_runner_of_another_number_of_envs_or_control_refuses_it():
     with Runner(ARM, 2, workers=0) as runner:
         snapshot = runner.snapshot()
         with pytest.raises(InvalidArgumentError, match="another num_envs"):

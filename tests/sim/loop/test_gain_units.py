@@ -1,7 +1,5 @@
 """Gains per unit of inertia on real robots."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import load_bundled

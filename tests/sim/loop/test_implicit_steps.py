@@ -1,7 +1,5 @@
 """The implicit law on real robots at large time steps: stable, and as exact as at small ones."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Actuators in the loop: changed in flight, delivered and compensated as the models say."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

@@ -2,8 +2,6 @@
 restores.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tiny_urdf import joint, link, write

@@ -4,17 +4,12 @@ test_conformance.py shows that a run goes on from a snapshot bit by bit, test_st
 runners refuse it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import pickle
 import re
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,13 +17,13 @@ from identical import assert_identical
 from option_values import ARM
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Randomization, Robot, Runner, Snapshot, Uniform
+from batchpid.sim import Randomization, Runner, Snapshot, Uniform
 
 N = 2
 GOAL = np.full(ARM.dof, 0.2)
 
 
-def make(**options: Any) -> Runner:
+def make(**options):
     params = ARM.params(kp=20.0, ki=5.0, kd=2.0, anti_windup="back_calculation", effort_limit=5.0)
     return Runner(
         ARM, N, **{"params": params, "workers": 0, "on_invalid_input": "contain", **options}
@@ -36,7 +31,7 @@ def make(**options: Any) -> Runner:
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def good(tmp_path_factory):
     path = tmp_path_factory.mktemp("snapshot") / "good.npz"
     with make() as runner:
         runner.step(GOAL, setpoint_rate=0.1 * GOAL)
@@ -48,7 +43,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --------------------------------------------------------------------------------------------------
 
 
-def test_a_new_process_and_a_copy_go_on_from_it(jaco2: Robot, tmp_path: Path) -> None:
+def test_a_new_process_and_a_copy_go_on_from_it(jaco2, tmp_path):
     noise = np.random.default_rng(0).uniform(-0.5, 0.5, (6, N, jaco2.dof))
     table = np.clip(jaco2.settings.target + noise, jaco2.lower, jaco2.upper)
     with Runner(jaco2, N, workers=0, params=jaco2.params()) as runner:
@@ -72,7 +67,7 @@ def test_a_new_process_and_a_copy_go_on_from_it(jaco2: Robot, tmp_path: Path) ->
     np.testing.assert_array_equal(np.load(tmp_path / "qpos.npy"), went_on.qpos)
 
 
-def test_it_holds_faults_params_and_time() -> None:
+def test_it_holds_faults_params_and_time():
     with make() as runner:
         with pytest.warns(UserWarning, match="env 1"):
             runner.step([GOAL, [np.nan, 0.0]])
@@ -91,32 +86,30 @@ def test_it_holds_faults_params_and_time() -> None:
 # --------------------------------------------------------------------------------------------------
 
 
-def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def read(path):
     """Return the head of a file and its arrays."""
     with np.load(path) as file:
         tables = dict(file)
     return json.loads(str(tables.pop("head"))), tables
 
 
-def write(
-    path: Path, head: Any, tables: dict[str, Any], save: Callable[..., None] = np.savez
-) -> Path:
+def write(path, head, tables, save=np.savez):
     save(path, head=np.array(json.dumps(head)), **tables)
     return path
 
 
-def head(**changes: Any) -> Callable[..., None]:
+def head(**changes):
     return lambda head, tables: head.update(changes)
 
 
-def about(**changes: Any) -> Callable[..., None]:
+def about(**changes):
     return lambda head, tables: head["about"].update(changes)
 
 
-def array(name: str, change: Callable[[np.ndarray], Any] | None) -> Callable[..., None]:
+def array(name, change):
     """Return a damage that changes an array, or removes it."""
 
-    def damage(head: Any, tables: dict[str, Any]) -> None:
+    def damage(head, tables):
         if change is None:
             del tables[name]
         else:
@@ -125,10 +118,10 @@ def array(name: str, change: Callable[[np.ndarray], Any] | None) -> Callable[...
     return damage
 
 
-def params(pattern: str, text: str) -> Callable[..., None]:
+def params(pattern, text):
     """Return a damage that changes the text of the params."""
 
-    def damage(head: Any, tables: dict[str, Any]) -> None:
+    def damage(head, tables):
         head["params"], count = re.subn(pattern, text, head["params"])
         assert count
 
@@ -161,15 +154,13 @@ DAMAGES = {
 
 
 @pytest.fixture(scope="module")
-def runner() -> Any:
+def runner():
     with make() as made:
         yield made
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_a_damaged_snapshot_is_refused_before_anything_changes(
-    good: Path, runner: Runner, name: str, tmp_path: Path
-) -> None:
+def test_a_damaged_snapshot_is_refused_before_anything_changes(good, runner, name, tmp_path):
     runner.restore(Snapshot.load(write(tmp_path / "rewritten.npz", *read(good))))
     parts, before = read(good), runner.observe()
     DAMAGES[name](*parts)
@@ -189,7 +180,7 @@ def test_a_damaged_snapshot_is_refused_before_anything_changes(
         array("episodes", None),
     ],
 )
-def test_episodes_that_do_not_agree_are_refused(damage: Any, tmp_path: Path) -> None:
+def test_episodes_that_do_not_agree_are_refused(damage, tmp_path):
     path = tmp_path / "drawn.npz"
     with make(randomization=Randomization(payload=Uniform(0, 0.5)), params=None) as runner:
         runner.snapshot().save(path)
@@ -200,9 +191,9 @@ def test_episodes_that_do_not_agree_are_refused(damage: Any, tmp_path: Path) -> 
             runner.restore(Snapshot.load(write(path, *parts)))
 
 
-def test_what_is_no_snapshot_is_refused_and_not_executed(good: Path, tmp_path: Path) -> None:
+def test_what_is_no_snapshot_is_refused_and_not_executed(good, tmp_path):
     class Evil:
-        def __reduce__(self) -> Any:
+        def __reduce__(self):
             return (tmp_path.joinpath("ran").touch, ())
 
     encrypted = bytearray(good.read_bytes())

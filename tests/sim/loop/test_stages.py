@@ -2,8 +2,6 @@
 each feature is the same on every path is in test_conformance.py.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

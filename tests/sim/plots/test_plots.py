@@ -1,7 +1,5 @@
 """Figures show the measured values of any run."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

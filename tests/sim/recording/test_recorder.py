@@ -1,7 +1,5 @@
 """A recorder streams every tick to a file that any reader of HDF5 reads, even after a kill."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -2,8 +2,6 @@
 names.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import fields, replace
 

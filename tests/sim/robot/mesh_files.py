@@ -1,7 +1,5 @@
 """A tetrahedron as a mesh file of each format, and a robot with a mesh."""
 
-from __future__ import annotations
-
 import json
 import struct
 
@@ -14,13 +12,13 @@ CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], "<f4")
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], "<u4")
 
 
-def stl() -> bytes:
+def stl():
     """Tetrahedron as binary STL."""
     facets = (np.zeros(3, "<f4").tobytes() + CORNERS[face].tobytes() + bytes(2) for face in FACES)
     return bytes(80) + struct.pack("<I", len(FACES)) + b"".join(facets)
 
 
-def ascii_stl() -> bytes:
+def ascii_stl():
     lines = ["solid tetrahedron"]
     for face in FACES:
         lines += ["facet normal 0 0 0", " outer loop"]
@@ -29,7 +27,7 @@ def ascii_stl() -> bytes:
     return "\n".join([*lines, "endsolid tetrahedron\n"]).encode()
 
 
-def obj() -> bytes:
+def obj():
     lines = [
         *("v {} {} {}".format(*corner) for corner in CORNERS),
         *("f {} {} {}".format(*face + 1) for face in FACES),
@@ -37,7 +35,7 @@ def obj() -> bytes:
     return "\n".join(lines).encode()
 
 
-def dae() -> bytes:
+def dae():
     coordinates, indices = (
         " ".join(map(str, table.ravel().tolist())) for table in (CORNERS, FACES)
     )
@@ -52,7 +50,7 @@ source="#v" offset="0"/><p>{indices}</p></triangles></mesh></geometry></library_
 </library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>""".encode()
 
 
-def glb(**changed: object) -> bytes:
+def glb(**changed):
     binary = FACES.tobytes() + CORNERS.tobytes()
     content = {
         "asset": {"version": "2.0"},
@@ -98,7 +96,7 @@ GOOD = {
 }
 
 
-def arm(name: str) -> str:
+def arm(name):
     return one_joint(
         arm=INERTIAL + f'<collision><geometry><mesh filename="{name}"/></geometry></collision>'
     )

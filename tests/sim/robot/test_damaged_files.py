@@ -2,10 +2,7 @@
 memory.
 """
 
-from __future__ import annotations
-
 import resource
-from collections.abc import Collection
 from pathlib import Path
 
 import pytest
@@ -71,7 +68,7 @@ SNIPPETS += [
 
 
 @st.composite
-def damaged(draw: st.DrawFn, data: bytes) -> bytes:
+def damaged(draw, data):
     """Draw ``data`` with flipped bits, replaced parts or a cut."""
     for _ in range(draw(st.integers(1, 3))):
         at = draw(st.integers(0, len(data)))
@@ -87,7 +84,7 @@ def damaged(draw: st.DrawFn, data: bytes) -> bytes:
     return data
 
 
-def try_loading(path: Path, build: bool) -> None:
+def try_loading(path, build):
     """Load a robot and ``build`` a scene of it: an error is one of ours, and the memory is bounded."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
@@ -100,7 +97,7 @@ def try_loading(path: Path, build: bool) -> None:
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
 
 
-def fuzz(count: int, folder: Path, built: Collection[str]) -> None:
+def fuzz(count, folder, built):
     path, srdf = (folder / name for name in ("test.urdf", "test.srdf"))
 
     @settings(
@@ -111,7 +108,7 @@ def fuzz(count: int, folder: Path, built: Collection[str]) -> None:
         suppress_health_check=list(HealthCheck),
     )
     @given(data=st.data())
-    def run(data: st.DataObject) -> None:
+    def run(data):
         base = data.draw(st.sampled_from(NAMES), label="robot")
         contents = {path: SOURCES[base]}
         if base == "one joint":

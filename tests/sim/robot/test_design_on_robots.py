@@ -5,8 +5,6 @@ The robots are the bundled ones and, where it is installed, the robots of the pa
 PhysX takes a dimensionless coefficient.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import load_published

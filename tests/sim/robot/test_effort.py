@@ -1,7 +1,5 @@
 """Effort limits of designed gains, where the URDF gives none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tiny_urdf import LIMIT, joint, link, one_joint, robot, write

@@ -13,11 +13,11 @@ from batchpid.task_space.frames import compose, matrix_of, rotate, total
 BOX = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
 
 
-def load(tmp_path, *parts, **options) -> Robot:
+def load(tmp_path, *parts, **options):
     return Robot.load(write(tmp_path, robot(*parts)), **options)
 
 
-def names_of(tables) -> list[str]:
+def names_of(tables):
     return [body.name for body in tables.bodies]
 
 

@@ -7,18 +7,18 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 from batchpid.sim import Robot
 
 
-def hand(folder, **mimics: str) -> Robot:
+def hand(folder, **mimics):
     """Return a robot of joints side by side, with a limit and a mimic each."""
     links = [link("base", INERTIAL), *(link(f"l_{name}") for name in mimics)]
     joints = [joint(name, "base", f"l_{name}", inner=inner) for name, inner in mimics.items()]
     return Robot.load(write(folder, robot(*links, *joints)))
 
 
-def limit(lower: float, upper: float) -> str:
+def limit(lower, upper):
     return f'<limit lower="{lower}" upper="{upper}" effort="10" velocity="2"/>'
 
 
-def mimic(leader: str, multiplier: float = 1.0, offset: float = 0.0) -> str:
+def mimic(leader, multiplier=1.0, offset=0.0):
     return f'<mimic joint="{leader}" multiplier="{multiplier}" offset="{offset}"/>'
 
 

@@ -1,7 +1,5 @@
 """The robot as MJCF: MuJoCo's own loader gives the simulated robot, with motors or servos."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

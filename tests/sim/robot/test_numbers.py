@@ -1,10 +1,6 @@
 """Every number of a URDF is read as it stands, or refused or reported with its text."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from lxml import etree
@@ -65,7 +61,7 @@ WRONG = (
 )
 
 
-def changed(at: int, key: str, change: Callable[[str], str]) -> tuple[str, str]:
+def changed(at, key, change):
     """Return WHOLE with one of its numbers changed, and the new text."""
     root = etree.fromstring(WHOLE.encode())
     element = list(root.iter())[at]
@@ -73,7 +69,7 @@ def changed(at: int, key: str, change: Callable[[str], str]) -> tuple[str, str]:
     return etree.tostring(root, encoding="unicode"), element.get(key)
 
 
-def report(path: Path) -> str:
+def report(path):
     """Return the error, or the findings, of loading a robot."""
     try:
         return "\n".join(map(str, Robot.load(path).repairs))
@@ -111,7 +107,7 @@ def test_an_expression_of_xacro_is_refused(at, key, expression, tmp_path):
     ],
 )
 def test_degrees_are_recognised(old, new, said, tmp_path):
-    def findings(text: str) -> str:
+    def findings(text):
         return "\n".join(map(str, Robot.load(write(tmp_path, text)).check()))
 
     assert re.search(said, findings(WHOLE.replace(old, new)))

@@ -2,8 +2,6 @@
 robot runs.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 
@@ -40,7 +38,7 @@ def test_a_repair_is_told_and_the_robot_runs_or_strict_refuses(case, tmp_path):
 
 
 def test_repairs_have_the_effect_that_they_tell(tmp_path):
-    def load(case: str) -> Robot:
+    def load(case):
         return Robot.load(write(tmp_path, REPAIRED[case][0]))
 
     assert (load("swapped limits").lower, load("swapped limits").upper) == (1, 2)
@@ -118,7 +116,7 @@ def test_a_mass_of_zero_is_not_that_of_the_shapes(tmp_path):
 ENTRIES = st.lists(st.floats(-1, 1), min_size=9, max_size=9)
 
 
-def symmetric(entries: list[float]) -> np.ndarray:
+def symmetric(entries):
     half = np.reshape(entries, (3, 3))
     return half + half.T
 

@@ -2,8 +2,6 @@
 poses.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +21,7 @@ BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
 SLIDE = '<limit lower="-0.5" upper="0.5" effort="10" velocity="2"/>'
 
 
-def sliders(*places: float) -> str:
+def sliders(*places):
     """Return a robot of boxes of 0.2 m on slides along y from a base in the air, which they do not
     touch.
     """
@@ -36,11 +34,11 @@ def sliders(*places: float) -> str:
     return robot(*parts)
 
 
-def reasons(loaded: Robot) -> dict[tuple[str, str], str]:
+def reasons(loaded):
     return {(pair.first, pair.second): pair.reason for pair in loaded.self_contact.pairs}
 
 
-def touches(loaded: Robot) -> bool:
+def touches(loaded):
     return bool(loaded.dynamics().in_contact(loaded.start[None])[0])
 
 

@@ -1,7 +1,5 @@
 """Every fault of a URDF has its error, with culprit and remedy; none runs, hangs or crashes."""
 
-from __future__ import annotations
-
 import re
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """The repaired robot as a URDF: it loads as the same robot, without repairs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from faulty_urdfs import REPAIRED

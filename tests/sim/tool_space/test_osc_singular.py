@@ -2,8 +2,6 @@
 damped motion, and no effect on other envs.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from osc_arms import START, six

@@ -1,7 +1,5 @@
 """First candidates of searches for robots that differ from the model."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from batchpid.sim.tuning.candidates import DESIGNS, GainCandidates

@@ -1,7 +1,5 @@
 """Metrics of step responses, evaluations of gains, and the tuned gains that ship."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Gain sets by name, and from files."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Moves to evaluate gains on, their shortest durations and their smooth efforts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

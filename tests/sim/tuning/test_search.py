@@ -1,7 +1,5 @@
 """The search for gains: its seed, its units, its costs."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -2,8 +2,6 @@
 any loss.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 

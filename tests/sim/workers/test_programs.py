@@ -2,8 +2,6 @@
 their end.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -32,7 +30,7 @@ SHORT = "while True: runner.step(robot.settings.target)"
 STEP = "os.write({output}, str(runner.step(robot.settings.target).ok.all()).encode())"
 
 
-def start(body: str, *arguments: str, output: int = 1, text: str = PROGRAM, **options):
+def start(body, *arguments, output=1, text=PROGRAM, **options):
     """Start a program with a runner; return its process and the pids of its workers."""
     program = text.format(body=textwrap.dedent(body).format(output=output), output=output)
     paths = [str(ROOT), *filter(None, sys.path)]
