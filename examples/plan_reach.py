@@ -1,7 +1,7 @@
 """Plan with the simulated robot: a panda reaches around a ball, by rollouts of 64 copies of its
 present state.
 
-    python examples/plan_reach.py [--no-motors] [--delay 0.03] [--film reach.mp4]
+    python examples/plan_reach.py [--no-motors] [--delay 0.03] [--film reach.mp4]    (needs SciPy)
 
 Predictive sampling: every 50 ms, 64 splines of setpoints run for 0.3 s, and the robot follows the
 best one. The copies have the delay of the robot's motors; with --no-motors they have ideal ones.

@@ -113,7 +113,7 @@ def identify_logs(
         Field("s", low=1e-5, high=0.01),
         flag(
             "Time step of the control that drove the robot [s]. Default: as the recordings say, else"
-            " the period of the rows up to 2.5 ms, or a part of a longer one of at most 1 ms."
+            " the period of the rows up to 2.5 ms, or a part of a longer one of at most 0.5 ms."
         ),
     ] = None,
     hold: Annotated[

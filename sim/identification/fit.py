@@ -34,7 +34,7 @@ at least the correlation rho of neighbouring residuals.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,7 +42,6 @@ import numpy as np
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import bounded_solution
-from batchpid.sim.identification.unknowns import Unknown
 
 OUTLIER = 2.0
 """Ratio C of a residual to its size above which its weight in the loss decreases."""
@@ -131,8 +130,8 @@ class Fit(NamedTuple):
     """Size of the residuals that the fit was weighted with (joints,)."""
     converged: bool
     certainty: Certainty = UNCERTAIN
-    dropped: tuple[Unknown, ...] = ()
-    """Delay and lag of setpoints that the logs do not need."""
+    dropped: Sequence[str] = ()
+    """"setpoint_delay" and "setpoint_lag", where the logs do not need them."""
     effects: Mapping[str, float] = {}
     """Effects that were added, with the share of the held-out error that each left."""
 
@@ -140,28 +139,26 @@ class Fit(NamedTuple):
 def solve(
     problem: Problem,
     point: Float64,
-    size: Float64 | None = None,
-    evaluations: int = 60,
-    progress: Callable[[], object] | None = None,
+    *,
+    evaluations: int,
+    progress: Callable[[], object],
     tolerance: float = TOLERANCE,
 ) -> Fit:
-    """Return the fit from a ``point``; it begins with a ``size`` (joints,) of the residuals, or the
-    one at the point.
+    """Return the fit from a ``point``.
 
-    The size of residuals that are left may be far smaller, which would give the prior too much
-    weight: it is taken anew until it stays.
+    The size of the residuals that are left may be far smaller than at the point, which would give
+    the prior too much weight: it is taken anew until it stays.
     """
     low, high = problem.unknowns.bounds
     point = np.clip(point, low, high)
     place = iterate(problem, point, FIRST_CHANGE * np.eye(len(point)))
-    weight = problem.size(place.evaluation) if size is None else size
+    weight = problem.size(place.evaluation)
     damping = DAMPING
     growth = GROWTH
     rounds = 1
     settled = False
     for _ in range(evaluations - 1):
-        if progress is not None:
-            progress()
+        progress()
         before = cost(problem, place, weight)
         triangle = triangle_of(problem, place, weight)
         step, expected = bounded_step(triangle, damping, low - place.point, high - place.point)
@@ -172,7 +169,7 @@ def solve(
             square = max(float(triangle[:, 0] @ triangle[:, 0]) / rows_of(problem), 1e-6)
             hessian = triangle[:, 1:].T @ triangle[:, 1:] / square
             axes, _ = axes_of(hessian, np.maximum(abs(further), 1))
-            place = iterate(problem, further, _inward(further, axes, low, high))
+            place = iterate(problem, further, inward(further, axes, low, high))
             damping = max(damping * (0.1 if gain > 0.5 * expected else 0.5), 1e-9)
             growth = GROWTH
         else:
@@ -250,7 +247,7 @@ def bounded_step(
     return step, 0.5 * float(decrease)
 
 
-def _inward(
+def inward(
     point: Float64,
     axes: Float64,
     low: Float64,
@@ -288,6 +285,8 @@ def with_certainty(fit: Fit) -> Fit:
     scale = prior * unknowns.sizes
     total = np.abs(unknowns.values(point) + unknowns.described)
     deviation = np.maximum(np.sqrt(ratio) * scale, LEAST_DEVIATION * total)
+    is_delay = np.array([entry.kind == "delay" for entry in unknowns.entries])
+    deviation += problem.half_row / INTERVAL * is_delay
     # Correlations come from the information.
     spans, axes = np.linalg.eigh(covariance)
     lengths = np.minimum(deviation, scale) / np.sqrt(variance)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from multiprocessing import get_context
 from typing import Any
@@ -18,6 +19,7 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks import choice, flag, instance, integer, number
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.identification.fit import solve
 from batchpid.sim.identification.log import CommandKind, Log, checked
 from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.problem import Problem, windows_of
@@ -31,7 +33,7 @@ from batchpid.sim.identification.regression import (
 )
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import Exact, LogPlant
-from batchpid.sim.identification.trials import fit, with_effects
+from batchpid.sim.identification.trials import fit
 from batchpid.sim.identification.unknowns import (
     BASIC,
     EXTRAS,
@@ -53,7 +55,7 @@ FOLLOWS = 0.01
 """A joint is stuck if the standard deviation of its positions is at most this share of its
 setpoints'.
 """
-LONGEST_STEP, USUAL_STEP = 2.5e-3, 1e-3
+LONGEST_STEP, USUAL_STEP = 2.5e-3, 5e-4
 """Period up to which the rows of a log count as steps of the control, and the longest time step
 otherwise [s].
 """
@@ -95,7 +97,7 @@ def identify(
         Default: as the recordings say, else "gravity+coriolis+friction".
     timestep
         Time step of the control that drove the robot [s]. Default: as the recordings say, else the
-        period of the rows up to 2.5 ms, or a part of a longer one of at most 1 ms.
+        period of the rows up to 2.5 ms, or a part of a longer one of at most 0.5 ms.
     payload
         Find a payload, too.
     payload_link
@@ -138,25 +140,29 @@ def identify(
         timestep,
     )
     law_unknown = bool({"kd", "gain"}.intersection(kinds))
-    data, guesses = _regress(robot, data, law_unknown, progress)
+    progress = progress or _idle
+    data, guess = _regress(robot, data, law_unknown, progress)
     windows = windows_of(data)
     with ExitStack() as stack:
         run = _map(stack, integer("workers", workers, 0, 1000))
-        starts = dict[Any, list[Problem]]()
+        starts = []
         for place, share in product(places, SATURATIONS if "saturation" in kinds else (0.7,)):
-            for guess in guesses:
-                unknowns = _unknowns(
-                    robot,
-                    data,
-                    guess,
-                    kinds,
-                    place,
-                    share,
-                )
-                starts.setdefault((place, share), []).append(Problem(data, windows, unknowns, run))
-        solution = with_effects(fit(starts, evaluations, progress), evaluations, progress)
+            unknowns = _unknowns(
+                robot,
+                data,
+                guess,
+                kinds,
+                place,
+                share,
+            )
+            starts.append(Problem(data, windows, unknowns, run))
+        solution = fit(starts, partial(solve, evaluations=evaluations, progress=progress))
     # Worker processes end with the fit.
     return Identification(solution._replace(problem=replace(solution.problem, run=map)), still)
+
+
+def _idle() -> None:
+    """Report no progress."""
 
 
 def _payload_links(robot: Robot, name: str | None) -> list[str | None]:
@@ -339,15 +345,15 @@ def _regress(
     robot: Robot,
     data: list[LogData],
     law_unknown: bool,
-    progress: Callable[[], object] | None,
-) -> tuple[list[LogData], list[Guess]]:
-    """Return the logs, marked whether the compensation passes through the motors, and the guesses
-    of the regression.
+    progress: Callable[[], object],
+) -> tuple[list[LogData], Guess]:
+    """Return the logs, marked whether the compensation passes through the motors, and the guess of
+    the regression.
 
     Setpoints may seem late where gains are unknown. Raises InvalidArgumentError where a log makes
     far more sense in another reading.
     """
-    guesses = regress(_fitted(data))
+    guess = regress(_fitted(data))
     if data[0].drive.gravity:
         # A robot that adds the compensation by itself may do so exactly, whatever its motors.
         none = np.zeros(data[0].plant.joints)
@@ -355,16 +361,16 @@ def _regress(
         for part in data:
             drive = part.drive._replace(powered=none, further=(Exact(),))
             exact.append(part._replace(drive=drive))
-        others = regress(_fitted(exact))
-        if others[0].cost < guesses[0].cost - DETOUR:
+        other = regress(_fitted(exact))
+        if other.cost < guess.cost - DETOUR:
             data = exact
-            guesses = others
-    words = better_reading(robot, _fitted(data)[0], guesses[0], progress)
+            guess = other
+    words = better_reading(robot, _fitted(data)[0], guess, progress)
     if words and not (law_unknown and words.endswith("late")):
         remedy = "correct the log, or name its columns with sign and unit, as in"
         remedy += """ --columns "effort: -effort:{joint} mNm\""""
         raise InvalidArgumentError("logs", f"make sense with {words}", remedy=remedy)
-    return data, guesses
+    return data, guess
 
 
 def _fitted(data: list[LogData]) -> list[LogData]:
@@ -422,8 +428,14 @@ def _unknowns(
         "top_speed": np.quantile(np.abs(motion.qvel), 0.99, axis=0),
         "error": share * np.quantile(np.abs(motion.command - motion.qpos), 0.95, axis=0),
     }
-    unknowns = Unknowns(robot, log.joints, sizes, plant.heavy_links)
-    return unknowns.adding(kinds, starts, payload_link)
+    unknowns = Unknowns(
+        robot,
+        log.joints,
+        sizes,
+        plant.heavy_links,
+        payload_link,
+    )
+    return unknowns.adding(kinds, starts)
 
 
 def _map(stack: ExitStack, workers: int) -> Callable[..., Any]:

@@ -61,6 +61,16 @@ class Problem:
     run: Callable[..., Any] = map
     """Map over groups of windows: ``map``, or that of worker processes."""
 
+    @property
+    def half_row(self) -> float:
+        """Time by which efforts seem late if the robot held them and the log is interpolated [s]:
+        half of the time between rows. A delay of setpoints is an unknown of its own.
+        """
+        log, _, _, drive = self.data[0]
+        if log.held or drive.mode == "pid":
+            return 0.0
+        return max(float(np.median(np.diff(log.command_time))) - drive.timestep, 0.0) / 2
+
     def coarse(self, judged: bool = False) -> Problem:
         """Return the problem with every FEWER-th window, or with the beginnings of logs of
         setpoints, for the first steps of a fit; itself where logs are short.

@@ -22,18 +22,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.motors.actuators import Actuators
-from batchpid.motors.friction import Friction
+from batchpid.arrays.elementwise import wrap
+from batchpid.motors.friction import compensation
 from batchpid.sim.identification.log import Log, interpolated
-from batchpid.sim.identification.simulator import Candidates, LogPlant
-from batchpid.sim.loop.loop_run import LoopRun, MotionPlant
+from batchpid.sim.identification.simulator import LogPlant
 from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control
 from batchpid.task_space.tree_quantities import inverse_dynamics
 
-VALUES = "armature", "damping", "friction", "strength", "bias", "cost"
-"""Results for a joint."""
+VALUES = "armature", "damping", "friction", "strength", "bias"
+"""Values of a joint."""
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
 EFFORT_DELAYS = np.arange(0.0, 0.03, 1e-3)
@@ -105,12 +105,6 @@ class Guess(NamedTuple):
         """Mean of the costs."""
         return float(self.costs.mean())
 
-    @property
-    def odd(self) -> Bool:
-        """Mask (joints,): the motor explains little of the efforts, or its strength is far from 1."""
-        strength = self.values["strength"]
-        return (self.costs > WORST) | (strength < STRENGTHS[0]) | (strength > STRENGTHS[1])
-
 
 def smooth(log: Log, timestep: float) -> Motion:
     """Return the motion of ``log`` on the grid, filtered without phase lag."""
@@ -146,9 +140,9 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
     return np.ascontiguousarray((line + filtered[: len(line)])[: len(table)])
 
 
-def regress(data: Sequence[LogData]) -> list[Guess]:
-    """Return the motors of logs at the delays of the least cost, the best first: one guess for each
-    delay of the setpoints that explains the efforts about as well.
+def regress(data: Sequence[LogData]) -> Guess:
+    """Return the motors of logs at the delays of the least cost; setpoints that were logged late are
+    the last explanation.
     """
     every = 1 + sum(len(part.motion.qpos) for part in data) // MOST_REGRESSION_ROWS
     cutoff = min(_cutoff(part.log) for part in data)
@@ -166,18 +160,15 @@ def regress(data: Sequence[LogData]) -> list[Guess]:
         for joint, fast in enumerate(moves.T):
             table = [column[fast, joint] for column in (*columns, efforts[shift, delay])]
             joints.append(_solve(table))
-        values = dict(zip(VALUES, np.array(joints).T, strict=True))
-        values |= {"delay": delays[[delay]], "setpoint_delay": shifts[[shift]]}
-        guesses.append(Guess(values, values.pop("cost")))
+        *values, costs = np.array(joints).T
+        named = dict(zip(VALUES, values, strict=True))
+        named |= {"delay": delays[[delay]], "setpoint_delay": shifts[[shift]]}
+        guesses.append(Guess(named, costs))
+    best = min(guesses, key=attrgetter("cost"))
     # Logs show the sum of both delays; armature and damping can hide how it is divided.
-    guesses.sort(key=attrgetter("cost"))
-    alike = [guess for guess in guesses if guess.cost < guesses[0].cost + ALIKE_COSTS]
-    # Setpoints that were logged late are the last explanation.
+    alike = [guess for guess in guesses if guess.cost < best.cost + ALIKE_COSTS]
     usual = [guess for guess in alike if guess.values["setpoint_delay"][0] > -1e-9]
-    best = dict[float, Guess]()
-    for guess in usual or alike:
-        best.setdefault(float(guess.values["setpoint_delay"][0]), guess)
-    return list(best.values())
+    return min(usual or alike, key=attrgetter("cost"))
 
 
 def _table(
@@ -229,37 +220,27 @@ def _commanded(part: LogData) -> Float64:
     """Return logged efforts (1, steps, joints), or the law's along a motion (setpoint delays,
     steps, joints).
     """
-    motion, drive, plant = part.motion, part.drive, part.plant
+    motion, drive = part.motion, part.drive
     if drive.mode == "effort":
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
-    none = np.zeros(count)
-    alone = drive._replace(
-        gravity=False,
-        coriolis=False,
-        further=(),
-    )
-    loop = plant.loop(
-        alone,
-        Candidates(
-            Actuators(),
-            {},
-            none,
-            none,
-            {},
-            {},
-        ),
-    )
-    loop = replace(loop, control=loop.control._replace(friction=Friction()))
-    tables = [np.repeat(plant.spread(table)[:, None], count, axis=1) for table in motion[:2]]
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)
     setpoints = motion.command[np.clip(np.arange(steps)[:, None] - late, 0, steps - 1)]
-    moving = loop.changed(plant=MotionPlant(*tables))
-    run = LoopRun(moving, tables[0][0], tables[1][0], plant.spread(setpoints[0]), steps)
-    run.setpoints[...] = plant.spread(setpoints)
-    run.run(steps)
-    efforts: Float64 = run.effort[..., plant.columns]
-    return efforts.swapaxes(0, 1)
+    qpos, qvel = (np.repeat(table[:, None], count, axis=1) for table in motion[:2])
+    forward = np.zeros_like(setpoints)
+    if drive.modelled is not None:
+        error = wrap(setpoints - qpos, drive.turns, np)
+        forward = compensation(
+            drive.modelled,
+            error,
+            None,
+            drive.band,
+        )
+    law = bp.BatchPID(drive.params, count, drive.timestep)
+    rates = qvel if drive.params.measurement_rate is not None else [None] * steps
+    inputs = zip(setpoints, qpos, rates, forward, strict=True)
+    efforts = [law(row, y, rate, feedforward=f) for row, y, rate, f in inputs]
+    return np.array(efforts).swapaxes(0, 1)
 
 
 def _solve(table: Sequence[Float64]) -> list[float]:
@@ -330,7 +311,7 @@ def better_reading(
     robot: Robot,
     data: LogData,
     guess: Guess,
-    progress: Callable[[], object] | None,
+    progress: Callable[[], object],
 ) -> str:
     """Return the reading of a log that explains its efforts far better than the present one, in
     words; "" for none.
@@ -339,20 +320,22 @@ def better_reading(
     robot's limits.
     """
     log = data.log
+    strength = guess.values["strength"]
+    # The motor explains little of the efforts, or its strength is far from 1.
+    odd = (guess.costs > WORST) | (strength < STRENGTHS[0]) | (strength > STRENGTHS[1])
     limits = robot.effort_limit[list(log.joints)]
     beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > OTHER_UNIT_RATIO * limits
-    if guess.odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
+    if odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
         begin = log.part(
             log.time < log.time[0] + TRIED_SECONDS, log.command_time < log.time[0] + TRIED_SECONDS
         )
         names = [robot.joint_names[joint] for joint in log.joints]
         costs = dict[str, float]()
-        for words, on_qpos, on_command in _readings(log.kind, names, guess.odd):
-            if progress is not None:
-                progress()
+        for words, on_qpos, on_command in _readings(log.kind, names, odd):
+            progress()
             other = replace(begin, qpos=begin.qpos @ on_qpos, command=begin.command @ on_command)
             motion = smooth(other, data.drive.timestep)
-            costs[words] = regress([data._replace(log=other, motion=motion)])[0].cost
+            costs[words] = regress([data._replace(log=other, motion=motion)]).cost
         present = costs.pop("")
         best = min(costs.values())
         if best < min(present - EVIDENCE, WORST):

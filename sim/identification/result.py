@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,17 +25,44 @@ from batchpid.sim.identification.unknowns import UNKNOWN_KINDS, Unknown, Unknown
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import load_robot_actuators
 from batchpid.sim.robot.urdf_export import to_urdf
-from batchpid.stages import Control
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+ROBOT = "robot"
+"""Place of unknowns of the whole robot."""
 KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
 AT_BOUND = 1e-6
 """Distance from a bound, over the typical size, at which a value is there."""
 EXPLAINS = 0.5
 """Share of the position error of the robot as described that a file may leave."""
+
+
+class Estimate(NamedTuple):
+    """Value of an unknown, with the description's."""
+
+    value: float
+    low: float
+    high: float
+    """Ends of the 95 % interval."""
+    is_shown: bool
+    """False if the logs do not determine it: it has its likeliest value."""
+    remark: str
+    """Unknowns that it cannot be told from if it is not shown, or that it is at its bound."""
+
+    def cell(self, is_positive: bool) -> str:
+        """Return it with its interval, or its bound where the interval is wider than itself."""
+        half = self.high - self.value
+        if not self.is_shown:
+            text = "not shown by these logs"
+        elif half > abs(self.value) and is_positive:
+            text = f"< {self.high:.2g}"
+        else:
+            # As many digits as the first one of the interval has, and one more.
+            digits = np.log10(max(abs(self.value), half) / half)
+            text = f"{self.value:.{1 + int(np.ceil(digits))}g} ± {half:.1g}"
+        return f"{text} ({self.remark})" if self.remark else text
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,56 +73,34 @@ class Identification:
     still: tuple[str, ...]
     """Joints that did not move."""
 
-    @cached_property
-    def errors(self) -> tuple[Float64, Float64]:
-        """Root mean square of the position error by joint (joints,) on the held-out part of the
-        logs, simulated from the logged state: of the robot as described and as identified.
-        """
-        problem = self.fit.problem
-        described = self._described.errors(np.zeros(0), free_states=False)
-        return described[0], problem.errors(self._point, free_states=False)[0]
-
-    @property
-    def _described(self) -> Problem:
-        """The problem without unknowns."""
-        return replace(self.fit.problem, unknowns=replace(self.unknowns, entries=()))
-
     @property
     def unknowns(self) -> Unknowns:
         """Unknowns of the fit; those that the logs do not show have their likeliest values."""
         return self.fit.problem.unknowns
 
     @property
-    def remarks(self) -> list[str]:
-        """Sentences on what was left out of the logs, and on joints that did not move."""
-        logs = (part.log for part in self.fit.problem.data)
-        remarks = dict.fromkeys(remark for log in logs for remark in log.remarks)
-        words = "did not move, or did not follow its setpoint: left out, and held in place"
-        return [*remarks, *(f"joint {name!r} {words}" for name in self.still)]
-
-    @property
-    def _point(self) -> Float64:
-        return self.fit.point
-
-    @property
-    def robot(self) -> Robot:
-        """The robot, at rest where it did not move."""
-        return self.unknowns.robot
-
-    @property
-    def joints(self) -> tuple[int, ...]:
-        """Numbers of the joints that the logs hold and that moved."""
-        return self.unknowns.joints
-
-    @property
-    def drive(self) -> Control:
-        """Control of the first log."""
-        return self.fit.problem.data[0].drive
-
-    @property
     def values(self) -> Float64:
         """Values of the unknowns (unknowns,), in addition to the robot's description."""
-        return self.unknowns.values(self._point)
+        return self.unknowns.values(self.fit.point)
+
+    @property
+    def joint_names(self) -> list[str]:
+        """Names of the joints that the logs hold and that moved."""
+        return [self.unknowns.robot.joint_names[joint] for joint in self.unknowns.joints]
+
+    @property
+    def _described(self) -> Problem:
+        """The problem without unknowns."""
+        return replace(self.fit.problem, unknowns=replace(self.unknowns, entries=()))
+
+    @cached_property
+    def errors(self) -> tuple[Float64, Float64]:
+        """Root mean square of the position error by joint (joints,) on the held-out part of the
+        logs, simulated from the logged state: of the robot as described and as identified.
+        """
+        described = self._described.errors(np.zeros(0), free_states=False)
+        found = self.fit.problem.errors(self.fit.point, free_states=False)
+        return described[0], found[0]
 
     @property
     def held_out_error(self) -> tuple[float, float]:
@@ -110,43 +115,62 @@ class Identification:
         return after < EXPLAINS * before
 
     @property
-    def converged(self) -> bool:
-        """False if the fit has stopped at the largest number of evaluations."""
-        return self.fit.converged
-
-    @property
-    def effects(self) -> dict[str, float]:
-        """Effects that were added because they lower the held-out error, and the share of it that
-        each left.
+    def remarks(self) -> list[str]:
+        """Sentences on the parts that were left out, effects that were added, the robot's
+        compensation, and a fit that stopped at the largest number of evaluations.
         """
-        return dict(self.fit.effects)
+        data = self.fit.problem.data
+        drive = data[0].drive
+        remarks = list(dict.fromkeys(remark for part in data for remark in part.log.remarks))
+        for name in self.still:
+            words = "did not move, or did not follow its setpoint: left out, and held in place"
+            remarks.append(f"joint {name!r} {words}")
+        for name, share in self.fit.effects.items():
+            remarks.append(f"with {name}, which lowers the held-out error by {1 - share:.0%}")
+        if drive.gravity:
+            parts = {"coriolis": drive.coriolis, "friction": drive.modelled is not None}
+            forces = "+".join(["gravity", *compress(parts, parts.values())])
+            path = "apart from its motors" if drive.further else "through its motors"
+            remarks.append(f"the robot compensates {forces} {path}")
+        if half := self.fit.problem.half_row:
+            words = "commands are interpolated between rows: if the robot held them (--hold), the"
+            remarks.append(f"{words} delay is {half:.2g} s shorter")
+        if self.fit.dropped:
+            remarks.append(f"not needed by these logs: {', '.join(self.fit.dropped)}")
+        if not self.fit.converged:
+            remarks.append("the fit has not converged: the values are the best so far")
+        return remarks
 
-    @property
-    def not_shown(self) -> dict[str, list[str]]:
-        """Unknowns that the logs do not show, e.g. "elbow: strength", and for each those that it
-        cannot be told from.
+    @cached_property
+    def estimates(self) -> dict[str, dict[str, Estimate]]:
+        """Unknowns by joint, link of a mass, or "robot", and by kind, a name of
+        :data:`batchpid.sim.identification.unknowns.UNKNOWN_KINDS`.
         """
-        shown, alike = self.fit.certainty.shown, self.fit.certainty.alike
-        names = [self._name(entry) for entry in self.unknowns.entries]
-        groups = dict[str, list[str]]()
-        for row in np.flatnonzero(~shown).tolist():
-            others = np.flatnonzero(alike[row]).tolist()
-            groups[names[row]] = [names[other] for other in others if other != row]
-        return groups
+        unknowns = self.unknowns
+        certainty = self.fit.certainty
+        halves = INTERVAL * certainty.deviation
+        least = [entry.least for entry in unknowns.entries]
+        lows = np.maximum(self.values - halves, least)
+        rows = np.array([self.values, lows, self.values + halves]) + unknowns.described
+        low, high = unknowns.bounds
+        is_held = (self.fit.point <= low + AT_BOUND) | (self.fit.point >= high - AT_BOUND)
+        names = [f"{self._place(entry)}: {entry.kind}" for entry in unknowns.entries]
+        estimates: dict[str, dict[str, Estimate]] = {}
+        for at, entry in enumerate(unknowns.entries):
+            is_shown = bool(certainty.shown[at])
+            others = [names[other] for other in np.flatnonzero(certainty.alike[at]) if other != at]
+            remark = "at its bound" if is_held[at] else ""
+            if others and not is_shown:
+                remark = f"cannot be told from {', '.join(others)}"
+            row = Estimate(*rows[:, at].tolist(), is_shown, remark)  # type: ignore[call-arg]
+            estimates.setdefault(self._place(entry), {})[entry.kind] = row
+        return estimates
 
-    @property
-    def not_needed(self) -> list[str]:
-        """Kinds of unknowns of the setpoints that were left out: without them the held-out error is
-        about the same.
-        """
-        return [entry.kind for entry in self.fit.dropped]
-
-    @property
-    def at_bounds(self) -> list[str]:
-        """Unknowns whose value, with the description's, is at its bound."""
-        low, high = self.unknowns.bounds
-        is_held = (self._point <= low + AT_BOUND) | (self._point >= high - AT_BOUND)
-        return [self._name(entry) for entry in self.unknowns.only(is_held).entries]
+    def _place(self, entry: Unknown) -> str:
+        """Return the joint of an unknown, the link of a mass, or "robot"."""
+        return (
+            self.joint_names[entry.place] if isinstance(entry.place, int) else entry.place or ROBOT
+        )
 
     def interval(
         self, kind: str, joint: int | str | None = None
@@ -154,57 +178,38 @@ class Identification:
         """Return estimate, lower and upper end of the 95 % interval; None if the logs do not
         identify it.
 
-        Friction and damping include the description's. ``kind`` is a name of
-        :data:`batchpid.sim.identification.unknowns.UNKNOWN_KINDS`, ``joint`` the number of a joint
-        among :attr:`joints`, the name of a link for "mass", None for "delay", "setpoint_delay" and
-        "payload".
+        Friction and damping include the description's. ``joint`` is the number of a joint among
+        :attr:`joint_names`, its name, or the name of a link for "mass"; None for "delay",
+        "setpoint_delay", "setpoint_lag" and "payload".
 
         Raises
         ------
         InvalidArgumentError
             There is no such unknown.
         """
-        places = [(entry.kind, entry.place) for entry in self.unknowns.entries]
-        dropped = [(entry.kind, entry.place) for entry in self.fit.dropped]
-        if (kind, joint) not in places + dropped:
-            problem = f"is no unknown of {joint!r}"
-            remedy = f"there are {sorted({name for name, _ in places + dropped})}"
-            raise InvalidArgumentError("kind", problem, value=kind, remedy=remedy)
-        if (kind, joint) in dropped:
+        if kind in self.fit.dropped and joint is None:
             return None
-        row = places.index((kind, joint))
-        return self._rows[row] if self.fit.certainty.shown[row] else None
-
-    @property
-    def _rows(self) -> list[tuple[float, float, float]]:
-        """Estimate and ends of the interval of each unknown, with the description's values."""
-        described = self.unknowns.described
-        halves = INTERVAL * self.fit.certainty.deviation
-        least = [entry.least for entry in self.unknowns.entries]
-        lows = np.maximum(self.values - halves, least)
-        rows = np.array([self.values, lows, self.values + halves]) + described
-        return [tuple(row) for row in rows.T.tolist()]
-
-    def _place(self, entry: Unknown) -> str | None:
-        """Return the joint of an unknown, or the link of a mass."""
-        if entry.joint is None:
-            return entry.link if entry.kind == "mass" else None
-        return self.robot.joint_names[self.joints[entry.joint]]
-
-    def _name(self, entry: Unknown) -> str:
-        return f"{self._place(entry) or 'robot'}: {entry.kind}"
+        try:
+            place = self.joint_names[joint] if isinstance(joint, int) else joint or ROBOT
+            estimate = self.estimates[place][kind]
+        except (IndexError, KeyError):
+            problem = f"is no unknown of {joint!r}"
+            remedy = f"there are {sorted({entry.kind for entry in self.unknowns.entries})}"
+            raise InvalidArgumentError("kind", problem, value=kind, remedy=remedy) from None
+        return estimate[:3] if estimate.is_shown else None
 
     def actuators(self) -> bp.Actuators:
         """Return the identified actuators; joints that are not in the logs are ideal.
 
         Friction and damping are in addition to the robot's description.
         """
+        robot = self.unknowns.robot
         fields = _of_all_joints(self.unknowns, self.values[None])
         options: dict[str, Any] = {name: table[0] for name, table in fields.items()}
-        return bp.make_actuators(self.robot.dof, **options, joint_names=self.robot.joint_names)
+        return bp.make_actuators(robot.dof, **options, joint_names=robot.joint_names)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write :meth:`actuators` to a .yaml or .json file, with intervals, errors and the
+        """Write :meth:`actuators` to a .yaml or .json file, with estimates, errors and the
         confidence region; and :meth:`gains`, if the law was identified, to NAME-gains.yaml.
         """
         region = {
@@ -213,32 +218,21 @@ class Identification:
             "root": self.fit.certainty.root.tolist(),
         }
         about = self.document() | {KEY: region}
-        bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
+        bp.save_actuators(path, self.actuators(), self.unknowns.robot.joint_names, about)
         gains = self.gains()
         if gains is not None:
-            names = [self.robot.joint_names[joint] for joint in self.joints]
-            bp.save_params(Path(path).with_name(f"{Path(path).stem}-gains.yaml"), gains, names)
+            beside = Path(path).with_name(f"{Path(path).stem}-gains.yaml")
+            bp.save_params(beside, gains, self.joint_names)
 
     def document(self) -> Document:
-        """Return the result as plain values: estimate and 95 % interval of each unknown by joint,
-        link or "robot", and the errors.
-        """
-        intervals: Document = {}
-        shown = self.fit.certainty.shown.tolist()
-        for entry, row, is_shown in zip(self.unknowns.entries, self._rows, shown, strict=True):
-            if is_shown:
-                intervals.setdefault(self._place(entry) or "robot", {})[entry.kind] = list(row)
+        """Return the result as plain values: :attr:`estimates`, errors and remarks."""
+        estimates: Document = {}
+        for place, table in self.estimates.items():
+            estimates[place] = {kind: estimate._asdict() for kind, estimate in table.items()}
         return {
-            "intervals": intervals,
-            "not_shown": self.not_shown,
-            "not_needed": self.not_needed,
-            "at_bounds": self.at_bounds,
-            "effects": self.effects,
-            "did_not_move_hence_ideal": list(self.still),
-            "remarks": self.remarks,
+            "estimates": estimates,
             "held_out_error": list(self.held_out_error),
-            "converged": self.converged,
-            "compensation_through_motors": not self.drive.further,
+            "remarks": self.remarks,
             "identified_from": [part.log.source for part in self.fit.problem.data],
         }
 
@@ -252,20 +246,20 @@ class Identification:
             Masses are not among the unknowns (extras=["mass"]).
         """
         pairs = zip(self.unknowns.entries, self.values.tolist(), strict=True)
-        factors = {str(entry.link): value for entry, value in pairs if entry.kind == "mass"}
+        factors = {str(entry.place): value for entry, value in pairs if entry.kind == "mass"}
         if not factors:
             remedy = "identify with extras=['mass']"
             raise InvalidArgumentError("corrected_urdf", "no mass was found", remedy=remedy)
-        return to_urdf(self.robot, mass_factors=factors).text
+        return to_urdf(self.unknowns.robot, mass_factors=factors).text
 
     def gains(self) -> bp.PIDParams | None:
         """Return the params of the identified law, of the logged joints; None without unknowns of
         the law.
         """
         law = self.unknowns.tables(self.values[None], "law")
-        if self.drive.mode == "effort" or law.keys() <= {"slew"}:
+        if law.keys() <= {"slew"}:
             return None
-        return changed_params(self.drive.params, law)
+        return changed_params(self.fit.problem.data[0].drive.params, law)
 
     def figure(self) -> Figure:
         """Return a picture of the position errors along the first log, before and after."""
@@ -274,66 +268,33 @@ class Identification:
         windows = [window for window in self.fit.problem.windows if window.log == 0]
         tables = []
         for problem in (self._described, self.fit.problem):
-            point = self._point[: len(problem.unknowns.entries)]
+            point = self.fit.point[: len(problem.unknowns.entries)]
             first = replace(problem, windows=windows)
             tables.append(first.evaluate(point, free_states=False, held_out=True))
         errors = []
         for window, before, after in zip(windows, *tables, strict=True):
             errors.append((window.time, window.fitted, before[..., 0], after[..., 0]))
-        names = [self.robot.joint_names[joint] for joint in self.joints]
-        units = [self.robot.units[joint] for joint in self.joints]
-        title = f"{self.robot.name}: position error, shaded where it was not fitted"
-        return plots.fit_errors(errors, names, units, title)
+        robot = self.unknowns.robot
+        units = [robot.units[joint] for joint in self.unknowns.joints]
+        title = f"{robot.name}: position error, shaded where it was not fitted"
+        return plots.fit_errors(errors, self.joint_names, units, title)
 
     def report(self) -> str:
-        """Return values, intervals and errors as text."""
-        document = self.document()
+        """Return estimates, errors and remarks as text."""
         lines = ["values with 95 % intervals, SI units"]
-        for place, table in document["intervals"].items():
-            cells = ", ".join(f"{kind} {_cell(kind, *row)}" for kind, row in table.items())
-            lines.append(f"{place}: {cells}")
-        drive = self.drive
-        if drive.gravity:
-            parts = {"coriolis": drive.coriolis, "friction": drive.modelled is not None}
-            forces = "+".join(["gravity", *compress(parts, parts.values())])
-            path = "apart from its motors" if drive.further else "through its motors"
-            lines.append(f"the robot compensates {forces} {path}")
+        for place, table in self.estimates.items():
+            cells = []
+            for kind, estimate in table.items():
+                cells.append(f"{kind} {estimate.cell(UNKNOWN_KINDS[kind].is_positive)}")
+            lines.append(f"{place}: {', '.join(cells)}")
         before, after = self.held_out_error
         lines.append(
             "position error on the held-out part, simulated from the logged state:"
             f" {before:.3g} as described, {after:.3g} with these"
         )
-        joints = zip(self.joints, self.errors[1], strict=True)
-        errors = [f"{self.robot.joint_names[joint]} {error:.2g}" for joint, error in joints]
-        lines.append(f"by joint: {', '.join(errors)}")
-        for name, share in self.effects.items():
-            lines.append(f"with {name}, which lowers the held-out error by {1 - share:.0%}")
-        for name, others in self.not_shown.items():
-            words = f", which cannot be told from {', '.join(others)}" if others else ""
-            lines.append(f"not shown by these logs: {name}{words}")
-        if self.not_needed:
-            lines.append(f"not needed by these logs: {', '.join(self.not_needed)}")
-        if self.at_bounds:
-            lines.append(f"at its bound: {', '.join(self.at_bounds)}")
-        if not self.converged:
-            lines.append("the fit has not converged: the values are the best so far")
-        lines += self.remarks
-        return "\n".join(lines)
-
-
-def _cell(
-    kind: str,
-    value: float,
-    low: float,
-    high: float,
-) -> str:
-    """Return a value with its interval, or its bound where the interval is wider than itself."""
-    half = high - value
-    if half > abs(value) and UNKNOWN_KINDS[kind].positive:
-        return f"< {high:.2g}"
-    # As many digits as the first one of the interval has, and one more.
-    digits = np.log10(max(abs(value), half) / half)
-    return f"{value:.{1 + int(np.ceil(digits))}g} ± {half:.1g}"
+        joints = zip(self.joint_names, self.errors[1], strict=True)
+        lines.append(f"by joint: {', '.join(f'{name} {error:.2g}' for name, error in joints)}")
+        return "\n".join([*lines, *self.remarks])
 
 
 def _of_all_joints(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
@@ -377,7 +338,7 @@ def draw_motors(
         entries = []
         for kind, place in region["unknowns"]:
             joint = robot.joint_names.index(place) if UNKNOWN_KINDS[kind].per == "joint" else None
-            least = max(least_value(robot, kind, joint or 0), 1e-3 * UNKNOWN_KINDS[kind].neutral)
+            least = least_value(robot, kind, joint or 0)
             entries.append(Unknown(kind, joint, 0.0, 1.0, least))
         root = np.array(region["root"], float)
         normal = np.random.default_rng(seed).normal(size=(count, root.shape[1]))
@@ -386,6 +347,6 @@ def draw_motors(
         problem = f"is missing or cannot be read ({bad})"
         remedy = "write the file with `batchpid identify` of this robot"
         raise InvalidArgumentError(f"{path}: {KEY}", problem, remedy=remedy) from None
-    unknowns = Unknowns(robot, tuple(range(robot.dof)), {}, (), tuple(entries))
+    unknowns = Unknowns(robot, tuple(range(robot.dof)), {}, (), entries=tuple(entries))
     values = np.clip(values, *unknowns.bounds)
     return nominal.replace(**_of_all_joints(unknowns, values))

@@ -12,7 +12,7 @@ of each, give the order of the trials.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,8 +26,8 @@ from batchpid.sim.identification.fit import (
     axes_of,
     bounded_step,
     inverse,
+    inward,
     iterate,
-    solve,
     triangle_of,
     with_certainty,
 )
@@ -50,126 +50,72 @@ EFFECTS = {
 has more friction at rest, but a few percent may be an error of the model that looks like a mass.
 """
 
-Progress = Callable[[], object] | None
+Solver = Callable[..., Fit]
+""":func:`solve` with its number of evaluations, of a problem, from a point, to a tolerance."""
 
 
-def fit(
-    starts: Mapping[Hashable, Sequence[Problem]],
-    evaluations: int,
-    progress: Progress = None,
-) -> Fit:
-    """Fit from the best of ``starts``: alternatives by label, each with guesses of the motors."""
-    problem, point = _best_start(starts, progress)
+def fit(starts: Sequence[Problem], solver: Solver) -> Fit:
+    """Fit from the best of ``starts``."""
+    problem, point = _best_start(starts, solver)
     coarse = problem.coarse()
     if coarse is not problem:
-        point = solve(
-            coarse,
-            point,
-            None,
-            evaluations,
-            progress,
-            ROUGH_TOLERANCE,
-        ).point
-    result = with_certainty(solve(problem, point, None, evaluations, progress))
-    return _without_sender(result, evaluations, progress)
-
-
-def with_effects(
-    result: Fit,
-    evaluations: int,
-    progress: Progress = None,
-) -> Fit:
-    """Return a fit with the effects that lower the held-out error, the most helpful first."""
+        point = solver(coarse, point, tolerance=ROUGH_TOLERANCE).point
+    result = with_certainty(solver(problem, point))
+    # The effects that lower the held-out error, the most helpful first.
     while result.certainty.colored > COLORED:
-        trial = _with_effect(result, evaluations, progress)
+        trial = _with_effect(result, solver)
         if trial is result:
             break
         result = trial
-    return result
+    return _without_sender(result, solver)
 
 
-def _best_start(
-    starts: Mapping[Hashable, Sequence[Problem]], progress: Progress
-) -> tuple[Problem, Float64]:
+def _best_start(starts: Sequence[Problem], solver: Solver) -> tuple[Problem, Float64]:
     """Return the problem and the point of the start with the least error after a short fit."""
-
-    def error(problem: Problem, point: Float64) -> float:
-        return float(np.linalg.norm(problem.size(problem.evaluate(point))))
-
-    tried = list[tuple[float, int, Problem, Float64]]()
-    for guesses in starts.values():
-        problem = guesses[0]
-        if len(guesses) > 1:
-            problem = min(guesses, key=lambda one: error(one.coarse(), one.unknowns.start))
-        point = problem.unknowns.start
-        if len(starts) == 1:
-            return problem, point
-        coarse = problem.coarse()
-        point = solve(
+    point = starts[0].unknowns.start
+    if len(starts) == 1:
+        return starts[0], point
+    least = np.inf
+    for start in starts:
+        coarse = start.coarse()
+        end = solver(
             coarse,
-            point,
-            None,
-            TRIAL,
-            progress,
-            ROUGH_TOLERANCE,
+            start.unknowns.start,
+            evaluations=TRIAL,
+            tolerance=ROUGH_TOLERANCE,
         ).point
-        tried.append((error(coarse, point), len(tried), problem, point))
-    return min(tried)[2:]
+        error = float(np.linalg.norm(coarse.size(coarse.evaluate(end))))
+        if error < least:
+            problem = start
+            point = end
+            least = error
+    return problem, point
 
 
-def _without_sender(
-    result: Fit,
-    evaluations: int,
-    progress: Progress,
-) -> Fit:
+def _without_sender(result: Fit, solver: Solver) -> Fit:
     """Return a fit without the delay and the lag of setpoints, or one of them, if the held-out
     error is about the same.
 
     Intervals stay as wide as with them: the motor's delay may be theirs in part.
     """
     error = _left(result)
-    # A value at its bound of zero is left out as it is.
-    result = _without(result, [kind for kind in SENDER if _value(result, kind) == 0.0])
     for kinds in (SENDER, SENDER[1:], SENDER[:1]):
-        smaller = _without(result, kinds)
-        if smaller is result:
+        unknowns = result.problem.unknowns
+        is_kept = np.array([entry.kind not in kinds for entry in unknowns.entries])
+        if is_kept.all():
             continue
-        problem, point, size, *_ = smaller
-        fitted = solve(problem, point, size, evaluations, progress)
-        if _left(fitted) * KEPT <= error:
+        problem = replace(result.problem, unknowns=unknowns.only(is_kept))
+        smaller = solver(problem, result.point[is_kept])
+        if _left(smaller._replace(size=result.size)) * KEPT <= error:
             return smaller._replace(
-                point=fitted.point,
-                size=fitted.size,
-                converged=fitted.converged,
+                certainty=result.certainty.only(is_kept),
+                dropped=kinds,
+                effects=result.effects,
             )
     return result
 
 
-def _value(result: Fit, kind: str) -> float:
-    """Return the value of the unknown of a kind; NaN if there is none."""
-    pairs = zip(result.problem.unknowns.entries, result.point.tolist(), strict=True)
-    return next((value for entry, value in pairs if entry.kind == kind), np.nan)
-
-
-def _without(result: Fit, kinds: Sequence[str]) -> Fit:
-    """Return a fit without the unknowns of ``kinds``, the others as they are."""
-    unknowns = result.problem.unknowns
-    is_kept = np.array([entry.kind not in kinds for entry in unknowns.entries])
-    if is_kept.all():
-        return result
-    return result._replace(
-        problem=replace(result.problem, unknowns=unknowns.only(is_kept)),
-        point=result.point[is_kept],
-        certainty=result.certainty.only(is_kept),
-        dropped=(*result.dropped, *unknowns.only(~is_kept).entries),
-    )
-
-
-def _with_effect(
-    result: Fit,
-    evaluations: int,
-    progress: Progress,
-) -> Fit:
+def _with_effect(result: Fit, solver: Solver) -> Fit:
     """Return a fit with the effect whose linear step leaves the least held-out error, or the fit
     itself.
     """
@@ -188,8 +134,7 @@ def _with_effect(
     point = np.append(result.point, wider.start[count:])
     changes = FIRST_CHANGE * np.eye(len(point))
     changes[:count, :count] = _axes(result)
-    if progress is not None:
-        progress()
+    changes = inward(point, changes, *wider.bounds)
     triangle = triangle_of(wide, iterate(wide, point, changes), result.size)
     low, high = wider.bounds - point
     names = np.array([entry.kind for entry in wider.entries])
@@ -206,21 +151,14 @@ def _with_effect(
     is_used = np.isin(names, [*present, *kinds_of(effects[best])])
     trial = replace(wide, unknowns=wider.only(is_used))
     start = (point + steps[best])[is_used]
-    further = solve(
-        trial,
-        start,
-        None,
-        evaluations,
-        progress,
-        ROUGH_TOLERANCE,
-    )
+    further = solver(trial, start, tolerance=ROUGH_TOLERANCE)
     share = _left(further._replace(size=result.size)) / before
     if share > EFFECTS[effects[best]]:
         return result
     trial = replace(trial, windows=problem.windows)
-    further = solve(trial, further.point, None, evaluations, progress)
+    further = solver(trial, further.point)
     added = {**result.effects, effects[best]: share}
-    return with_certainty(further._replace(dropped=result.dropped, effects=added))
+    return with_certainty(further._replace(effects=added))
 
 
 def _axes(result: Fit) -> Float64:

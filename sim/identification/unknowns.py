@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -35,9 +35,15 @@ class Kind(NamedTuple):
     """Value without effect."""
     field: str = ""
     """Field of :class:`batchpid.Actuators`."""
-    positive: bool = True
+    least: float = 0.0
+    """Least value."""
     most: float = np.inf
     """Largest value."""
+
+    @property
+    def is_positive(self) -> bool:
+        """Whether there are no negative values."""
+        return self.least >= 0
 
 
 UNKNOWN_KINDS = {
@@ -51,6 +57,7 @@ UNKNOWN_KINDS = {
         0.3,
         1.0,
         "strength",
+        1e-3,
     ),
     "effort_scale": Kind(
         "sensor",
@@ -59,6 +66,7 @@ UNKNOWN_KINDS = {
         0.3,
         1.0,
         "strength",
+        1e-3,
     ),
     "bias": Kind(
         "motor",
@@ -66,7 +74,7 @@ UNKNOWN_KINDS = {
         "effort",
         10.0,
         field="bias",
-        positive=False,
+        least=-np.inf,
     ),
     "delay": Kind(
         "motor",
@@ -95,13 +103,21 @@ UNKNOWN_KINDS = {
         0.01,
         20.0,
         field="position_offset",
-        positive=False,
+        least=-np.inf,
     ),
     "gain": Kind("law", "joint", 1.0, 3.0, 1.0),
     "kd": Kind("law", "joint", 1.0, 2.0, 1.0),
     "saturation": Kind("law", "joint", "error", 2.0, np.inf),
     "slew": Kind("law", "joint", "top_speed", 2.0, np.inf),
-    "mass": Kind("robot", "link", 1.0, 0.3, 1.0),
+    # A body without any mass has no center.
+    "mass": Kind(
+        "robot",
+        "link",
+        1.0,
+        0.3,
+        1.0,
+        least=1e-3,
+    ),
 }
 """Kinds of unknowns. "effort_scale" is the scale of measured efforts, "static" the friction at rest
 in addition to "friction", "stribeck" the speed at which half of it is left. "gain" is a factor of
@@ -115,12 +131,8 @@ EXTRAS = ("load_friction", "stribeck", "offset", "mass", "gain", "kd", "saturati
 """Kinds that a fit has on request; "stribeck" brings "static" with it."""
 SENDER = ("setpoint_delay", "setpoint_lag")
 """Kinds that every fit of setpoints has in addition."""
-DESCRIBED = {"damping": "damping", "friction": "friction"}
-"""Kinds that add to a value of the robot's description, and the name there."""
-
-
-LEAST_MASS_FACTOR = 1e-3
-"""Least factor of a mass: a body without any has no center."""
+DESCRIBED = ("damping", "friction")
+"""Kinds that add to a value of the robot's description, which has the same name."""
 
 
 def kinds_of(effect: str) -> list[str]:
@@ -132,30 +144,19 @@ class Unknown(NamedTuple):
     """One unknown."""
 
     kind: str
-    joint: int | None
-    """Number of its joint among the logged ones; None for an unknown of the whole robot or of a
-    link.
-    """
+    place: int | str | None
+    """Number of its joint among the logged ones, or link of a mass; None for the whole robot."""
     start: float
     size: float
     least: float
     """Least value."""
-    link: str | None = None
-    """Link of a mass or of the payload."""
-
-    @property
-    def place(self) -> int | str | None:
-        """Joint, or link of a mass."""
-        return self.link if self.kind == "mass" else self.joint
 
 
 def least_value(robot: Robot, kind: str, joint: int) -> float:
     """Return the least value of an unknown of a joint of ``robot``; with the description's it is
     zero.
     """
-    if kind in DESCRIBED:
-        return -float(getattr(robot, DESCRIBED[kind])[joint])
-    return 0.0 if UNKNOWN_KINDS[kind].positive else -np.inf
+    return -float(getattr(robot, kind)[joint]) if kind in DESCRIBED else UNKNOWN_KINDS[kind].least
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,55 +173,38 @@ class Unknowns:
     """Typical values (joints,) by name."""
     links: Sequence[str]
     """Links whose masses can be unknown."""
+    payload_link: str | None = None
     entries: tuple[Unknown, ...] = ()
 
-    def adding(
-        self,
-        kinds: Sequence[str],
-        starts: Mapping[str, Float64],
-        payload_link: str | None = None,
-    ) -> Unknowns:
+    def adding(self, kinds: Sequence[str], starts: Mapping[str, Float64]) -> Unknowns:
         """Return these and the unknowns of ``kinds``.
 
         ``starts`` (joints,) or (1,) are values of some kinds, with the description's; others begin
         at their typical size.
         """
         entries = list(self.entries)
+        places: dict[str, Sequence[Any]] = {"joint": range(len(self.joints)), "robot": [None]}
+        places["link"] = self.links
         for name in kinds:
             kind = UNKNOWN_KINDS[name]
-            if kind.per == "link":
-                entries += [
-                    Unknown(
-                        name,
-                        None,
-                        1.0,
-                        1.0,
-                        LEAST_MASS_FACTOR,
-                        link,
-                    )
-                    for link in self.links
-                ]
-                continue
-            for joint in range(len(self.joints)) if kind.per == "joint" else (None,):
-                column = joint or 0
+            for place in places[kind.per]:
+                column = place if isinstance(place, int) else 0
                 size = kind.size
                 if isinstance(size, str):
                     size = float(self.typical[size][column])
                 least = least_value(self.robot, name, self.joints[column])
-                start = size * kind.positive
+                start = size * kind.is_positive
                 if name in starts:
                     start = float(starts[name][column])
                 if name in DESCRIBED:
                     start += least
-                link = payload_link if name == "payload" else None
                 entries.append(
                     Unknown(
                         name,
-                        joint,
+                        place,
                         max(start, least),
                         size,
                         least,
-                        link,
                     )
                 )
         return replace(self, entries=tuple(entries))
@@ -254,7 +238,7 @@ class Unknowns:
         """
         means = []
         for kind, entry in zip(self.kinds, self.entries, strict=True):
-            means.append(1.0 if kind.neutral == 1.0 else entry.start * kind.positive)
+            means.append(1.0 if kind.neutral == 1.0 else entry.start * kind.is_positive)
         mean = np.array(means) / self.sizes
         return mean, self.spread(mean)
 
@@ -282,7 +266,7 @@ class Unknowns:
             if kind.target in targets:
                 neutral = np.full((len(values), len(self.joints)), kind.neutral)
                 table = tables.setdefault(kind.field or entry.kind, neutral)
-                joint = slice(None) if entry.joint is None else [entry.joint]
+                joint: Any = slice(None) if entry.place is None else [entry.place]
                 table[:, joint] = values[:, column, None]
         # An unknown of friction at rest is in addition to friction in motion.
         if "static" in tables:
@@ -297,10 +281,10 @@ class Unknowns:
         none = np.zeros((len(values), 1))
         sender = self.tables(values, "setpoint")
         late, lag = (sender.get(name, none)[:, 0] for name in SENDER)
-        masses: dict[str, dict[str, Float64]] = {"payload": {}, "mass": {}}
+        masses: dict[str, dict[Any, Float64]] = {"payload": {}, "mass": {}}
         for column, entry in enumerate(self.entries):
-            if entry.link is not None:
-                masses[entry.kind][entry.link] = values[:, column]
+            if entry.kind in masses:
+                masses[entry.kind][entry.place or self.payload_link] = values[:, column]
         law = self.tables(values, "law")
         return Candidates(Actuators(**fields), law, late, lag, **masses)
 

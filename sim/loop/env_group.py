@@ -280,8 +280,11 @@ class EnvGroup:
         whole ticks.
         """
         while True:
+            # A native call has ended at the last tick, or at an event within a tick.
             if self._runs_whole:
-                self._complete()
+                assert isinstance(self._executor, NativeExecutor)
+                self._runs_whole = False
+                self.tick, self._step = self._executor.complete()
             if self.tick == ticks:
                 break
             with np.errstate(all="ignore"):  # overflow and invalid values become faults
@@ -291,12 +294,6 @@ class EnvGroup:
                 run_ticks(self._start(), ticks, substeps)
         self.steps += ticks * substeps
 
-    def _complete(self) -> None:
-        """Complete the ticks of a native call: they are observed, up to an event within a tick."""
-        assert isinstance(self._executor, NativeExecutor)
-        self._runs_whole = False
-        self.tick, self._step = self._executor.complete()
-
     def _run_tick(self, substeps: int) -> None:
         """Run the present tick, or the rest of it, and observe it."""
         executor = self._executor
@@ -305,7 +302,11 @@ class EnvGroup:
         before = self.steps + self.tick * substeps
         command = rows.command
         if done == 0:
-            self._push(substeps)
+            if self._pushes.counts:
+                assert self._draws is not None
+                inputs = self._faults.suspended, self._draws.episodes, substeps
+                if self._pushes.push(self.pack, *inputs):
+                    executor.measure()
             if self._sensed:
                 self.pack.take_sensed()  # those of the ticks before
             if self._faults.suspended.any() or not are_finite(*command):
@@ -339,18 +340,6 @@ class EnvGroup:
             shown = self._shown[name]
             shown[...] = sums > 0 if shown.dtype == bool else sums / substeps
             shown[self._faults.failed] = 0
-
-    def _push(self, substeps: int) -> None:
-        """Push the bases that are due before a tick of ``substeps`` sim steps."""
-        pushes, draws = self._pushes, self._draws
-        if not pushes.counts:
-            return
-        assert draws is not None
-        rows, twists = pushes.due(self._faults.suspended, draws.episodes)
-        if rows:
-            self.pack.push(rows, twists)
-            self._executor.measure()
-        pushes.counts["steps"] += substeps
 
     def observe(self, rows: Arrays) -> None:
         """Write observation and faults into these envs' rows."""

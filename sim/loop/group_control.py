@@ -147,27 +147,27 @@ def _for_envs(stage: Stage, num_envs: int, envs: slice) -> Stage:
     return part
 
 
-def empty_states(
+def empty_control(
     options: RunnerOptions,
     params: bp.PIDParams,
     actuators: bp.Actuators | None,
-    stiction: bool,
-) -> tuple[tuple[Any, ...], States]:
-    """Return the stages and states of all envs of a runner, without its robots; ``stiction`` says
-    whether joints have Coulomb friction.
+) -> tuple[tuple[Any, ...], States, Values]:
+    """Return the stages of all envs of a runner, without its robots; their states; and values that
+    a stage may read, 0.
+
+    ``params`` and ``actuators`` include the draws of the randomization.
     """
     joints = options.robot.joints
     rows = np.zeros((options.num_envs, len(joints)))
     controller = None if isinstance(options.control, str) else OwnController(options)
-    friction = Friction(coulomb=rows if stiction else None)
-    envs = slice(0, options.num_envs)
+    stiction = options.has_stiction(actuators)
     control = control_of(
         options,
         params,
         actuators,
         joints,
-        friction,
-        envs,
+        Friction(coulomb=rows if stiction else None),
+        slice(0, options.num_envs),
         controller,
     )
     stages = stages_of(control)
@@ -176,39 +176,34 @@ def empty_states(
         load=lambda: rows,
     )
     measured = Measured(rows, rows, rows)
-    values = Values(Command(None), measured, measured, options.timestep, model=model)
-    return stages, started(stages, values)
+    values = Values(
+        command=Command(*[rows] * 4),
+        measured=measured,
+        seen=measured,
+        timestep=options.timestep,
+        step=Step(0, 1, np.zeros(())),
+        last=Outputs(rows, rows),
+        forward=rows,
+        limits=(rows, rows),
+        outputs=Outputs(*[rows] * 4),
+    )
+    return stages, started(stages, values._replace(model=model)), values
 
 
 def untraceable(options: RunnerOptions) -> str:
     """Return which of the caller's stages cannot run in native code, and why; "" if all can."""
-    acting = options.params, options.actuators, options.has_stiction(options.actuators)
-    stages, _ = empty_states(options, *acting)
+    stages, states, values = empty_control(options, options.params, options.actuators)
+    shape = values.forward.shape
     names = {stage.name for stage in options.stages}
-    row = np.zeros((options.num_envs, options.robot.dof))
-    reading = Measured(row, row, row)
-    step = Step(0, 1, np.zeros(()))
-    values = Values(Command(*[row] * 4), reading, reading, options.timestep, step)
-    values = values._replace(
-        last=Outputs(row, row),
-        forward=row,
-        limits=(row, row),
-    )
-    values = values.told(
-        qf=row,
-        motor=row,
-        saturated=row,
-        guarded=row,
-    )
-    for stage in stages:
-        if stage.name in names:
-            state, _ = stage.init(values)
-            if any(leaf.shape != row.shape for leaf in leaves(state)):
-                return f"the state of stage {stage.name!r} is not (envs, joints)"
-            try:
-                bind_stages([stage], (state,), values, row.shape)
-            except (AttributeError, AssertionError, TypeError, ValueError) as error:
-                return f"stage {stage.name!r}: {error}"
+    for stage, state in zip(stages, states, strict=True):
+        if stage.name not in names:
+            continue
+        if any(leaf.shape != shape for leaf in leaves(state)):
+            return f"the state of stage {stage.name!r} is not (envs, joints)"
+        try:
+            bind_stages([stage], (state,), values, shape)
+        except (AttributeError, AssertionError, TypeError, ValueError) as error:
+            return f"stage {stage.name!r}: {error}"
     return ""
 
 

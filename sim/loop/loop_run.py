@@ -5,60 +5,37 @@ place of an engine, else step by step in NumPy.
 from __future__ import annotations
 
 import ctypes
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Float64, Rows
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import WIDTH, structure
-from batchpid.sim.engine.native_model import NativeModel, NativeRefresh, aligned, table
+from batchpid.sim.engine.native_model import NativeModel, aligned, table
 from batchpid.sim.loop.closed_loop import ClosedLoop, LoopState
-from batchpid.sim.loop.group_control import GroupControl
+from batchpid.sim.loop.group_control import GroupControl, model_functions
 from batchpid.sim.loop.native_executor import Buffers, TickProgram
-from batchpid.sim.loop.tree_plant import IMPEDANCE, TreePlant
+from batchpid.sim.loop.tree_plant import IMPEDANCE
 from batchpid.stages import stages_of
-from batchpid.stages.friction import REFRESH_STEPS
 from batchpid.stages.stage import by_name, started
-from batchpid.stages.values import Command, Measured, Model, Step, Values
-
-
-class MotionPlant:
-    """Plant that moves as ``qpos`` and ``qvel`` (steps, envs, dof) say, whatever its efforts."""
-
-    def __init__(self, qpos: Float64, qvel: Float64) -> None:
-        self.motion = qpos, qvel
-
-    def init(self, qpos: Array, qvel: Array) -> int:
-        """Return the state at the first step."""
-        return 0
-
-    def read(self, state: Any) -> tuple[Float64, Float64]:
-        """Return positions and velocities (envs, dof)."""
-        qpos, qvel = self.motion
-        at = min(state, len(qpos) - 1)
-        return qpos[at], qvel[at]
-
-    def step(self, state: Any, effort: Array) -> int:
-        """Return the state of the next step."""
-        return int(state + 1)
+from batchpid.stages.values import Command, Measured, Step, Values
 
 
 class LoopRun:
     """Run of a closed loop from ``qpos`` and ``qvel`` (envs, dof) on, up to ``steps`` sim steps at
     a time.
 
-    Its plant is a :class:`.TreePlant`, or a :class:`MotionPlant`, which runs once. ``setpoint`` (envs,
-    dof) is that at the start.
+    Its plant is a :class:`.TreePlant`. ``setpoint`` (envs, dof) is that at the start.
 
     Attributes
     ----------
     setpoints
         Setpoints or efforts of the next sim steps (steps, envs, dof), for the caller to fill in.
-    qpos, qvel, effort
-        Positions and velocities after each sim step, and the motors' effort in it (steps, envs,
-        dof).
+    qpos, qvel
+        Positions and velocities after each sim step (steps, envs, dof).
     measured
         Reading before the first sim step.
     states
@@ -74,11 +51,7 @@ class LoopRun:
         steps: int,
     ) -> None:
         self._loop = loop
-        self.setpoints, self.effort = np.zeros((2, steps, *qpos.shape))
-        if isinstance(loop.plant, MotionPlant):
-            self.qpos, self.qvel = loop.plant.motion
-        else:
-            self.qpos, self.qvel = np.zeros((2, steps, *qpos.shape))
+        self.setpoints, self.qpos, self.qvel = np.zeros((3, steps, *qpos.shape))
         self._plant = loop.plant.init(qpos, qvel)
         stages = stages_of(loop.control)
         command = Command(np.array(setpoint), feedforward=np.zeros_like(setpoint))
@@ -119,40 +92,39 @@ class LoopRun:
         state = LoopState(self._plant, self._states, episode)
         for at in range(steps):
             state, seen = self._loop.step(state, self.setpoints[at])
-            self.effort[at] = seen.effort
-            if not isinstance(self._loop.plant, MotionPlant):
-                self.qpos[at], self.qvel[at] = seen[:2]
+            self.qpos[at], self.qvel[at] = seen[:2]
         self._plant, self._states, _ = state
 
     def _copies(self, program: TickProgram) -> list[tuple[Rows, Rows]]:
         """Return the copies between the tables and the arrays of a sim step."""
-        command, measured = program.buffers.command, program.buffers.measured
-        copies = [(self.setpoints, command.setpoint)]
-        results = [(self.qpos, measured.qpos), (self.qvel, measured.qvel)]
-        if isinstance(self._loop.plant, MotionPlant):
-            copies += zip(self._loop.plant.motion, measured[:2], strict=True)
-            results = [(self.effort, program.outputs.motor)]
+        _, command, measured, _ = program.buffers
         # Bytes are copied as they are, numbers of observations in single precision.
-        return copies + [(rows.view(np.bool_), row.view(np.bool_)) for rows, row in results]
+        rows = [
+            (self.qpos.view(np.bool_), measured.qpos.view(np.bool_)),
+            (self.qvel.view(np.bool_), measured.qvel.view(np.bool_)),
+        ]
+        return [(self.setpoints, command.setpoint), *rows]
 
 
 class Lanes:
-    """Robots of a closed loop in lanes of native code, for :class:`.TickProgram`; with a
-    :class:`MotionPlant` there are none.
-    """
+    """Robots of a closed loop in lanes of native code, for :class:`.TickProgram`."""
 
     def __init__(self, loop: ClosedLoop, qpos: Float64, qvel: Float64) -> None:
-        plant = loop.plant
+        plant: Any = loop.plant
         self.rigid_tree = loop.tree
         self.size, self.dof = qpos.shape
         self.force_model = NativeModel(lambda: self.rigid_tree)
         self.joint_model = self.force_model
-        self.steps_natively = isinstance(plant, TreePlant)
+        self.steps_natively = True
+        self.spec = SimpleNamespace(fixed_base=True)
+        self.first_env = 0
+        self.armature = np.zeros((1, self.dof))
+        actuators = loop.control.actuators
+        if actuators is not None and actuators.armature is not None:
+            self.armature = actuators.armature
         self._control = loop.control
         self._start = qpos, qvel
         self._group = structure("Group")(robots=self.size, dof=self.dof)
-        if not isinstance(plant, TreePlant):
-            return
         if plant.bodies.mass.ndim > 2:
             self.joint_model = NativeModel(
                 lambda: self.rigid_tree, inertias=self.rigid_tree.inertias(plant.bodies)
@@ -185,27 +157,21 @@ class Lanes:
         self._group.lanes = ctypes.addressof(free)
         self._kept = arrays, free
 
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
+        """Return parts of the passive force at the start (envs, dof)."""
+        return self.force_model.passive_force(*self._start, gravity, coriolis)
+
+    def read_base_motion(self) -> None:
+        """Return None: the base is fixed."""
+
     def values(self, command: Command) -> Values:
         """Return the values of the first sim step before its stages."""
+        pack: Any = self
         control = self._control
-        force = self.force_model.passive_force
-        parts = control.gravity, control.coriolis
-        model = Model(
-            passive_force=lambda qpos, qvel: force(qpos, qvel, *parts),
-            load=lambda: force(*self._start, True, True),
-            envs=np.arange(self.size),
-        )
-        if control.friction.coulomb is not None:
-            armature = np.zeros((1, self.dof))
-            if control.actuators is not None and control.actuators.armature is not None:
-                armature = control.actuators.armature
-            constants = control.friction, control.drive, control.coupling, control.timestep
-            refresh = NativeRefresh(
-                self.joint_model, self.size, armature, *constants, REFRESH_STEPS
-            )
-            model = model._replace(refresh=refresh)
         qpos, qvel = self._start
-        measured = Measured(qpos.copy(), qvel.copy(), force(qpos, qvel, *parts))
+        passive = self.passive_force(control.gravity, control.coriolis)
+        measured = Measured(qpos.copy(), qvel.copy(), passive)
+        model = model_functions(pack, control)
         return Values(command, measured, measured, control.timestep, model=model)
 
     def prepare(self, program: TickProgram) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -262,6 +263,7 @@ def describe(robot: Robot) -> Document:
     }
 
 
+@lru_cache(maxsize=16)
 def content(robot: Robot) -> str:
     """Return the digest of bodies, joints and shapes, with the content of mesh files in place of
     their paths.

@@ -4,9 +4,6 @@ import batchpid as bp
 from batchpid.sim import Robot, Runner, write_recording
 from batchpid.sim.identification import excite
 
-pytest.importorskip("scipy")
-
-
 PENDULUM = """<robot name="pendulum"><link name="base"/>
 <link name="bob"><inertial><origin xyz="0 0 -0.3"/><mass value="2"/>
 <inertia ixx="0.03" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.005"/></inertial></link>

@@ -59,15 +59,27 @@ def assert_right(found, truth=TRUTH, near=0.02):
 def test_motors_are_found_from_setpoints(found):
     assert_right(found)
     assert found.explains
-    assert found.converged
+    assert found.fit.converged
     assert found.interval("setpoint_delay") is None
-    assert set(found.not_needed) == {"setpoint_delay", "setpoint_lag"}
+    assert "not needed by these logs: setpoint_delay, setpoint_lag" in found.report()
 
 
 def test_motors_are_found_from_efforts(robot, effort_log):
     found = identify(robot, [effort_log], payload=False)
     assert_right(found)
     assert found.held_out_error[1] < 0.05 * found.held_out_error[0]
+
+
+@pytest.mark.parametrize("name", ["log", "effort_log"])
+def test_an_interpolated_log_tells_what_its_delays_contain(robot, request, name):
+    """The robot held the commands of each row, 5 ms long."""
+    log = replace(request.getfixturevalue(name), held=False)
+    found = identify(robot, [log], payload=False)
+    for kind, field in (*KINDS.items(), ("delay", "command_delay")):
+        for joint, true in enumerate(np.atleast_1d(TRUTH[field]).tolist()):
+            _, low, high = found.interval(kind, None if kind == "delay" else joint)
+            assert low <= true <= high
+    assert ("delay is 0.002 s shorter" in found.report()) == (log.kind == "effort")
 
 
 def test_the_number_of_workers_does_not_change_the_result(robot, effort_log):
@@ -86,7 +98,8 @@ def test_a_compensation_through_the_motors_is_part_of_the_model(tmp_path, compen
     robot = load(tmp_path, text)
     log = log_of(robot, run(robot, motion(), compensate=compensate), NOISE)
     found = identify(robot, [log], payload=False)
-    assert not found.drive.further
+    assert "compensates gravity" in found.report()
+    assert "through its motors" in found.report()
     total = TRUTH | {"viscous": [0.4, 0.3], "coulomb": [0.7, 0.5]}
     assert_right(found, total)
 
@@ -150,9 +163,10 @@ def test_what_a_log_cannot_tell_reaches_the_symmetric_truth(tmp_path):
     robot = load(tmp_path)
     log = log_of(robot, effort_run(robot), NOISE)
     found = identify(robot, [log], payload=False, extras=["mass"])
-    assert "shoulder: strength" in found.not_shown
-    assert "elbow: armature" in found.not_shown["shoulder: strength"]
-    assert "cannot be told from" in found.report()
+    strength = found.estimates["shoulder"]["strength"]
+    assert not strength.is_shown
+    assert "elbow: armature" in strength.remark
+    assert "strength not shown by these logs (cannot be told from" in found.report()
     for kind, field in KINDS.items():
         for joint, true in enumerate(TRUTH[field]):
             row = found.interval(kind, joint)
@@ -197,13 +211,13 @@ def test_an_effect_that_lowers_the_held_out_error_is_added(robot, tmp_path):
     heavy = load(tmp_path, text)
     log = log_of(robot, run(heavy, motion()), NOISE)
     better = identify(robot, [log], payload=False)
-    assert better.effects["mass"] < 0.5
+    assert better.fit.effects["mass"] < 0.5
     assert "with mass, which lowers the held-out error by" in better.report()
     pairs = zip(better.unknowns.entries, better.values, strict=True)
-    factors = {entry.link: value for entry, value in pairs if entry.kind == "mass"}
+    factors = {entry.place: value for entry, value in pairs if entry.kind == "mass"}
     # All masses and strengths have one scale.
     assert factors["fore"] / factors["upper"] == pytest.approx(1.4, rel=0.05)
-    assert "robot: delay" not in better.not_shown
+    assert better.estimates["robot"]["delay"].is_shown
     (tmp_path / "corrected.urdf").write_text(better.corrected_urdf())
     corrected = Robot.load(tmp_path / "corrected.urdf").mass_matrix(np.zeros((1, 2)))[0, 1, 1]
     before = robot.mass_matrix(np.zeros((1, 2)))[0, 1, 1]
@@ -239,7 +253,7 @@ def test_joints_that_did_not_move_are_left_out(robot, log):
     jammed = replace(log, qpos=still, command=log.command * [1, 0])
     found = identify(robot, [jammed], payload=False)
     assert "'elbow' did not move" in found.report()
-    assert found.joints == (0,)
+    assert found.joint_names == ["shoulder"]
     assert found.still == ("elbow",)
     with pytest.raises(bp.InvalidArgumentError, match="show no motion of any joint"):
         identify(robot, [replace(log, qpos=0 * still, command=0 * log.command)])
@@ -276,7 +290,8 @@ def test_the_report_has_all_values_and_errors(found):
     for words in ("shoulder", "as described"):
         assert words in report
     document = found.document()
-    assert document["intervals"]["elbow"]["strength"][0] == found.interval("strength", 1)[0]
+    assert document["estimates"]["elbow"]["strength"]["value"] == found.interval("strength", 1)[0]
+    assert found.interval("strength", 1) == found.interval("strength", "elbow")
     assert len(found.figure().axes) == 2
     for place in (("strength", 5), ("delay", 0), ("mass", "fore"), ("speed", 0)):
         with pytest.raises(bp.InvalidArgumentError):
