@@ -446,8 +446,8 @@ class Robot:
         return bp.load_params(file, self.joint_names)[0]
 
     def mjcf_gains(self) -> bp.PIDParams:
-        """Return params with the gains of the servos of an MJCF file: kp, ki and kd, on the
-        measured velocity, and the limits of their integrals.
+        """Return params with the gains of the servos of an MJCF file: kp and kd, on the measured
+        velocity.
 
         Joints without servo have gains of 0; a velocity servo has kd alone. The setpoint is a
         joint's position. :meth:`guard` has its limits. Raises InvalidArgumentError without servos.
@@ -456,9 +456,4 @@ class Robot:
         if gains is None:
             problem = f"{self.name!r} has no servos of an MJCF file"
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
-        # MuJoCo's integral grows during saturation, up to its limit.
-        return self.params(
-            **gains,
-            anti_windup="none",
-            measurement_rate="measured",
-        )
+        return self.params(**gains, measurement_rate="measured")

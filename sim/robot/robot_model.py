@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -51,37 +51,26 @@ SAMPLES = 200
 """Number of sampled poses; MoveIt's."""
 
 
+@dataclass(frozen=True, eq=False)
 class RobotModel:
     """Dynamics and contacts of a robot on a fixed base, at poses qpos (n, dof).
 
     Friction, damping and motors are left out. Several threads may use one object.
-
-    Parameters
-    ----------
-    tree, coupling
-        Tree of the simulated links on a fixed base, and the coupling of its joints.
-    tables, ignored
-        Simulated bodies of the robot, and pairs of its links that do not collide.
-    ground
-        Whether there is a ground at height 0.
     """
 
-    def __init__(
-        self,
-        tree: RigidTree,
-        coupling: Coupling,
-        tables: Tables,
-        ignored: frozenset[frozenset[str]],
-        ground: bool,
-    ) -> None:
-        self.tree = tree
-        self._coupling = coupling
-        self._tables = tables
-        self._ignored = ignored
-        self._ground = ground
+    tree: RigidTree
+    """Tree of the simulated links on a fixed base."""
+    coupling: Coupling
+    """Coupling of its joints."""
+    tables: Tables
+    """Simulated bodies."""
+    ignored: frozenset[frozenset[str]]
+    """Pairs of links that do not collide."""
+    ground: bool
+    """Whether there is a ground at height 0."""
 
     def __reduce__(self) -> Any:  # a controller that keeps it can be sent to worker processes
-        return RobotModel, (self.tree, self._coupling, self._tables, self._ignored, self._ground)
+        return RobotModel, (self.tree, self.coupling, self.tables, self.ignored, self.ground)
 
     def mass_matrix(self, qpos: Array) -> Array:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg], in NumPy or JAX as
@@ -100,7 +89,7 @@ class RobotModel:
         followers.
         """
         still = np.zeros_like(qpos)
-        efforts: Float64 = self._coupling.efforts(self.inverse_dynamics(qpos, still, still))
+        efforts: Float64 = self.coupling.efforts(self.inverse_dynamics(qpos, still, still))
         return efforts
 
     def forward_dynamics(self, qpos: Array, qvel: Array, effort: Array) -> Array:
@@ -161,12 +150,12 @@ class RobotModel:
 
     @cached_property
     def _coupled(self) -> RigidTree:
-        return replace(self.tree, coupling=self._coupling)
+        return replace(self.tree, coupling=self.coupling)
 
     @cached_property
     def contacts(self) -> Contacts:
         """Distances of the links to each other and to the ground."""
-        return Contacts(self.tree, self._tables.shapes, self._ignored, self._ground)
+        return Contacts(self.tree, self.tables.shapes, self.ignored, self.ground)
 
     def in_contact(self, qpos: Rows, clearance: float = 0.0) -> Bool:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground
