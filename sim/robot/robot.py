@@ -318,11 +318,12 @@ class Robot:
         folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
         source = reading.read_robot(path, fixed_base, folders, missing_meshes)
         report(path, source.repairs, strict)
-        joints = couple([joint for joint in source.tables.joints if joint.moves])
-        if not joints:
+        moving = [joint for joint in source.tables.joints if joint.moves]
+        if not moving:
             raise RobotError(
                 f"{path}: a robot without moving joints cannot be controlled; check the joint types"
             )
+        joints = couple(moving)
         source = reading.with_srdf(source)
         source = source._replace(self_collision=self_collision, dissipation=dissipation)
         robot = cls(source, joints, reading.read_settings(path, joints))
@@ -346,8 +347,7 @@ class Robot:
         control: str = "pid",
         engine: str | None = None,
     ) -> Findings:
-        """Return the findings of the preflight, most severe first: oddities of this robot and of
-        running it this way.
+        """Return the findings of the preflight, most severe first: oddities of robot and run.
 
         Parameters
         ----------
