@@ -154,7 +154,9 @@ def touching_links(
 def _odd_sizes(plan: _Plan) -> Iterator[Finding]:
     """Yield links whose shapes are larger than the robot, or the robot if all are tiny."""
     tables = plan.robot.tables
-    sizes = {name: size for name in tables.links if (size := extent(tables.shapes_of(name)))}
+    sizes: dict[str, float] = defaultdict(float)
+    for shape in tables.shapes:
+        sizes[shape.owner] = max(sizes[shape.owner], extent(shape))
     of_chain = f"the robot's chain of joints is {plan.chain:.3g} m long"
     for name, size in sizes.items():
         if size > LARGEST_SHAPES * max(plan.chain, SHORTEST_CHAIN):
