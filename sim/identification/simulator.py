@@ -141,11 +141,9 @@ class LogPlant:
         self.tree = replace(tree, coupling=Coupling.of(tree.dof, followers))
         """Rigid tree of the logged joints and their followers."""
         self.joints = len(logged)
-        # A slice is not copied, as it is for indices.
-        self.columns: Any = number[logged] if followers else slice(None)
+        self.columns = number[logged]
         """Joints of the tree that are logged."""
-        leaders = [logged.index(joint) for joint in coupling.leader[moves].tolist()]
-        self._leaders = np.array(leaders) if followers else None
+        self._leaders = [logged.index(joint) for joint in coupling.leader[moves].tolist()]
         self._friction = robot.friction[logged], robot.damping[logged]
         free = free | robot.continuous[logged]
         self.low = self.spread(np.where(free, -np.inf, robot.lower[logged]))
@@ -157,9 +155,9 @@ class LogPlant:
         """Return a table (..., joints) of logged joints as one of the tree (..., dof), with the
         columns of leaders for followers.
         """
-        if self._leaders is None or np.shape(table)[-1:] != (self.joints,):
+        if np.shape(table)[-1:] != (self.joints,):
             return table
-        return table[..., self._leaders]
+        return np.take(table, self._leaders, axis=-1)
 
     @property
     def heavy_links(self) -> list[str]:
