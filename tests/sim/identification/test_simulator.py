@@ -118,7 +118,10 @@ def test_followers_move_with_their_leader(tmp_path):
 def test_candidates_and_stretches_do_not_affect_each_other(tmp_path):
     robot, setpoints = load(tmp_path), motion(0.5)
     plant, drive = LogPlant(robot, (0, 1)), control(gains(), "gravity+coriolis")
-    stretches = [stretch_of(setpoints, setpoints[0]), stretch_of(setpoints[20:60], setpoints[20])]
+    stretches = [
+        stretch_of(setpoints[:40], setpoints[0]),
+        stretch_of(setpoints[20:60], setpoints[20]),
+    ]
     # Each candidate comes once for each stretch.
     strengths = np.array([[1.0, 1.0], [0.9, 0.9], [0.5, 1.2]])
     made = candidates(6, **TRUTH)
