@@ -152,10 +152,8 @@ def _sources(
     name, and the others as they are.
     """
     matched = dict[str, tuple[str, float]]()
-    for unit in ("ms", "us", "ns"):
-        if f"time_{unit}" in columns and "time" not in columns:
-            matched["time"] = f"time_{unit}", UNITS[unit]
-    for text in patterns:
+    times = [f"time: time_{unit} {unit}" for unit in ("ms", "us", "ns")]
+    for text in [*[text for text in times if text.split()[1] in columns], *patterns]:
         name, _, right = text.partition(": ")
         pattern, *units = right.split() or [""]
         try:
@@ -165,17 +163,15 @@ def _sources(
             raise error(f"columns {text!r}", "has an unknown unit", remedy, units[0]) from None
         if pattern.startswith("-"):
             scale = -scale
-            pattern = pattern[1:]
-        names = {pattern: name}
-        if "{joint}" in pattern:
-            joints = robot.joint_names
-            names = {pattern.replace("{joint}", joint): f"{name}:{joint}" for joint in joints}
-        present = [column for column in columns if column in names]
+        present = dict[str, tuple[str, float]]()
+        for joint in robot.joint_names if "{joint}" in pattern else [""]:
+            column = pattern.removeprefix("-").replace("{joint}", joint)
+            if column in columns:
+                present[f"{name}:{joint}" if joint else name] = column, scale
         if not present:
             problem = f"has no column of the pattern {text!r}"
             raise error(source, problem, f"its columns are {', '.join(columns)}")
-        for column in present:
-            matched[names[column]] = column, scale
+        matched |= present
     used = {column for column, _ in matched.values()}
     return {column: (column, 1.0) for column in columns if column not in used} | matched
 
@@ -272,12 +268,6 @@ def _build(
     """Return the log that the columns of a file hold; ``commands`` are columns with their own
     times.
     """
-    if "time" not in columns:
-        problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
-        remedy = "begin the header with time, in seconds, or time_ms, time_us, time_ns"
-        if proposed := _proposed(robot, columns):
-            remedy = f"name its columns (--columns {proposed})"
-        raise error(source, problem, remedy)
     by = columns_by_joint(robot, source, columns | commands, LOG_QUANTITIES)
     if by["feedforward"]:
         remedy = "log the complete efforts, without the columns of the feedforward"
@@ -286,28 +276,35 @@ def _build(
     measured = not by["effort"]
     by["effort"] = by["effort"] or by["measured_effort"]
     kind = kind or ("effort" if by["effort"] else "setpoint")
-    joints = list[int]()
-    for joint, name in enumerate(robot.joint_names):
-        if robot.independent[joint] and name in by["qpos"] | by[kind]:
-            joints.append(joint)
+    logged = by["qpos"] | by[kind]
+    joints = [
+        joint
+        for joint in np.flatnonzero(robot.independent).tolist()
+        if robot.joint_names[joint] in logged
+    ]
     names = [robot.joint_names[joint] for joint in joints]
-    tables = dict[str, Float64]()
+    needed = {"time": columns.get("time")}
     for quantity in ("qpos", kind):
         for name in names or ["JOINT"]:
-            if name not in by[quantity]:
-                remedy = "positions and commands are needed; a joint without both rests"
-                if not names and (proposed := _proposed(robot, columns)):
-                    remedy = f"name its columns (--columns {proposed})"
-                raise error(f"{source}: column {quantity}:{name}", "is missing", remedy)
-        tables[quantity] = np.stack([by[quantity][name] for name in names], axis=1)
+            needed[f"{quantity}:{name}"] = by[quantity].get(name)
+    for column, values in needed.items():
+        if values is None:
+            remedy = f"{A_LOG}; a joint without both rests"
+            proposed = _proposed(robot, columns)
+            if proposed and not names:
+                remedy = f"name its columns (--columns {proposed})"
+            raise error(f"{source}: column {column}", "is missing", remedy)
+    qpos, command = (
+        np.stack([by[quantity][name] for name in names], axis=1) for quantity in ("qpos", kind)
+    )
     return Log(
         source,
         tuple(joints),
         kind,
         columns["time"],
-        tables["qpos"],
+        qpos,
         commands["time"],
-        tables[kind],
+        command,
         held=reading.hold,
         measured=measured and kind == "effort",
     )
@@ -446,15 +443,15 @@ def _check_clocks(path: Path, delays: dict[tuple[str, bool], float]) -> None:
 
     ``delays`` are the times from stamp to receipt [s], by topic and whether it has stamps.
     """
-    remedy = "stamp the messages of both topics by one clock, when they are measured or sent"
-    if len({is_stamped for _, is_stamped in delays}) > 1:
-        words = [f"{topic!r} {'with' if has else 'without'} stamps" for topic, has in delays]
-        problem = f"has messages of two clocks, the sender's and the recorder's: {', '.join(words)}"
-        raise error(str(path), problem, remedy)
-    if delays and max(delays.values()) - min(delays.values()) > CLOCK_OFFSET:
-        words = [f"{topic!r} {delay:.3f} s" for (topic, _), delay in delays.items()]
-        problem = f"has stamps of two clocks: before receipt by {', '.join(words)}"
-        raise error(str(path), problem, remedy)
+    kinds = {is_stamped for _, is_stamped in delays}
+    times = delays.values()
+    if len(kinds) > 1 or (delays and max(times) - min(times) > CLOCK_OFFSET):
+        words = []
+        for (topic, is_stamped), delay in delays.items():
+            when = f"{delay:.3f} s before receipt" if is_stamped else "without stamps"
+            words.append(f"{topic!r} {when}")
+        remedy = "stamp the messages of both topics by one clock, when they are measured or sent"
+        raise error(str(path), f"has stamps of two clocks: {', '.join(words)}", remedy)
 
 
 def _topics(path: Path) -> list[str]:

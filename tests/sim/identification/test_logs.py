@@ -93,7 +93,7 @@ def changed(name, row, value, kind="setpoint"):
 
 
 FAULTS = {
-    r"has no column 'time', but a": {"a": TIME},
+    r"column time.* is missing.*time, qpos:JOINT": {"a": TIME},
     r"column qpos:elbow.* is missing": {"time": TIME, "effort:elbow": TIME},
     r"column qpos:JOINT.* is missing": {"time": TIME},
     r"column setpoint:elbow.* is missing": (
