@@ -8,6 +8,7 @@ one. docs/training.md explains the choices.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -19,6 +20,7 @@ from matplotlib.figure import Figure
 from batchpid.sim import Robot, plots
 
 SCORES = ("success", "error")  # of the learning curve
+NEAR = 0.15
 FINE = 0.2  # scale on which the agent sees small errors [rad or m]
 
 
@@ -57,24 +59,44 @@ def make_envs(config):
     # The agent gives one increment, which each row of the chunk repeats.
     single = gymnasium.spaces.Box(-1.0, 1.0, envs.single_action_space.shape[1:])
     return gymnasium.wrappers.vector.TransformAction(
-        envs, lambda action: np.repeat(action[:, None], config.chunk, 1), None, single
+        envs, lambda action: np.repeat(eased(action)[:, None], config.chunk, 1), None, single
     )
 
 
-def features(observation):
-    """Return the inputs of the agent (envs, 4 joints): velocity, error, its size, and the error on
-    a fine scale.
+def eased(action):
+    """Return increments for actions in [-1, 1]: finer near 0."""
+    action = np.clip(action, -1.0, 1.0)
+    return action * (NEAR + (1.0 - NEAR) * np.abs(action))
+
+
+def split(observation, config):
+    """Return joint positions, speeds, goals, and setpoints (envs, joints) each. Without chunks the
+    positions stand for the setpoints.
     """
-    qpos, qvel, goal = np.split(observation, 3, axis=1)
-    error = goal - qpos
-    return np.concatenate([qvel, error, np.abs(error), np.tanh(error / FINE)], axis=1)
+    if config.chunk is None:
+        qpos, qvel, goal = np.split(observation, 3, axis=1)
+        return qpos, qvel, goal, qpos
+    return np.split(observation, 4, axis=1)
 
 
-def potential(envs, observation):
-    """Return minus the mean over joints of |goal - qpos| / range (envs,)."""
-    qpos, _, goal = np.split(observation, 3, axis=1)
-    _, _, span = np.split(envs.observation_space.high - envs.observation_space.low, 3, axis=1)
-    return -(np.abs(goal - qpos) / span).mean(1)
+def features(observation, config):
+    """Return the inputs of the agent: velocity, error of the setpoint, its size, and the error on a
+    fine scale; with chunks the way that the robot still has to the setpoint, too.
+    """
+    qpos, qvel, goal, setpoint = split(observation, config)
+    error = goal - setpoint
+    rows = [qvel, error, np.abs(error), np.tanh(error / FINE)]
+    if config.chunk is not None:
+        rows.append(setpoint - qpos)
+        rows.append(np.sign(error) * np.sqrt(np.tanh(np.abs(error) / FINE)))
+    return np.concatenate(rows, axis=1)
+
+
+def potential(envs, observation, config):
+    """Return minus the mean over joints of |goal - setpoint| / range (envs,)."""
+    _, _, goal, setpoint = split(observation, config)
+    _, _, span, _ = split(envs.observation_space.high - envs.observation_space.low, config)
+    return -(np.abs(goal - setpoint) / span).mean(1)
 
 
 def shaping(envs, config):
@@ -82,7 +104,8 @@ def shaping(envs, config):
     observations.
     """
     return lambda before, after: (
-        config.shaping * (config.discount * potential(envs, after) - potential(envs, before))
+        config.shaping
+        * (config.discount * potential(envs, after, config) - potential(envs, before, config))
     )
 
 
@@ -115,11 +138,11 @@ def draw(curve, config):
 
 def main(config: Config):
     """Train, evaluate, and draw the learning curve."""
-    envs = make_envs(config)
+    envs, inputs = make_envs(config), partial(features, config=config)
     if config.policy is None:
-        act, curve = ppo.train(envs, config, SCORES, features, shaping(envs, config))
+        act, curve = ppo.train(envs, config, SCORES, inputs, shaping(envs, config))
     else:
-        act, curve = ppo.Policy.load(config.policy, features), None
+        act, curve = ppo.Policy.load(config.policy, inputs), None
     success, error, reward = evaluate(envs, act, config)
     envs.close()
     print(

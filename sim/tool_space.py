@@ -144,7 +144,7 @@ class OperationalSpace:
         pose = ts.link_poses(tree, self._posture, [link], point=self.point)[0, 0]
         neutral = [*pose, *[0.0] * (len(entries) - len(POSE_UNITS))]
         self._columns = np.zeros(tree.dof, np.intp)  # of the setpoint, for each joint; 0 for none
-        controlled = tree.chain(link) | ~tree.independent
+        controlled = tree.chain(link) | ~tree.coupling.independent
         for name in names("joints", list(joints)):
             joint = tree.joint_names.index(choice("joints", name, tree.joint_names))
             if controlled[joint]:

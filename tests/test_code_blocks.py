@@ -92,7 +92,7 @@ SOURCES = [
     *("assets/*", "Makefile", "pyproject.toml", "setup.py", ".ci/*"),
 ]
 FOREIGN = """
-ActuatorCfg DCMotorCfg PDJointPosControllerConfig max_effort slewmax mjDSBL_CONSTRAINT
+ActuatorCfg DCMotorCfg PDJointPosControllerConfig max_effort mjDSBL_CONSTRAINT
 first_robot zero_qpos pid_qf get_joints viewer sim_freq control_freq pd_joint_pos pd_joint_delta_pos
 _load_scene balance_passive_force proportional_on_measurement error_map set_auto_mode last_output
 gym_env_vectorize_mode impratio noslip_iterations auth verifies ulimit jax_numpy_rank_promotion

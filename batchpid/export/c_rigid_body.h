@@ -26,11 +26,16 @@ static inline void batchpid_rotate(const double *turn, const double *a, double *
 static inline void batchpid_place(const double *qpos, batchpid_bodies *b) {
   /* [poses] */
   for (int j = 0; j < BATCHPID_JOINTS; ++j) {
-    const double sine = sin(qpos[j]), rest = 1.0 - cos(qpos[j]);
+    const double sine = slides[j] ? 0.0 : sin(qpos[j]), cosine = slides[j] ? 1.0 : cos(qpos[j]);
     const int up = above[j];
     double turn[9], place[3], mixed[9];
-    for (int i = 0; i < 9; ++i) turn[i] = k_turn[j][i] + sine * k_sine[j][i] + rest * k_cosine[j][i];
-    for (int i = 0; i < 3; ++i) place[i] = k_place[j][i] + qpos[j] * k_slide[j][i];
+    for (int i = 0; i < 3; ++i) {
+      const double *row = k_turn[j] + 3 * i; /* the axis is the x axis of the body */
+      turn[3 * i] = row[0];
+      turn[3 * i + 1] = cosine * row[1] + sine * row[2];
+      turn[3 * i + 2] = cosine * row[2] - sine * row[1];
+      place[i] = k_place[j][i] + (slides[j] ? qpos[j] * row[0] : 0.0);
+    }
     for (int i = 0; i < 3; ++i) {
       for (int k = 0; k < 3; ++k) {
         const double column[3] = {turn[k], turn[3 + k], turn[6 + k]};

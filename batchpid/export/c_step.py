@@ -286,20 +286,15 @@ def rigid_body(c: Dialect, tree: RigidTree) -> str:
     tree.
     """
     bodies = tree.bodies
-    # A joint's rotation is linear in 1, sin q and 1 - cos q, so that three constant matrices a
-    # joint are enough.
-    rotations = {"turn": bodies.at_zero, "sine": bodies.sine, "cosine": bodies.cosine}
     above = _integers(c, "above", tree.body_parents)
-    poses = above + "".join(
-        c.table(f"k_{name}", leaf[:, :, :3].reshape(-1, 9)) for name, leaf in rotations.items()
-    )
-    poses += c.table("k_place", bodies.at_zero[..., 3]) + c.table("k_slide", bodies.slide[..., 3])
-    poses += c.table("k_center", bodies.center) + c.table("k_tensor", bodies.tensor.reshape(-1, 9))
+    poses = above + c.table("k_turn", bodies.at_zero[:, :, :3].reshape(-1, 9))
+    poses += c.table("k_place", bodies.at_zero[..., 3]) + c.table("k_center", bodies.center[:-1])
+    poses += c.table("k_tensor", bodies.tensor[:-1].reshape(-1, 9))
     poses += _integers(c, "slides", bodies.slides[:, 0])
     coupling = _integers(c, "leader", tree.coupling.leader)
     coupling += c.table("multiplier", tree.coupling.multiplier)
     fall = ", ".join(map(c.number, bodies.gravity.tolist()))
-    masses = above + coupling + c.table("k_mass", bodies.mass[:, 0])
+    masses = above + coupling + c.table("k_mass", bodies.mass[:-1, 0])
     masses += c.table("k_armature", np.asarray(tree.armature))
     masses += f"  static const {c.type} gravity[3] = {{{fall}}};\n"
     return c.translated(

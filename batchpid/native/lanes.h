@@ -72,31 +72,37 @@ struct alignas(WIDTH * sizeof(double)) Lanes {  // GCC aligns its vectors otherw
   }
 };
 
-// Write sine and cosine of angles [rad]: x = n pi / 2 + r with pi / 2 in three parts (W. J. Cody and W. Waite, Software
+// Write cosines and sines of angles [rad]: x = n pi / 2 + r with pi / 2 in three parts (W. J. Cody and W. Waite, Software
 // Manual for the Elementary Functions, 1980), and the polynomials of FreeBSD's msun (k_sin.c, k_cos.c) for |r| <= pi / 4.
 // The error is below 2e-16 (1.5e-16 on a million angles), and the bits are the same on every processor, other than those of the C library.
-inline void sine_and_cosine(Lanes x, Lanes &sine, Lanes &cosine) {
+inline void write_cosines(std::int64_t count, Lanes const *angle, Lanes *cosine, Lanes *sine) {
   constexpr double FARTHEST_ANGLE = 1e6, SHIFT = 0x1.8p52;  // adding it rounds to integers
   constexpr double HALF_PI[3] = {1.57079632673412561417e+00, 6.07710050630396597660e-11, 2.02226624871116645580e-21};
   typedef Lanes::Packed Packed;
-  Packed const n = (x.of * 6.36619772367581382433e-01 + SHIFT) - SHIFT;
-  Packed const r = ((x.of - n * HALF_PI[0]) - n * HALF_PI[1]) - n * HALF_PI[2], z = r * r;
-  Packed const s_tail = 2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10);
-  Packed const s_head = 8.33333333332248946124e-03 + z * (-1.98412698298579493134e-04 + z * s_tail);
-  Packed const s = r + r * z * (-1.66666666666666324348e-01 + z * s_head);
-  Packed const c_tail = -2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 - z * 1.13596475577881948265e-11);
-  Packed const c_head = -1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + z * c_tail);
-  Packed const rest = 0.5 * z, w = 1.0 - rest;
-  Packed const c = w + (((1.0 - w) - rest) + z * z * (4.16666666666666019037e-02 + z * c_head));
-  Packed const quarter = n - 4.0 * ((n * 0.25 + SHIFT) - SHIFT);  // -2 to 2
-  auto const odd = (quarter == 1.0) | (quarter == -1.0), half = (quarter == 2.0) | (quarter == -2.0);
-  Packed const a = odd ? c : s, b = odd ? s : c;
-  sine.of = (half | (quarter == -1.0)) ? -a : a;
-  cosine.of = (half | (quarter == 1.0)) ? -b : b;
-  for (int k = 0; k < WIDTH; ++k) {
-    if (std::fabs(x.of[k]) <= FARTHEST_ANGLE) continue;
-    sine.of[k] = std::sin(x.of[k]);
-    cosine.of[k] = std::cos(x.of[k]);
+  Lanes far{};
+  for (std::int64_t i = 0; i < count; ++i) {
+    Packed const x = angle[i].of;
+    far += 1.0 - at_least_mask(FARTHEST_ANGLE, absolute(angle[i]));
+    Packed const n = (x * 6.36619772367581382433e-01 + SHIFT) - SHIFT;
+    Packed const r = ((x - n * HALF_PI[0]) - n * HALF_PI[1]) - n * HALF_PI[2], z = r * r;
+    Packed const s_tail = 2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10);
+    Packed const s_head = 8.33333333332248946124e-03 + z * (-1.98412698298579493134e-04 + z * s_tail);
+    Packed const s = r + r * z * (-1.66666666666666324348e-01 + z * s_head);
+    Packed const c_tail = -2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 - z * 1.13596475577881948265e-11);
+    Packed const c_head = -1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + z * c_tail);
+    Packed const rest = 0.5 * z, w = 1.0 - rest;
+    Packed const c = w + (((1.0 - w) - rest) + z * z * (4.16666666666666019037e-02 + z * c_head));
+    // -2 to 2. Masks are numbers: GCC compares vectors of AVX-512 in scalar code unless it selects by the comparison.
+    Packed const quarter = n - 4.0 * ((n * 0.25 + SHIFT) - SHIFT), square = quarter * quarter;
+    Packed const a = square == 1.0 ? c : s, b = square == 1.0 ? s : c;
+    sine[i].of = square - quarter > 1.0 ? -a : a;
+    cosine[i].of = square + quarter > 1.0 ? -b : b;
+  }
+  for (std::int64_t at = 0; any_positive(far) && at < count * WIDTH; ++at) {
+    double const x = angle[at / WIDTH].of[at % WIDTH];
+    if (std::fabs(x) <= FARTHEST_ANGLE) continue;
+    sine[at / WIDTH].of[at % WIDTH] = std::sin(x);
+    cosine[at / WIDTH].of[at % WIDTH] = std::cos(x);
   }
 }
 
@@ -135,6 +141,13 @@ Lanes gather(T const *table, std::int64_t columns, std::int64_t column, std::int
 template <class T>
 void scatter(Lanes value, T *table, std::int64_t columns, std::int64_t column, std::int64_t first, std::int64_t rows) {
   for (int k = 0; k < WIDTH && first + k < rows; ++k) table[(first + k) * columns + column] = static_cast<T>(value.of[k]);
+}
+
+// Write all columns of WIDTH rows, from row `first` on.
+inline void scatter_rows(Lanes const *values, std::int64_t columns, double *table, std::int64_t first, std::int64_t rows) {
+  for (std::int64_t row = first; row < rows && row < first + WIDTH; ++row) {
+    for (std::int64_t j = 0; j < columns; ++j) table[row * columns + j] = values[j].of[row - first];
+  }
 }
 
 // Return the product of a row, or of a column whose entries are `stride` apart, and a vector.

@@ -89,6 +89,14 @@ struct BodyState {
   Inertia<N> inertia;
 };
 
+// Return the frame of a base at the origin.
+template <class N>
+BodyState<N> body_of_base() {
+  BodyState<N> base{};
+  base.axes[0].x = base.axes[1].y = base.axes[2].z = N(1.0);
+  return base;
+}
+
 template <class N, class T>
 Vector<N> in_axes(Vector<N> const (&axes)[3], T x, T y, T z) {
   return x * axes[0] + y * axes[1] + z * axes[2];
@@ -104,30 +112,35 @@ Vector<N> turning(BodyState<N> const &body, bool slides) {
   return slides ? Vector<N>{} : body.axes[0];
 }
 
+// Return the frame of a body on the one above it, at a position of its joint [rad or m], with cosine and sine of an angle.
+template <class N, class T>
+BodyState<N> place_body(BodyState<N> const &above, BodyRow<T> const &row, bool slides, N cosine, N sine, N position) {
+  BodyState<N> at;
+  for (int k = 0; k < 3; ++k) {
+    double const column[3] = {double(row.rotation[0][k]), double(row.rotation[1][k]), double(row.rotation[2][k])};
+    at.axes[k] = along_axes(above.axes, column);
+  }
+  at.origin = above.origin + along_axes(above.axes, row.position);
+  if (slides) {
+    at.origin = at.origin + position * at.axes[0];
+    at.moving = at.axes[0];
+  } else {
+    at.moving = cross(at.origin, at.axes[0]);
+    Vector<N> const y = at.axes[1], z = at.axes[2];
+    at.axes[1] = cosine * y + sine * z;
+    at.axes[2] = cosine * z - sine * y;
+  }
+  return at;
+}
+
 // Write the frames of the bodies at a pose. tree (dof, 2): the joint above, or -1; whether it slides.
 template <class N, class T>
 void place_bodies(std::int64_t dof, std::int32_t const *tree, BodyRow<T> const *rows, N const *cosine, N const *sine,
                   N const *qpos, BodyState<N> *body) {
-  BodyState<N> base{};
-  base.axes[0].x = base.axes[1].y = base.axes[2].z = N(1.0);
+  BodyState<N> const base = body_of_base<N>();
   for (std::int64_t j = 0; j < dof; ++j) {
     BodyState<N> const &above = tree[2 * j] < 0 ? base : body[tree[2 * j]];
-    BodyRow<T> const &row = rows[j];
-    BodyState<N> &at = body[j];
-    for (int k = 0; k < 3; ++k) {
-      double const column[3] = {double(row.rotation[0][k]), double(row.rotation[1][k]), double(row.rotation[2][k])};
-      at.axes[k] = along_axes(above.axes, column);
-    }
-    at.origin = above.origin + along_axes(above.axes, row.position);
-    if (tree[2 * j + 1]) {
-      at.origin = at.origin + qpos[j] * at.axes[0];
-      at.moving = at.axes[0];
-    } else {
-      at.moving = cross(at.origin, at.axes[0]);
-      Vector<N> const y = at.axes[1], z = at.axes[2];
-      at.axes[1] = cosine[j] * y + sine[j] * z;
-      at.axes[2] = cosine[j] * z + -sine[j] * y;
-    }
+    body[j] = place_body(above, rows[j], tree[2 * j + 1] != 0, cosine[j], sine[j], qpos[j]);
   }
 }
 
@@ -204,17 +217,23 @@ void efforts_of_wrenches(std::int64_t dof, std::int32_t const *tree, BodyState<N
   }
 }
 
+// Return the motion of a body on the one above it, at a rate of its joint, without its acceleration.
+template <class N>
+BodyMotion<N> move_body(BodyMotion<N> const &above, BodyState<N> const &body, bool slides, N rate) {
+  Vector<N> const w = rate * turning(body, slides), v = rate * body.moving;
+  BodyMotion<N> at{above.turning + w, above.moving + v, above.turning_change, above.moving_change, {}, {}};
+  at.turning_change = at.turning_change + cross(at.turning, w);
+  at.moving_change = at.moving_change + cross(at.turning, v) + cross(at.moving, w);
+  return at;
+}
+
 // Write the motions of the bodies on a base with a given motion, without acceleration of the joints.
 template <class N>
 void move_bodies(std::int64_t dof, std::int32_t const *tree, BodyState<N> const *body, N const *qvel,
                  BodyMotion<N> const &base, BodyMotion<N> *motion) {
   for (std::int64_t j = 0; j < dof; ++j) {
     BodyMotion<N> const &above = tree[2 * j] < 0 ? base : motion[tree[2 * j]];
-    Vector<N> const w = qvel[j] * turning(body[j], tree[2 * j + 1]), v = qvel[j] * body[j].moving;
-    BodyMotion<N> &at = motion[j];
-    at = BodyMotion<N>{above.turning + w, above.moving + v, above.turning_change, above.moving_change, {}, {}};
-    at.turning_change = at.turning_change + cross(at.turning, w);
-    at.moving_change = at.moving_change + cross(at.turning, v) + cross(at.moving, w);
+    motion[j] = move_body(above, body[j], tree[2 * j + 1] != 0, qvel[j]);
   }
 }
 

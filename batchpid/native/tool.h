@@ -127,7 +127,7 @@ class ToolDynamics {
 
   // Set the frames of the bodies at positions (dof,).
   void place(Lanes const *qpos) {
-    for (std::int64_t i = 0; i < tree_.dof; ++i) sine_and_cosine(qpos[i], sine_[i], cosine_[i]);
+    write_cosines(tree_.dof, qpos, cosine_.data(), sine_.data());
     place_bodies(tree_.dof, above(), tree_.bodies(), cosine_.data(), sine_.data(), qpos, bodies_.data());
   }
   // Set the velocities of the bodies, from those of the joints (dof,).

@@ -1,9 +1,9 @@
 """Frames, rotations and spatial inertias, with any leading axes, for NumPy and JAX arrays.
 
 A frame is a matrix (..., 3, 4): the axes of the frame as columns, and its position. A pose (..., 7)
-is a position and a unit quaternion (w, x, y, z), the order that SAPIEN and viser use. Functions of
-quaternions that follow :func:`compose` are for NumPy alone. Products are written as sums of
-elementwise products: their rounding does not depend on the number of rows, as a library's does.
+is a position and a unit quaternion (w, x, y, z), the order that SAPIEN and viser use. Products are
+written as sums of elementwise products: their rounding does not depend on the number of rows, as a
+library's does.
 
 Spatial inertias: R. Featherstone, Rigid Body Dynamics Algorithms (2008), section 2.13.
 """
@@ -50,37 +50,33 @@ def cross(a: Array, b: Array) -> Array:
     return namespace(a, b).stack(crossed(components(a), components(b)), axis=-1)
 
 
+def cross_matrix(vector: Array) -> Array:
+    """Return C (..., 3, 3) with C a = c x a for vectors c (..., 3)."""
+    # Row i is e_i x c.
+    return cross(namespace(vector).eye(3, dtype=vector.dtype), vector[..., None, :])
+
+
 def rotate(turn: Array, vector: Array) -> Array:
     """Return the vectors (..., 3) turned by matrices (..., 3, 3): R v."""
-    return (
-        turn[..., 0] * vector[..., :1]
-        + turn[..., 1] * vector[..., 1:2]
-        + turn[..., 2] * vector[..., 2:3]
-    )
+    return (turn * vector[..., None, :]).sum(-1)
 
 
 def unrotate(turn: Array, vector: Array) -> Array:
     """Return the vectors (..., 3) in the axes of matrices (..., 3, 3): R^T v."""
-    return (
-        turn[..., 0, :] * vector[..., :1]
-        + turn[..., 1, :] * vector[..., 1:2]
-        + turn[..., 2, :] * vector[..., 2:3]
-    )
+    return (turn * vector[..., None]).sum(-2)
+
+
+def multiply(a: Array, b: Array) -> Array:
+    """Return the products of matrices (..., n, 3) and (..., 3, m)."""
+    return (a[..., None] * b[..., None, :, :]).sum(-2)
 
 
 def in_axes(turn: Array, twists: Array) -> Array:
     """Return the columns of ``twists`` (..., 6, n) in the axes of matrices (..., 3, 3)."""
     xp = namespace(turn, twists)
-    columns = namespace(twists).moveaxis(twists, -1, -2)
-    halves = [
-        unrotate(turn[..., None, :, :], part) for part in (columns[..., :3], columns[..., 3:])
-    ]
-    return xp.moveaxis(xp.concatenate(halves, axis=-1), -1, -2)
-
-
-def multiply(a: Array, b: Array) -> Array:
-    """Return the products of matrices (..., n, 3) and (..., 3, m)."""
-    return a[..., :1] * b[..., :1, :] + a[..., 1:2] * b[..., 1:2, :] + a[..., 2:3] * b[..., 2:3, :]
+    back = xp.swapaxes(turn, -1, -2)
+    halves = [multiply(back, twists[..., :3, :]), multiply(back, twists[..., 3:, :])]
+    return xp.concatenate(halves, axis=-2)
 
 
 def turned(frame: Array, inner: Array) -> Array:
@@ -94,16 +90,15 @@ def turned(frame: Array, inner: Array) -> Array:
 
 
 def matrix_of(wxyz: Array) -> Array:
-    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but 0."""
-    xp = namespace(wxyz)
-    w, x, y, z = (wxyz[..., k] for k in range(4))
-    s = 2 / (w * w + x * x + y * y + z * z)
-    rows = (
-        (1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)),
-        (s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x)),
-        (s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y)),
-    )
-    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but 0.
+
+    R = 1 + 2 (w C + C C) / (w, v)^2 with C a = v x a, and C C = v v^T - v^2 1.
+    """
+    v = wxyz[..., 1:]
+    scale = 2 / (wxyz * wxyz).sum(-1)[..., None, None]
+    eye = namespace(wxyz).eye(3, dtype=wxyz.dtype)
+    square = v[..., None] * v[..., None, :] - (v * v).sum(-1)[..., None, None] * eye
+    return eye + scale * (wxyz[..., :1, None] * cross_matrix(v) + square)
 
 
 def wxyz_of(turn: Array) -> Array:
@@ -113,24 +108,14 @@ def wxyz_of(turn: Array) -> Array:
     multiple of q.
     """
     xp = namespace(turn)
-    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = (
-        [turn[..., i, j] for j in range(3)] for i in range(3)
-    )
-    squares = [1 + r00 + r11 + r22, 1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22]
-    wx = r21 - r12
-    wy = r02 - r20
-    wz = r10 - r01
-    xy = r10 + r01
-    xz = r02 + r20
-    yz = r21 + r12
-    rows = [
-        [squares[0], wx, wy, wz],
-        [wx, squares[1], xy, xz],
-        [wy, xy, squares[2], yz],
-        [wz, xz, yz, squares[3]],
-    ]
-    table = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
-    best = xp.stack(squares, axis=-1).argmax(-1)
+    back = xp.swapaxes(turn, -1, -2)
+    odd = turn - back
+    trace = xp.trace(turn, axis1=-2, axis2=-1)[..., None, None]
+    axis = xp.stack([odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]], axis=-1)[..., None]
+    first = xp.concatenate([1 + trace, xp.swapaxes(axis, -1, -2)], axis=-1)
+    even = turn + back + (1 - trace) * xp.eye(3, dtype=turn.dtype)
+    table = xp.concatenate([first, xp.concatenate([axis, even], axis=-1)], axis=-2)
+    best = xp.diagonal(table, axis1=-2, axis2=-1).argmax(-1)
     q = xp.take_along_axis(table, best[..., None, None], axis=-2)[..., 0, :]
     q = q / xp.sqrt((q * q).sum(-1, keepdims=True))
     return xp.where(q[..., :1] < 0, -q, q)
@@ -149,18 +134,14 @@ def rotation_error(goal: Array, wxyz: Array) -> Array:
     atan2(|v|, w).
     """
     xp = namespace(goal, wxyz)
-    gw = goal[..., :1]
-    g = goal[..., 1:]
-    qw = wxyz[..., :1]
-    q = wxyz[..., 1:]
-    w = gw * qw + (g * q).sum(-1, keepdims=True)
-    v = qw * g - gw * q - cross(g, q)
-    w, v = xp.where(w < 0, -w, w), xp.where(w < 0, -v, v)
+    turn = compose(goal, inverse(wxyz))
+    turn = xp.where(turn[..., :1] < 0, -turn, turn)
+    w, v = turn[..., :1], turn[..., 1:]
     length = xp.sqrt((v * v).sum(-1, keepdims=True))
+    # Small angles are 2 sin.
     small = length < 1e-12 * w
-    return v * xp.where(
-        small, 2 / xp.where(small, w, 1.0), 2 * xp.atan2(length, w) / xp.where(small, 1.0, length)
-    )
+    angle = xp.where(small, 1.0, xp.atan2(length, w))
+    return v * (2 * angle / xp.where(small, w, length))
 
 
 def pose_error(goal: Array, pose: Array) -> Array:
@@ -186,18 +167,16 @@ def moved(pose: Array, step: Array) -> Array:
 
 def compose(a: Array, b: Array) -> Array:
     """Return the rotation b followed by a: Hamilton's product of (..., 4) and (..., 4)."""
-    aw, ax, ay, az = (a[..., k] for k in range(4))
-    bw, bx, by, bz = (b[..., k] for k in range(4))
-    w = aw * bw - ax * bx - ay * by - az * bz
-    x = aw * bx + ax * bw + ay * bz - az * by
-    y = aw * by - ax * bz + ay * bw + az * bx
-    z = aw * bz + ax * by - ay * bx + az * bw
-    return namespace(a, b).stack([w, x, y, z], axis=-1)
+    aw, av = a[..., :1], a[..., 1:]
+    bw, bv = b[..., :1], b[..., 1:]
+    w = aw * bw - (av * bv).sum(-1, keepdims=True)
+    v = aw * bv + bw * av + cross(av, bv)
+    return namespace(a, b).concatenate([w, v], axis=-1)
 
 
-def inverse(q: Rows) -> Rows:
+def inverse(q: Array) -> Array:
     """Return the inverse of unit quaternions (..., 4): the conjugate."""
-    return np.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
+    return namespace(q).concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
 def placed(base: Rows, poses: Rows) -> Rows:
@@ -265,27 +244,23 @@ def spatial_matrix(inertia: SpatialInertia) -> Float64:
 
     S = [[m 1, -m C], [m C, I - m C C]] with C a = c x a.
     """
-    mass = inertia.mass
     # The origin moves with v; the center of mass with v + w x c.
-    cross = _cross_matrix(inertia.center)
-    matrix = np.zeros((6, 6))
-    matrix[:3, :3] = mass * np.eye(3)
-    matrix[:3, 3:] = -mass * cross
-    matrix[3:, :3] = mass * cross
-    matrix[3:, 3:] = inertia.tensor - mass * cross @ cross
-    return matrix
+    mass = inertia.mass
+    cross = cross_matrix(inertia.center)
+    lower = [mass * cross, inertia.tensor - mass * cross @ cross]
+    return np.block([[mass * np.eye(3), -mass * cross], lower])
 
 
 def moved_matrix(matrix: Float64, place: Float64) -> Float64:
     """Return spatial matrices (..., 6, 6) in another frame, in which their present frame has the
     homogeneous pose ``place`` (4, 4).
     """
-    turn = np.zeros(
-        (6, 6)
-    )  # velocity (v, w) in the matrices' frame, from the velocity in the other one
-    turn[:3, :3] = turn[3:, 3:] = place[:3, :3].T
-    turn[:3, 3:] = -place[:3, :3].T @ _cross_matrix(place[:3, 3])
-    return turn.T @ matrix @ turn
+    # Velocity (v, w) in the matrices' frame, from the velocity in the other one.
+    back = place[:3, :3].T
+    zero = np.zeros((3, 3))
+    turn = np.block([[back, -back @ cross_matrix(place[:3, 3])], [zero, back]])
+    moved: Float64 = turn.T @ matrix @ turn
+    return moved
 
 
 def inertia_rows(matrices: Float64) -> Float64:
@@ -293,20 +268,9 @@ def inertia_rows(matrices: Float64) -> Float64:
     mass = matrices[:, 0, 0, None]
     # The block m C holds the center of mass thrice; one entry of each is read.
     center = matrices[:, [5, 3, 4], [1, 2, 0]] / mass
-    cross = _cross_matrix(center)
+    cross = cross_matrix(center)
     tensor = matrices[:, 3:, 3:] + mass[:, :, None] * cross @ cross
     return np.hstack([mass, center, tensor.reshape(-1, 9)])
-
-
-def _cross_matrix(vector: Float64) -> Float64:
-    """Return C (..., 3, 3) with C a = c x a for vectors c (..., 3)."""
-    x, y, z = np.moveaxis(vector, -1, 0)
-    zero = np.zeros_like(x)
-    return np.moveaxis(
-        np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]),
-        (0, 1),
-        (-2, -1),
-    )
 
 
 def total(parts: Sequence[SpatialInertia]) -> SpatialInertia:

@@ -24,14 +24,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Bool, Float64, Rows
+from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.records import array_summary
 from batchpid.checks import array, choice, entries, instance, integer, positive
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import pose_error
+from batchpid.task_space.osc_state import Tool
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
-from batchpid.task_space.symmetric import gram, product, quiet, whitened
+from batchpid.task_space.symmetric import gram, product, quiet, solve
 from batchpid.task_space.tree_kinematics import read_point
 from batchpid.task_space.tree_quantities import evaluated
 
@@ -115,177 +116,142 @@ def inverse_kinematics(
     goal, rows = _goals_and_starts(tree, pose, start)
     if point is not None:
         point = array("point", read_point(goal[0], point), (3,), "xyz", kind="entry")
-    search = _Search(tree, link, point, np.array([position, rotation]), iterations)
-    # The draws are shares of the range, the same for every env, whatever the others do.
-    shares = np.random.default_rng(seed).uniform(size=(starts - 1, tree.dof))
-    number = np.zeros(len(goal), np.intp)
+    tool = Tool(tree, link, point)
+    tolerance = np.array([position, rotation])
+    low, high = np.asarray(tree.lower), np.asarray(tree.upper)
+    # The draws are shares of the range, or of a turn without limits; the same for every env,
+    # whatever the others do.
+    shares = np.random.default_rng(seed).uniform(size=(starts - 1, 1, tree.dof))
     with quiet():
-        best = search.solve(goal, rows)
+        best = _search(tool, tolerance, iterations, goal, rows)
+        number = np.zeros(len(goal), np.intp)
         # Most poses are reached from one of the first five starts.
-        for first, last in ((0, 4), (4, starts - 1)):
-            left = np.flatnonzero(~search.reached(best))
-            drawn = shares[first:last]
-            if not len(left) or not len(drawn):
-                continue
-            began = np.concatenate([search.drawn(rows[left], share) for share in drawn])
-            results = search.solve(np.tile(goal[left], (len(drawn), 1)), began)
-            for at in range(len(drawn)):
-                part = results.rows(slice(at * len(left), (at + 1) * len(left)))
-                present = best.rows(left)
-                # The first start that reaches a pose is kept, else the nearest.
-                nearer = search.size(part) < search.size(present)
-                nearer &= ~search.reached(present)
-                best.write(left[nearer], part.rows(nearer))
-                number[left[nearer]] = first + 1 + at
-    success = search.reached(best)
-    steps = best.steps[:, 0].astype(np.intp)
+        for done, drawn in ((0, shares[:4]), (4, shares[4:])):
+            left = np.flatnonzero(~_reached(best[1], tolerance))
+            begin = np.where(np.isfinite(low), low, rows[left] - np.pi)
+            end = np.where(np.isfinite(high), high, rows[left] + np.pi)
+            # Joints outside of the chain stay where they are.
+            began = np.where(tree.chain(link), begin + drawn * (end - begin), rows[left])
+            goals = np.broadcast_to(goal[left], (*began.shape[:2], 7)).reshape(-1, 7)
+            new = _search(
+                tool, tolerance, iterations, goals, tree.positions(began).reshape(-1, tree.dof)
+            )
+            results = [
+                np.concatenate([old[None, left], leaf.reshape(*began.shape[:2], leaf.shape[1])])
+                for old, leaf in zip(best, new, strict=True)
+            ]
+            # The first start that reaches a pose is kept, else the nearest.
+            errors = results[1]
+            size = np.where(_reached(errors, tolerance), -1.0, (errors / tolerance).max(-1))
+            chosen = size.argmin(0)
+            number[left] = np.where(chosen > 0, done + chosen, number[left])
+            for old, leaf in zip(best, results, strict=True):
+                old[left] = leaf[chosen, np.arange(len(left))]
+    qpos, errors, steps = best
+    success = _reached(errors, tolerance)
     result = IKResult(
-        best.qpos,
-        best.errors[:, 0],
-        best.errors[:, 1],
+        qpos,
+        errors[:, 0],
+        errors[:, 1],
         success,
         number,
-        steps,
+        steps[:, 0].astype(np.intp),
     )
     if on_failure != "return" and not success.all():
         raise _failure(result)
     return result
 
 
-class _Found(NamedTuple):
-    """Nearest poses of some searches."""
-
-    qpos: Float64
-    """Positions (n, dof)."""
-    errors: Float64
-    """Errors of position and rotation (n, 2) [m, rad]."""
-    steps: Float64
-    """Numbers of steps (n, 1)."""
-
-    def rows(self, chosen: Rows | slice) -> _Found:
-        """Return some rows."""
-        return _Found(*(leaf[chosen] for leaf in self))
-
-    def write(self, rows: Rows, part: _Found) -> None:
-        """Write ``part`` over some rows."""
-        for leaf, values in zip(self, part, strict=True):
-            leaf[rows] = values
+def _reached(errors: Float64, tolerance: Float64) -> Array:
+    """Return where both errors (..., 2) are within the tolerances."""
+    within: Array = (errors <= tolerance).all(-1)
+    return within
 
 
-class _Search(NamedTuple):
-    """Searches for the poses of one tool."""
+def _search(
+    tool: Tool,
+    tolerance: Float64,
+    iterations: int,
+    goal: Float64,
+    qpos: Float64,
+) -> list[Float64]:
+    """Search for the poses ``goal`` (n, 7) from ``qpos`` (n, dof), within the limits.
 
-    tree: RigidTree
-    link: str
-    point: Float64 | None
-    tolerance: Float64
-    """Of position and rotation (2,) [m, rad]."""
-    iterations: int
+    Return the nearest positions (n, dof), their errors (n, 2) [m, rad] and their numbers of steps
+    (n, 1).
+    """
+    tree, link, point = tool
+    native = native_rows.search(
+        tree,
+        tree.index(link),
+        point,
+        goal,
+        qpos,
+        tolerance,
+        iterations,
+    )
+    if native is not None:
+        return native
+    # The same search in NumPy: the definition of the native one.
+    best = [qpos.copy(), np.full((len(goal), 2), np.inf), np.zeros((len(goal), 1))]
+    # Rows that have arrived leave, so the others pay for themselves alone.
+    going = np.arange(len(goal))
+    for step in range(iterations + 1):
+        present = evaluated(tree, ("pose", "jacobian"), qpos, None, link, point)
+        error = pose_error(goal[going], present["pose"])
+        lengths = np.sqrt((error * error).reshape(-1, 2, 3).sum(-1))
+        nearer = (lengths / tolerance).max(-1) < (best[1][going] / tolerance).max(-1)
+        nearest = qpos, lengths, np.full((len(qpos), 1), float(step))
+        for leaf, values in zip(best, nearest, strict=True):
+            leaf[going[nearer]] = values[nearer]
+        stay = ~_reached(lengths, tolerance)
+        going = going[stay]
+        if not len(going):
+            break
+        qpos = tree.positions(_stepped(tool, present["jacobian"], qpos, error))[stay]
+    return best
 
-    @property
-    def limits(self) -> tuple[Float64, Float64]:
-        """Position limits of the joints (dof,)."""
-        return np.asarray(self.tree.lower), np.asarray(self.tree.upper)
 
-    def size(self, nearest: _Found) -> Float64:
-        """Return the larger of position and rotation error over its tolerance (n,)."""
-        worst: Float64 = (nearest.errors / self.tolerance).max(-1)
-        return worst
-
-    def reached(self, nearest: _Found) -> Bool:
-        """Return the rows (n,) with both errors within the tolerances."""
-        within: Bool = nearest.errors <= self.tolerance
-        return within[:, 0] & within[:, 1]
-
-    def drawn(self, rows: Float64, share: Float64) -> Float64:
-        """Return starts at a ``share`` (dof,) of the range of each joint, half a turn about
-        ``rows`` without limits.
-        """
-        low, high = self.limits
-        low = np.where(np.isfinite(low), low, rows - np.pi)
-        high = np.where(np.isfinite(high), high, rows + np.pi)
-        # Joints outside of the chain stay where they are.
-        chain = self.tree.chain(self.link)
-        return self.tree.positions(np.where(chain, low + share * (high - low), rows))
-
-    def solve(self, goal: Float64, qpos: Float64) -> _Found:
-        """Return the results of searches that begin at ``qpos`` (n, dof), within the limits."""
-        tool = self.tree, self.tree.index(self.link), self.point
-        native = native_rows.search(
-            *tool,
-            self.limits,
-            goal,
-            qpos,
-            self.tolerance,
-            self.iterations,
-        )
-        if native is not None:
-            return _Found(*native)
-        # The same search in NumPy: the definition of the native one.
-        count = len(goal)
-        best = _Found(
-            qpos.copy(),
-            np.full((count, 2), np.inf),
-            np.zeros((count, 1)),
-        )
-        # Rows that have arrived leave, so the others pay for themselves alone.
-        going = np.arange(count)
-        q = qpos
-        for step in range(self.iterations + 1):
-            present = evaluated(self.tree, ("pose", "jacobian"), q, None, self.link, self.point)
-            error = pose_error(goal[going], present["pose"])
-            lengths = np.sqrt((error * error).reshape(-1, 2, 3).sum(-1))
-            nearest = _Found(q, lengths, np.full((len(q), 1), float(step)))
-            better = self.size(nearest) < self.size(best.rows(going))
-            best.write(going[better], nearest.rows(better))
-            stay = ~self.reached(nearest)
-            going = going[stay]
-            q = self.tree.positions(self._stepped(present["jacobian"], q, error))[stay]
-            if not len(going):
-                break
-        return best
-
-    def _stepped(
-        self,
-        jacobian: Float64,
-        qpos: Float64,
-        error: Float64,
-    ) -> Float64:
-        """Return the positions (n, dof) after a step within the limits."""
-        # Damping grows with the error: far away the steps are short and safe, near by quadratic.
-        damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
-        # Joints that would pass a limit stop there, and the others take over their share.
-        free = np.ones(qpos.shape, bool)
-        move = np.zeros_like(qpos)
-        for _ in range(_PASSES):
-            part = np.where(free[:, None], jacobian, 0.0)
-            rest = error - product(jacobian, np.where(free, 0.0, move))
-            move = np.where(free, _damped(part, damping, rest), move)
-            target = qpos + move
-            within = np.clip(target, *self.limits)
-            beyond = free & (target != within)
-            move = np.where(beyond, within - qpos, move)
-            free = free & ~beyond
-            if not beyond.any():
-                break
-        # Geodesic acceleration: the curvature of the path of the tool.
-        names = ("jacobian_rate",)
-        rates = evaluated(self.tree, names, qpos, self.tree.rates(move), self.link, self.point)
-        acceleration = -_damped(part, damping, rates["jacobian_rate"])
-        size = np.sqrt((acceleration * acceleration).sum(-1, keepdims=True))
-        most = _LARGEST_ACCELERATION * np.sqrt((move * move).sum(-1, keepdims=True))
-        share = np.where(size > most, most / size, 1.0) / 2
-        return np.clip(qpos + move + np.where(free, share * acceleration, 0.0), *self.limits)
+def _stepped(
+    tool: Tool,
+    jacobian: Float64,
+    qpos: Float64,
+    error: Float64,
+) -> Float64:
+    """Return the positions (n, dof) after a step within the limits."""
+    tree, link, point = tool
+    limits = np.asarray(tree.lower), np.asarray(tree.upper)
+    # Damping grows with the error: far away the steps are short and safe, near by quadratic.
+    damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
+    # Joints that would pass a limit stop there, and the others take over their share.
+    free = np.ones(qpos.shape, bool)
+    move = np.zeros_like(qpos)
+    for _ in range(_PASSES):
+        part = np.where(free[:, None], jacobian, 0.0)
+        rest = error - product(jacobian, np.where(free, 0.0, move))
+        move = np.where(free, _damped(part, damping, rest), move)
+        target = qpos + move
+        within = np.clip(target, *limits)
+        beyond = free & (target != within)
+        move = np.where(beyond, within - qpos, move)
+        free = free & ~beyond
+        if not beyond.any():
+            break
+    # Geodesic acceleration: the curvature of the path of the tool.
+    names = ("jacobian_rate",)
+    rates = evaluated(tree, names, qpos, tree.rates(move), link, point)
+    acceleration = -_damped(part, damping, rates["jacobian_rate"])
+    size = np.sqrt((acceleration * acceleration).sum(-1, keepdims=True))
+    most = _LARGEST_ACCELERATION * np.sqrt((move * move).sum(-1, keepdims=True))
+    share = np.where(size > most, most / size, 1.0) / 2
+    return np.clip(qpos + move + np.where(free, share * acceleration, 0.0), *limits)
 
 
 def _damped(part: Float64, damping: Float64, vector: Float64) -> Float64:
     """Return J^T (J J^T + damping 1)^-1 v (n, dof) of the columns ``part`` (n, 6, dof) of J."""
     rows = part.swapaxes(-1, -2)
-    # One Cholesky factor serves both J and the error: J^T (L L^T)^-1 v.
-    factor = whitened(
-        gram(rows, rows) + damping * np.eye(6), np.concatenate([part, vector[..., None]], axis=-1)
-    )
-    return gram(factor[..., :-1], factor[..., -1:])[..., 0]
+    matrix = gram(rows, rows) + damping * np.eye(6)
+    return gram(part, solve(matrix, vector[..., None]))[..., 0]
 
 
 def _goals_and_starts(

@@ -113,14 +113,13 @@ def search(
     tree: RigidTree,
     index: int,
     point: Array,
-    limits: tuple[Float64, Float64],
     goal: Array,
     start: Array,
     tolerance: Array,
     iterations: int,
 ) -> list[Float64] | None:
-    """Search, from ``start`` (n, dof), for joint positions within ``limits`` (dof,) that bring a
-    tool to the poses ``goal`` (n, 7).
+    """Search, from ``start`` (n, dof), for joint positions within the limits of the tree that bring
+    a tool to the poses ``goal`` (n, 7).
 
     Return the nearest positions (n, dof), their errors (n, 2) and their numbers of steps (n, 1).
     The tool is at a ``point`` (3,) of the link ``index``; ``tolerance`` is (2,).
@@ -137,7 +136,8 @@ def search(
         iterations,
         goal,
         tool_frames(tree, index, point),
-        *(limit[None] for limit in limits),
+        np.asarray(tree.lower)[None],
+        np.asarray(tree.upper)[None],
         tolerance[None],
         *results,
     )

@@ -224,7 +224,7 @@ def make_osc_params(
     if rows["damping"] is None:
         rows["damping"] = 2 * rows["damping_ratio"] * np.sqrt(rows["stiffness"])
     # Critical damping and the like follow from the stiffness that is left.
-    posture = rows["posture_stiffness"] * tree.independent
+    posture = rows["posture_stiffness"] * tree.coupling.independent
     rows["posture_stiffness"] = posture
     rows["posture_damping"] = 2 * rows["posture_damping_ratio"] * np.sqrt(posture)
     ends = {name: rows[name] for name in ("effort_limit", "effort_min", "effort_max")}
@@ -238,7 +238,7 @@ def make_osc_params(
     if rows["limit_margin"] is None:
         rows["limit_stiffness"] = None
     else:
-        rows["limit_stiffness"] = rows["limit_stiffness"] * tree.independent
+        rows["limit_stiffness"] = rows["limit_stiffness"] * tree.coupling.independent
         rows["limit_margin"] = margin = np.minimum(rows["limit_margin"], (upper - lower) / 4)
         # A joint with a margin of 0 is pushed from nowhere: its ends lie at infinity.
         rows["limit_low"] = np.where(margin > 0, lower + margin, -np.inf)

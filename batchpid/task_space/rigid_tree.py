@@ -29,6 +29,7 @@ from batchpid.task_space.frames import (
     inertia_rows,
     matrix_of,
     moved_matrix,
+    rotate,
     spatial_matrix,
     total,
     turned,
@@ -44,36 +45,27 @@ MAKE_TREE = "pass robot.kinematic_tree()"
 class Bodies(NamedTuple):
     """Bodies of a tree, one for each degree of freedom, and the frames of its links in them.
 
-    The frame of body j in its parent's is ``at_zero + sin(q) sine + (1 - cos(q)) cosine + q
-    slide``, each (3, 4): rotation and position. This is Rodrigues' formula with the placement of
-    the joint multiplied in. Inertias may differ from robot to robot: mass, center and tensor then
-    have a leading axis (robots, ...).
+    The frame of body j in its parent's is ``at_zero`` turned about its x axis by q, or shifted along
+    it. Inertias may differ from robot to robot: mass, center and tensor then have a leading axis
+    (robots, ...). Their last row belongs to the base and the links fixed to it.
     """
 
     at_zero: Array
-    sine: Array
-    cosine: Array
-    slide: Array
+    """(dof, 3, 4): rotation and position."""
     slides: Array
     """1.0 for a prismatic joint, else 0.0 (dof, 1)."""
     mass: Array
-    """(dof, 1) [kg]."""
+    """(dof + 1, 1) [kg]."""
     center: Array
-    """Center of mass in the body's frame (dof, 3) [m]."""
+    """Center of mass in the body's frame (dof + 1, 3) [m]."""
     tensor: Array
-    """Inertia tensor about the center of mass, in the body's axes (dof, 3, 3) [kg m^2]."""
+    """Inertia tensor about the center of mass, in the body's axes (dof + 1, 3, 3) [kg m^2]."""
     moves: Array
     """1.0 where joint i moves body j (dof j, dof i)."""
     link_frames: Array
     """Frames of the links in their bodies (links, 3, 4)."""
     armature: Array
     gravity: Array
-    base_mass: Array
-    """Mass of the base and the links fixed to it (1,) [kg]; center (3,) and tensor (3, 3) as for
-    the bodies.
-    """
-    base_center: Array
-    base_tensor: Array
 
 
 @dataclass(
@@ -200,15 +192,11 @@ class RigidTree:
             link = int(self.parent[link])
         return self.links[tip]
 
-    @property
+    @cached_property
     def held(self) -> RigidTree:
         """Same tree on a fixed base, with all joints independent."""
         if self.fixed_base and self.coupling.is_identity:
             return self
-        return self._held
-
-    @cached_property
-    def _held(self) -> RigidTree:
         return replace(self, fixed_base=True, coupling=Coupling.of(self.dof))
 
     def fixed_at(self, qpos: Float64, moves: NDArray[np.bool_]) -> RigidTree:
@@ -241,11 +229,6 @@ class RigidTree:
             joint_names=names,
             coupling=Coupling.of(len(names)),
         )
-
-    @property
-    def independent(self) -> NDArray[np.bool_]:
-        """Mask (dof,) of the joints that are not followers."""
-        return self.coupling.independent
 
     def positions(self, qpos: Array) -> Array:
         """Return ``qpos`` (..., dof) with the followers moved to match their leaders."""
@@ -299,7 +282,7 @@ class RigidTree:
         parents = list[int]()
         links_of = list[list[int]]()
         frames = np.zeros((len(self.links), 3, 4))
-        local = np.zeros((4, self.dof, 3, 4))  # at_zero, sine, cosine, slide
+        at_zero = np.zeros((self.dof, 3, 4))
         moves = np.zeros((self.dof, self.dof))
         slides = np.zeros((self.dof, 1))
         # From the base outwards: the frame of each link in its body, and each body's placement.
@@ -314,14 +297,9 @@ class RigidTree:
                 continue
             joint = len(parents)
             turn = _along_x(self.axis[link])
-            place = np.column_stack([frames[link][:, :3] @ turn, frames[link][:, 3]])
-            local[0, joint] = place
-            if self.joint_types[link] == "revolute":
-                local[1, joint, :, :3] = place[:, :3] @ _ABOUT_X
-                local[2, joint, :, :3] = place[:, :3] @ _ABOUT_X @ _ABOUT_X
-            else:
-                local[3, joint, :, 3] = place[:, 0]
-                slides[joint] = 1.0
+            at_zero[joint] = frames[link]
+            at_zero[joint, :, :3] = frames[link][:, :3] @ turn
+            slides[joint] = self.joint_types[link] == "prismatic"
             parents.append(body[above])
             moves[joint, joint] = 1.0
             if parents[-1] >= 0:
@@ -330,12 +308,28 @@ class RigidTree:
             links_of.append([link])
             # The body's frame has the axis along x; its link is turned back from that.
             frames[link] = np.column_stack([turn.T, np.zeros(3)])
-        on_base = [link for link, of in enumerate(body) if of < 0]
-        mass, center, tensor = self._inertias([*links_of, on_base], frames)
-        of_joints = slides, mass[:-1], center[:-1], tensor[:-1]
-        of_base = mass[-1], center[-1], tensor[-1]
-        leaves = *local, *of_joints, moves, frames, self.armature, self.gravity, *of_base
+        links_of.append([link for link, of in enumerate(body) if of < 0])
+        inertias = [self._inertia(links, frames[links]) for links in links_of]
+        mass, center, tensor = map(np.array, zip(*inertias, strict=True))
+        leaves = (
+            at_zero,
+            slides,
+            mass[:, None],
+            center,
+            tensor,
+            moves,
+            frames,
+            self.armature,
+            self.gravity,
+        )
         return tuple(body), tuple(parents), Bodies(*map(read_only, leaves))
+
+    def _inertia(self, links: list[int], frames: Float64) -> SpatialInertia:
+        """Return the inertia of some links, from their ``frames`` in a body, in its frame."""
+        turn = frames[..., :3]
+        center = frames[..., 3] + rotate(turn, self.center[links])
+        tensor = turn @ self.inertia[links] @ turn.transpose(0, 2, 1)
+        return total(list(map(SpatialInertia, self.mass[links].tolist(), center, tensor)))
 
     @cached_property
     def tables(self) -> tuple[NDArray[np.int32], Float64]:
@@ -344,28 +338,16 @@ class RigidTree:
         """
         bodies = self.bodies
         joints = np.column_stack([self.body_parents, bodies.slides[:, 0]]).astype(np.int32)
-        parts = (
-            bodies.at_zero[:, :, :3],
-            bodies.at_zero[:, :, 3],
-            bodies.mass,
-            bodies.center,
-            bodies.tensor,
-        )
-        rows = np.hstack([part.reshape(self.dof, -1) for part in parts])
+        turns = bodies.at_zero[:, :, :3].reshape(-1, 9)
+        rows = np.hstack([turns, bodies.at_zero[:, :, 3], self.inertias()[:-1]])
         return read_only(joints), read_only(rows)
 
     def inertias(self, bodies: Bodies | None = None) -> Float64:
         """Return mass, center of mass and inertia tensor of each body, then of the base (..., dof +
         1, 13).
         """
-        of = bodies or self.bodies
-        parts = of.mass, of.center, of.tensor.reshape(*of.center.shape[:-1], 9)
-        rows = np.concatenate(parts, axis=-1)
-        base = np.concatenate(
-            [of.base_mass, of.base_center, of.base_tensor.reshape(*of.base_center.shape[:-1], 9)],
-            -1,
-        )
-        return np.concatenate([rows, base[..., None, :]], axis=-2)
+        _, _, mass, center, tensor, *_ = bodies or self.bodies
+        return np.concatenate([mass, center, tensor.reshape(*center.shape[:-1], 9)], axis=-1)
 
     def varied(self, added: Mapping[str, Float64]) -> Bodies:
         """Return the bodies of n robots with spatial inertias (n, 6, 6) added to links, in the axes
@@ -382,41 +364,11 @@ class RigidTree:
             mass, center, tensor = np.split(rows[0, body], [1, 4])
             nominal = SpatialInertia(float(mass[0]), center, tensor.reshape(3, 3))
             rows[:, body] = inertia_rows(spatial_matrix(nominal) + matrices)
-        mass = rows[..., :1]
-        center = rows[..., 1:4]
-        tensor = rows[..., 4:].reshape(
-            *rows.shape[:-1],
-            3,
-            3,
-        )
         return self.bodies._replace(
-            mass=mass[:, :-1],
-            center=center[:, :-1],
-            tensor=tensor[:, :-1],
-            base_mass=mass[:, -1],
-            base_center=center[:, -1],
-            base_tensor=tensor[:, -1],
+            mass=rows[..., :1],
+            center=rows[..., 1:4],
+            tensor=rows[..., 4:].reshape(*rows.shape[:-1], 3, 3),
         )
-
-    def _inertias(
-        self, links_of: list[list[int]], frames: Float64
-    ) -> tuple[Float64, Float64, Float64]:
-        """Return mass, center of mass and inertia tensor of the bodies with these links, in their
-        frames.
-        """
-        bodies = []
-        for links in links_of:
-            turn = frames[links, :, :3]
-            center = frames[links, :, 3] + (turn @ self.center[links][..., None])[..., 0]
-            tensor = turn @ self.inertia[links] @ turn.transpose(0, 2, 1)
-            parts = map(SpatialInertia, self.mass[links].tolist(), center, tensor)
-            bodies.append(total(list(parts)))
-        masses, centers, tensors = map(np.array, zip(*bodies, strict=True))
-        return masses[:, None], centers, tensors
-
-
-_ABOUT_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Matrix of the cross product with the x axis."""
 
 
 def _along_x(axis: Float64) -> Float64:

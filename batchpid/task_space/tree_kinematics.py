@@ -92,7 +92,7 @@ def check_masses(tree: RigidTree) -> None:
     matrix is singular.
     """
     # A leader moves the masses of its followers, too.
-    moved = tree.bodies.moves.T @ tree.bodies.mass[:, 0] + tree.bodies.armature
+    moved = tree.bodies.moves.T @ tree.bodies.mass[:-1, 0] + tree.bodies.armature
     moved = tree.coupling.of_all(tree.coupling.reduced_damping(moved))
     for joint, kg in zip(tree.joint_names, moved, strict=True):
         if not kg > 0:
@@ -123,14 +123,13 @@ def motions_of(
     xp: ArrayModule,
 ) -> Motions:
     """Return the frames of the bodies and the motions of the joints at ``qpos`` (dof, rows)."""
-    # Rodrigues' formula with the placement multiplied in: four constant matrices a joint.
-    q = qpos[:, None, None]
-    local = (
-        bodies.at_zero
-        + xp.sin(q) * bodies.sine
-        + (1 - xp.cos(q)) * bodies.cosine
-        + q * bodies.slide
-    )
+    x, y, z, place = (bodies.at_zero[:, :, k] for k in range(4))
+    slides = bodies.slides[:, None]
+    q = qpos[:, None]
+    cosine = xp.cos((1 - slides) * q)
+    sine = xp.sin((1 - slides) * q)
+    columns = x + 0 * q, cosine * y + sine * z, cosine * z - sine * y, place + slides * q * x
+    local = xp.stack(columns, axis=2)
     base = xp.broadcast_to(xp.eye(3, 4, dtype=q.dtype)[None, ..., None], local[:1].shape)
     # The base is the last row, whose index is -1.
     frames = xp.concatenate([local, base])

@@ -83,7 +83,7 @@ def _inertias(mass: Array, center: Array, tensor: Array, frames: Array) -> Inert
 
 
 def _of_bodies(bodies: Bodies, frames: Array) -> Inertias:
-    return _inertias(bodies.mass, bodies.center, bodies.tensor, frames)
+    return _inertias(bodies.mass[:-1], bodies.center[:-1], bodies.tensor[:-1], frames)
 
 
 def _products(a: Sequence[Array], b: Sequence[Array]) -> Array:
@@ -116,9 +116,8 @@ def _of_base(
     """Return the inertias of the base (1, rows), and M_bb (rows, 6, 6), linear parts first: the
     momenta of the whole robot under the motions of its base.
     """
-    center, tensor = bodies.base_center[None], bodies.base_tensor[None]
     frame = xp.eye(3, 4, dtype=bodies.mass.dtype)[None, ..., None]
-    base = _inertias(bodies.base_mass, center, tensor, frame)
+    base = _inertias(bodies.mass[-1:], bodies.center[-1:], bodies.tensor[-1:], frame)
     # Composites of the joints on the base contain all bodies but the base itself.
     robot = [
         _on_base(tree, part)[None] + of_base for part, of_base in zip(whole, base, strict=True)

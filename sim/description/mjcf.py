@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
+from batchpid.arrays.array_types import Float64, MjModel, MjSpec
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
@@ -24,7 +23,6 @@ from batchpid.motors import make_actuators
 from batchpid.sim.description.mjcf_bodies import (
     PLANE,
     RobotInFile,
-    TableReader,
     can_collide,
     excluded_pairs,
     label,
@@ -109,8 +107,7 @@ def _read(
         fixed_base = not (robot.base and model.body_jntnum[robot.base])
     couplings = read_couplings(robot)
     motors = read_motors(robot, couplings)
-    reader = TableReader(robot, motors)
-    tables = reader.read(couplings, is_held=fixed_base)
+    tables = robot.read(couplings, motors, is_held=fixed_base)
     _report_unused(robot)
     # The start pose is that of the keyframe, else the reference pose.
     key = home(model)
@@ -119,22 +116,16 @@ def _read(
     if robot.base and not fixed_base:
         at = model.jnt_qposadr[model.body_jntadr[robot.base]]
         base_start = tuple(pose[at : at + 7].tolist())
-    start = {name: pose[model.jnt_qposadr[joint]] for joint, name in robot.joints.items()}
-    joints = [joint.name for joint in tables.joints if joint.moves]
+    numbers = {name: joint for joint, name in robot.joints.items()}
+    order = [numbers[joint.name] for joint in tables.joints if joint.moves]
 
-    def column(values: Mapping[str, float], missing: float = 0.0) -> Float64:
-        return read_only(np.array([values.get(joint, missing) for joint in joints], np.float64))
+    def column(values: Float64) -> Float64:
+        return read_only(values[order].astype(np.float64))
 
-    gains = {name: column(getattr(motors, name)) for name in ("kp", "ki", "kd")}
-    # A file of motors alone has no gains to offer.
-    has_gains = any(gain.any() for gain in gains.values())
-    gains["integral_limit"] = column(motors.integral_limit, np.inf)
-    effects: Document = {"armature": column(motors.armature), "lag": column(motors.lag)}
-    for effect in ("saturation_effort", "no_load_speed"):
-        effects[effect] = column(getattr(motors, effect), np.inf)
     actuators = None
-    if joints:
-        actuators = make_actuators(len(joints), **effects)
+    if order:
+        actuators = make_actuators(len(order), armature=column(motors.armature))
+    gains = {"kp": column(motors.kp), "kd": column(motors.kd)}
     return Source(
         path,
         name,
@@ -142,10 +133,11 @@ def _read(
         tuple(findings),
         fixed_base,
         base_start,
-        column(start),
-        gains if has_gains else None,
+        column(pose[model.jnt_qposadr]),
+        # A file of motors alone has no gains to offer.
+        gains if (motors.kp + motors.kd).any() else None,
         mjcf=_file(path, compiled, robot, fixed_base),
-        disabled=excluded_pairs(model, reader.solid),
+        disabled=excluded_pairs(model, robot.solid),
         actuators=actuators if actuators is not None and actuators.num_joints else None,
     )
 
@@ -185,7 +177,9 @@ def _file(
         bodies=tuple(robot.bodies.values()),
         falling=tuple(robot.bodies[body] for body in free if not robot.is_of_robot(body)),
         loops=tuple(loops),
-        losses=tuple(robot.losses),
+        lost="; ".join(
+            f"{kind} ({', '.join(names)})" for kind, names in robot.lost.items() if names
+        ),
         is_alone=all(robot.is_of_robot(body) for body in model.jnt_bodyid),
         has_floor=bool(grounds) and not (floats and fixed_base),
         friction=float(model.geom_friction[grounds[0], 0]) if grounds else 1.0,
@@ -194,53 +188,49 @@ def _file(
 
 def _report_unused(robot: RobotInFile) -> None:
     """Report content that is not simulated, apart from motors, couplings and shapes."""
-    model = robot.model
+    model, option = robot.model, robot.model.opt
     counts = {
         "sites": model.nsite,
         "sensors": model.nsensor,
         "cameras": model.ncam,
         "keyframes": model.nkey - (home(model) is not None),
-        "<flag sleep='enable'>": int(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP > 0),
+        "<flag sleep='enable'>": int(option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP > 0),
     }
-    left_out = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
-    if left_out:
-        text = f"elements that the simulation does not use are left out: {left_out}"
-        robot.repair("unknown-element", text, "expect no effect")
-    option = model.opt
-    bits = mujoco.mjtDisableBit
+    unused = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+    if unused:
+        text = f"elements that the simulation does not use are left out: {unused}"
+        robot.repairs.append(Finding("unknown-element", text, "expect no effect"))
+    disabled = {
+        switch
+        for switch in (*_SWITCHES, "GRAVITY", "ACTUATION")
+        if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{switch}")
+    }
+    # What no engine simulates, then what MuJoCo alone does.
+    ignored = [f"<flag {switch.lower()}>" for switch in sorted(disabled.difference(_SWITCHES))]
     if tuple(option.gravity) != GRAVITY:
-        text = f"gravity is {GRAVITY} m/s^2, not the file's"
-        remedy = "draw the file's with Randomization(gravity=...)"
-        robot.repair("option", text, remedy)
-    for switch in ("GRAVITY", "ACTUATION"):
-        if option.disableflags & getattr(bits, f"mjDSBL_{switch}"):
-            text = f"<flag {switch.lower()}='disable'/> has no effect"
-            remedy = "expect gravity, and the efforts of the controller"
-            robot.repair("option", text, remedy)
-    disabled = ", ".join(
-        switch.lower()
-        for switch in _SWITCHES
-        if option.disableflags & getattr(bits, f"mjDSBL_{switch}")
-    )
-    # Every row: whether the file has it, and what is lost.
-    for is_there, text in (
-        (disabled, f"without <flag>, which disables {disabled}"),
-        (option.density or option.viscosity, "without the medium (<option density= viscosity=>)"),
-        (model.nflex, "flexible bodies are rigid"),
-        ((model.body_plugin >= 0).any(), "without the plugins of bodies"),
-    ):
-        if is_there:
-            robot.lose(text)
+        ignored.append("gravity")
+    ignored += [
+        f"gravcomp of {robot.bodies[body]!r}"
+        for body in np.flatnonzero(model.body_gravcomp).tolist()
+        if robot.is_of_robot(body)
+    ]
+    if ignored:
+        text = f"has no effect, gravity is {GRAVITY} m/s^2: {', '.join(ignored)}"
+        remedy = "let the controller compensate, or use Randomization(gravity=...)"
+        robot.repairs.append(Finding("option", text, remedy))
+    lost = robot.lost
+    lost["<flag>"] += [switch.lower() for switch in _SWITCHES if switch in disabled]
+    if option.density or option.viscosity:
+        lost["the medium"].append("density, viscosity")
+    if model.nflex:
+        lost["flexible bodies"].append("rigid")
+    if (model.body_plugin >= 0).any():
+        lost["plugins"].append("of bodies")
     for joint, name in robot.joints.items():
         if model.jnt_stiffness[joint] or model.jnt_stiffnesspoly[joint].any():
-            robot.lose("without the spring of the joint", name)
+            lost["springs"].append(repr(name))
         if model.dof_dampingpoly[model.jnt_dofadr[joint]].any():
-            robot.lose("the damping that grows with the speed is left out", name)
-    for body in np.flatnonzero(model.body_gravcomp).tolist():
-        if robot.is_of_robot(body):
-            text = "gravity compensation of this body (gravcomp) is not simulated"
-            remedy = "let the controller compensate"
-            robot.repair("option", text, remedy, link=robot.bodies[body])
+            lost["damping that grows with the speed"].append(repr(name))
 
 
 class Compiled(NamedTuple):

@@ -17,6 +17,8 @@ A mesh collides as its convex hull, in MuJoCo and in PhysX, and an ellipsoid as 
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,10 +38,11 @@ from batchpid.sim.description.tables import (
     Tables,
     breadth_first,
     unique,
+    with_mass,
     without_mass,
 )
 from batchpid.sim.findings import Finding
-from batchpid.sim.geometry.shapes import Shape, ShapeKind, possible_inertia
+from batchpid.sim.geometry.shapes import Shape, ShapeKind, hull_graph
 from batchpid.task_space.frames import about, compose, matrix_of, rotate
 
 if TYPE_CHECKING:
@@ -73,9 +76,11 @@ class RobotInFile:
     """Robot of a compiled file: names of its parts, by their numbers in the model.
 
     ``bodies`` has all bodies of the file, ``joints`` the hinges and slides of the robot, ``base``
-    is the body of the root, 0 for the world. ``link_names`` and ``joint_names`` are all names in
-    use. ``repairs`` are findings of what is simulated otherwise than the file says, ``losses`` of
-    what is lost where MuJoCo does not simulate the file itself.
+    is the body of the root, 0 for the world. ``moments`` are the moment arms of the outputs of
+    actuators on the degrees of freedom, at the reference pose. After :meth:`read` ``solid`` is the
+    row of each body that has shapes, by the body's number. ``link_names`` and ``joint_names`` are all names in
+    use. ``repairs`` are findings of what is simulated otherwise than the file says. ``lost`` has names
+    of contents, by kind, that only an engine simulates that reads the file itself.
 
     Raises RobotError for a ball joint, and for several robots.
     """
@@ -83,7 +88,7 @@ class RobotInFile:
     def __init__(self, model: MjModel, path: Path, repairs: list[Finding]) -> None:
         self.model = model
         self.repairs = repairs
-        self.losses: list[Finding] = []
+        self.lost: dict[str, list[str]] = defaultdict(list)
         names = [model.body(body).name for body in range(1, model.nbody)]
         self.link_names = {"world", *names}
         self.joint_names = {model.joint(joint).name for joint in range(model.njnt)}
@@ -91,12 +96,21 @@ class RobotInFile:
         for body, name in enumerate(names, start=1):
             self.bodies[body] = name or unique(f"body{body}", self.link_names)
         self._roots = model.body_rootid
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        self.moments = np.zeros((len(data.moment_rownnz), model.nv))
+        sparse = data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        mujoco.mju_sparse2dense(self.moments, *sparse)
         self._left_out: set[int] = set()
         joints = {
             joint: model.joint(joint).name or unique(f"joint{joint}", self.joint_names)
             for joint in range(model.njnt)
             if int(model.jnt_type[joint]) not in (_FREE, _BALL)
         }
+        self._anchors = {0: ORIGIN}  # origin of each body's row, in the frame of the body
+        self._bodies: list[Body] = []
+        self._shapes: list[Shape] = []
+        self.solid: dict[int, str] = {}
         self.base = self._find_base(joints, path)
         self.joints = {
             joint: name
@@ -107,32 +121,6 @@ class RobotInFile:
     def is_of_robot(self, body: int) -> bool:
         """Return whether a body, or the world, is of the robot."""
         return int(self._roots[body]) not in self._left_out
-
-    def repair(
-        self,
-        code: str,
-        text: str,
-        remedy: str,
-        joint: str | None = None,
-        link: str | None = None,
-        detail: str = "",
-    ) -> None:
-        """Report what is simulated otherwise in every engine."""
-        self.repairs.append(
-            Finding(
-                code,
-                text,
-                remedy,
-                joint,
-                link,
-                detail,
-            )
-        )
-
-    def lose(self, text: str, joint: str | None = None, link: str | None = None) -> None:
-        """Report what an engine loses that does not simulate the file."""
-        remedy = "use the engine 'mujoco', which simulates the file itself"
-        self.losses.append(Finding("engine", text, remedy, joint, link))
 
     def _find_base(self, joints: dict[int, str], path: Path) -> int:
         """Return the base, after the bodies that are not of the robot are left out."""
@@ -146,7 +134,9 @@ class RobotInFile:
         # A flexible body has three slides for each vertex.
         soft = {int(body) for body in model.flex_vertbodyid if not model.body_geomnum[body]} & tops
         moving -= soft
-        if driven := moving & _roots_of_actuators(model):
+        # Actuators move the children of the world, themselves or bodies below them.
+        driven = moving & set(model.body_rootid[model.dof_bodyid[self.moments.any(0)]].tolist())
+        if driven:
             moving -= (moving & free) - driven
         floating = moving & free
         if len(floating) > 1 or (floating and moving - free):
@@ -167,8 +157,8 @@ class RobotInFile:
                 where = f"{path}: body {self.bodies[body]!r}"
                 problem = f"the ball joint {label(model.joint(joint))} has no single position"
                 raise RobotError(f"{where}: {problem} to control; replace it by three hinges")
-        for body in sorted(self._left_out - soft):
-            self.lose("is apart from the robot: left out", link=self.bodies[body])
+        apart = sorted(self._left_out - soft)
+        self.lost["bodies apart from the robot"] += [repr(self.bodies[body]) for body in apart]
         if floating:
             return floating.pop()
         # The only body, if it is held at the origin, is the root in place of the world.
@@ -181,56 +171,35 @@ class RobotInFile:
                 return 0
         return only
 
-
-def _roots_of_actuators(model: MjModel) -> set[int]:
-    """Return the children of the world that actuators move, themselves or bodies below them."""
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    dofs = data.moment_colind[: data.moment_rownnz.sum()]
-    return {int(body) for body in model.body_rootid[model.dof_bodyid[dofs]]}
-
-
-class TableReader:
-    """Reader of the tables of ``robot``.
-
-    ``solid`` is the row of each body that has shapes, by the body's number.
-    """
-
-    def __init__(self, robot: RobotInFile, motors: JointMotors) -> None:
-        self._model = robot.model
-        self._robot = robot
-        self._motors = motors
-        self._anchors = {0: ORIGIN}  # origin of each body's row, in the frame of the body
-        self._bodies: list[Body] = []
-        self._shapes: list[Shape] = []
-        self.solid: dict[int, str] = {}
-
-    def read(self, couplings: Couplings, is_held: bool) -> Tables:
+    def read(self, couplings: Couplings, motors: JointMotors, is_held: bool) -> Tables:
         """Return the tables; ``is_held`` says whether a base on a free joint is fixed."""
-        model, robot = self._model, self._robot
+        model = self.model
+        read_joint = partial(self._read_joint, couplings, motors)
         root = None
-        if robot.base == 0:
-            self._add(0, Body(robot.bodies[0], None), ORIGIN)
+        if self.base == 0:
+            self._add(0, Body(self.bodies[0], None), ORIGIN)
         # A free joint that is held keeps its turn: a row above the base has it.
-        elif is_held and model.body_quat[robot.base][0] != 1:
-            root = unique(f"{robot.bodies[robot.base]}_frame", robot.link_names)
+        elif is_held and model.body_quat[self.base][0] != 1:
+            root = unique(f"{self.bodies[self.base]}_frame", self.link_names)
             self._bodies.append(Body(root, None))
-        rows = {robot.base}
+        rows = {self.base}
         for body in range(1, model.nbody):
             above = int(model.body_parentid[body])
-            if body == robot.base:
-                self._read_body(body, root, couplings)
-            elif above in rows and robot.is_of_robot(body):
-                self._read_body(body, robot.bodies[above], couplings)
+            if body == self.base:
+                self._read_body(body, root, read_joint)
+            elif above in rows and self.is_of_robot(body):
+                self._read_body(body, self.bodies[above], read_joint)
                 rows.add(body)
         self._report_absent(rows)
         return breadth_first(self._bodies, self._shapes)
 
-    def _read_body(self, body: int, parent: str | None, couplings: Couplings) -> None:
+    def _read_body(
+        self, body: int, parent: str | None, read_joint: Callable[[int, str, str], Joint]
+    ) -> None:
         """Read a body, and the joints between it and the row ``parent``; None for the root."""
-        model = self._model
-        name = self._robot.bodies[body]
-        joints = [joint for joint in self._robot.joints if model.jnt_bodyid[joint] == body]
+        model = self.model
+        name = self.bodies[body]
+        joints = [joint for joint in self.joints if model.jnt_bodyid[joint] == body]
         place = model.body_pos[body] - self._anchors[int(model.body_parentid[body])]
         turn = model.body_quat[body].copy()
         anchor = ORIGIN
@@ -238,7 +207,7 @@ class TableReader:
             place = ORIGIN
         row = Body(name, None)
         if parent is not None and not joints:
-            fixed = unique(f"{name}_fixed", self._robot.joint_names)
+            fixed = unique(f"{name}_fixed", self.joint_names)
             row = Body(name, Joint(fixed, "fixed", parent, name), place, turn)
         for number in joints:
             axis = model.jnt_axis[number]
@@ -252,8 +221,8 @@ class TableReader:
                 turn = compose(turn, about(axis, np.asarray(-rest)))
             link = name
             if number != joints[-1]:
-                link = unique(f"{name}_{self._robot.joints[number]}", self._robot.link_names)
-            row = Body(link, self._read_joint(number, str(parent), link, couplings), place, turn)
+                link = unique(f"{name}_{self.joints[number]}", self.link_names)
+            row = Body(link, read_joint(number, str(parent), link), place, turn)
             if number != joints[-1]:
                 self._bodies.append(row)
             # The next joint of the body begins where this one ends.
@@ -264,14 +233,14 @@ class TableReader:
 
     def _read_joint(
         self,
+        couplings: Couplings,
+        motors: JointMotors,
         number: int,
         parent: str,
         link: str,
-        couplings: Couplings,
     ) -> Joint:
-        model = self._model
-        motors = self._motors
-        name = self._robot.joints[number]
+        model = self.model
+        name = self.joints[number]
         dof = model.jnt_dofadr[number]
         lower, upper = -np.inf, np.inf
         if model.jnt_limited[number]:
@@ -282,13 +251,16 @@ class TableReader:
             kind = "revolute"
         else:
             kind = "continuous"
-        soft_lower, soft_upper = motors.setpoints.get(name, (-np.inf, np.inf))
-        rate = motors.setpoint_rate.get(name, np.inf)
-        if soft_lower > lower or soft_upper < upper or rate < np.inf:
-            text = "its servo in the file limits position or rate of the setpoint"
+        soft_lower, soft_upper = motors.setpoints[:, number].tolist()
+        if soft_lower > lower or soft_upper < upper:
+            text = "its servo in the file limits the setpoint"
             remedy = "pass guard=True to a runner for these limits"
-            detail = f"{soft_lower:g} to {soft_upper:g}, {rate:g}/s"
-            self._robot.repair("limits", text, remedy, name, detail=detail)
+            detail = f"{soft_lower:g} to {soft_upper:g}"
+            self.repairs.append(Finding("limits", text, remedy, name, detail=detail))
+        mimic = None
+        if number in couplings:
+            leader, *law = couplings[number]
+            mimic = Mimic(self.joints[leader], *law)
         return Joint(
             name,
             kind,
@@ -296,55 +268,44 @@ class TableReader:
             link,
             lower,
             upper,
-            effort_limit=motors.effort_limit[name],
-            velocity_limit=rate,
+            effort_limit=float(motors.effort_limit[number]),
             soft_lower=soft_lower,
             soft_upper=soft_upper,
             damping=float(model.dof_damping[dof]),
             friction=float(model.dof_frictionloss[dof]),
-            mimic=Mimic(*couplings[name]) if name in couplings else None,
+            mimic=mimic,
             axis=tuple(model.jnt_axis[number].tolist()),
-            has_motor=name not in motors.unmoved,
+            has_motor=not motors.unmoved[number],
         )
 
     def _add(self, body: int, row: Body, anchor: Float64) -> None:
         """Add a row with inertia and shapes of a body, in a frame with its origin at ``anchor``."""
-        model = self._model
+        model = self.model
         self._anchors[body] = anchor
         for geom in self._geoms(body):
             if (shape := self._read_shape(geom, row.name, anchor)) is not None:
                 self._shapes.append(shape)
                 self.solid[body] = row.name
         mass = float(model.body_mass[body])
-        center = model.body_ipos[body] - anchor
-        inertia = np.diag(model.body_inertia[body])
         # Else the row would get the mass of its shapes.
         if mass == 0 and body in self.solid:
             row = without_mass(row)
         if mass > 0:
-            inertia, repair = possible_inertia(mass, inertia)
-            if repair is not None:
-                text, detail = repair
-                remedy = "correct <inertia>"
-                self._robot.repair("inertia", text, remedy, link=row.name, detail=detail)
-            axes = model.body_iquat[body].copy()
-            row = row._replace(
-                mass=mass,
-                center=center,
-                inertia=inertia,
-                inertia_wxyz=axes,
-            )
+            center = model.body_ipos[body] - anchor
+            inertia = np.diag(model.body_inertia[body])
+            turn = model.body_iquat[body].copy()
+            row = with_mass(row, mass, center, inertia, turn, self.repairs)
         self._bodies.append(row)
 
     def _geoms(self, body: int) -> list[int]:
         """Return the geoms of a body that can collide."""
-        first = int(self._model.body_geomadr[body])
-        geoms = range(first, first + int(self._model.body_geomnum[body]))
-        return [geom for geom in geoms if can_collide(self._model, geom)]
+        first = int(self.model.body_geomadr[body])
+        geoms = range(first, first + int(self.model.body_geomnum[body]))
+        return [geom for geom in geoms if can_collide(self.model, geom)]
 
     def _read_shape(self, geom: int, link: str, anchor: Float64) -> Shape | None:
         """Return the shape of a geom of ``link``, None for a plane or a height field."""
-        model = self._model
+        model = self.model
         shape_type = int(model.geom_type[geom])
         place = model.geom_pos[geom] - anchor
         turn = model.geom_quat[geom].copy()
@@ -379,8 +340,8 @@ class TableReader:
         """Report the shapes of the robot and of the world that are no shapes of the tables. A level
         plane at height 0 is the ground of the engines.
         """
-        model = self._model
-        absent = []
+        model = self.model
+        absent = self.lost["planes, height fields and shapes of the world"]
         for geom in [geom for body in sorted({0, *rows}) for geom in self._geoms(body)]:
             body = int(model.geom_bodyid[geom])
             kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
@@ -389,9 +350,6 @@ class TableReader:
             is_solid = body in self.solid and kind not in ("plane", "hfield")
             if not is_ground and not is_solid:
                 absent.append(f"{kind} {label(model.geom(geom))}")
-        if absent:
-            text = f"without planes, height fields and shapes of the world: {', '.join(absent)}"
-            self._robot.lose(text)
 
 
 def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair, ...]:
@@ -430,19 +388,12 @@ def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair,
 
 
 def _hull(model: MjModel, mesh: int) -> Float64:
-    """Return the vertices (n, 3) [m] of the convex hull of a mesh, or of the mesh if it has none.
-
-    The hull's graph has the layout of ``mesh_graph`` in MuJoCo's mjmodel.h: two counts, an address
-    for each vertex, and the numbers of the vertices.
-    """
+    """Return the vertices (n, 3) [m] of the convex hull of a mesh, or of the mesh if it has none."""
     first = int(model.mesh_vertadr[mesh])
     count = int(model.mesh_vertnum[mesh])
     vertices: Float64 = model.mesh_vert[first : first + count].astype(np.float64)
-    begin = int(model.mesh_graphadr[mesh])
-    if begin >= 0:
-        corners = int(model.mesh_graph[begin])
-        begin += 2 + corners
-        vertices = vertices[np.sort(model.mesh_graph[begin : begin + corners])]
+    if model.mesh_graphadr[mesh] >= 0:
+        vertices = vertices[np.sort(hull_graph(model, mesh)[0])]
     return vertices
 
 

@@ -30,7 +30,7 @@ from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.trees import digest, mapped
 from batchpid.motors import Actuators
 from batchpid.sim.findings import Finding
-from batchpid.sim.geometry.shapes import LEAST_MASS, Shape
+from batchpid.sim.geometry.shapes import LEAST_MASS, Shape, possible_inertia
 from batchpid.task_space.frames import SpatialInertia, matrix_of
 
 CONTACT_FRICTION = 0.3
@@ -224,6 +224,30 @@ def unique(name: str, names: set[str]) -> str:
     return new
 
 
+def with_mass(
+    body: Body,
+    mass: float,
+    center: Float64,
+    inertia: Float64,
+    wxyz: Float64,
+    findings: list[Finding],
+) -> Body:
+    """Return ``body`` with a mass [kg], and an inertia that a body can have: another than
+    ``inertia`` is a finding.
+    """
+    inertia, repair = possible_inertia(mass, inertia)
+    if repair is not None:
+        text, detail = repair
+        remedy = "correct <inertia>"
+        findings.append(Finding("inertia", text, remedy, link=body.name, detail=detail))
+    return body._replace(
+        mass=mass,
+        center=center,
+        inertia=inertia,
+        inertia_wxyz=wxyz,
+    )
+
+
 def without_mass(body: Body) -> Body:
     """Return ``body`` with next to no mass, in place of that of its shapes."""
     tensor = 1e-3 * LEAST_MASS * np.eye(3)
@@ -287,7 +311,7 @@ class MjcfFile:
     (:func:`batchpid.sim.description.mjcf.compile_scene`), and ``content`` is the digest of the
     model. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
     other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
-    links. ``losses`` are findings of what is lost in an engine that does not simulate the file.
+    links. ``lost`` is what an engine lacks that does not simulate the file, in words.
     ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of
     the world can collide, unless the root is fixed to the origin in place of its free joint.
     ``friction`` is the coefficient of its ground, the first of these planes.
@@ -299,7 +323,7 @@ class MjcfFile:
     bodies: tuple[str, ...]
     falling: tuple[str, ...] = ()
     loops: tuple[str, ...] = ()
-    losses: tuple[Finding, ...] = ()
+    lost: str = ""
     is_alone: bool = True
     has_floor: bool = False
     friction: float = 1.0
@@ -319,9 +343,7 @@ class Source(NamedTuple):
     start: Float64 | None = None
     """Start pose (dof,) [rad or m] of the file, None if it has none."""
     gains: Mapping[str, Float64] | None = None
-    """Gains ``kp``, ``ki``, ``kd`` of the servos of an MJCF file (dof,), and the ``integral_limit``
-    [N m or N]; None without servos.
-    """
+    """Gains ``kp`` and ``kd`` of the servos of an MJCF file (dof,); None without servos."""
     mjcf: MjcfFile | None = None
     actuators: Actuators | None = None
     disabled: tuple[DisabledPair, ...] = ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from lxml import etree
@@ -19,12 +20,13 @@ from batchpid.sim.description.tables import (
     Joint,
     Mimic,
     Visual,
+    with_mass,
     without_mass,
 )
 from batchpid.sim.description.xml import fault, numbers, read_numbers
 from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.mesh_files import LARGEST_NUMBER, check_mesh, find_mesh
-from batchpid.sim.geometry.shapes import MOMENTS, SMALLEST, Shape, from_entries, possible_inertia
+from batchpid.sim.geometry.shapes import MOMENTS, SMALLEST, Shape, from_entries
 from batchpid.task_space.frames import from_rpy
 
 GIVE_RANGE = "give <limit lower= upper=>"
@@ -60,20 +62,10 @@ class ElementReader:
         text: str,
         remedy: str,
         joint: str | None = None,
-        link: str | None = None,
-        detail: str = "",
+        **place: Any,
     ) -> None:
-        """Report a repair."""
-        self._findings.append(
-            Finding(
-                code,
-                text,
-                remedy,
-                joint,
-                link,
-                detail,
-            )
-        )
+        """Report a repair; ``place`` are further fields of the finding."""
+        self._findings.append(Finding(code, text, remedy, joint, **place))
 
     def read_visuals(self, root: etree._Element) -> None:
         """Read the shapes that are drawn, without findings: they change no motion."""
@@ -259,15 +251,13 @@ class ElementReader:
         for problem in filter(None, (fault(inertia, key, "0") for key in MOMENTS)):
             text = f"{problem}: the inertia tensor counts as missing"
             self.warn("inertia", text, "correct <inertia>", link=body.name)
-        tensor, repair = possible_inertia(value[0], tensor)
-        if repair is not None:
-            text, detail = repair
-            self.warn("inertia", text, "correct <inertia>", link=body.name, detail=detail)
-        return body._replace(
-            mass=value[0],
-            center=center,
-            inertia=tensor,
-            inertia_wxyz=turn,
+        return with_mass(
+            body,
+            value[0],
+            center,
+            tensor,
+            turn,
+            self._findings,
         )
 
     def _read_collision(self, link: str, collision: etree._Element) -> None:

@@ -15,14 +15,14 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import product
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Document, Float64, MjModel, MjsBody, MjSpec, Rows
+from batchpid.arrays.array_types import Document, Float64, MjModel, MjsBody, MjSpec
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
@@ -123,70 +123,44 @@ def mesh_file(shape: Shape) -> str:
     return str(path)
 
 
-def half_extents(shape: Shape) -> tuple[Float64, Float64]:
-    """Return center (3,) and half size (3,) [m] of the box around a shape, in its frame."""
+def extent(shape: Shape) -> float:
+    """Return the diagonal [m] of the box around a shape; of a capsule without its ends."""
     if shape.kind == "mesh":
-        vertices = hull(shape)
-        low = vertices.min(0)
-        high = vertices.max(0)
-        return (high + low) / 2, (high - low) / 2
-    if shape.kind == "box":
-        return np.zeros(3), np.array(shape.size)
-    radius = shape.size[0]
-    height = {"sphere": radius, "cylinder": shape.size[-1], "capsule": radius + shape.size[-1]}
-    return np.zeros(3), np.array([radius, radius, height[shape.kind]])
-
-
-_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
-
-
-def extent(shapes: Sequence[Shape]) -> float:
-    """Return the diagonal [m] of the box around the shapes of a link, 0 without any."""
-    corners = []
-    for shape in shapes:
-        center, half = half_extents(shape)
-        corners.append(rotate(matrix_of(shape.wxyz), center + half * _CORNERS) + shape.position)
-    if corners:
-        return float(np.linalg.norm(np.ptp(np.concatenate(corners), axis=0)))
-    return 0.0
+        return float(np.linalg.norm(np.ptp(hull(shape), axis=0)))
+    return 2 * float(np.linalg.norm(shape.size))
 
 
 @lru_cache(maxsize=256)
 def mesh_hull(file: str, content: str) -> Triangles:
     """Return the convex hull of a mesh file with this digest, unscaled [m]. Raises RobotError."""
     try:
-        hull_of_mesh = convex_hull(_mesh_surface(file, content).vertices)
+        return convex_hull(_mesh_surface(file, content).vertices)
     except ValueError as error:
-        raise RobotError(
-            f"{file}: cannot be read: {error}; repair the file, or remove that <collision>"
-        ) from error
-    return hull_of_mesh
+        raise _unreadable(file, error) from error
 
 
-def _mesh_surface(file: str, content: str) -> Triangles:
-    """Return the triangles of a mesh file, without copies of vertices, unscaled [m]."""
+def _unreadable(file: str, error: Exception) -> RobotError:
+    return RobotError(
+        f"{file}: cannot be read: {error}; repair the file, or remove that <collision>"
+    )
+
+
+def _mesh_surface(file: str, content: str) -> Any:
+    """Return the mesh of a file as of ``trimesh``, without copies of vertices, unscaled [m]."""
     data = mesh_bytes(file, content)
     try:
         mesh = read_mesh(file, data)
-        rows = np.ascontiguousarray(mesh.vertices, float) + 0.0  # no -0.0
-        # Unique by their bytes, which is much faster than along an axis.
-        vertices, numbers = np.unique(rows.view("V24"), return_inverse=True)
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
     except Exception as error:
-        raise RobotError(
-            f"{file}: cannot be read: {error}; repair the file, or remove that <collision>"
-        ) from error
-    return Triangles(vertices.view(float).reshape(-1, 3), numbers.ravel()[mesh.faces])
+        raise _unreadable(file, error) from error
+    return mesh
 
 
 @lru_cache(maxsize=256)
 def mesh_solid(file: str, content: str) -> Triangles | None:
     """Return the surface of a mesh file that encloses a volume, unscaled [m]; None for others."""
-    surface = _mesh_surface(file, content)
-    edges = surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    forth, back = ({*map(tuple, rows.tolist())} for rows in (edges, edges[:, ::-1]))
-    # Around a volume every edge is one of two triangles, once in each direction.
-    is_closed = len(forth) == len(edges) and forth == back
-    return surface if is_closed and surface.volume > 0 else None
+    mesh = _mesh_surface(file, content)
+    return Triangles(mesh.vertices, mesh.faces) if mesh.is_volume else None
 
 
 def hull_share(shape: Shape) -> float:
@@ -202,8 +176,6 @@ def convex_hull(points: Float64) -> Triangles:
 
     Raises ValueError if MuJoCo's compiler refuses the points.
     """
-    import mujoco
-
     spec = mujoco.MjSpec()
     shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     spec.add_mesh(
@@ -213,43 +185,35 @@ def convex_hull(points: Float64) -> Triangles:
     )
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
     model = spec.compile()
-    # The hull's graph has two counts, the addresses and numbers of the vertices, edges, triangles.
-    graph = model.mesh_graph[model.mesh_graphadr[0] :]
-    corners, count = graph[:2].tolist()
-    numbers = graph[2 + corners : 2 + 2 * corners]
-    faces = graph[2 + 3 * corners + 3 * count :][: 3 * count]
-    row = {number: index for index, number in enumerate(numbers.tolist())}
+    corners, faces = hull_graph(model, 0)
+    # MuJoCo turns a mesh to its principal axes.
+    vertices = rotate(matrix_of(model.mesh_quat[0]), model.mesh_vert[corners].astype(float))
+    row = {number: index for index, number in enumerate(corners.tolist())}
     triangles = np.array([row[number] for number in faces.tolist()], np.int64).reshape(-1, 3)
-    return Triangles(read_only(vertices_in_file(model, numbers)), triangles)
+    return Triangles(read_only(vertices + model.mesh_pos[0]), triangles)
 
 
-def vertices_in_file(model: MjModel, indices: Rows) -> Float64:
-    """Return vertices of the only mesh of a model in the frame of its file; MuJoCo's are in
-    principal axes.
+def hull_graph(model: MjModel, mesh: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the numbers of the vertices (n,) of the convex hull of a mesh of a model, and those of
+    its triangles (3 f,).
     """
-    import mujoco
-
-    turned = np.zeros(9)
-    place = model.mesh_pos[0]
-    mujoco.mju_quat2Mat(turned, model.mesh_quat[0])
-    points: Float64 = model.mesh_vert[indices].astype(float) @ turned.reshape(3, 3).T + place
-    return points
+    # Two counts, the addresses and numbers of the vertices, edges, triangles.
+    graph = model.mesh_graph[model.mesh_graphadr[mesh] :]
+    corners, count = graph[:2].tolist()
+    after = 2 + 3 * corners + 3 * count
+    return graph[2 + corners : 2 + 2 * corners], graph[after : after + 3 * count]
 
 
 def inertia_of(shapes: Sequence[Shape]) -> SpatialInertia:
     """Return the sum of the inertias of shapes of DENSITY, in the frame of their body, by MuJoCo's
     compiler.
     """
-    import mujoco
-
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body()
     for shape in shapes:
         add_geom(spec, body, shape, density=DENSITY)
     model = spec.compile()
-    axes = np.zeros(9)
-    mujoco.mju_quat2Mat(axes, model.body_iquat[1])
-    turn = axes.reshape(3, 3)
+    turn = matrix_of(model.body_iquat[1])
     tensor = turn * model.body_inertia[1] @ turn.T
     center = model.body_ipos[1].copy()
     return SpatialInertia(float(model.body_mass[1]), read_only(center), read_only(tensor))
@@ -262,8 +226,6 @@ def add_geom(
     **options: object,
 ) -> None:
     """Add a shape to a body of a ``mujoco.MjSpec``; equal hulls share a mesh."""
-    import mujoco
-
     kinds = mujoco.mjtGeom
     if shape.kind == "mesh":
         vertices = hull(shape)

@@ -38,7 +38,9 @@ class ReachVectorEnv(RobotVectorEnv):
     their leaders. A setpoint has one number for each of them.
 
     - *Observation* (envs, 3 joints): qpos, qvel, goal [rad or m, and per second], clipped to the
-      space. On a floating base its pose and twist (13) stand before the goal.
+      space. On a floating base its pose and twist (13) stand before the goal. With ``chunk`` the
+      setpoint of the last executed row (joints) stands behind it: the robot gets there late, and
+      the next chunk counts from there.
     - *Action* (envs, joints) in [-1, 1]: the setpoint within its limits, or an increment of the
       setpoint, which moves during the step; with ``chunk`` (envs, rows, joints). An episode begins
       with the setpoint at the joints' pose.
@@ -95,9 +97,14 @@ class ReachVectorEnv(RobotVectorEnv):
             problem = "takes no joint setpoints"
             raise InvalidArgumentError("control", problem, remedy="subclass RobotVectorEnv")
         # Only a law that takes errors the short way round follows a setpoint past pi.
-        self._setpoint_turns = np.zeros(len(self.joint_names))
-        if self.runner.control == "pid" and self.runner.params.continuous is not None:
-            continuous = np.asarray(self.runner.params.continuous, np.float64).min(0)
+        self._setpoint_turns = None
+        params = self.runner.params
+        if (
+            self._turns is not None
+            and self.runner.control == "pid"
+            and params.continuous is not None
+        ):
+            continuous = np.asarray(params.continuous, np.float64).min(0)
             self._setpoint_turns = np.minimum(self._turns, continuous[self._index] / TURN)
         self._goal = np.zeros((self.num_envs, len(self.joint_names)))
         self._error = np.zeros_like(self._goal)  # of the last observation: success comes first
@@ -109,7 +116,7 @@ class ReachVectorEnv(RobotVectorEnv):
         self.joint_names = tuple(robot.joint_names[joint] for joint in index)
         continuous = robot.continuous[index]
         # Periods for wrap: 1 / (2 pi) for continuous joints, else 0.
-        self._turns = np.where(continuous, 1 / TURN, 0.0)
+        self._turns = continuous / TURN if continuous.any() else None
         self._start = wrap(robot.start[index], self._turns, np)
         # Every joint has a finite range: a space needs bounds.
         middle = np.where(continuous, 0.0, self._start)
@@ -132,8 +139,9 @@ class ReachVectorEnv(RobotVectorEnv):
         base = np.zeros(0)
         if not robot.fixed_base:
             base = np.repeat([BASE_BOUND, 1.0, MAX_SPEED], [3, 4, 6])
-        low = np.concatenate([self.low - beyond, -speed, -base, self.low])
-        high = np.concatenate([self.high + beyond, speed, base, self.high])
+        goals = 1 if self._rows is None else 2  # goal and setpoint
+        low = np.concatenate([self.low - beyond, -speed, -base, *[self.low] * goals])
+        high = np.concatenate([self.high + beyond, speed, base, *[self.high] * goals])
         observation = spaces.Box(low.astype(np.float32), high.astype(np.float32))
         return observation, spaces.Box(-1.0, 1.0, (len(names),), np.float32)
 
@@ -160,12 +168,15 @@ class ReachVectorEnv(RobotVectorEnv):
         return self._of_robot(change / self.step_seconds)
 
     def observe(self, observed: Observation) -> Float32:
-        """Return qpos, qvel, pose and twist of a floating base, and goal."""
-        qpos = wrap(observed.qpos[:, self._index].astype(np.float64), self._turns, np)
-        rows = [qpos, observed.qvel[:, self._index]]
+        """Return qpos, qvel, pose and twist of a floating base, goal, and with chunks the setpoint."""
+        qpos = observed.qpos[:, self._index].astype(np.float64)
+        rows = [wrap(qpos, self._turns, np), observed.qvel[:, self._index]]
         if observed.base_pose is not None:
             rows += [observed.base_pose, observed.base_twist]
-        return np.concatenate([*rows, self._goal], axis=1).astype(np.float32)
+        rows.append(self._goal)
+        if self._rows is not None:
+            rows.append(wrap(self.setpoint[:, self._index], self._turns, np))
+        return np.concatenate(rows, axis=1, dtype=np.float32)
 
     def success(self, observation: Float32) -> Bool:
         """Return whether every joint is within the tolerance."""

@@ -106,6 +106,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     """Simulated time of a step [s]; in :meth:`spaces` that of a row, if there are chunks."""
     action: Float64
     """Last action (envs, size), within the action space; of a chunk the last row of the step."""
+    setpoint: Float64
+    """Setpoints at the end of the last step (envs, command size), from which the next action counts."""
     observed: Observation
     """Last observation of the runner: joint positions, velocities, efforts, ..."""
 
@@ -148,11 +150,11 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         check_free(self, options, chosen)
         arguments = {**signature(type(self)).parameters, **signature(RobotVectorEnv).parameters}
         check_keywords(type(self).__name__, options, {**arguments, **OPTIONS})
+        self._period, self._rows, self._ticks = self.step_seconds, chunk, 1
         # Spaces come first: an invalid one is an error before any process starts.
         self.single_observation_space, self.single_action_space = self.spaces()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._action_shape = (self.num_envs, *(self.single_action_space.shape or ()))
-        self._period, self._rows, self._ticks = self.step_seconds, chunk, 1
         if chunk is not None:
             self._rows = integer("chunk", chunk, 1, 499)
             self._ticks = integer("execute", chunk if execute is None else execute, 1, chunk)
@@ -178,7 +180,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             number("latency", high, 0.0, self.step_seconds, "s"),
         ]
         self._waits = np.zeros(self.num_envs, np.int64)
-        self._chunks: list[tuple[Float64, Float64]] = []
+        self._later: list[Document] = []  # ticks of the step that have not begun
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.metadata = {  # type: ignore[misc]
             **type(self).metadata,
@@ -188,7 +190,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self.runner = Runner(self.robot, self.num_envs, **options, **chosen)
         self._generators = np.random.default_rng().spawn(self.num_envs)
         self._starts = np.tile(self.robot.start, (self.num_envs, 1))
-        self._setpoint = np.zeros((self.num_envs, self.runner.command.size))
+        self.setpoint = np.zeros((self.num_envs, self.runner.command.size))
         self.action = np.zeros(self._action_shape)
         self._action_names: Sequence[str] = [str(column) for column in range(self.action.shape[1])]
         self._observation = np.zeros(self.observation_space.shape or (), np.float32)
@@ -233,7 +235,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """
         if self.runner.options.sets_positions:
             return qpos
-        return np.broadcast_to(self.runner.command.neutral, self._setpoint.shape)
+        return np.broadcast_to(self.runner.command.neutral, self.setpoint.shape)
 
     def command(self, action: Float64, setpoint: Float64) -> ArrayLike:
         """Return the setpoints of the Runner (envs, command size) for the actions (envs, size).
@@ -342,44 +344,50 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         shape = self.action_space.shape or ()
         action = array("actions", actions, shape, self._action_names, kind="entry")
         action = np.clip(action, space.low, space.high)
-        begins = self._done.copy()
-        if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
+        begins, last = self._done, self.setpoint
+        holds = begins.any()
+        if holds and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             raise error.ResetNeeded(
                 f"env {int(np.argmax(begins))} has ended; reset it before the next step"
             )
-        # In next-step mode an ended env holds its setpoint: step_wait begins its next episode.
-        last = self._setpoint
+        rows, setpoints = [action], [last]
         if self._rows is not None:
-            self._send_chunk(action, last, begins)
-            return
-        setpoint = self._returned("command", self.command(action, last), last.shape)
-        setpoint[begins] = last[begins]
-        rate = self.rate(setpoint, last)
-        if rate is not None:
-            rate = self._returned("rate", rate, last.shape)
-            rate[begins] = 0.0
-        self.runner.send(setpoint, setpoint_rate=rate)
-        self.action = action
-        self._setpoint = setpoint
+            rows = list(action.swapaxes(0, 1))
+        for row in rows:
+            moved = self.command(row, setpoints[-1])
+            setpoints.append(self._returned("command", moved, last.shape))
+        setpoint = setpoints[self._ticks]
+        # In next-step mode an ended env holds its setpoint: step_wait begins its next episode.
+        if holds:
+            setpoint = np.where(begins[:, None], last, setpoint)
+        if self._rows is None:
+            first: Document = {"setpoint": setpoint, "setpoint_rate": self.rate(setpoint, last)}
+            if first["setpoint_rate"] is not None:
+                rate = self._returned("rate", first["setpoint_rate"], last.shape)
+                first["setpoint_rate"] = np.where(begins[:, None], 0.0, rate)
+        else:
+            first, *self._later = self._chunks(rows, setpoints)
+        self.runner.send(**first)
+        self.action = rows[self._ticks - 1]
+        self.setpoint = setpoint
         self._is_stepping = True
 
-    def _send_chunk(self, action: Float64, last: Float64, begins: Bool) -> None:
-        """Begin a step with chunks of actions (envs, rows, size); envs that begin get none."""
-        rows = [last]
-        for row in action.swapaxes(0, 1):
-            rows.append(self._returned("command", self.command(row, rows[-1]), last.shape))
+    def _chunks(self, rows: Sequence[Float64], setpoints: Sequence[Float64]) -> list[Document]:
+        """Return the arguments of the ticks of a step: the chunk with its age where it enters."""
+        if self._ticks < len(rows) and not np.array_equal(
+            self.command(rows[0], setpoints[0]), setpoints[1]
+        ):
+            problem = (
+                f"{type(self).__name__}.command gives another setpoint when it is called again"
+            )
+            remedy = "leave execute out, or let command depend on action and setpoint alone"
+            raise InvalidArgumentError("execute", problem, remedy=remedy)
         assert self.runner.options.plan is not None
-        held = self.runner.options.plan.horizon - len(rows)
-        chunk = np.stack(rows + held * rows[-1:], 1)
-        for tick in range(self._ticks):
-            enters = (self._waits == tick) & ~begins
-            age = np.where(enters, tick * self._period, np.inf)
-            self._chunks.append((chunk, age))
-        chunk, age = self._chunks.pop(0)
-        self.runner.send(chunk, latency=age)
-        self.action = action[:, self._ticks - 1]
-        self._setpoint = np.where(begins[:, None], last, rows[self._ticks])
-        self._is_stepping = True
+        held = self.runner.options.plan.horizon - len(setpoints)
+        chunk = np.stack(list(setpoints) + held * [setpoints[-1]], 1)
+        waits = np.where(self._done, -1, self._waits)  # envs that begin get none
+        ages = [np.where(waits == tick, tick * self._period, np.inf) for tick in range(self._ticks)]
+        return [{"setpoint": chunk, "latency": age} for age in ages]
 
     def step_wait(self) -> tuple[Float32, Float64, Bool, Bool, Document]:
         """Wait for the step that :meth:`step_async` began; return what :meth:`step` returns.
@@ -392,20 +400,18 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if not self._is_stepping:
             raise CallOrderError("step_wait: no step is under way; call step_async(actions) first")
         observed = self.runner.recv()
-        while self._chunks:
-            chunk, age = self._chunks.pop(0)
-            observed = self.runner.step(chunk, latency=age)
+        while self._later:
+            observed = self.runner.step(**self._later.pop(0))
         # From here on the step has ended, even if a hook of the task raises.
         self._is_stepping = False
         self._observe(observed)
-        begins = self._done.copy()
+        begins = self._done
         self._steps += 1
-        observation = self._observation
-        success = self._success
-        count = (self.num_envs,)
+        observation, success = self._observation, self._success
+        count = success.shape
         reward = self._returned("reward", self.reward(observation, success), count)
-        ends = self._returned("terminated", self.terminated(observation, success), count)
-        terminated = self._diverged | ends.astype(bool)
+        ends = self._returned("terminated", self.terminated(observation, success), count, bool)
+        terminated = self._diverged | ends
         truncated = np.zeros(count, bool)
         if self.max_episode_steps is not None:
             truncated = self._steps >= self.max_episode_steps
@@ -483,8 +489,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if randomization is not None and randomization.qpos is not None:
             self._starts = np.where(mask[:, None], observed.qpos, self._starts)
         first = self.first_setpoint(self._starts)
-        first = self._returned("first_setpoint", first, self._setpoint.shape, mask)
-        self._setpoint = np.where(mask[:, None], first, self._setpoint)
+        first = self._returned("first_setpoint", first, self.setpoint.shape, mask=mask)
+        self.setpoint = np.where(mask[:, None], first, self.setpoint)
         self._observe(observed)
 
     def _observe(self, observed: Observation) -> None:
@@ -495,35 +501,37 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self.observed = observed
         self._diverged = ~observed.ok
         rows = self.observe(observed)
-        rows = self._returned("observe", rows, self._observation.shape, observed.ok)
-        rows = np.clip(rows.astype(np.float32), space.low, space.high)
+        shape = self._observation.shape
+        rows = self._returned("observe", rows, shape, np.float32, observed.ok)
+        rows = np.clip(rows, space.low, space.high)
         self._observation = np.where(observed.ok[:, None], rows, self._observation)
         success = self.success(self._observation)
-        success = self._returned("success", success, observed.ok.shape)
-        self._success = observed.ok & success.astype(bool)
+        self._success = observed.ok & self._returned("success", success, observed.ok.shape, bool)
 
     def _returned(
         self,
         hook: str,
         value: ArrayLike,
         shape: tuple[int, ...],
+        dtype: type = np.float64,
         mask: Bool | None = None,
-    ) -> Float64:
-        """Return a hook's value as an array, 0 in envs that are not in ``mask``; raise
-        InvalidArgumentError for another shape, NaN or infinity.
+    ) -> Rows:
+        """Return a hook's value as an array; raise InvalidArgumentError for another shape, and for
+        NaN or infinity in the envs of ``mask``.
         """
-        rows = np.asarray(value, np.float64)
+        rows = np.asarray(value)
         name = f"{type(self).__name__}.{hook}"
         if rows.shape != shape:
             problem = f"returned an array of shape {rows.shape}"
             raise InvalidArgumentError(name, problem, remedy=f"return one of shape {shape}")
+        sound = np.isfinite(rows)
         if mask is not None:
-            rows = np.where(mask[:, None], rows, 0.0)
-        if not np.isfinite(rows).all():
-            index = tuple(np.argwhere(~np.isfinite(rows))[0].tolist())
+            sound |= ~mask[:, None]
+        if not sound.all():
+            index = tuple(np.argwhere(~sound)[0].tolist())
             problem = f"returned a number that is not finite, at index {index}"
             raise InvalidArgumentError(name, problem, remedy="return finite numbers")
-        return rows
+        return rows.astype(dtype, copy=False)
 
     def _expect_no_step(self, call: str) -> None:
         """Raise CallOrderError if a step has begun and has not been waited for."""
@@ -536,9 +544,10 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         the mask.
         """
         info: Document = {}
-        values = {"success": self._success, **self.info(self._observation)}
-        for key, value in (values | {"diverged": self._diverged}).items():
+        further = self.info(self._observation)
+        values = {"success": self._success, **further, "diverged": self._diverged}
+        for key, value in values.items():
             self._returned("info", value, mask.shape)
             info[key] = value * mask
-            info[f"_{key}"] = mask.copy()
+            info[f"_{key}"] = mask
         return info

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
@@ -184,13 +185,8 @@ class ClosedLoop:
         else:
             import jax
 
-            # The outputs of the last step alone are carried out of the loop.
-            def body(both: Any, index: Array) -> tuple[Any, None]:
-                return sim_step(both[0], index), None
-
-            shapes = jax.eval_shape(sim_step, carry, 0)[1]
-            zeros = jax.tree.map(lambda leaf: xp.zeros(leaf.shape, leaf.dtype), shapes)
-            (carry, outputs), _ = jax.lax.scan(body, (carry, zeros), xp.arange(substeps))
+            carry, outputs = jax.lax.scan(sim_step, carry, xp.arange(substeps))
+            outputs = jax.tree.map(itemgetter(-1), outputs)
         qpos, qvel = self.plant.read(carry[0])
         seen = outputs.motor, outputs.saturated, outputs.guarded
         return LoopState(*carry, episode), LoopObservation(qpos, qvel, *seen)
@@ -308,11 +304,9 @@ def closed_loop(
         checked,
         checked.params,
         actuators,
-        scene.joints,
         friction,
         slice(0, num_envs),
         controller,
-        scene.dissipation == "urdf",
     )
     tree = robot.kinematic_tree(armature=np.zeros(robot.dof)).held
     if plant is None:

@@ -5,7 +5,7 @@ every sim step with the state of the group.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -89,16 +89,23 @@ class Pushes:
             counts[mask] = 0
         self._take(np.flatnonzero(mask), episodes)
 
-    def due(self, suspended: Bool, episodes: Int64) -> tuple[list[int], Float64]:
-        """Return the envs that are pushed now, and the changes of their twists (n, 6)."""
+    def push(
+        self,
+        pack: EnginePack,
+        suspended: Bool,
+        episodes: Int64,
+        substeps: int,
+    ) -> bool:
+        """Push the bases that are due before a tick of ``substeps`` sim steps; return whether there
+        are some.
+        """
         rows = np.flatnonzero((self.counts["steps"] >= self.counts["due"]) & ~suspended)
         if rows.size:
-            twists = self._draw("push", rows, episodes)
-        else:
-            twists = np.zeros((0, 6))
-        self.counts["number"][rows] += 1
-        self._take(rows, episodes)
-        return rows.tolist(), twists
+            pack.push(rows.tolist(), self._draw("push", rows, episodes))
+            self.counts["number"][rows] += 1
+            self._take(rows, episodes)
+        self.counts["steps"] += substeps
+        return bool(rows.size)
 
     def _take(self, rows: NDArray[np.intp], episodes: Int64) -> None:
         """Set the time of the next push of envs ``rows``."""
@@ -146,8 +153,7 @@ class OwnController:
             self._first = self._begun(envs)
             return self._first
         with controller_errors(self):
-            like = {name: leaf[:1].repeat(envs, 0) for name, leaf in self._first.items()}
-            return _like(like, self._begun(envs))
+            return _like(self._first, self._begun(envs), envs)
 
     def _begun(self, envs: int) -> dict[str, Rows]:
         # The structure stays the same; between sim steps only its arrays are kept, by name.
@@ -173,38 +179,34 @@ class OwnController:
         Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape
         or dtype, or JAX cannot trace it.
         """
-        if namespace(*inputs[1:3]) is not np:
-            return self._traced(state, *inputs)
-        # The controller may keep them, but not write to them.
-        copies = (read_only(np.array(rows)) for rows in inputs)
-        new, returned, *limited = self._called(unflatten(self._structure, state), *copies)
-        # Copies again: the controller may change its own arrays at any time.
-        leaves = _like(state, flatten(new, read=np.array))
-        effort = _like({"effort": inputs[1]}, {"effort": np.array(returned, np.float64)})["effort"]
-        return leaves, effort, *limited
-
-    def _called(self, *arguments: Any) -> tuple[Array, ...]:
-        if self._reporting is not None:
-            return self._reporting(*arguments)
-        state, effort = self._controller(*arguments[:-1])
-        return state, effort
-
-    def _traced(self, leaves: Document, *inputs: Array) -> tuple[Array, ...]:
-        """Call the controller within a JAX program."""
+        xp = namespace(*inputs[1:3])
+        if xp is np:
+            # The controller may keep them, but not write to them.
+            return self._checked(state, [read_only(np.array(rows)) for rows in inputs], xp)
         import jax
 
-        qpos = inputs[1]
         try:
-            state, returned, *limited = self._called(unflatten(self._structure, leaves), *inputs)
-            new = _like(leaves, flatten(state, read=jax.numpy.asarray))
-            efforts = {"effort": jax.numpy.asarray(returned, qpos.dtype)}
+            return self._checked(state, inputs, xp)
         except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
             raise InvalidArgumentError(
                 "control",
                 f"cannot be traced by JAX: {str(error).splitlines()[0]}",
                 remedy="write it in jax.numpy, or use backend='numpy'",
             ) from error
-        return new, _like({"effort": qpos}, efforts)["effort"], *limited
+
+    def _checked(self, state: Document, inputs: Sequence[Array], xp: Any) -> tuple[Array, ...]:
+        new, returned, *limited = self._called(unflatten(self._structure, state), *inputs)
+        qpos = inputs[1]
+        # Copies: the controller may change its own arrays at any time.
+        leaves = _like(state, flatten(new, read=xp.array), len(qpos))
+        effort = _like({"effort": qpos}, {"effort": xp.array(returned, qpos.dtype)}, len(qpos))
+        return leaves, effort["effort"], *limited
+
+    def _called(self, *arguments: Any) -> tuple[Array, ...]:
+        if self._reporting is not None:
+            return self._reporting(*arguments)
+        state, effort = self._controller(*arguments[:-1])
+        return state, effort
 
 
 @contextmanager
@@ -238,15 +240,16 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
         return unflatten(state, flatten(state))
 
 
-def _like(before: Document, leaves: Document) -> Document:
-    """Return the arrays that a controller returned in the dtypes of ``before``.
+def _like(before: Document, leaves: Document, envs: int) -> Document:
+    """Return the arrays that a controller returned for ``envs`` envs in the dtypes of ``before``.
 
     Raises InvalidArgumentError if names or shapes differ, or a dtype cannot be cast.
     """
     for name in {**before, **leaves}:
         old: Any = before.get(name)
         new: Any = leaves.get(name)
-        is_fit = old is not None and new is not None and new.shape == old.shape
+        is_there = old is not None and new is not None
+        is_fit = is_there and new.shape == (envs, *old.shape[1:])
         if is_fit and np.can_cast(new.dtype, old.dtype, "same_kind"):
             continue
         # Without the number of envs, which is that of a group.

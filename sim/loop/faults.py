@@ -7,9 +7,7 @@ fault in time, and to put that env into a state from which it can be simulated.
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +17,8 @@ from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST, EnginePack
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
-from batchpid.sim.options.groups import FaultAction
+from batchpid.sim.options.options import RunnerOptions
+from batchpid.stages.values import Command
 
 CAUSES = (
     "state",
@@ -42,7 +41,7 @@ COMMAND_CAUSES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
 """Causes in an entry of the command, which need not be a joint."""
 
 MOST_EVENTS = 10_000
-"""Largest number of faults in a log."""
+"""Largest number of faults that a runner keeps."""
 NO_STEP = -1
 """Sim step of the last fault of an env that has none."""
 
@@ -89,45 +88,6 @@ class FaultWarning(UserWarning):
     """
 
 
-class FaultLog:
-    """Last :data:`MOST_EVENTS` faults of a runner's envs. Immutable; methods return a copy.
-
-    ``read`` returns the last fault of an env in the arrays of a tick.
-    """
-
-    def __init__(self, num_envs: int, read: Callable[[int, Arrays], Fault]) -> None:
-        self.events: tuple[Fault, ...] = ()
-        """Latest last."""
-        self._read = read
-        self._steps: Rows = np.full(num_envs, NO_STEP)
-
-    def __len__(self) -> int:
-        """Return the number of envs."""
-        return len(self._steps)
-
-    def without(self, mask: Bool) -> FaultLog:
-        """Return a log in which the envs of ``mask`` (envs,), which were reset, have no last fault."""
-        return self.restored(np.where(mask, NO_STEP, self._steps))
-
-    def restored(self, steps: Rows) -> FaultLog:
-        """Return a log with the sim steps of the envs' last faults (envs,)."""
-        log = copy.copy(self)
-        log._steps = steps.copy()
-        return log
-
-    def with_events(self, arrays: Arrays) -> FaultLog:
-        """Return a log with the faults of ``arrays`` that this log does not have yet."""
-        steps = arrays.fault.step
-        # A fault is new if it has another step than the env's last one.
-        new = np.flatnonzero((steps != NO_STEP) & (steps != self._steps)).tolist()
-        if not new:
-            return self
-        log = self.restored(steps)
-        events = [self._read(env, arrays) for env in new]
-        log.events = (*self.events, *events)[-MOST_EVENTS:]
-        return log
-
-
 class FaultContainment:
     """Last fault of each of M envs, and the state in which a failed env goes on.
 
@@ -142,22 +102,19 @@ class FaultContainment:
     start_base
         Pose and twist of the base (M, 13) to which each env is reset, and where it is suspended;
         unused on fixed ones.
-    step, joint, cause
-        :class:`batchpid.sim.loop.arrays.FaultArrays` of the envs (M,).
+    rows
+        Last faults (M,).
     """
 
-    def __init__(self, size: int, dof: int, action: FaultAction) -> None:
-        self.suspends = action == "hold"
+    def __init__(self, size: int, options: RunnerOptions) -> None:
+        self._options = options
+        self.suspends = options.on_fault == "hold"
         self.suspended, self.failed, self._unplaced = (np.zeros(size, bool) for _ in range(3))
-        self.start_qpos, self.start_qvel, self.suspended_qpos = np.zeros((3, size, dof))
+        self.start_qpos, self.start_qvel, self.suspended_qpos = np.zeros(
+            (3, size, options.robot.dof)
+        )
         self.start_base = np.tile(BASE_AT_REST, (size, 1))
-        self.step = np.full(size, NO_STEP)
-        self.joint, self.cause = np.zeros((2, size), int)
-
-    @property
-    def rows(self) -> FaultArrays:
-        """The last faults."""
-        return FaultArrays(self.step, self.joint, self.cause)
+        self.rows = FaultArrays(np.full(size, NO_STEP), *np.zeros((2, size), int))
 
     def begin_tick(self) -> bool:
         """Forget the failures of the last tick; return whether no env is suspended."""
@@ -167,7 +124,47 @@ class FaultContainment:
     def clear(self, mask: Bool) -> None:
         """Clear the faults of the envs of ``mask`` (M,), which are reset."""
         self.suspended[mask] = self.failed[mask] = False
-        self.step[mask] = NO_STEP
+        self.rows.step[mask] = NO_STEP
+
+    def take_starts(
+        self,
+        mask: Bool,
+        qpos: Float64,
+        qvel: Float64,
+        base: Float64 | None,
+    ) -> dict[str, Bool]:
+        """Take the states (M, ...) to which the envs of ``mask`` (M,) are reset; return the entries
+        that are not finite, by cause. An env with such an entry keeps its last start.
+        """
+        causes = {"qpos": qpos, "qvel": qvel}
+        wrong: dict[str, Bool] = {
+            cause: mask[:, None] & ~np.isfinite(rows) for cause, rows in causes.items()
+        }
+        good = mask & ~(wrong["qpos"] | wrong["qvel"]).any(1)
+        self.start_qpos[good], self.start_qvel[good] = qpos[good], qvel[good]
+        if base is not None:
+            self.start_base[good] = base[good]
+        return wrong
+
+    def contained(self, command: Command, step: int, qpos: Float64) -> Command:
+        """Record a fault in sim step ``step`` of the envs whose commands are not finite; return the
+        command with neutral values for all failed envs, which are at ``qpos`` (M, dof).
+        """
+        for cause, rows in command._asdict().items():
+            self.fail(~np.isfinite(rows), cause, step, qpos)
+        options = self._options
+        setpoint = qpos if options.sets_positions else options.command.neutral
+        neutral = Command(setpoint, 0.0, 0.0, 0.0)
+        failed = self.failed[:, None]
+        return Command(*map(np.where, [failed] * len(neutral), neutral, command))
+
+    def places(self) -> tuple[Float64, Float64]:
+        """Return positions and velocities (M, dof) in which failed envs go on: suspended, or at
+        their start.
+        """
+        if self.suspends:
+            return self.suspended_qpos, np.zeros_like(self.start_qvel)
+        return self.start_qpos, self.start_qvel
 
     def fail(
         self,
@@ -184,9 +181,9 @@ class FaultContainment:
             return
         # The first fault of an env in a tick is the one that counts.
         new = failed & ~self.failed
-        self.step[new] = step
-        self.joint[new] = bad.argmax(1)[new]
-        self.cause[new] = CAUSES.index(cause)
+        self.rows.step[new] = step
+        self.rows.joint[new] = bad.argmax(1)[new]
+        self.rows.cause[new] = CAUSES.index(cause)
         self.failed |= failed
         self._unplaced |= failed
         if self.suspends:

@@ -56,7 +56,7 @@ class TreePlant:
         link that each joint moves; it may be traced.
         """
         bodies = self.bodies
-        rows = factor[..., None]
+        rows = namespace(factor).append(factor, 1.0)[:, None]  # the base keeps its mass
         heavy = bodies._replace(mass=bodies.mass * rows, tensor=bodies.tensor * rows[..., None])
         return replace(self, bodies=heavy)
 

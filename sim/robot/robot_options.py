@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -226,8 +227,12 @@ def scene_of(
     )
 
 
-def engine_findings(robot: Robot, name: str, timestep: float) -> Iterator[Finding]:
-    """Yield what of ``robot`` an engine cannot run, or runs otherwise than the file says."""
+def engine_findings(robot: Robot, name: str | None, timestep: float) -> Iterator[Finding]:
+    """Yield what of ``robot`` an engine, if any, cannot run, or runs otherwise than the file
+    says.
+    """
+    if name is None:
+        return
     engine = load_engine(name)
     ground = {"ground": robot.has_ground, "mjcf": robot.mjcf}
     scene = scene_of(robot, timestep, engine.physics["accurate"], **ground)
@@ -262,6 +267,7 @@ def describe(robot: Robot) -> Document:
     }
 
 
+@lru_cache(maxsize=16)
 def content(robot: Robot) -> str:
     """Return the digest of bodies, joints and shapes, with the content of mesh files in place of
     their paths.

@@ -6,9 +6,8 @@ the workers, and then replaces its state by the result of :func:`committed`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +19,8 @@ from batchpid.arrays.trees import flatten
 from batchpid.checks import env_mask
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.loop.arrays import Arrays, Snapshot
-from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, Fault, FaultLog
-from batchpid.sim.loop.group_control import empty_states
+from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, MOST_EVENTS, NO_STEP, Fault
+from batchpid.sim.loop.group_control import empty_control
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE
@@ -49,7 +48,10 @@ class RunnerState(NamedTuple):
     params: bp.PIDParams
     actuators: bp.Actuators | None
     draws: Draws
-    faults: FaultLog
+    faults: tuple[Fault, ...]
+    """The last :data:`batchpid.sim.loop.faults.MOST_EVENTS` faults, latest last."""
+    fault_steps: Rows
+    """Sim step of the last fault of each env (envs,)."""
     motion: Motion | None
     """Setpoint of the last tick and its rate, or position and velocity after a reset. None for
     other setpoints.
@@ -63,7 +65,9 @@ class RunnerState(NamedTuple):
 
     def changed(self, change: int, envs: Bool | slice = ALL, **values: Any) -> RunnerState:
         """Return a state with other ``values``, which notes a ``change`` of some envs."""
-        changes = np.zeros(len(self.faults), np.uint8) if self.changes is None else self.changes
+        changes = (
+            np.zeros(len(self.fault_steps), np.uint8) if self.changes is None else self.changes
+        )
         changes = changes.copy()
         changes[envs] |= change
         return self._replace(changes=changes, **values)
@@ -76,11 +80,11 @@ class RunnerState(NamedTuple):
         draws = NOTHING
         if options.randomization is not None:
             draws = options.randomization.first(robot, count, options.first_env)
-        faults = FaultLog(count, partial(_fault, options))
         motion = None
         if options.sets_positions:
             motion = (np.tile(robot.start, (count, 1)), None)
-        return cls(options.params, options.actuators, draws, faults, motion)
+        steps = np.full(count, NO_STEP)
+        return cls(options.params, options.actuators, draws, (), steps, motion)
 
 
 # -- requests
@@ -144,46 +148,56 @@ def goal_of(chunk: Float64, latency: Float64, before: Float64) -> Float64:
 # -- the state after them
 
 
-def committed(request: Request, state: RunnerState, outcome: Outcome) -> RunnerState:
+def committed(options: RunnerOptions, state: RunnerState, outcome: Outcome) -> RunnerState:
     """Return the state after a request, from the state before it and the outcome in the workers."""
-    change = CHANGES.get(request.method)
-    return state if change is None else change(request, state, outcome)
+    method, arguments = outcome.request.method, outcome.request.arguments
+    if method == "run":
+        return _after_run(options, state, outcome)
+    if method == "reset":
+        return _after_reset(options, state, outcome)
+    if method == "restore":
+        return _after_restore(state, *arguments)
+    if method == "set_params":
+        return state.changed(PARAMS, params=arguments[0])
+    if method == "set_actuators":
+        return state.changed(ACTUATORS, actuators=arguments[0])
+    if method == "snapshot":
+        return state._replace(steps_since_checkpoint=0)
+    return state
 
 
-def _after_reset(request: Request, state: RunnerState, outcome: Outcome) -> RunnerState:
-    mask, qpos, qvel, draws, _ = request.arguments
+def _after_reset(options: RunnerOptions, state: RunnerState, outcome: Outcome) -> RunnerState:
+    mask, qpos, qvel, draws, _ = outcome.request.arguments
     motion = state.motion
     if motion is not None:
         setpoint, rate = motion
         rate = np.where(mask[:, None], qvel, 0.0 if rate is None else rate)
         motion = np.where(mask[:, None], qpos, setpoint), rate
-    faults = state.faults.without(mask).with_events(outcome.at(0))
+    state = state._replace(fault_steps=np.where(mask, NO_STEP, state.fault_steps))
+    state = _with_faults(options, state, outcome.at(0))
     return state.changed(
         RESET,
         mask,
-        faults=faults,
         draws=draws,
         motion=motion,
     )
 
 
-def _after_run(request: Request, state: RunnerState, outcome: Outcome) -> RunnerState:
-    setpoint, rate, *_ = request.command
-    faults = state.faults
+def _after_run(options: RunnerOptions, state: RunnerState, outcome: Outcome) -> RunnerState:
+    setpoint, rate, *_ = outcome.request.command
     motion = state.motion
     work = state.work
     count = outcome.num_ticks
     ok = outcome.arrays.observation.ok[:count]
     if np.count_nonzero(ok) < ok.size:
         for arrays in outcome.completed:
-            faults = faults.with_events(arrays)
+            state = _with_faults(options, state, arrays)
     if motion is not None and count:
         motion = setpoint[count - 1], None if rate is None else rate[count - 1]
     if outcome.failure is None:
         work = tuple(outcome.results), count
-    steps = count * request.substeps
+    steps = count * outcome.request.substeps
     return state._replace(
-        faults=faults,
         motion=motion,
         steps=state.steps + steps,
         steps_since_checkpoint=state.steps_since_checkpoint + steps,
@@ -192,20 +206,7 @@ def _after_run(request: Request, state: RunnerState, outcome: Outcome) -> Runner
     )
 
 
-def _after_params(request: Request, state: RunnerState, _: Outcome) -> RunnerState:
-    return state.changed(PARAMS, params=request.arguments[0])
-
-
-def _after_actuators(request: Request, state: RunnerState, _: Outcome) -> RunnerState:
-    return state.changed(ACTUATORS, actuators=request.arguments[0])
-
-
-def _after_snapshot(_: Request, state: RunnerState, __: Outcome) -> RunnerState:
-    return state._replace(steps_since_checkpoint=0)
-
-
-def _after_restore(request: Request, state: RunnerState, _: Outcome) -> RunnerState:
-    snapshot, draws = request.arguments
+def _after_restore(state: RunnerState, snapshot: Snapshot, draws: Draws) -> RunnerState:
     motion = state.motion
     if motion is not None:
         setpoint, rate = snapshot.rows["motion"].swapaxes(0, 1)
@@ -215,22 +216,23 @@ def _after_restore(request: Request, state: RunnerState, _: Outcome) -> RunnerSt
         params=snapshot.params,
         actuators=snapshot.actuators,
         draws=draws,
-        faults=state.faults.restored(snapshot.rows["containment/step"]),
+        fault_steps=snapshot.rows["containment/step"],
         motion=motion,
         steps=snapshot.steps,
         steps_since_checkpoint=0,
     )
 
 
-CHANGES: dict[str, Callable[[Request, RunnerState, Outcome], RunnerState]] = {
-    "reset": _after_reset,
-    "run": _after_run,
-    "set_params": _after_params,
-    "set_actuators": _after_actuators,
-    "snapshot": _after_snapshot,
-    "restore": _after_restore,
-}
-"""Functions for the state after a request, by its method; the others change nothing."""
+def _with_faults(options: RunnerOptions, state: RunnerState, arrays: Arrays) -> RunnerState:
+    """Return the state with the faults in the arrays of a tick that it does not have yet."""
+    steps = arrays.fault.step
+    # A fault is new if it has another step than the env's last one.
+    new = np.flatnonzero((steps != NO_STEP) & (steps != state.fault_steps)).tolist()
+    if not new:
+        return state
+    faults = state.faults + tuple([_fault(options, env, arrays) for env in new])
+    return state._replace(faults=faults[-MOST_EVENTS:], fault_steps=steps.copy())
+
 
 # -- snapshots
 
@@ -265,8 +267,8 @@ def restored(options: RunnerOptions, snapshot: Snapshot, present: Snapshot) -> R
         # Delays of drawn actuators say how long the histories are.
         draws = randomization.draw(options.robot, snapshot.episodes(num_envs))
         acting = randomization.randomized("actuators", actuators, draws, options.robot)
-    empty = empty_states(options, params, acting, options.has_stiction(acting))
-    control = by_name(*empty)
+    stages, states, _ = empty_control(options, params, acting)
+    control = by_name(stages, states)
     rows = {name: table for name, table in present.rows.items() if "control/" not in name}
     snapshot.check_rows(rows | flatten({"control": control}))
     return restore_request(replace(snapshot.copy(), params=params, actuators=actuators), draws)

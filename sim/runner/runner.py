@@ -30,7 +30,6 @@ from batchpid.sim.findings import report_shortfalls
 from batchpid.sim.loop.arrays import Snapshot
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.group_control import describe, native_obstacle
-from batchpid.sim.loop.loop import joined
 from batchpid.sim.options.groups import (
     DEFAULT_ENGINE,
     Backend,
@@ -446,18 +445,8 @@ class Runner(SingleOwner):
         }
         options = self.options
         ticks = count_ticks(options, setpoints)
-        chunks = list[tuple[Float64, Float64]]()
-        if options.plan is None:
-            refuse_latency(latency)
-        else:
-            entries, ages = read_chunks(options, arrays, latency, ticks)
-            chunks = list(zip(entries, ages + self._lateness, strict=True))
-            goals = [self._goal]
-            for chunk in chunks:
-                goals.append(goal_of(*chunk, goals[-1]))
-            arrays["setpoints"] = np.array(goals[1:])
         seconds = options.substeps * options.timestep
-        command = read_command(options, self._state, arrays, seconds, ticks)
+        command, chunks = self._command(arrays, latency, seconds, ticks)
         seen = empty_observation(ticks, self.num_envs, options.robot.dof, observed=options.observed)
         info = self.info
         steps = self._state.steps + options.substeps * np.arange(1.0, ticks + 1)
@@ -484,7 +473,7 @@ class Runner(SingleOwner):
         next(shown, None)  # the end
         seen = seen._replace(**{name: derive(seen) for name, derive in self._derived.items()})
         rated = command.setpoint_rate is not None
-        info = replace(info, rates=rated, faults=self._state.faults.events)
+        info = replace(info, rates=rated, faults=self._state.faults)
         times = steps * options.timestep
         return Rollout(
             times,
@@ -622,7 +611,7 @@ class Runner(SingleOwner):
             start=start,
             versions=dict(self._versions),
             begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
-            faults=state.faults.events,
+            faults=state.faults,
         )
 
     @cached_property
@@ -642,7 +631,7 @@ class Runner(SingleOwner):
     @property
     def faults(self) -> tuple[Fault, ...]:
         """Envs that failed, latest last: the last ten thousand."""
-        return self._state.faults.events
+        return self._state.faults
 
     @property
     def draws(self) -> dict[str, NDArray[np.float64]]:
@@ -767,18 +756,6 @@ class Runner(SingleOwner):
         substeps: int | None,
     ) -> Request:
         """Return the request for the arguments of :meth:`step`, checked; a chunk enters the plan."""
-        inputs = dict(zip(Command._fields, arrays, strict=True))
-        chunk = None
-        if self.options.plan is None:
-            refuse_latency(latency)
-        elif not any(entry is not None for entry in arrays[:3]):
-            inputs["setpoint"] = self._goal
-        else:
-            if inputs["setpoint"] is None:
-                inputs["setpoint"], latency = self._goal, np.inf
-            chunks, ages = read_chunks(self.options, inputs, latency)
-            chunk = chunks[0], ages[0] + self._lateness
-            inputs["setpoint"] = goal_of(*chunk, self._goal)
         if substeps is None:
             count = self.substeps
         else:
@@ -787,11 +764,37 @@ class Runner(SingleOwner):
             problem = f"is not the runner's {self.substeps}"
             remedy = "all ticks of a recording have the same length"
             raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
-        seconds = count * self.timestep
-        command = read_command(self.options, self._state, inputs, seconds)
-        if chunk is not None:
+        inputs = dict(zip(Command._fields, arrays, strict=True))
+        command, chunks = self._command(inputs, latency, count * self.timestep)
+        for chunk in chunks:
             self._add_chunk(*chunk)
         return run_request(1, count, command)
+
+    def _command(
+        self,
+        inputs: dict[str, ArrayLike | None],
+        latency: ArrayLike,
+        seconds: float,
+        ticks: int | None = None,
+    ) -> tuple[Command, list[tuple[Float64, Float64]]]:
+        """Return the command of one tick, or of ``ticks``: :func:`read_command`; and the chunk of
+        each, with the latency of each env.
+        """
+        setpoint, *rates, _ = inputs
+        chunks = list[tuple[Float64, Float64]]()
+        if self.options.plan is None:
+            refuse_latency(latency)
+        elif all(inputs[name] is None for name in (setpoint, *rates)):
+            inputs[setpoint] = self._goal
+        else:
+            entries, ages = read_chunks(self.options, inputs, latency, ticks)
+            chunks = list(zip(entries, ages + self._lateness, strict=True))
+            goals = [self._goal]
+            for chunk in chunks:
+                goals.append(goal_of(*chunk, goals[-1]))
+            inputs[setpoint] = goals[1] if ticks is None else np.array(goals[1:])
+        command = read_command(self.options, self._state, inputs, seconds, ticks)
+        return command, chunks
 
     @property
     def _goal(self) -> Float64:
@@ -806,7 +809,7 @@ class Runner(SingleOwner):
 
     def _read(self, request: Request) -> Any:
         """Return the result of a request that reads from the loops of all envs."""
-        return joined(request.method, self._execute(request).results)
+        return self._execute(request).result
 
     def _execute(self, request: Request) -> Outcome:
         """Execute a request, or complete the one that was sent; then issue warnings.
@@ -833,9 +836,9 @@ class Runner(SingleOwner):
             call.waits = self._is_running = False
             # Ticks before a failure count: the workers have run them.
             if outcome.failure is None or is_run:
-                self._state = committed(request, before, outcome)
+                self._state = committed(self.options, before, outcome)
             if is_run and self.recorder is not None:
-                self._record(self.recorder, request, before, outcome)
+                self._record(self.recorder, before, outcome)
             if outcome.failure is not None and request.changes_loop:
                 self._fail(outcome.failure.error)
         except BaseException as error:
@@ -850,7 +853,7 @@ class Runner(SingleOwner):
         # Warnings come last: as errors they must leave a runner that can go on.
         while pool.warnings:
             warn(pool.warnings.pop(), RecoveryWarning)
-        events = self._state.faults.events
+        events = self._state.faults
         if events and not self._has_warned:
             self._has_warned = True
             text = f"{events[0]}; see runner.faults for more; this warning is not repeated"
@@ -885,14 +888,9 @@ class Runner(SingleOwner):
         """Whether envs go on with the same bits after a snapshot as without it."""
         return "complete_state" in self.options.load_engine().capabilities
 
-    def _record(
-        self,
-        recorder: Recorder,
-        run: Request,
-        before: RunnerState,
-        outcome: Outcome,
-    ) -> None:
+    def _record(self, recorder: Recorder, before: RunnerState, outcome: Outcome) -> None:
         """Pass completed ticks on to the recorder."""
+        run = outcome.request
         for number, arrays in enumerate(outcome.completed):
             time = (before.steps + (number + 1) * run.substeps) * self.timestep
             recorder.append(

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.loop import Failure, failed, joined
+from batchpid.sim.loop.loop import Failure, failed
 from batchpid.sim.options.groups import Ray
 from batchpid.sim.workers.requests import Request, SharedArrays, Start, split
 from batchpid.sim.workers.worker import Worker, WorkerLost, pickled
@@ -82,7 +82,7 @@ class Node:
             arrays = self._pool.arrays.at(slice(outcome.num_ticks))
         if outcome.failure is not None:
             return outcome.failure.portable(), arrays
-        return joined(request.method, outcome.results), arrays
+        return outcome.result, arrays
 
 
 def _failure(error: Exception) -> Failure:

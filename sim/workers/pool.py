@@ -20,7 +20,7 @@ import numpy as np
 from batchpid.arrays.array_types import Bool
 from batchpid.errors import ClosedError, SingleOwner
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.loop import Failure, first
+from batchpid.sim.loop.loop import Failure, first, joined
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeInfo, NodeWorker
 from batchpid.sim.workers.requests import BUILD, Request, SharedArrays, Start, split
@@ -52,6 +52,7 @@ class RecoveryWarning(UserWarning):
 class Outcome(NamedTuple):
     """Outcome of a request in all workers."""
 
+    request: Request
     results: list[Any]
     """Result of each worker; None of one that failed."""
     failure: Failure | None
@@ -62,6 +63,11 @@ class Outcome(NamedTuple):
     """Input and output of all ticks."""
     at: Callable[[int], Arrays]
     """Function that returns views of the arrays at a tick."""
+
+    @property
+    def result(self) -> Any:
+        """Result for all envs."""
+        return joined(self.request.method, self.results)
 
     @property
     def completed(self) -> list[Arrays]:
@@ -267,7 +273,7 @@ class WorkerPool(SingleOwner):
             self.replay.append(request)
         if count:
             self.present = self._at(count - 1)
-        return Outcome(results, failure, count, self.arrays, self._at)
+        return Outcome(request, results, failure, count, self.arrays, self._at)
 
     def close(self) -> None:
         """End all workers at once. May be called again, as after an interrupt."""

@@ -43,6 +43,35 @@ def run(plan, times, chunks, start=0.0):
     return np.moveaxis(np.array(rows), 1, 0), state
 
 
+def blended(chunks, plan, ticks):
+    """Return the rows of the plan (ticks, joints) by the formulas of batchpid/plan/sampling.py;
+    chunk k is for the times from k + 1 on.
+    """
+    knots, rates = np.zeros((2, ticks + plan.horizon, plan.num_joints))
+    weights, rows = np.zeros(len(knots)), np.arange(plan.horizon)
+    options = {name: float(leaf[0, 0]) for name, leaf in plan.leaves().items()}
+    for k, ((chunk, _),) in chunks.items():
+        old = weights[k + 1 + rows, None]
+        weight = 1 - old * (1 - np.exp(-options.get("weight", 0.0)))
+        if "share" in options:
+            weight = np.where(old > 0, old * options["share"] / (1 - options["share"]), 1.0)
+        if "taper" in options:
+            weight = weight * np.minimum(
+                1, (plan.horizon - rows[:, None]) * PERIOD / options["taper"]
+            )
+        mean = (old * knots[k + 1 + rows] + weight * chunk) / (old + weight)
+        if "fade" in options:
+            time, fade = PERIOD * rows[:, None], options["fade"]
+            offset, slope = knots[k + 1] - chunk[0], rates[k + 1] - (chunk[1] - chunk[0]) / PERIOD
+            rise = np.minimum(5 * time / fade, 1)
+            eased = (offset + fade * slope) * rise * (1 - rise) ** 2 / 5
+            mean = chunk + offset * np.maximum(1 - time / fade, 0) + eased
+        knots[k + 1 :], rates[k + 1 :], weights[k + 1 :] = mean[-1], 0.0, 0.0
+        knots[k + 1 + rows], weights[k + 1 + rows] = mean, (old + weight)[:, 0]
+        rates[k + 1 + rows] = np.gradient(mean, PERIOD, axis=0)
+    return knots[:ticks]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_ensembles_are_those_of_act_and_averages_those_of_lerobot(seed):
     rng = np.random.default_rng(seed)
@@ -60,13 +89,18 @@ def test_ensembles_are_those_of_act_and_averages_those_of_lerobot(seed):
             averages[k] = (1 - share) * averages[k] + share * row
         if not rows:
             acts[k], averages[k] = acts[k - 1], averages[k - 1]
-    times = PERIOD * np.arange(30)
-    for plan, expected in (
-        (made("ensemble", horizon=horizon, weight=weight, taper=None, latest=()), acts),
-        (made("average", horizon=horizon, share=share, rate=None, acceleration=None), averages),
-    ):
+    times, taper = PERIOD * np.arange(30), rng.uniform(0.05, 0.3)
+    ensemble = made("ensemble", horizon=horizon, weight=weight, taper=None, latest=())
+    average = made("average", horizon=horizon, share=share, rate=None, acceleration=None)
+    others = (
+        made("align", horizon=horizon, fade=rng.uniform(0.2, 1.5), latest=()),
+        made("ensemble", horizon=horizon, weight=weight, taper=taper, latest=()),
+        made("average", horizon=horizon, taper=taper, rate=None, acceleration=None),
+    )
+    expected = [(ensemble, acts), (average, averages)]
+    for plan, row in (*expected, *((plan, blended(kept, plan, 30)[1:]) for plan in others)):
         (setpoint, _, _), _ = run(plan, times, kept)
-        np.testing.assert_allclose(setpoint[1:], expected, atol=1e-6)
+        np.testing.assert_allclose(setpoint[1:], row, atol=1e-6)
 
 
 def test_single_rows_in_straight_lines_are_a_linear_interpolator():

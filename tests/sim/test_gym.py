@@ -54,9 +54,13 @@ def test_chunks_that_come_late_are_executed_whole():
     joints = len(envs.joint_names)
     change = np.abs(first - start)[:, :joints] / envs.max_increment
     assert (change.max(1) < 0.3).all()  # of 0.4: it came late
+    # The observation ends in the pose that the chunk leads to.
+    reached = np.minimum(start[:, :joints] + 0.4 * envs.max_increment, envs.high)
+    np.testing.assert_allclose(start[:, 3 * joints :], start[:, :joints], atol=1e-6)
+    np.testing.assert_allclose(first[:, 3 * joints :], reached, atol=1e-6)
+    assert envs.observation_space.contains(first)
     for _ in range(25):
         last, *_ = envs.step(0 * moves)
-    reached = np.minimum(start[:, :joints] + 0.4 * envs.max_increment, envs.high)
     np.testing.assert_allclose(last[:, :joints], reached, atol=1e-3)
     envs.close()
 

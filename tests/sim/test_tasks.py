@@ -178,6 +178,29 @@ def test_setpoints_are_steps_unless_a_task_gives_their_rates(hinge, task):
     envs.close()
 
 
+class Wink(Nod):
+    """A hinge whose setpoint depends on how often it was asked for."""
+
+    asked = 0
+
+    def command(self, action, setpoint):
+        self.asked += 1
+        return setpoint + 0.02 * action * self.asked
+
+
+def test_a_command_with_a_state_executes_whole_chunks(hinge):
+    """Rows that are not executed would count."""
+    for task, execute in ((Nod, 2), (Wink, 4), (Wink, 2)):
+        envs = task(1, hinge, workers=0, chunk=4, execute=execute)
+        envs.reset(seed=0)
+        if (task, execute) == (Wink, 2):
+            with pytest.raises(InvalidArgumentError, match=r"^execute: Wink.command gives another"):
+                envs.step(np.ones((1, 4, 1)))
+        else:
+            envs.step(np.ones((1, 4, 1)))
+        envs.close()
+
+
 def test_options_that_a_task_chooses_are_refused(hinge):
     with pytest.raises(TypeError, match="observe"):
         RobotVectorEnv(1)

@@ -88,13 +88,15 @@ FOR_EACH_PROCESSOR static void evaluate(FreeMotion const &of, std::int64_t block
   Lanes const *armature = of.armature + block * dof, *gravity = of.gravity + 3 * block;
   Lanes *bias = of.bias + block * dof, *mass = of.mass + block * (dof * (dof + 1) / 2);
   Posed &posed = room.posed;
-  std::copy(qpos, qpos + dof, posed.qpos.data());
-  posed.place(Bodies{dof, model.tree, model.rows});
-  posed.weigh(model, block * WIDTH, of.robots);
   BodyMotion<Lanes> root{};
   root.moving_change = {-gravity[0], -gravity[1], -gravity[2]};
-  move_bodies(dof, model.tree, posed.bodies.data(), qvel, root, room.motions.data());
-  for (std::int64_t j = 0; j < dof; ++j) room.motions[j].accelerate(posed.bodies[j].inertia);
+  posed.place(dof, model.tree, model.rows, qpos, [&](std::int64_t j, BodyState<Lanes> &body) {
+    std::int32_t const above = model.tree[2 * j];
+    model.weigh(j, block * WIDTH, of.robots, body);
+    BodyMotion<Lanes> motion = move_body(above < 0 ? root : room.motions[above], body, model.tree[2 * j + 1] != 0, qvel[j]);
+    motion.accelerate(body.inertia);
+    room.motions[j] = motion;
+  });
   efforts_of_wrenches(dof, model.tree, posed.bodies.data(), room.motions.data(), bias);
   composite_mass_matrix(dof, model.tree, posed.bodies.data(), [&](std::int64_t i, std::int64_t j, Lanes product) {
     mass[j * (j + 1) / 2 + i] = product;

@@ -10,13 +10,6 @@
 
 namespace batchpid {
 
-// Robots of one kind: the joint above each, or -1, and whether it slides (dof, 2); and rows of BodyRow (dof, 25).
-struct Bodies {
-  std::int64_t dof;
-  std::int32_t const *tree;
-  double const *rows;
-};
-
 // Base of robots: fixed at the origin of the world; free to move; or held where it is, at the rate at which it turns.
 enum class Base : std::int32_t { FIXED, FREE, HELD };
 
@@ -25,7 +18,7 @@ constexpr std::int64_t BASE_SIZE = 6;
 
 // Robots of one kind that may differ in their masses; Python fills in the fields.
 struct FOR_PYTHON Model {
-  std::int32_t const *tree;  // (dof, 2)
+  std::int32_t const *tree;  // (dof, 2): the joint above, or -1, and whether it slides
   double const *rows;        // (dof, 25); the places of the joints are used
   double const *inertias;    // (robots or 1, dof + 1, 13), of BodyInertia; the last is the base's
   double gravity[3];
@@ -33,17 +26,17 @@ struct FOR_PYTHON Model {
   std::int32_t varies;       // each robot has its own inertias
   Base base;
 
-  // Return the inertias of body j of robots `first` to `first + WIDTH`.
-  inline __attribute__((always_inline)) BodyInertia<Lanes> inertia(std::int64_t j, std::int64_t first,
-                                                                   std::int64_t robots) const {
+  // Weigh body j of robots `first` to `first + WIDTH`, at its frame.
+  inline __attribute__((always_inline)) void weigh(std::int64_t j, std::int64_t first, std::int64_t robots,
+                                                   BodyState<Lanes> &at) const {
+    if (!varies) return batchpid::weigh(reinterpret_cast<BodyInertia<double> const *>(inertias)[j], at);
     constexpr std::int64_t NUMBERS = sizeof(BodyInertia<double>) / sizeof(double);
     BodyInertia<Lanes> own;
     auto *leaf = reinterpret_cast<Lanes *>(&own);
     for (std::int64_t k = 0; k < NUMBERS; ++k) {
-      std::int64_t const place = j * NUMBERS + k;
-      leaf[k] = varies ? gather(inertias, (dof + 1) * NUMBERS, place, first, robots) : Lanes(inertias[place]);
+      leaf[k] = gather(inertias, (dof + 1) * NUMBERS, j * NUMBERS + k, first, robots);
     }
-    return own;
+    batchpid::weigh(own, at);
   }
 };
 
@@ -56,26 +49,29 @@ struct Posed {
     for (auto *leaf : {&qpos, &qvel, &cosine, &sine}) leaf->resize(static_cast<std::size_t>(dof));
     bodies.resize(static_cast<std::size_t>(dof));
   }
-  // Place the bodies at the positions in qpos.
-  inline __attribute__((always_inline)) void place(Bodies const &of) {
+  // Place the bodies, of rows (dof, 25), and call finish(j, body) for each: all at once, while it is in registers.
+  template <class Finish>
+  inline __attribute__((always_inline)) void place(std::int64_t dof, std::int32_t const *tree, double const *rows,
+                                                   Lanes const *at, Finish finish) {
     static_assert(sizeof(BodyRow<double>) == 25 * sizeof(double));
-    for (std::int64_t j = 0; j < of.dof; ++j) sine_and_cosine(qpos[j], sine[j], cosine[j]);
-    auto const *rows = reinterpret_cast<BodyRow<double> const *>(of.rows);
-    place_bodies(of.dof, of.tree, rows, cosine.data(), sine.data(), qpos.data(), bodies.data());
-  }
-  // Weigh the placed bodies of robots `first` to `first + WIDTH` of a model.
-  inline __attribute__((always_inline)) void weigh(Model const &of, std::int64_t first, std::int64_t rows) {
-    for (std::int64_t j = 0; j < of.dof; ++j) batchpid::weigh(of.inertia(j, first, rows), bodies[j]);
+    write_cosines(dof, at, cosine.data(), sine.data());
+    BodyState<Lanes> const base = body_of_base<Lanes>();
+    for (std::int64_t j = 0; j < dof; ++j) {
+      auto const &row = reinterpret_cast<BodyRow<double> const *>(rows)[j];
+      BodyState<Lanes> const &above = tree[2 * j] < 0 ? base : bodies[static_cast<std::size_t>(tree[2 * j])];
+      BodyState<Lanes> body = place_body(above, row, tree[2 * j + 1] != 0, cosine[j], sine[j], at[j]);
+      finish(j, body);
+      bodies[j] = body;
+    }
   }
   // Place and weigh the bodies of robots `first` to `first + WIDTH` of a model; return the inertia of their base.
-  inline __attribute__((always_inline)) Inertia<Lanes> pose(Model const &of, std::int64_t first, std::int64_t rows,
+  inline __attribute__((always_inline)) Inertia<Lanes> pose(Model const &of, std::int64_t first, std::int64_t robots,
                                                             double const *at) {
-    for (std::int64_t j = 0; j < of.dof; ++j) qpos[j] = gather(at, of.dof, j, first, rows);
-    place(Bodies{of.dof, of.tree, of.rows});
-    weigh(of, first, rows);
-    BodyState<Lanes> base{};
-    base.axes[0].x = base.axes[1].y = base.axes[2].z = Lanes(1.0);
-    batchpid::weigh(of.inertia(of.dof, first, rows), base);
+    for (std::int64_t j = 0; j < of.dof; ++j) qpos[j] = gather(at, of.dof, j, first, robots);
+    auto const weigh = [&](std::int64_t j, BodyState<Lanes> &body) { of.weigh(j, first, robots, body); };
+    place(of.dof, of.tree, of.rows, qpos.data(), weigh);
+    BodyState<Lanes> base = body_of_base<Lanes>();
+    weigh(of.dof, base);
     return base.inertia;
   }
 };
@@ -141,7 +137,7 @@ FOR_EACH_PROCESSOR static void write_joint_matrices(Model const &of, std::int64_
   std::vector<Lanes> matrix(static_cast<std::size_t>(size));
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
     joint_matrix(of, first, rows, qpos, posed, matrix.data());
-    for (std::int64_t k = 0; k < size; ++k) scatter(matrix[k], out, size, k, first, rows);
+    scatter_rows(matrix.data(), size, out, first, rows);
   }
 }
 
@@ -191,24 +187,25 @@ FOR_EACH_PROCESSOR static void write_forces(Model const &of, Parts parts, std::i
     bool const held = of.base != Base::FREE;
     if (parts.coriolis || (parts.gravity && held)) add(parts.coriolis, 1.0);
     if (parts.coriolis && !parts.gravity && held) add(false, -1.0);
-    for (std::int64_t j = 0; j < dof; ++j) scatter(force[j], out, dof, j, first, rows);
+    scatter_rows(force.data(), dof, out, first, rows);
   }
 }
 
-// Write the mass matrices (rows, dof, dof) at qpos + ahead * qvel, both (rows, dof); qvel may be null for zero.
-FOR_EACH_PROCESSOR static void write_mass_matrices(Bodies const &of, std::int64_t rows, double const *qpos,
-                                                   double const *qvel, double ahead, double *out) {
-  Posed posed(of.dof);
-  std::vector<Lanes> matrix(static_cast<std::size_t>(of.dof * of.dof));
-  for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    for (std::int64_t j = 0; j < of.dof; ++j) {
-      posed.qpos[j] = gather(qpos, of.dof, j, first, rows);
-      if (qvel != nullptr) posed.qpos[j] += ahead * gather(qvel, of.dof, j, first, rows);
+// Write the mass matrices (robots, dof, dof) of bodies (dof, 25) at qpos + ahead * qvel, both (robots, dof).
+FOR_EACH_PROCESSOR static void write_mass_matrices(std::int64_t dof, std::int32_t const *tree, double const *bodies,
+                                                   std::int64_t robots, double const *qpos, double const *qvel,
+                                                   double ahead, double *out) {
+  Posed posed(dof);
+  std::vector<Lanes> matrix(static_cast<std::size_t>(dof * dof));
+  for (std::int64_t first = 0; first < robots; first += WIDTH) {
+    for (std::int64_t j = 0; j < dof; ++j) {
+      posed.qpos[j] = gather(qpos, dof, j, first, robots) + ahead * gather(qvel, dof, j, first, robots);
     }
-    posed.place(of);
-    weigh_bodies(of.dof, reinterpret_cast<BodyRow<double> const *>(of.rows), posed.bodies.data());
-    composite_mass_matrix(of.dof, of.tree, posed.bodies.data(), matrix.data());
-    for (std::int64_t k = 0; k < of.dof * of.dof; ++k) scatter(matrix[k], out, of.dof * of.dof, k, first, rows);
+    posed.place(dof, tree, bodies, posed.qpos.data(), [&](std::int64_t j, BodyState<Lanes> &body) {
+      weigh(reinterpret_cast<BodyRow<double> const *>(bodies)[j].inertia, body);
+    });
+    composite_mass_matrix(dof, tree, posed.bodies.data(), matrix.data());
+    scatter_rows(matrix.data(), dof * dof, out, first, robots);
   }
 }
 

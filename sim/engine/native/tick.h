@@ -101,7 +101,7 @@ inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t s
   auto const n = static_cast<std::size_t>(tick.dof);
   double *found = tick.matrix;
   double const ahead = 0.5 * static_cast<double>(steps - 1) * tick.timestep;
-  write_mass_matrices({tick.dof, tick.tree, tick.bodies}, robots, tick.pose, tick.rate, ahead, found);
+  write_mass_matrices(tick.dof, tick.tree, tick.bodies, robots, tick.pose, tick.rate, ahead, found);
   for (std::int64_t row = 0; row < robots; ++row, found += n * n) {
     for (std::size_t j = 0; j < n; ++j) {
       double &entry = found[j * n + j];

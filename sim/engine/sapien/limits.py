@@ -52,8 +52,9 @@ def refusals(spec: SceneSpec) -> Iterator[Finding]:
 
 def shortfalls(spec: SceneSpec) -> Iterator[Finding]:
     """Yield content that SAPIEN simulates otherwise than the robot's file says."""
-    if spec.mjcf is not None:
-        yield from spec.mjcf.losses
+    if spec.mjcf is not None and spec.mjcf.lost:
+        text = f"simulated without contents of the file: {spec.mjcf.lost}"
+        yield Finding("engine", text, f"{_MUJOCO}, which simulates the file itself")
     if not spec.collisions:
         return
     for pair in filter_words(spec)[1]:

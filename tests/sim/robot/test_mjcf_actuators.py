@@ -57,14 +57,6 @@ READ = {  # of an actuator with a moment arm of 1: input's gain, kp, kd, and lim
     '<position kp="5" kv="2" forcerange="-3 3" {}/>': (5, 5, 2, 3),
     '<position kp="5" ctrlrange="-9 9" {}/>': (5, 5, 0, np.inf),
     '<general gainprm="4" biastype="affine" biasprm="0 -5 -2" {}/>': (4, 5, 2, np.inf),
-    '<pid kp="5" kv="2" forcerange="-3 3" {}/>': (5, 5, 2, 3),
-    '<dcmotor motorconst="2 3" resistance="5" input="ff" {}/>': (1, 0, 0, np.inf),
-    '<dcmotor motorconst="1 1" resistance="1" input="pos ff" controller="5 0 2 0 0 0" {}/>': (
-        5,
-        5,
-        2,
-        np.inf,
-    ),
 }
 ARMS = {
     'joint="j"': 1,
@@ -126,7 +118,7 @@ OTHERS = (
     '<damper kv="2" ctrlrange="0 1" {}/>',
     '<cylinder timeconst=".1" area="2" bias="0 -5 0" {}/>',
     '<muscle lengthrange="0 1" {}/>',
-    '<pid kp="5" input="vel ff" {}/>',
+    '<pid kp="5" {}/>',
     '<motor delay="0.01" nsample="9" {}/>',
     '<dcmotor nominal="24 6 3" {}/>',
     '<plugin plugin="mujoco.pid" actdim="0" {}><config key="kp" value="5"/></plugin>',
