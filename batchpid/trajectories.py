@@ -22,12 +22,11 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.records import array_summary
 from batchpid.checks import at_least, broadcast, positive, read_array, time_step
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space.frames import compose
+from batchpid.task_space.frames import moved, pose_error
 
 _PEAK_VELOCITY = 15 / 8  # of the minimum-jerk s, times T
 _PEAK_ACCELERATION = 10 / math.sqrt(3)  # times T^2
 _ROUNDING = 1e-12  # share of a duration: a tick that ends this much before the end is the last one
-_NO_WAY = 1e-100  # [rad or m]: below this a quotient by the distance would overflow
 
 
 class Trajectory(NamedTuple):
@@ -122,7 +121,7 @@ def minimum_jerk(
         total = np.broadcast_to(needed.max(-1, keepdims=True), move.shape)
     time = _ticks(dt, total)
     safe = np.maximum(total, dt)  # a move within one tick is done at its end
-    tau = np.minimum(time[(...,) + (None,) * move.ndim] / safe, 1.0)
+    tau = np.minimum(time.reshape(-1, *[1] * move.ndim) / safe, 1.0)
     s = tau**3 * (10 + tau * (6 * tau - 15))
     rate = 30 * tau**2 * (1 - tau) ** 2 / safe
     acceleration = 60 * tau * (1 - tau) * (1 - 2 * tau) / safe**2
@@ -163,20 +162,10 @@ def straight_line(
         Poses (ticks, 7); twists (ticks, 6) [m/s, rad/s] and their derivatives, in the world's axes.
     """
     first, last = (broadcast(name, x, (7,)) for name, x in (("start", start), ("target", target)))
-    q0, q1 = (pose[3:] / np.linalg.norm(pose[3:]) for pose in (first, last))
-    conjugate = q0 * np.array([1, -1, -1, -1])
-    turn = compose(q1, conjugate)
-    # q and -q are the same rotation; the one with w >= 0 turns less.
-    turn = turn if turn[0] >= 0 else -turn
-    sine = np.linalg.norm(turn[1:])
-    angle = 2 * np.arctan2(sine, turn[0])
-    axis = turn[1:] / max(sine, 1e-300)  # a turn by 0 needs none
-    move = np.concatenate([last[:3] - first[:3], angle * axis])
+    unit = np.append(first[:3], first[3:] / np.linalg.norm(first[3:]))
+    move = pose_error(last, unit)
     s = minimum_jerk([0.0], [1.0], dt, duration=duration)
-    half = s.position * angle / 2
-    q = compose(np.concatenate([np.cos(half), np.sin(half) * axis], 1), q0)
-    place = first[:3] + s.position * move[:3]
-    position = np.concatenate([place, q], 1)
+    position = moved(unit, s.position * move)
     return Trajectory(s.time, position, s.velocity * move, s.acceleration * move)
 
 
@@ -203,22 +192,19 @@ def trapezoidal(
     x0, move = _move(start, target)
     v = _limits("max_velocity", max_velocity, move, finite=False)
     a = _limits("max_acceleration", max_acceleration, move)
-    distance = np.abs(move)
-    moves = distance > _NO_WAY
-    # Limits of s itself: the joints' limits, per metre or radian of the move.
-    vs = np.divide(v, distance, out=np.full(move.shape, np.inf), where=moves)
-    as_ = np.divide(a, distance, out=np.full(move.shape, np.inf), where=moves)
-    # The slowest joint sets the pace of all.
-    vs, as_ = (np.broadcast_to(limit.min(-1, keepdims=True), move.shape) for limit in (vs, as_))
-    moves = np.broadcast_to(moves.any(-1, keepdims=True), move.shape)
+    # Limits of s itself: the joints' limits, per metre or radian of the move. The slowest joint sets
+    # the pace of all.
+    with np.errstate(divide="ignore", over="ignore"):
+        vs, as_ = ((limit / np.abs(move)).min(-1, keepdims=True) for limit in (v, a))
     # An env that does not move gets any number, and a duration of 0.
+    moves = np.isfinite(as_)
     as_ = np.where(moves, as_, 1.0)
     # A short move never reaches its cruising velocity.
     peak = np.minimum(np.where(moves, vs, 1.0), np.sqrt(as_))
     ramp = peak / as_
     total = np.where(moves, 1 / peak + ramp, 0.0)
     time = _ticks(dt, total)
-    t = np.minimum(time[(...,) + (None,) * move.ndim], total)
+    t = np.minimum(time.reshape(-1, *[1] * move.ndim), total)
     left = total - t
     s = np.where(
         t < ramp,

@@ -135,17 +135,10 @@ def take_rows(table: Array, rows: Array) -> Array:
     joint, or in several (..., n, joints); the numbers of the rows are floats.
     """
     xp = namespace(table, rows)
-    if xp is not np:
-        # Robot by robot, so devices that share the envs do not communicate.
-        if rows.ndim == table.ndim:
-            return xp.take_along_axis(table, rows.astype(int), -2)
-        return xp.take_along_axis(table, rows[..., None, :].astype(int), -2)[..., 0, :]
-    # By places in the whole table: NumPy's take_along_axis takes three times as long.
-    count, joints = table.shape[-2:]
-    axes = (*table.shape[:-2], *[1] * (rows.ndim - table.ndim + 2))
-    begin = np.arange(0, table.size, count * joints).reshape(axes)
-    column = np.arange(joints).reshape(*[1] * (rows.ndim - 1), joints)
-    return table.reshape(-1)[begin + rows.astype(int) * joints + column]
+    # Robot by robot, so devices that share the envs do not communicate.
+    if rows.ndim == table.ndim:
+        return xp.take_along_axis(table, rows.astype(int), -2)
+    return xp.take_along_axis(table, rows[..., None, :].astype(int), -2)[..., 0, :]
 
 
 def replace_envs(state: T, fresh: T, mask: Array) -> T:

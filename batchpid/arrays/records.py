@@ -140,6 +140,9 @@ class Record(tuple[Any, ...]):
                 problem = f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}"
                 remedy = "give one row, or one row per env"
                 raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy=remedy)
+            if leaf.dtype != self.dtype:
+                problem = f"is {leaf.dtype}, another one is {self.dtype}"
+                raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy="use one dtype")
             if not is_traced(leaf):
                 field = self.FIELDS.get(name, Field(low=-math.inf))
                 values = np.asarray(leaf)
@@ -341,14 +344,11 @@ def span(values: Array) -> str:
             return f"{array.sum()} of {array.size}"
         # The range leaves NaN out; "nan" follows it.
         present = array[~np.isnan(array)]
+        ends = [f"{end:.4g}" for end in (present.min(), present.max())] if present.size else []
     except (TypeError, ValueError, RuntimeError):
         return type(values).__name__
-    parts = []
-    if present.size:
-        parts.append(" to ".join(dict.fromkeys(f"{e:.4g}" for e in (present.min(), present.max()))))
-    if present.size < array.size:
-        parts.append("nan")
-    return " or ".join(parts) or "empty"
+    ranges = [" to ".join(dict.fromkeys(ends)), "nan" * (present.size < array.size)]
+    return " or ".join(filter(None, ranges)) or "empty"
 
 
 def summary(name: str, parts: Iterable[str]) -> str:
@@ -368,18 +368,14 @@ def array_summary(arrays: Any, *axes: str) -> str:
     each.
     """
     leaves = {name: leaf for name, leaf in arrays._asdict().items() if leaf is not None}
+    shapes = [leaf.shape for leaf in arrays if len(getattr(leaf, "shape", ())) == len(axes)]
+    # The largest size of each axis, as in "64 envs" and "1 joint".
+    largest = (max(lengths) for lengths in zip(*shapes, strict=True))
+    sizes = [
+        f"{n} {axis[: None if n != 1 else -1]}" for n, axis in zip(largest, axes, strict=False)
+    ]
     ranges = [
         f"{name} {type(leaf).__name__ if isinstance(leaf, tuple) else span(leaf)}"
         for name, leaf in leaves.items()
     ]
-    return summary(type(arrays).__name__, [*_sizes(arrays, axes), *ranges])
-
-
-def _sizes(leaves: Iterable[Any], axes: tuple[str, ...]) -> list[str]:
-    """Return the largest size of each axis with its name, as in ["64 envs", "9 joints"]."""
-    shapes = [leaf.shape for leaf in leaves if len(getattr(leaf, "shape", ())) == len(axes)]
-    sizes = (max(lengths) for lengths in zip(*shapes, strict=True))
-    return [
-        f"{size} {axis if size != 1 else axis[:-1]}"
-        for size, axis in zip(sizes, axes, strict=False)
-    ]
+    return summary(type(arrays).__name__, [*sizes, *ranges])

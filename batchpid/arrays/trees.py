@@ -141,13 +141,12 @@ def digest(*values: Array) -> str:
     Values may be None, bools, ints, floats, strings, bytes, arrays, and sequences, sets, mappings,
     named tuples and dataclasses of these. Numbers of different types, and arrays of different dtypes,
     have different digests. Byte order, strides, and the order of sets and mappings do not matter.
-    Raises InvalidArgumentError for a value of another type, or an array of objects; the message
-    names its place, such as ``[0]['kp']``.
+    Raises InvalidArgumentError for a value of another type, or an array of objects.
     """
-    return _digest(values, "").hex()
+    return _digest(values).hex()
 
 
-def _digest(value: Any, where: str) -> bytes:
+def _digest(value: Any) -> bytes:
     # Exact types: a bool is an int, and must not have the digest of 1.
     kind = type(value)
     if value is None or kind in (bool, int, float, str):
@@ -164,25 +163,19 @@ def _digest(value: Any, where: str) -> bytes:
     title = f"{kind.__module__}.{kind.__qualname__}"
     names = getattr(kind, "_fields", getattr(kind, "__dataclass_fields__", None))
     if names is not None:
-        parts = {name: getattr(value, name) for name in names}
-        return _hashed(title, _digest(parts, where))
+        return _hashed(title, _digest({name: getattr(value, name) for name in names}))
     # The digests of parts all have the same length, so that no separator is needed.
     if kind in (list, tuple):
-        entries = [_digest(part, f"{where}[{index}]") for index, part in enumerate(value)]
-        return _hashed("sequence", b"".join(entries))
+        return _hashed("sequence", b"".join(map(_digest, value)))
     if kind in (set, frozenset):
-        return _hashed("set", b"".join(sorted(_digest(part, where) for part in value)))
+        return _hashed("set", b"".join(sorted(map(_digest, value))))
     if isinstance(value, Mapping):
         # Sorted by digest, since keys of different types have no order.
-        pairs = [
-            _digest(key, where) + _digest(part, f"{where}[{key!r}]") for key, part in value.items()
-        ]
+        pairs = (_digest(key) + _digest(part) for key, part in value.items())
         return _hashed("mapping", b"".join(sorted(pairs)))
-    if hasattr(kind, "dtype"):
-        title += f" of {value.dtype}"
     problem = f"is a {title}, which has no digest"
     remedy = "pass numbers, strings and arrays, or tuples, mappings and dataclasses of these"
-    raise InvalidArgumentError(f"values{where}", problem, remedy=remedy)
+    raise InvalidArgumentError("values", problem, remedy=remedy)
 
 
 def _hashed(kind: str, content: bytes) -> bytes:

@@ -156,24 +156,20 @@ class RecordFile(Generic[R]):
     ) -> tuple[R, list[str]]:
         """Return the record of a document and the names of its joints."""
         joints = self._joints(source, document)
-        if joint_names is None:
-            order = list(joints)
-        else:
-            order = names("joint_names", joint_names)
+        order = list(joints) if joint_names is None else names("joint_names", joint_names)
         missing = sorted(set(order) - set(joints))
         unknown = sorted(set(joints) - set(order))
         if unknown or (missing and not self.partial):
             problem = f"has other joints: missing {missing}, unknown {unknown}"
             remedy = f"the file's joints are {', '.join(joints)}"
             raise InvalidArgumentError(source, problem, remedy=remedy)
-        chosen = {joint: joints.get(joint, {}) for joint in order}
-        options = self.arguments(source, chosen)
+        options = self.arguments(source, {joint: joints.get(joint, {}) for joint in order})
         options |= {name: value for name, value in document.items() if name in self.head}
         with named(source):
             return self.make(len(order), **options, joint_names=order), order
 
     def _joints(self, source: str, document: Any) -> dict[str, Document]:
-        """Return the joints of a document of this form, with checked keys and types of values."""
+        """Return the joints of a document of this form, with checked keys."""
         version = document.get("format") if isinstance(document, dict) else None
         if version != self.format:
             problem = f"holds no {self.record.NAME}"
@@ -182,12 +178,12 @@ class RecordFile(Generic[R]):
                 problem = f"is a file of another version ({version}; this one reads {self.format})"
                 remedy = "write the file anew"
             raise InvalidArgumentError(source, problem, remedy=remedy)
+        # Names and types first: their errors name a key, where a constructor could not.
         for key in document:
             choice(f"{source}: key", key, ("format", "about", *self.head, "joints"))
         if not isinstance(document.get("about", {}), dict):
             raise error(source, "about", "must be a mapping", "use 'key: value', or leave it out")
         choice(f"{source}: dtype", document.get("dtype", "float64"), ("float32", "float64"))
-        # Names and types first: their errors name a key, where a constructor could not.
         joints = document.get("joints")
         if not isinstance(joints, dict) or not all(isinstance(name, str) for name in joints or [0]):
             raise error(source, "joints", "must map names to options", "name the joints")
@@ -195,32 +191,13 @@ class RecordFile(Generic[R]):
             if not isinstance(options, dict):
                 remedy = "give e.g. an empty mapping, {}"
                 raise error(source, "joints", "must map options to values", remedy, joint)
-            for name in self.required:
-                if name not in options:
-                    remedy = f"give '{name}: <number>'"
-                    raise error(source, "joints", f"has no {name}", remedy, joint)
-            for name, value in options.items():
-                self.check_option(source, joint, name, value)
+            for name in [name for name in options if name not in self.fields]:
+                remedy = f"use one of {', '.join(self.fields)}"
+                raise error(source, name, "unknown option", remedy, joint)
+            for name in [name for name in self.required if name not in options]:
+                remedy = f"give '{name}: <number>'"
+                raise error(source, "joints", f"has no {name}", remedy, joint)
         return joints
-
-    def check_option(
-        self,
-        source: str,
-        joint: str,
-        name: str,
-        value: object,
-    ) -> None:
-        """Raise InvalidArgumentError for an unknown option, or a value of a wrong type."""
-        if name not in self.fields:
-            remedy = f"use one of {', '.join(self.fields)}"
-            raise error(source, name, "unknown option", remedy, joint)
-        neutral = self.fields[name].neutral
-        kind: type = type(neutral)
-        for entry in value if isinstance(value, list) and value else [value]:
-            if not (is_number(entry) if kind is float else isinstance(entry, kind)):
-                problem = f"is {reprlib.repr(entry)}, which is not a {kind.__name__}"
-                remedy = f"give one, as in '{name}: {neutral}', or a list of one per env"
-                raise error(source, name, problem, remedy, joint)
 
 
 def _column(
@@ -232,21 +209,24 @@ def _column(
     """Return an option of all joints as an array (1 | envs, joints), neutral where it is left
     out.
     """
+    neutral = field.neutral
+    kind: type = type(neutral)
     columns: dict[str, list[object]] = {}
     for joint, options in joints.items():
-        value = options.get(name, field.neutral)
-        if isinstance(value, list):
-            columns[joint] = value
-        else:
-            columns[joint] = [value]
+        value = options.get(name, neutral)
+        columns[joint] = value if isinstance(value, list) and value else [value]
+        for entry in columns[joint]:
+            if not (is_number(entry) if kind is float else isinstance(entry, kind)):
+                problem = f"is {reprlib.repr(entry)}, which is not a {kind.__name__}"
+                remedy = f"give one, as in '{name}: {neutral}', or a list of one per env"
+                raise error(source, name, problem, remedy, joint)
     envs = max(map(len, columns.values()))
     for joint, values in columns.items():
         if len(values) not in (1, envs):
             problem = f"has {len(values)} values, others {envs}"
             raise error(source, name, problem, "give one per env", joint)
-    kind: type = object if isinstance(field.neutral, str) else type(field.neutral)
     rows = [values * (envs // len(values)) for values in columns.values()]
-    return np.array(rows, dtype=kind).T
+    return np.array(rows, dtype=object if kind is str else kind).T
 
 
 def read(path: str | os.PathLike[str]) -> Any:

@@ -164,8 +164,8 @@ def _step(
     """Check the arguments of a step and advance the law."""
     y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
     check_state(state, params)
-    given = dict(zip(inputs, rest, strict=True))
-    return advance(discretise(params.for_rank(y.ndim), dt), state, r, y, **given)
+    optional = dict(zip(inputs, rest, strict=True))
+    return advance(discretise(params.for_rank(y.ndim), dt), state, r, y, **optional)
 
 
 def advance(

@@ -26,7 +26,7 @@ A new effect is, in :mod:`batchpid.motors.actuators`, a field of :class:`Actuato
 several fields. Files, randomizations and the table of docs/actuators.md (``python docs/tables.py``)
 take it from there; each export has it, or lists it as a difference. Here it is a field of
 :class:`MotorCoefficients`, a value in :func:`discretise`, a start in :func:`init` if it has a state,
-and a term in ``_delivered`` (motor), ``_play`` or ``_encode`` (sensor). An effect that changes the
+and a term in :func:`advance_effort` (motor) or :func:`advance_measurement` (sensor). An effect that changes the
 limits of commands has a term in ``command_envelope``, too. Terms may use the operations of
 :mod:`batchpid.native.extensions` only (no sin, exp or pow), so that they also run in JAX and in
 native code; coefficients may use any.
@@ -260,25 +260,6 @@ def _motor(k: MotorCoefficients, effort: Array) -> Array:
     return effort + k.bias
 
 
-def _delivered(
-    k: MotorCoefficients,
-    behind: Array,
-    effort: Array,
-    qpos: Array,
-    qvel: Array,
-) -> Array:
-    """Return s u + b within the envelope, after the lag; ``behind`` is the effort of the step
-    before, None without.
-    """
-    xp = namespace(effort, qpos, qvel)
-    # The lagged effort stays within the envelope, too.
-    low, high = limits(k.envelope, qvel)
-    motor = clip(_motor(k, effort), low, high, xp)
-    if k.intake is not None:
-        motor = clip(behind + k.intake * (motor - behind), low, high, xp)
-    return motor
-
-
 def command_limits(k: MotorCoefficients, qvel: Array) -> tuple[Array, Array]:
     """Return the smallest and the largest commanded effort that the motor does not clip at
     ``qvel``.
@@ -288,46 +269,6 @@ def command_limits(k: MotorCoefficients, qvel: Array) -> tuple[Array, Array]:
     no limit.
     """
     return limits(k.commands, qvel)
-
-
-def _play(
-    k: MotorCoefficients,
-    encoder: Array,
-    qpos: Array,
-    qvel: Array,
-) -> tuple[Array, Array]:
-    """Return position and velocity behind the backlash; ``encoder`` is the position of the step
-    before.
-    """
-    xp = namespace(qpos, qvel)
-    # The encoder moves once the play is used up, and not before.
-    behind = wrap(encoder - qpos, k.turns, xp)
-    offset = clip(behind, -k.play, k.play, xp)
-    return qpos + offset, qvel * (offset != behind).astype(qvel.dtype)
-
-
-def _encode(
-    k: MotorCoefficients,
-    qpos: Array,
-    qvel: Array,
-    position: Array,
-    velocity: Array,
-) -> tuple[Array, Array]:
-    """Return position and velocity as encoded: with offset and noise, in steps of the resolution.
-
-    ``position`` and ``velocity`` are the noise, or None.
-    """
-    xp = namespace(qpos, qvel)
-    if k.position_offset is not None:
-        qpos = qpos + k.position_offset
-    qpos = qpos if position is None else qpos + position
-    qvel = qvel if velocity is None else qvel + velocity
-    # Resolution comes last: noise and offset are rounded, as in an encoder.
-    if k.position_resolution is not None:
-        qpos = xp.rint(qpos / k.position_resolution) * k.position_resolution
-    if k.velocity_resolution is not None:
-        qvel = xp.rint(qvel / k.velocity_resolution) * k.velocity_resolution
-    return qpos, qvel
 
 
 def advance_effort(
@@ -346,8 +287,12 @@ def advance_effort(
     if k.command is not None:
         command = push_history(command, effort)
         effort = delay.read(command, k.command, None, xp)
-    motor = _delivered(k, behind, effort, qpos, qvel)
-    return ActuatorState(command, behind if k.intake is None else motor, *state[2:]), motor
+    low, high = limits(k.envelope, qvel)
+    motor = clip(_motor(k, effort), low, high, xp)
+    if k.intake is not None:
+        # The lagged effort stays within the envelope, too.
+        motor = behind = clip(behind + k.intake * (motor - behind), low, high, xp)
+    return ActuatorState(command, behind, *state[2:]), motor
 
 
 def advance_measurement(
@@ -366,30 +311,31 @@ def advance_measurement(
     command, effort, positions, velocities, encoder, key, step = state
     # Play, delay, encoder: in the order in which a signal passes them.
     if k.play is not None:
-        encoder, qvel = _play(k, encoder, qpos, qvel)
-        qpos = encoder
+        # The encoder moves once the play is used up, and not before.
+        behind = wrap(encoder - qpos, k.turns, xp)
+        offset = clip(behind, -k.play, k.play, xp)
+        qpos = encoder = qpos + offset
+        qvel = qvel * (offset != behind).astype(qvel.dtype)
     if k.sensor is not None:
         positions, velocities = push_history(positions, qpos), push_history(velocities, qvel)
         qpos = delay.read(positions, k.sensor, k.turns, xp)
         qvel = delay.read(velocities, k.sensor, None, xp)
+    if k.position_offset is not None:
+        qpos = qpos + k.position_offset
     if key is not None:
         if drawn is None:
             drawn = measurement_noise(k, key, step, qpos, xp)
         step = step + _ONE
-    qpos, qvel = _encode(k, qpos, qvel, *(drawn or (None, None)))
-    return (
-        ActuatorState(
-            command,
-            effort,
-            positions,
-            velocities,
-            encoder,
-            key,
-            step,
-        ),
-        qpos,
-        qvel,
-    )
+        position, velocity = drawn
+        qpos = qpos if position is None else qpos + position
+        qvel = qvel if velocity is None else qvel + velocity
+    # Resolution comes last: noise and offset are rounded, as in an encoder.
+    if k.position_resolution is not None:
+        qpos = xp.rint(qpos / k.position_resolution) * k.position_resolution
+    if k.velocity_resolution is not None:
+        qvel = xp.rint(qvel / k.velocity_resolution) * k.velocity_resolution
+    state = ActuatorState(command, effort, positions, velocities, encoder, key, step)
+    return state, qpos, qvel
 
 
 def measurement_noise(

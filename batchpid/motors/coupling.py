@@ -85,38 +85,38 @@ class Coupling(NamedTuple):
         leaders = np.arange(joints)
         multipliers = np.ones(joints)
         offsets = np.zeros(joints)
-        direct = {follower.joint: follower for follower in followers}
-        # A chain of followers is multiplied out, down to its leader.
-        for joint in direct:
-            multiplier = 1.0
-            offset = 0.0
-            leader = joint
-            passed = set[int]()
-            while leader in direct:
-                if leader in passed:
-                    raise ValueError(f"joint {joint} follows itself")
-                passed.add(leader)
-                _, leader, factor, shift = direct[leader]
-                multiplier, offset = multiplier * factor, offset + multiplier * shift
-            leaders[joint] = leader
-            multipliers[joint] = multiplier
-            offsets[joint] = offset
-        independent = np.array([joint not in direct for joint in range(joints)], bool)
+        independent = np.ones(joints, bool)
+        for follower in followers:
+            leaders[follower.joint] = follower.leader
+            multipliers[follower.joint] = follower.multiplier
+            offsets[follower.joint] = follower.offset
+            independent[follower.joint] = False
+        # Chains of followers are multiplied out, one link of each at a time, down to their leaders.
+        direct = leaders, multipliers, offsets
+        for _ in range(joints):
+            if independent[leaders].all():
+                break
+            offsets = offsets + multipliers * direct[2][leaders]
+            multipliers = multipliers * direct[1][leaders]
+            leaders = direct[0][leaders]
+        else:
+            raise ValueError(f"joint {np.argmin(independent[leaders])} follows itself")
         # Sums over followers have a fixed order: the first of each leader, then the second.
-        of_leader = [
-            [item for item in sorted(direct) if leaders[item] == joint] for joint in range(joints)
-        ]
         shares = list[Share]()
-        for number in range(max(map(len, of_leader), default=0)):
-            exists = np.array([len(item) > number for item in of_leader])
-            chosen = np.array([item[number] if len(item) > number else 0 for item in of_leader])
-            shares.append(
-                Share(*map(read_only, (exists, chosen, np.where(exists, multipliers[chosen], 0.0))))
-            )
-        leaders, multipliers, offsets, independent = map(
-            read_only, (leaders, multipliers, offsets, independent)
-        )
-        return cls(leaders, multipliers, offsets, independent, tuple(shares))
+        counts = np.zeros(joints, int)
+        for joint in np.flatnonzero(~independent):
+            leader = leaders[joint]
+            if counts[leader] == len(shares):
+                shares.append(
+                    Share(np.zeros(joints, bool), np.zeros(joints, int), np.zeros(joints))
+                )
+            share = shares[counts[leader]]
+            counts[leader] += 1
+            share.exists[leader] = True
+            share.joint[leader] = joint
+            share.multiplier[leader] = multipliers[joint]
+        arrays = map(read_only, (leaders, multipliers, offsets, independent))
+        return cls._make((*arrays, tuple(Share(*map(read_only, share)) for share in shares)))
 
     @property
     def is_identity(self) -> bool:
@@ -218,10 +218,3 @@ class Coupling(NamedTuple):
         if self.is_identity:
             return {}
         return {"leader": self.leader.astype(np.int32), "multiplier": np.array(self.multiplier)}
-
-    def __repr__(self) -> str:
-        laws = [
-            f"q{i} = {self.multiplier[i]:g} q{self.leader[i]} + {self.offset[i]:g}"
-            for i in self.followers
-        ]
-        return f"Coupling({len(self.leader)} joints: {', '.join(laws) or 'no followers'})"

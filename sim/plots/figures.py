@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 FORMATS = (".png", ".svg")
 """Suffixes of the files that :func:`save` writes."""
-ENV = "#4c78a8"
-MEDIAN = "#16324f"
-SECOND = "#e45756"
+FIRST = ("#4c78a8", "#16324f")
+SECOND = ("#e45756", "#8c2226")
+"""Colours of a run's envs, and of their median."""
 SETPOINT = "#2f8f4e"
 LIMIT = "#b23a48"
 SMALL = 7.0
@@ -74,36 +74,7 @@ def step_responses(
     InvalidArgumentError
         The robot has no such joint.
     """
-    run = _blank_failed(rollout)
-    command = run.info.own_command
-    labels = []
-    if command is not None and not run.info.sets_positions:
-        labels = [f"setpoint {label}" for label in command.labels]
-    figure, chosen, blocks = _joint_axes([run], joints, 2, title, labels)
-    # Joints come first, entries of another command after them.
-    for joint, (above, below) in zip(chosen, blocks, strict=False):
-        _draw_limits(above, run.info.lower[joint], run.info.upper[joint])
-        _draw_line(above, run.time, run.setpoint[..., joint])
-        _draw_fan(above, run.time, run.qpos[..., joint])
-        _show_positions(above, [run], joint)
-        _draw_efforts(below, run, joint)
-    pose = run.tool_pose
-    if pose is not None:
-        # Of the two quaternions of an orientation, the one that is nearer to the setpoint's.
-        products = (pose[..., 3:] * rollout.setpoint[..., 3:7]).sum(-1, keepdims=True)
-        turned = np.where(
-            products < 0,
-            -pose[..., 3:],
-            pose[..., 3:],
-        )
-        pose = np.concatenate([pose[..., :3], turned], axis=-1)
-    for entry, (above, below) in enumerate(blocks[len(chosen) :]):
-        _draw_line(above, run.time, rollout.setpoint[..., entry])
-        if pose is not None and entry < pose.shape[-1]:
-            _draw_fan(above, run.time, pose[..., entry])
-        below.remove()
-    _add_legend(figure)
-    return figure
+    return _responses([rollout], [""], joints, title)
 
 
 def efforts(rollout: Rollout) -> Figure:
@@ -111,7 +82,7 @@ def efforts(rollout: Rollout) -> Figure:
     run = _blank_failed(rollout)
     figure, chosen, blocks = _joint_axes([run], (), 1)
     for joint, (axes,) in zip(chosen, blocks, strict=True):
-        _draw_efforts(axes, run, joint)
+        _draw_efforts(axes, [run], [""], joint)
     _add_legend(figure)
     return figure
 
@@ -137,8 +108,7 @@ def comparison(
     labels: tuple[str, str] = ("first", "second"),
     title: str = "",
 ) -> Figure:
-    """Draw median and 10 to 90 % of the envs of two runs of the same joints, positions above
-    efforts.
+    """Draw two runs of the same joints as :func:`step_responses`, over each other.
 
     Raises
     ------
@@ -150,17 +120,39 @@ def comparison(
         problem = f"has the joints {', '.join(second.info.joint_names)}"
         remedy = f"compare runs with the joints {', '.join(info.joint_names)}"
         raise InvalidArgumentError("second", problem, remedy=remedy)
-    runs = [_blank_failed(first), _blank_failed(second)]
-    figure, chosen, blocks = _joint_axes(runs, (), 2, title)
-    for joint, (above, below) in zip(chosen, blocks, strict=True):
-        for run, colour, label in zip(runs, (ENV, SECOND), labels, strict=True):
-            _draw_band(above, run.time, run.qpos[..., joint], colour, label)
-            _draw_band(below, run.time, run.effort[..., joint], colour, label)
-        _draw_limits(above, info.lower[joint], info.upper[joint])
-        _draw_line(above, first.time, runs[0].setpoint[..., joint])
-        _draw_limits(below, -info.effort_limit[joint], info.effort_limit[joint])
-        _show_positions(above, runs, joint)
-        _show_efforts(below, runs, joint)
+    return _responses([first, second], [f"{label}: " for label in labels], (), title)
+
+
+def _responses(
+    rollouts: Sequence[Rollout],
+    labels: Sequence[str],
+    joints: Sequence[str],
+    title: str,
+) -> Figure:
+    """Draw runs of the same joints, and setpoints and limits of the first."""
+    runs = [_blank_failed(rollout) for rollout in rollouts]
+    run = runs[0]
+    command = run.info.own_command
+    entries = []
+    if command is not None and not run.info.sets_positions:
+        entries = [f"setpoint {label}" for label in command.labels]
+    figure, chosen, blocks = _joint_axes(runs, joints, 2, title, entries)
+    # Joints come first, entries of another command after them.
+    for joint, (above, below) in zip(chosen, blocks, strict=False):
+        _draw_positions(above, runs, labels, joint)
+        _draw_efforts(below, runs, labels, joint)
+    pose = run.tool_pose
+    setpoint = rollouts[0].setpoint
+    if pose is not None:
+        # Of the two quaternions of an orientation, the one that is nearer to the setpoint's.
+        products = (pose[..., 3:] * setpoint[..., 3:7]).sum(-1, keepdims=True)
+        signs = np.where(products < 0, -1.0, 1.0)
+        pose = np.concatenate([pose[..., :3], signs * pose[..., 3:]], axis=-1)
+    for entry, (above, below) in enumerate(blocks[len(chosen) :]):
+        _draw_setpoint(above, run.time, setpoint[..., entry])
+        if pose is not None and entry < pose.shape[-1]:
+            _draw_fan(above, run.time, pose[..., entry])
+        below.remove()
     _add_legend(figure)
     return figure
 
@@ -196,20 +188,8 @@ def fit_errors(
     held_out = np.concatenate([time[~fitted] for time, fitted, *_ in fits])
     for joint, (axes,) in enumerate(blocks):
         axes.set_ylabel(units[joint], fontsize=SMALL)
-        axes.semilogy(
-            time,
-            before[:, joint],
-            color=SECOND,
-            lw=0.8,
-            label="before",
-        )
-        axes.semilogy(
-            time,
-            after[:, joint],
-            color=ENV,
-            lw=0.8,
-            label="after",
-        )
+        for label, errors, colour in (("before", before, SECOND[0]), ("after", after, FIRST[0])):
+            axes.semilogy(time, errors[:, joint], color=colour, lw=0.8, label=label)
         # Minor ticks and exponents as formulas take most of a second to lay out.
         axes.yaxis.set_major_locator(LogLocator(numticks=5))
         axes.yaxis.set_minor_locator(NullLocator())
@@ -327,68 +307,39 @@ def _add_legend(figure: Figure) -> None:
     )
 
 
-def _draw_fan(axes: Axes, time: Rows, values: Rows) -> None:
+def _draw_fan(
+    axes: Axes,
+    time: Rows,
+    values: Rows,
+    label: str = "",
+    colours: tuple[str, str] = FIRST,
+) -> None:
     """Draw each env of ``values`` (ticks, envs) as a thin line, their median as a bold one."""
     lines = [np.stack([time, value], axis=1) for value in values.T]
     # As one bitmap: an SVG of 64 envs by 9 joints would hold half a million points.
     fan = LineCollection(
         lines,
-        colors=ENV,
+        colors=colours[0],
         linewidths=0.6,
         alpha=min(0.9, max(0.08, 12.0 / len(lines))),
         rasterized=True,
-        label="each env",
+        label=f"{label}each env",
     )
     axes.add_collection(fan, autolim=False)
-    (median,) = _quantiles(values, 0.5)
-    axes.plot(
-        time,
-        median,
-        color=MEDIAN,
-        lw=1.5,
-        label="median",
-    )
+    # Infinity counts as missing: a median of two of them would be NaN with a warning.
+    finite = np.where(np.isfinite(values), values, np.nan)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "All-NaN slice")
+        median = np.nanmedian(finite, axis=1)
+    axes.plot(time, median, color=colours[1], lw=1.5, label=f"{label}median")
 
 
-def _draw_band(
-    axes: Axes,
-    time: Rows,
-    values: Rows,
-    colour: str,
-    label: str,
-) -> None:
-    """Draw the median of the envs as a line, and 10 to 90 % of them as a band."""
-    low, median, high = _quantiles(values, 0.1, 0.5, 0.9)
-    axes.fill_between(
-        time,
-        low,
-        high,
-        color=colour,
-        alpha=0.2,
-        lw=0,
-    )
-    axes.plot(
-        time,
-        median,
-        color=colour,
-        lw=1.4,
-        label=f"{label}: median, 10 to 90 %",
-    )
-
-
-def _draw_line(axes: Axes, time: Rows, values: Rows) -> None:
+def _draw_setpoint(axes: Axes, time: Rows, values: Rows) -> None:
     """Draw one number of the setpoints (ticks, envs), as one line where all envs share it."""
     if (values == values[:, :1]).all():
         values = values[:, :1]
     shown = np.where(np.isfinite(values), values, np.nan)
-    lines = axes.plot(
-        time,
-        shown,
-        color=SETPOINT,
-        lw=1.1,
-        ls="--",
-        zorder=3,
-    )
+    lines = axes.plot(time, shown, color=SETPOINT, lw=1.1, ls="--", zorder=3)
     # One label for all lines: a legend names the setpoint once.
     lines[0].set_label("setpoint")
 
@@ -406,49 +357,62 @@ def _draw_limits(axes: Axes, low: float, high: float) -> None:
             )
 
 
-def _draw_efforts(axes: Axes, run: Rollout, joint: int) -> None:
-    """Draw the efforts against their limit, with their peak and the share of saturated samples."""
-    values = run.effort[..., joint]
-    limit = float(run.info.effort_limit[joint])
+def _draw_positions(
+    axes: Axes,
+    runs: Sequence[Rollout],
+    labels: Sequence[str],
+    joint: int,
+) -> None:
+    """Draw positions, and setpoints and limits of the first run. The axes hold all of them, but no
+    positions more than 15 % beyond the limits.
+    """
+    info = runs[0].info
+    low = info.lower[joint]
+    high = info.upper[joint]
+    setpoint = runs[0].setpoint[..., joint]
+    _draw_limits(axes, low, high)
+    _draw_setpoint(axes, runs[0].time, setpoint)
+    margin = 0.15 * (high - low)
+    # Setpoints outside the limits are worth seeing, a run that diverges is not.
+    far = np.append(_finite(setpoint), [low - margin, high + margin])
+    shown = [_finite(setpoint)]
+    for run, label, colours in zip(runs, labels, (FIRST, SECOND), strict=False):
+        values = run.qpos[..., joint]
+        _draw_fan(axes, run.time, values, label, colours)
+        shown.append(np.clip(_finite(values), far.min(), far.max()))
+    _show(axes, np.concatenate(shown), info.units[joint])
+
+
+def _draw_efforts(
+    axes: Axes,
+    runs: Sequence[Rollout],
+    labels: Sequence[str],
+    joint: int,
+) -> None:
+    """Draw efforts against the limit of the first run, with their peak and its share of saturated
+    samples.
+    """
+    info = runs[0].info
+    limit = float(info.effort_limit[joint])
     _draw_limits(axes, -limit, limit)
-    _draw_fan(axes, run.time, values)
-    _show_efforts(axes, [run], joint)
-    peak = np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
-    share = run.saturated[..., joint].mean()
-    text = f"peak {peak:.3g} of ±{limit:g} {axes.get_ylabel()}, saturated {share:.0%}"
+    for run, label, colours in zip(runs, labels, (FIRST, SECOND), strict=False):
+        _draw_fan(axes, run.time, run.effort[..., joint], label, colours)
+    values = np.concatenate([_finite(run.effort[..., joint]) for run in runs])
+    peak = np.abs(values).max(initial=0.0)
+    # A limit far away would flatten the curve.
+    ends = [limit, -limit] if peak > 0.2 * limit else []
+    unit = OBSERVED["effort"].unit_for(info.units[joint])
+    _show(axes, np.concatenate([values, [0.0], ends]), unit)
+    share = np.mean([run.saturated[..., joint].mean() for run in runs])
     axes.text(
         1,
         1,
-        text,
+        f"peak {peak:.3g} of ±{limit:g} {unit}, saturated {share:.0%}",
         transform=axes.transAxes,
         ha="right",
         va="bottom",
         fontsize=6.5,
     )
-
-
-def _show_positions(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
-    """Show all positions and the first run's setpoints, but no more than 15 % beyond the limits."""
-    info = runs[0].info
-    low = info.lower[joint]
-    high = info.upper[joint]
-    margin = 0.15 * (high - low)
-    setpoints = _finite(runs[0].setpoint[..., joint])
-    # Setpoints outside the limits are worth seeing, a run that diverges is not.
-    far = np.append(setpoints, [low - margin, high + margin])
-    positions = [np.clip(_finite(run.qpos[..., joint]), far.min(), far.max()) for run in runs]
-    _show(axes, np.concatenate([setpoints, *positions]), info.units[joint])
-
-
-def _show_efforts(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
-    """Show all efforts, and the limit of the first run unless it is more than five times as far."""
-    info = runs[0].info
-    values = np.concatenate([_finite(run.effort[..., joint]) for run in runs])
-    limit = float(info.effort_limit[joint])
-    # A limit far away would flatten the curve.
-    if np.abs(values).max(initial=0.0) > 0.2 * limit:
-        values = np.append(values, [limit, -limit])
-    _show(axes, np.append(values, 0.0), OBSERVED["effort"].unit_for(info.units[joint]))
 
 
 def _show(axes: Axes, values: Rows, unit: str) -> None:
@@ -465,17 +429,6 @@ def _show(axes: Axes, values: Rows, unit: str) -> None:
 def _finite(values: Rows) -> Rows:
     """Return the finite values, in one row."""
     return values[np.isfinite(values)]
-
-
-def _quantiles(values: Rows, *at: float) -> Rows:
-    """Return quantiles over the finite envs of ``values`` (ticks, envs), (len(at), ticks); NaN
-    without finite envs.
-    """
-    # Infinity counts as missing: a median of two of them would be NaN with a warning.
-    finite = np.where(np.isfinite(values), values, np.nan)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "All-NaN slice")
-        return np.nanquantile(finite, at, axis=1)
 
 
 def _blank_failed(rollout: Rollout) -> Rollout:

@@ -107,11 +107,3 @@ def test_the_identity_returns_its_arguments():
 def test_a_loop_of_followers_is_refused():
     with pytest.raises(ValueError, match="follows itself"):
         Coupling.of(3, [Follower(0, 1), Follower(1, 0)])
-
-
-def test_repr_shows_the_laws():
-    assert repr(Coupling.of(2)) == "Coupling(2 joints: no followers)"
-    assert (
-        repr(Coupling.of(2, [Follower(1, 0, -0.5, 0.1)]))
-        == "Coupling(2 joints: q1 = -0.5 q0 + 0.1)"
-    )

@@ -75,7 +75,7 @@ def test_values_do_not_run_into_each_other():
     "value", [object(), len, np.array([object()]), np.zeros(2, "f8, f4"), np.longdouble(1), int]
 )
 def test_what_may_hide_content_is_refused(value):
-    with pytest.raises(bp.InvalidArgumentError, match=r"values\[0\]\['k'\]\[1\].*no digest"):
+    with pytest.raises(bp.InvalidArgumentError, match="no digest"):
         digest({"k": [1, value]})
 
 

@@ -41,9 +41,12 @@ from batchpid.sim import (
 )
 from batchpid.sim.options.options import OPTIONS
 
-N, TICKS, SPLIT, FAILING = 5, 5, 3, 2
+N, TICKS, SPLIT, FAILING = 5, 5, 3, 3
 """Envs and ticks of the program, ticks before its snapshot, and the env that fails."""
-RESET = np.arange(N) % 2 == 0
+RESET = np.arange(N) > 2
+"""Envs of the reset: none of the first worker, and a part of the first group in this process."""
+COPIES = [1, 1, 4, 1, 0]
+"""Envs of a snapshot that is restored with other ones."""
 ENGINES = ("sapien", "mujoco")
 pytestmark = [
     pytest.mark.usefixtures("small_groups"),
@@ -352,7 +355,8 @@ def program(runner, case, rollout=None, disturb=None):
     rollout = rollout or (lambda runner, given: runner.rollout(**given))
     given = commands(case, runner)
     first = rollout(runner, part(given, slice(SPLIT)))
-    placed = runner.reset(mask=RESET[: runner.num_envs])
+    assert_identical(runner.reset(mask=np.zeros(runner.num_envs, bool)), runner.observe())
+    placed = runner.reset(mask=RESET[-runner.num_envs :])
     snapshot = runner.snapshot()
     if disturb is not None:
         disturb(runner)
@@ -429,7 +433,7 @@ def in_python(case):
 def in_numpy(case):
     """The NumPy executor, with mass matrices and passive forces from native code: bit-identical."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("batchpid.sim.loop.env_group.runs_natively", lambda setup: False)
+        patch.setattr("batchpid.sim.loop.native_executor.runs_natively", lambda setup: False)
         with make(case) as runner:
             check_equal(program(runner, case), reference(case))
 
@@ -474,17 +478,23 @@ def alone(case):
 
 
 def restored(case):
-    """Another runner continues from the file of a snapshot, bit-identically."""
+    """Another runner continues from the file of a snapshot, bit-identically, and so does each of
+    several copies of an env.
+    """
     expected = reference(case)
     with make(case) as runner, tempfile.TemporaryDirectory() as folder:
         expected.snapshot.save(path := f"{folder}/half.npz")
         given = commands(case, runner)
         runner.rollout(**part(given, slice(2)))
-        runner.restore(Snapshot.load(path))
+        snapshot = Snapshot.load(path)
+        runner.restore(snapshot)
         second, end, *_, poses = second_half(
             runner, given, lambda runner, given: runner.rollout(**given)
         )
+        runner.restore(snapshot.for_envs(COPIES))
+        copies = runner.rollout(**{name: rows[SPLIT:, COPIES] for name, rows in given.items()})
     check_equal(expected._replace(second=second, end=end, poses=poses), expected)
+    assert_identical(copies, second.for_envs(COPIES), skip={"time"})
 
 
 def recorded(case):

@@ -137,7 +137,7 @@ def test_comparison_takes_runs_of_other_lengths_but_not_of_other_joints():
     figure = plots.comparison(make(1), make(1, ticks=2 * TICKS, envs=2), labels=("run", "other"))
     assert all(axes.get_xlim()[1] == pytest.approx(0.6) for axes in figure.axes)
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert legend[:2] == ["run: median, 10 to 90 %", "other: median, 10 to 90 %"]
+    assert {"run: each env", "run: median", "other: median"} <= {*legend}
     with pytest.raises(InvalidArgumentError, match="joint1"):
         plots.comparison(make(1), make(2))
 
