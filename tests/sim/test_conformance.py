@@ -446,7 +446,7 @@ def in_python(case):
 def in_numpy(case):
     """The NumPy executor, with mass matrices and passive forces from native code: bit-identical."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("batchpid.sim.loop.env_group.runs_natively", lambda setup: False)
+        patch.setattr("batchpid.sim.loop.native_executor.runs_natively", lambda setup: False)
         with make(case) as runner:
             check_equal(program(runner, case), reference(case))
 
