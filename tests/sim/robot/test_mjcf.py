@@ -2,8 +2,6 @@
 a finding.
 """
 
-from __future__ import annotations
-
 import random
 import re
 from contextlib import suppress
