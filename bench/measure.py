@@ -35,7 +35,7 @@ from batchpid.sim import Robot
 from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.engine import native
 from batchpid.sim.engine.protocol import EnginePack, load_engine
-from batchpid.sim.loop import env_group
+from batchpid.sim.loop import native_executor
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options.options import RunnerOptions
@@ -156,7 +156,7 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     options = RunnerOptions(robot, share, engine="sapien", physics=workload.physics, params=params)
     shared = SharedArrays(Arrays.layout(options, 1, share))
     # In NumPy, with a call for each phase.
-    with patch.object(env_group, "runs_natively", return_value=False):
+    with patch.object(native_executor, "runs_natively", return_value=False):
         loop = Loop(options, slice(0, share), shared.arrays)
     for group in loop.groups:
         group._executor._is_native = False

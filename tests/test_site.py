@@ -5,10 +5,8 @@ target.
 import importlib.util
 import re
 import sys
-import warnings
 from pathlib import Path
 from types import ModuleType
-from urllib.parse import unquote
 
 import pytest
 
@@ -55,35 +53,6 @@ def places(package, name):
 def test_every_public_name_is_in_the_reference(package):
     names = importlib.import_module(package).__all__
     assert [name for name in names if not places(package, name) & REFERENCE] == []
-
-
-@pytest.mark.slow
-def test_every_link_of_the_site_has_a_target(tmp_path, monkeypatch):
-    pytest.importorskip("mkdocs")
-    pytest.importorskip("material")
-    from mkdocs.commands.build import build
-    from mkdocs.config import load_config
-
-    monkeypatch.setenv("NO_MKDOCS_2_WARNING", "1")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        # Without the plugin that reads docstrings, which takes a quarter of a minute.
-        config = load_config(
-            str(ROOT / "mkdocs.yml"), plugins=["search"], site_dir=str(tmp_path), strict=True
-        )
-        build(config)
-    pages = list(tmp_path.rglob("*.html"))
-    assert len(pages) > 20
-    dead = {
-        (str(page.relative_to(tmp_path)), link)
-        for page in pages
-        if page.name != "404.html"
-        for link in re.findall(r'(?:href|src)="([^"#?]+)', page.read_text())
-        if not re.match(r"\w+:|//|/|_mkdocstrings", link)
-        and not (page.parent / unquote(link)).exists()
-    }
-    assert dead == set()
-    assert 'href="SECURITY.html"' in (tmp_path / "view.html").read_text()
 
 
 def test_the_docs_are_built_with_their_warnings():

@@ -90,9 +90,13 @@ class Inertia(Stage):
         parts = zip(
             (*self.friction, self.armature), (*before.friction, before.armature), strict=True
         )
-        if all(np.array_equal(new, old) for new, old in parts):
-            return state
-        return state._replace(age=np.full_like(state.age, REFRESH_STEPS))
+        # An env does not depend on others that have been drawn anew.
+        changed = sum(
+            np.not_equal(0.0 if new is None else new, 0.0 if old is None else old)
+            for new, old in parts
+        )
+        is_due = np.broadcast_to(changed, state.gain.shape).any(1)
+        return state._replace(age=np.where(is_due, REFRESH_STEPS, state.age))
 
     def bind(self, program: Any, state: InertiaState, values: Values) -> Values:
         program.use(refresh=program.model.refresh)

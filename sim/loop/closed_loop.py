@@ -304,11 +304,9 @@ def closed_loop(
         checked,
         checked.params,
         actuators,
-        scene.joints,
         friction,
         slice(0, num_envs),
         controller,
-        scene.dissipation == "urdf",
     )
     tree = robot.kinematic_tree(armature=np.zeros(robot.dof)).held
     if plant is None:

@@ -16,17 +16,16 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.arrays.elementwise import clip
 from batchpid.arrays.trees import flatten, leaves, structure, unflatten
-from batchpid.sim.loop.array_executors import JAXExecutor, NumPyExecutor
+from batchpid.sim.loop.array_executors import NumPyExecutor
 from batchpid.sim.loop.arrays import Arrays, Snapshot
 from batchpid.sim.loop.env_parts import OwnController, Pushes, make_pack, variation
 from batchpid.sim.loop.faults import FaultContainment, are_finite, is_near
 from batchpid.sim.loop.group_control import GroupControl
-from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks, runs_natively
+from batchpid.sim.loop.native_executor import NativeExecutor, make_executor, run_ticks
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
 from batchpid.sim.signals import untouched
-from batchpid.stages.stage import States, adopted, by_name, placed, started
-from batchpid.stages.values import Command, Measured, Values
+from batchpid.stages.stage import adopted, by_name, placed, started
 
 
 class EnvGroup:
@@ -52,6 +51,8 @@ class EnvGroup:
     steps
         Sim steps before the run.
     """
+
+    _executor: NumPyExecutor | NativeExecutor
 
     def __init__(
         self,
@@ -80,7 +81,7 @@ class EnvGroup:
         actuators = options.actuators
         self._actuators = None if actuators is None else actuators.for_envs(envs)
         self._draws: Draws | None = None
-        self._faults = FaultContainment(size, self.pack.dof, options.on_fault)
+        self._faults = FaultContainment(size, options)
         self._pushes = Pushes(options, size)
         self._episode = np.zeros(size, np.int64)
         # Results of the last sim step, which outlive executors: native code writes them in each tick.
@@ -100,7 +101,7 @@ class EnvGroup:
         self._observes_natively = is_read and not needs_python
         if actuators is not None:
             self._write_joints()
-        self._start_control()
+        self._make_control(goes_on=False)
 
     def _acting(self) -> tuple[bp.PIDParams, bp.Actuators | None]:
         """Return params and actuators with the draws of the randomization."""
@@ -111,75 +112,40 @@ class EnvGroup:
             actuators = randomization.randomized("actuators", actuators, self._draws, robot)
         return params, actuators
 
-    def _setup(self) -> GroupControl:
-        """Return the control of the present robots, params and actuators."""
-        return GroupControl.of(self._options, self.pack, *self._acting(), self._controller)
-
-    def _values(self, setup: GroupControl) -> Values:
-        """Return the values in which stages start, at the present state of the robots."""
-        pack, control = self.pack, setup.control
-        passive = None
-        if control.gravity:
-            passive = pack.passive_force(True, control.coriolis)
-        measured = Measured(pack.read_qpos(), pack.read_qvel(), passive)
-        model = setup.model._replace(episode=self._episode)
-        return Values(Command(None), measured, measured, control.timestep, model=model)
-
-    def _start_control(self) -> None:
-        """Start the control of the present robots, params and actuators."""
-        setup = self._setup()
-        self._prepare(setup, started(setup.stages, self._values(setup)))
-
-    def _adopt(self) -> None:
-        """Make the stages of the present robots, params and actuators, which go on from the states
-        so far.
+    def _make_control(self, goes_on: bool = True) -> None:
+        """Make the control of the present robots, params and actuators, with its executor. It goes
+        on from the states so far, or starts.
         """
-        executor = self._executor
-        before = executor.setup
-        states = executor.read_state()
-        pairs = {
-            stage.name: (stage, state) for stage, state in zip(before.stages, states, strict=True)
-        }
-        setup = self._setup()
-        # New motors begin the streams of their noise again.
-        if setup.control.has_motors and not before.control.has_motors:
-            self._episode[:] = 0
-        self._prepare(setup, adopted(setup.stages, pairs, self._values(setup)))
-
-    def _prepare(self, setup: GroupControl, states: States) -> None:
-        """Make the executor, which goes on from the states, and set the engine's drives."""
-        # Native wherever the engine has native steps, under backend "numpy" too: the bits are the
-        # same.
-        self._executor: NumPyExecutor | NativeExecutor
-        if self._options.backend == "jax":
-            self._executor = JAXExecutor(setup, states)
-        elif self.pack.steps_natively and runs_natively(setup):
-            self._executor = NativeExecutor(
-                setup, states, self._arrays, self._shown, self._faults.rows
-            )
+        setup = GroupControl.of(self._options, self.pack, *self._acting(), self._controller)
+        stages, control = setup.stages, setup.control
+        if goes_on:
+            executor = self._executor
+            before = executor.setup
+            # New motors begin the streams of their noise again.
+            if control.has_motors and not before.control.has_motors:
+                self._episode[:] = 0
+            pairs = zip(before.stages, executor.read_state(), strict=True)
+            by_names = {stage.name: (stage, state) for stage, state in pairs}
+            states = adopted(stages, by_names, setup.values(self._episode))
         else:
-            self._executor = NumPyExecutor(setup, states)
-        control = setup.control
-        if control.mode == "drive":
-            damping, stiffness = control.drive
-            limit = control.params.effort_max
-            if limit is None:
-                limit = np.full_like(stiffness, np.inf)
-            self.pack.write_drive(stiffness, damping, limit)
+            states = started(stages, setup.values(self._episode))
+        tables = self._arrays, self._shown, self._faults.rows
+        self._executor = make_executor(setup, states, *tables)
+        setup.write_drives()
 
     # -- changes between ticks
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state carries on."""
         self._params = params
-        self._adopt()
+        self._make_control()
 
     def set_actuators(self, actuators: bp.Actuators | None) -> None:
         """Change the actuators in flight; their state carries on."""
         before, self._actuators = self._actuators, actuators
         if actuators is not None or before is not None:
             self._write_joints()
-            self._adopt()
+            self._make_control()
 
     def add_chunk(self, chunk: Float64, latency: Float64) -> None:
         """Add a chunk (M, rows, dof) that is ``latency`` (M,) [s] old to the plan."""
@@ -210,32 +176,15 @@ class EnvGroup:
         """
         self._draws = draws
         if mask.any():
-            self._faults.clear(mask)
+            faults = self._faults
+            faults.clear(mask)
             self._vary(mask, draws)
-            self._restart(mask, qpos, qvel, base)
+            wrong = faults.take_starts(mask, qpos, qvel, base)
+            self._place(mask, faults.start_qpos, faults.start_qvel)
+            for cause, entries in wrong.items():
+                faults.fail(entries, cause, self.steps, faults.start_qpos)
+            self._place_failed()
         self.observe(self._at(0))
-
-    def _restart(
-        self,
-        mask: NDArray[np.bool_],
-        qpos: Float64,
-        qvel: Float64,
-        base: Float64 | None,
-    ) -> None:
-        faults = self._faults
-        bad = {
-            cause: mask[:, None] & ~np.isfinite(rows)
-            for cause, rows in (("qpos", qpos), ("qvel", qvel))
-        }
-        # An env with a start that is not finite keeps its last one, and fails there.
-        good = mask & ~(bad["qpos"] | bad["qvel"]).any(1)
-        faults.start_qpos[good], faults.start_qvel[good] = qpos[good], qvel[good]
-        if base is not None:
-            faults.start_base[good] = base[good]
-        self._place(mask, faults.start_qpos, faults.start_qvel)
-        for cause, entries in bad.items():
-            faults.fail(entries, cause, self.steps, faults.start_qpos)
-        self._place_failed()
 
     def _vary(self, mask: NDArray[np.bool_], draws: Draws) -> None:
         """Put the draws of the envs of ``mask`` (M,) into effect, before these envs are placed."""
@@ -247,7 +196,7 @@ class EnvGroup:
         if randomization.changes_robot:
             self.pack.vary(rows, variation(self._options, len(rows), draws.for_envs(rows)))
         self._write_joints(rows)
-        self._adopt()
+        self._make_control()
 
     # -- ticks
 
@@ -310,7 +259,8 @@ class EnvGroup:
             if self._sensed:
                 self.pack.take_sensed()  # those of the ticks before
             if self._faults.suspended.any() or not are_finite(*command):
-                command = self._without_faults(command, before + 1)
+                command = self._faults.contained(command, before + 1, executor.measured.qpos)
+                self._place_failed()
         # An event may come at each sim step, the last one included.
         while True:
             if done == substeps:
@@ -427,7 +377,7 @@ class EnvGroup:
         self.pack.suspend(self._faults.suspended)
         self.pack.write_qf(self._shown["effort"])
         if not stays:
-            self._start_control()
+            self._make_control(goes_on=False)
         executor = self._executor
         executor.failed = False
         executor.measure()
@@ -459,32 +409,11 @@ class EnvGroup:
         self._faults.fail_state(self.pack, step, before, returned, limit)
         self._place_failed()
 
-    def _without_faults(self, command: Command, step: int) -> Command:
-        """Mark the envs with non-finite commands as failed in sim step ``step``; return commands
-        with neutral values for all failed envs.
-        """
-        faults, options = self._faults, self._options
-        for cause, rows in command._asdict().items():
-            faults.fail(~np.isfinite(rows), cause, step, self._executor.measured.qpos)
-        self._place_failed()
-        setpoint = (
-            self._executor.measured.qpos if options.sets_positions else options.command.neutral
-        )
-        failed = faults.failed[:, None]
-        neutral = Command(setpoint, 0.0, 0.0, 0.0)
-        return Command(*map(np.where, [failed] * len(neutral), neutral, command))
-
     def _place_failed(self) -> None:
         """Place the envs that have failed since the last call: suspended, or at their start."""
-        faults = self._faults
-        failed = faults.pop_unplaced()
-        if not failed.any():
-            return
-        qpos, qvel = faults.start_qpos, faults.start_qvel
-        if faults.suspends:
-            qpos = faults.suspended_qpos
-            qvel = np.zeros_like(qvel)
-        self._place(failed, qpos, qvel)
+        failed = self._faults.pop_unplaced()
+        if failed.any():
+            self._place(failed, *self._faults.places())
 
     def _place(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64) -> None:
         """Place the envs of ``mask`` (M,), and restart their control."""
@@ -502,7 +431,7 @@ class EnvGroup:
         executor.measure()
         if setup.control.has_motors:
             self._episode[mask] += 1
-        states = placed(setup.stages, executor.read_state(), self._values(setup), mask)
+        states = placed(setup.stages, executor.read_state(), setup.values(self._episode), mask)
         executor.write_state(states)
 
 

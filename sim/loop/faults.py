@@ -17,7 +17,8 @@ from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST, EnginePack
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
-from batchpid.sim.options.groups import FaultAction
+from batchpid.sim.options.options import RunnerOptions
+from batchpid.stages.values import Command
 
 CAUSES = (
     "state",
@@ -105,10 +106,13 @@ class FaultContainment:
         Last faults (M,).
     """
 
-    def __init__(self, size: int, dof: int, action: FaultAction) -> None:
-        self.suspends = action == "hold"
+    def __init__(self, size: int, options: RunnerOptions) -> None:
+        self._options = options
+        self.suspends = options.on_fault == "hold"
         self.suspended, self.failed, self._unplaced = (np.zeros(size, bool) for _ in range(3))
-        self.start_qpos, self.start_qvel, self.suspended_qpos = np.zeros((3, size, dof))
+        self.start_qpos, self.start_qvel, self.suspended_qpos = np.zeros(
+            (3, size, options.robot.dof)
+        )
         self.start_base = np.tile(BASE_AT_REST, (size, 1))
         self.rows = FaultArrays(np.full(size, NO_STEP), *np.zeros((2, size), int))
 
@@ -121,6 +125,46 @@ class FaultContainment:
         """Clear the faults of the envs of ``mask`` (M,), which are reset."""
         self.suspended[mask] = self.failed[mask] = False
         self.rows.step[mask] = NO_STEP
+
+    def take_starts(
+        self,
+        mask: Bool,
+        qpos: Float64,
+        qvel: Float64,
+        base: Float64 | None,
+    ) -> dict[str, Bool]:
+        """Take the states (M, ...) to which the envs of ``mask`` (M,) are reset; return the entries
+        that are not finite, by cause. An env with such an entry keeps its last start.
+        """
+        causes = {"qpos": qpos, "qvel": qvel}
+        wrong: dict[str, Bool] = {
+            cause: mask[:, None] & ~np.isfinite(rows) for cause, rows in causes.items()
+        }
+        good = mask & ~(wrong["qpos"] | wrong["qvel"]).any(1)
+        self.start_qpos[good], self.start_qvel[good] = qpos[good], qvel[good]
+        if base is not None:
+            self.start_base[good] = base[good]
+        return wrong
+
+    def contained(self, command: Command, step: int, qpos: Float64) -> Command:
+        """Record a fault in sim step ``step`` of the envs whose commands are not finite; return the
+        command with neutral values for all failed envs, which are at ``qpos`` (M, dof).
+        """
+        for cause, rows in command._asdict().items():
+            self.fail(~np.isfinite(rows), cause, step, qpos)
+        options = self._options
+        setpoint = qpos if options.sets_positions else options.command.neutral
+        neutral = Command(setpoint, 0.0, 0.0, 0.0)
+        failed = self.failed[:, None]
+        return Command(*map(np.where, [failed] * len(neutral), neutral, command))
+
+    def places(self) -> tuple[Float64, Float64]:
+        """Return positions and velocities (M, dof) in which failed envs go on: suspended, or at
+        their start.
+        """
+        if self.suspends:
+            return self.suspended_qpos, np.zeros_like(self.start_qvel)
+        return self.start_qpos, self.start_qvel
 
     def fail(
         self,

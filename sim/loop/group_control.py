@@ -7,7 +7,6 @@ are, for every executor alike, since NumPy's results differ in the last bits.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -21,7 +20,6 @@ from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
 from batchpid.motors.friction import Friction
 from batchpid.native.extensions import MOST_SUMMED
 from batchpid.sim.description.merging import coupling_of
-from batchpid.sim.description.tables import Joint
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import EnginePack
@@ -57,19 +55,39 @@ class GroupControl(NamedTuple):
 
         ``params`` and ``actuators`` include the draws of the randomization.
         """
-        scene = pack.spec
         first = pack.first_env - options.first_env
+        envs = slice(first, first + pack.size)
         control = control_of(
             options,
             params,
             actuators,
-            scene.joints,
             pack.friction,
-            slice(first, first + pack.size),
+            envs,
             controller,
-            scene.dissipation == "urdf",
         )
         return cls(options, pack, control, stages_of(control), model_functions(pack, control))
+
+    def values(self, episode: Array) -> Values:
+        """Return the values in which stages start, at the present state of the robots, in their
+        ``episode`` (M,).
+        """
+        pack, control = self.pack, self.control
+        passive = None
+        if control.gravity:
+            passive = pack.passive_force(True, control.coriolis)
+        measured = Measured(pack.read_qpos(), pack.read_qvel(), passive)
+        model = self.model._replace(episode=episode)
+        return Values(Command(None), measured, measured, control.timestep, model=model)
+
+    def write_drives(self) -> None:
+        """Set the engine's drives, if the control has some."""
+        control = self.control
+        if control.mode == "drive":
+            damping, stiffness = control.drive
+            limit = control.params.effort_max
+            if limit is None:
+                limit = np.full_like(stiffness, np.inf)
+            self.pack.write_drive(stiffness, damping, limit)
 
     @property
     def moves_drives(self) -> bool:
@@ -88,17 +106,14 @@ def control_of(
     options: RunnerOptions,
     params: bp.PIDParams,
     actuators: bp.Actuators | None,
-    joints: Sequence[Joint],
     friction: Friction,
     envs: slice,
     controller: Any,
-    share: float = 1.0,
 ) -> Control:
-    """Return the control of the envs ``envs`` of a runner.
-
-    ``friction`` is that of the joints, and ``share`` the part of the description's friction that
-    engine and law know.
-    """
+    """Return the control of the envs ``envs`` of a runner. ``friction`` is that of the joints."""
+    joints = options.scene.joints
+    # With SAPIEN's own dissipation, engine and law do not know the description's friction.
+    share = float(options.scene.dissipation == "urdf")
     compensated = options.compensate.split("+")
     described = known_joints(options.robot)
     turns = np.array([joint.continuous / TURN for joint in joints])
@@ -114,7 +129,7 @@ def control_of(
     return Control(
         timestep=options.timestep,
         envs=envs.stop - envs.start,
-        coupling=coupling_of(tuple(joints)),
+        coupling=coupling_of(joints),
         params=params,
         mode=options.control if isinstance(options.control, str) else "custom",
         controller=controller,
@@ -157,22 +172,20 @@ def empty_control(
 
     ``params`` and ``actuators`` include the draws of the randomization.
     """
-    joints = options.robot.joints
-    rows = np.zeros((options.num_envs, len(joints)))
+    rows = np.zeros((options.num_envs, options.robot.dof))
     controller = None if isinstance(options.control, str) else OwnController(options)
     stiction = options.has_stiction(actuators)
     control = control_of(
         options,
         params,
         actuators,
-        joints,
         Friction(coulomb=rows if stiction else None),
         slice(0, options.num_envs),
         controller,
     )
     stages = stages_of(control)
     model = Model(
-        joint_mass_matrix=lambda qpos: np.eye(len(joints)) + 0.0 * qpos[:, :, None],
+        joint_mass_matrix=lambda qpos: np.eye(rows.shape[1]) + 0.0 * qpos[:, :, None],
         load=lambda: rows,
     )
     measured = Measured(rows, rows, rows)

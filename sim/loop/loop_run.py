@@ -17,11 +17,11 @@ from batchpid.sim.engine.native import WIDTH, structure
 from batchpid.sim.engine.native_model import NativeModel, aligned, table
 from batchpid.sim.loop.closed_loop import ClosedLoop, LoopState
 from batchpid.sim.loop.group_control import GroupControl, model_functions
-from batchpid.sim.loop.native_executor import Buffers, TickProgram
+from batchpid.sim.loop.native_executor import TickProgram
 from batchpid.sim.loop.tree_plant import IMPEDANCE
 from batchpid.stages import stages_of
 from batchpid.stages.stage import by_name, started
-from batchpid.stages.values import Command, Measured, Step, Values
+from batchpid.stages.values import Command, Measured, Model, Step, Values
 
 
 class LoopRun:
@@ -68,13 +68,13 @@ class LoopRun:
         self._program = None
         if lanes is not None:
             setup: Any = GroupControl(None, lanes, loop.control, stages, values.model)  # type: ignore[arg-type]
-            buffers = Buffers(states, command, values.measured, np.zeros_like(qpos))
+            values = values._replace(model=Model(), step=Step(0, 1, np.zeros(())))
             self._program = TickProgram(
                 setup,
-                buffers,
+                states,
+                values,
+                np.zeros_like(qpos),
                 self._copies,
-                (),
-                False,
                 False,
             )
             lanes.prepare(self._program)
@@ -97,7 +97,7 @@ class LoopRun:
 
     def _copies(self, program: TickProgram) -> list[tuple[Rows, Rows]]:
         """Return the copies between the tables and the arrays of a sim step."""
-        _, command, measured, _ = program.buffers
+        command, measured, *_ = program.values
         # Bytes are copied as they are, numbers of observations in single precision.
         rows = [
             (self.qpos.view(np.bool_), measured.qpos.view(np.bool_)),

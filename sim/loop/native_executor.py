@@ -9,38 +9,29 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import DType, Pytree, Rows
+from batchpid.arrays.array_types import Pytree, Rows
 from batchpid.arrays.trees import leaves, mapped
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import number, structure
-from batchpid.sim.loop.array_executors import COUPLING_STEPS, Executor
+from batchpid.sim.loop.array_executors import COUPLING_STEPS, Executor, JAXExecutor, NumPyExecutor
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.loop.group_control import GroupControl, native_obstacle
 from batchpid.stages.stage import States, bind_stages, recalled, running
 from batchpid.stages.values import Command, Measured, Outputs, Step, Values
 
 
-class Buffers(NamedTuple):
-    """Arrays that native code reads and writes in each sim step."""
-
-    states: States
-    command: Command
-    measured: Measured
-    before: Rows
-    """Positions before the last sim step (M, dof)."""
-
-
 class TickProgram:
-    """Stages and arrays of the ticks of a group.
+    """Stages and arrays of the ticks of a group, whose native code changes the ``states`` in place.
 
-    ``copies`` returns the copies before and after each tick, between tables (ticks, M, ...) and
-    arrays of a sim step: commands are tables of float64. ``reads_force`` says whether the engine's
-    sim step reads the passive force, ``moves`` whether joint setpoints move within a tick, and
-    ``noise`` is that of positions and velocities in a sim step.
+    ``values`` are those of a sim step before its stages, without a model, and ``before`` the
+    positions before the last sim step (M, dof): arrays that native code writes in each sim step.
+    Setpoints move within a tick where ``values`` have their rates. ``copies`` returns the copies
+    before and after each tick, between tables (ticks, M, ...) and arrays of a sim step: commands are
+    tables of float64. ``reads_force`` says whether the engine's sim step reads the passive force.
 
     Attributes
     ----------
@@ -52,22 +43,21 @@ class TickProgram:
         Results of the last sim step.
     control
         Native controller, or None.
-    buffers
-        Arrays of a sim step.
     """
 
     def __init__(
         self,
         setup: GroupControl,
-        buffers: Buffers,
+        states: States,
+        values: Values,
+        before: Rows,
         copies: Callable[[TickProgram], list[tuple[Rows, Rows]]],
-        noise: Pytree,
         reads_force: bool,
-        moves: bool,
     ) -> None:
         _, pack, control, _, model = setup
-        self._setup, self.buffers = setup, buffers
-        self.pack, self.model = pack, model
+        self._setup, self._states = setup, states
+        self.pack, self.model, self.values = pack, model, values
+        self._shape = before.shape
         self._native = native.extension("_gateway")
         self._programs, self._stages = list[Any](), list[Any]()
         self._references = list[Any]()  # keeps arrays alive that native code has addresses of
@@ -81,11 +71,10 @@ class TickProgram:
             gravity=control.gravity,
             coriolis=control.coriolis,
         )
-        self._left = np.zeros(())
         self.place(
-            **buffers.measured._asdict(),
-            before=buffers.before,
-            left=self._left,
+            **values.measured._asdict(),
+            before=before,
+            left=values.step.left,
         )
         # SAPIEN knows neither measured states nor the model of varied robots.
         if control.gravity and (control.measures or not reads_force):
@@ -94,15 +83,7 @@ class TickProgram:
             else:
                 field = "read_force"
             setattr(self.tick, field, pack.force_model.address)
-        values = Values(
-            command=buffers.command if moves else buffers.command.resting(),
-            measured=buffers.measured,
-            seen=buffers.measured,
-            timestep=control.timestep,
-            step=Step(0, 1, self._left if moves else None),
-            noise=noise,
-        )
-        self.outputs = self._add_stages(recalled(setup.stages, buffers.states, values), moves)
+        self.outputs = self._add_stages(recalled(setup.stages, states, values))
         self.place(qf=self.outputs.qf)
         stages = (structure("Stage") * len(self._stages))(*self._stages)
         self.tick.stages, self.tick.stage_count = ctypes.addressof(stages), len(stages)
@@ -119,9 +100,7 @@ class TickProgram:
         """Let fields of the structure of native code point to these arrays."""
         for name, array in arrays.items():
             if array is not None:
-                setattr(
-                    self.tick, name, self._address(array, _CONSTANT_TYPES.get(name, np.float64))
-                )
+                setattr(self.tick, name, self._address(array))
 
     def use(self, **owners: Any) -> None:
         """Let fields of the structure of native code point to the structures of these objects."""
@@ -134,15 +113,15 @@ class TickProgram:
         effort, and the joints whose effort it limits.
         """
         controller: Any = self._setup.options.control
-        self.control = controller.bound(*seen, self._left)
+        self.control = controller.bound(*seen, self.values.step.left)
         self.control.set_state(state)
         self.use(control=self.control)
         return self.control.effort, self.control.limited
 
-    def _address(self, array: Rows, dtype: DType) -> int:
-        """Return the address of an array for native code, which has this dtype."""
-        if array.dtype != dtype or not array.flags.c_contiguous:
-            raise ValueError(f"not a contiguous array of {np.dtype(dtype)}")
+    def _address(self, array: Rows) -> int:
+        """Return the address of an array for native code."""
+        if not array.flags.c_contiguous:
+            raise ValueError("not a contiguous array")
         self._references.append(array)
         return array.ctypes.data
 
@@ -155,8 +134,8 @@ class TickProgram:
             if table.dtype == np.float64:
                 kind = "READ"
         return structure("Transfer")(
-            table=self._address(table[0], table.dtype),
-            row=self._address(row, row.dtype),
+            table=self._address(table[0]),
+            row=self._address(row),
             stride=0 if len(table) == 1 else table.strides[0],
             size=size,
             # A number of each env has the same value for all joints of the row.
@@ -166,12 +145,14 @@ class TickProgram:
 
     # -- stages
 
-    def _add_stages(self, values: Values, moves: bool) -> Outputs:
+    def _add_stages(self, values: Values) -> Outputs:
         """Add the stages; return the results after them."""
         setup = self._setup
-        for stage, state in zip(setup.stages, self.buffers.states, strict=True):
+        moves = values.command.setpoint_rate is not None
+        pairs = list(zip(setup.stages, self._states, strict=True))
+        for stage, state in pairs:
             if stage.due:
-                clock, due = [self._address(getattr(state, name), np.float64) for name in stage.due]
+                clock, due = [self._address(getattr(state, name)) for name in stage.due]
                 self._add_program(
                     [(stage, state)],
                     values,
@@ -180,7 +161,7 @@ class TickProgram:
                     due=due,
                 )
         waiting = list[tuple[Any, Pytree]]()
-        for stage, state in zip(setup.stages, self.buffers.states, strict=True):
+        for stage, state in pairs:
             if not stage.native:
                 waiting.append((stage, state))
                 continue
@@ -216,12 +197,11 @@ class TickProgram:
         stages, states = zip(*pairs, strict=True)
         # Native code sets the addresses of the noise, which is another in each sim step.
         drawn = [id(block) for block in leaves(values.noise)]
-        shape = self.buffers.before.shape
         made, values = bind_stages(
             stages,
             states,
             values,
-            shape,
+            self._shape,
             passes,
             renews,
         )
@@ -247,10 +227,6 @@ class TickProgram:
                 **fields,
             )
         )
-
-
-_CONSTANT_TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
-"""Dtypes of arrays that are not float64."""
 
 
 def _row_size(array: Rows) -> int:
@@ -335,15 +311,22 @@ class NativeExecutor(Executor):
         """Prepare the next ticks, from sim step ``step`` of ``tick`` on."""
         # A program for each kind of tick is made once, at the first such tick.
         if moves not in self._programs:
-            noise = mapped(lambda block: block[0].copy(), self._noise())
-            buffers = Buffers(self._states, self._command, self.measured, self.before)
+            measured = self.measured
+            values = Values(
+                command=self._command if moves else self._command.resting(),
+                measured=measured,
+                seen=measured,
+                timestep=self.setup.control.timestep,
+                step=Step(0, 1, np.zeros(())),
+                noise=mapped(lambda block: block[0].copy(), self._noise()),
+            )
             program = TickProgram(
                 self.setup,
-                buffers,
+                self._states,
+                values,
+                self.before,
                 self._copies,
-                noise,
                 self._native_force,
-                moves,
             )
             self._programs[moves] = program
             # A native controller has arrays of its own for its state.
@@ -438,6 +421,22 @@ def run_ticks(
         ticks = tuple([executor.prepare() for executor in executors])
         native.extension("_gateway").ticks(ticks, until, steps, whole)
         executors = [executor for executor in executors if executor.count_steps()]
+
+
+def make_executor(
+    setup: GroupControl,
+    states: States,
+    arrays: Arrays,
+    shown: Mapping[str, Rows],
+    faults: FaultArrays,
+) -> NumPyExecutor | NativeExecutor:
+    """Return the executor of a control, from ``states`` on."""
+    # Native wherever the engine has native steps, under backend "numpy" too: the bits are the same.
+    if setup.options.backend == "jax":
+        return JAXExecutor(setup, states)
+    if setup.pack.steps_natively and runs_natively(setup):
+        return NativeExecutor(setup, states, arrays, shown, faults)
+    return NumPyExecutor(setup, states)
 
 
 def runs_natively(setup: GroupControl) -> bool:

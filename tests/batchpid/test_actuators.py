@@ -26,13 +26,10 @@ def test_a_neutral_value_is_off():
     assert bp.motors.deliver(actuators, state, effort, q, q, DT)[1] is effort
 
 
-def test_replace_and_parts():
+def test_replace():
     actuators = bp.make_actuators(2, strength=[[0.9, 1.0], [1.1, 1.2]], bias=0.5)
     assert actuators.replace(bias=None).bias is None
     np.testing.assert_array_equal(actuators.replace(lag=0.01).strength, actuators.strength)
-    part = actuators.for_envs(slice(1, 2))
-    assert part.strength.tolist() == [[1.1, 1.2]]
-    assert part.bias.shape == (1, 2)
     assert repr(actuators) == "Actuators(2 envs, 2 joints, strength 0.9 to 1.2, bias 0.5)"
     with pytest.raises(InvalidArgumentError, match="every effect is off"):
         bp.make_actuators(2).replace(lag=0.1)

@@ -7,7 +7,6 @@ import pickle
 
 import numpy as np
 import pytest
-from law_cases import ENVS, JOINTS
 
 import batchpid as bp
 
@@ -36,17 +35,6 @@ def test_params_are_read_only_copies():
         assert [type(leaf) for leaf in again] == [type(leaf) for leaf in params]
 
 
-def test_options_build_the_same_params(options):
-    params = bp.make_params(JOINTS, **options)
-    for again in (bp.make_params(JOINTS, **params.options()), params.replace()):
-        assert [type(leaf) for leaf in again] == [type(leaf) for leaf in params]
-        assert all(
-            np.array_equal(a, b)
-            for a, b in zip(params, again, strict=True)
-            if isinstance(a, np.ndarray)
-        )
-
-
 def test_replace_changes_the_given_options_alone():
     params = bp.make_params(2, 1.0, 1.0, effort_limit=5.0, anti_windup="back_calculation")
     changed = params.replace(kp=[3.0, 4.0], effort_limit=2.0)
@@ -62,10 +50,3 @@ def test_uniform_strategies_need_no_mask():
     assert uniform.conditional is not None
     assert not isinstance(uniform.conditional, np.ndarray)
     assert mixed.conditional.tolist() == [[1, 0]]
-
-
-def test_params_for_another_number_of_envs_are_refused():
-    params = bp.make_params(JOINTS, np.ones((ENVS, JOINTS)))
-    params.check(ENVS)
-    with pytest.raises(bp.InvalidArgumentError, match=r"params\.kp: has shape"):
-        params.check(ENVS + 1)

@@ -36,7 +36,7 @@ def needs_jax():
 def small_groups(monkeypatch):
     """Give runners in this process several groups of envs."""
     for name in ("sapien", "mujoco"):
-        monkeypatch.setattr(load_engine(name), "group_size", 3)
+        monkeypatch.setattr(load_engine(name), "group_size", 4)
 
 
 @pytest.fixture(scope="session")

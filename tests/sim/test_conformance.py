@@ -14,6 +14,7 @@ import functools
 import os
 import signal
 import tempfile
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from identical import assert_identical
 from option_values import ARM, FRICTION, LINE, MOTORS, NOISE, SENSORS, SIGNALS, box
 from robots import load_bundled
 from thermal import Thermal
+from tiny_urdf import write
 
 import batchpid as bp
 from batchpid.sim import (
@@ -41,9 +43,12 @@ from batchpid.sim import (
 )
 from batchpid.sim.options.options import OPTIONS
 
-N, TICKS, SPLIT, FAILING = 5, 5, 3, 2
+N, TICKS, SPLIT, FAILING = 5, 5, 3, 3
 """Envs and ticks of the program, ticks before its snapshot, and the env that fails."""
-RESET = np.arange(N) % 2 == 0
+RESET = np.arange(N) > 2
+"""Envs of the reset: none of the first worker, and a part of the first group in this process."""
+COPIES = [1, 1, 4, 1, 0]
+"""Envs of a snapshot that is restored with other ones."""
 ENGINES = ("sapien", "mujoco")
 pytestmark = [
     pytest.mark.usefixtures("small_groups"),
@@ -141,6 +146,13 @@ PUSHES = {
     },
     "gravity": {"x": Uniform(-1, 1), "z": Uniform(-1, 1)},
 }
+SCENE = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
+  <body name="arm" pos="0 0 .05"><joint name="turn" axis="0 0 1" damping=".5"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/></body>
+  <body name="cube" pos=".3 .03 .1"><freejoint/><geom type="box" size=".04 .04 .04"/></body>
+  <body name="lamp" pos="-1 0 1" quat="1 .5 0 0"><joint type="ball"/><geom size=".05" pos="0 0 -.1"/></body>
+</worldbody><actuator><motor joint="turn" ctrlrange="-20 20"/></actuator></mujoco>"""
+"""Arm that pushes a falling cube, beside a lamp that swings."""
 EACH = np.arange(1.0, N + 1)[:, None] * [1.0, 0.5]
 GUARD = bp.make_guard(2, rate=0.5, acceleration=20.0)
 PLAN = bp.make_plan(2, period=0.02, horizon=4, blend="average", acceleration=30.0)
@@ -213,6 +225,7 @@ FEATURES = {
     "a reset at a fault": Feature({"on_fault": "reset", "speed_limit": 2.0}),
     "contact sensors": Feature({"contacts": ["hand"], "wrenches": ["arm"]}),
     "user content": Feature({"build": functools.partial(box, 0.05)}, engines=SAPIEN),
+    "objects of a scene": Feature({"robot": "scene"}, engines=MUJOCO, alike=False),
     "links in contact": Feature({"robot": "jaco2", "control": "effort"}, exact=True, alike=False),
     "mimic joints": Feature({"robot": "chain of mimics"}),
     "mimic joints under a drive": Feature({"robot": "mimic", "control": "drive"}, alike=False),
@@ -257,6 +270,9 @@ def robot_of(name):
     """Return a robot by its name in the features; "arm" has two joints, and links with shapes."""
     if name == "arm":
         return ARM
+    if name == "scene":
+        # Kept, since MuJoCo reads the file again.
+        return Robot.load(write(Path(tempfile.mkdtemp()), SCENE, "scene.xml"))
     if name == "worn":
         return dataclasses.replace(ARM, actuators=MOTORS)
     return load_bundled(name) if name in Robot.bundled() else robot_with(name)
@@ -352,7 +368,8 @@ def program(runner, case, rollout=None, disturb=None):
     rollout = rollout or (lambda runner, given: runner.rollout(**given))
     given = commands(case, runner)
     first = rollout(runner, part(given, slice(SPLIT)))
-    placed = runner.reset(mask=RESET[: runner.num_envs])
+    assert_identical(runner.reset(mask=np.zeros(runner.num_envs, bool)), runner.observe())
+    placed = runner.reset(mask=RESET[-runner.num_envs :])
     snapshot = runner.snapshot()
     if disturb is not None:
         disturb(runner)
@@ -429,7 +446,7 @@ def in_python(case):
 def in_numpy(case):
     """The NumPy executor, with mass matrices and passive forces from native code: bit-identical."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("batchpid.sim.loop.env_group.runs_natively", lambda setup: False)
+        patch.setattr("batchpid.sim.loop.native_executor.runs_natively", lambda setup: False)
         with make(case) as runner:
             check_equal(program(runner, case), reference(case))
 
@@ -474,17 +491,23 @@ def alone(case):
 
 
 def restored(case):
-    """Another runner continues from the file of a snapshot, bit-identically."""
+    """Another runner continues from the file of a snapshot, bit-identically, and so does each of
+    several copies of an env.
+    """
     expected = reference(case)
     with make(case) as runner, tempfile.TemporaryDirectory() as folder:
         expected.snapshot.save(path := f"{folder}/half.npz")
         given = commands(case, runner)
         runner.rollout(**part(given, slice(2)))
-        runner.restore(Snapshot.load(path))
+        snapshot = Snapshot.load(path)
+        runner.restore(snapshot)
         second, end, *_, poses = second_half(
             runner, given, lambda runner, given: runner.rollout(**given)
         )
+        runner.restore(snapshot.for_envs(COPIES))
+        copies = runner.rollout(**{name: rows[SPLIT:, COPIES] for name, rows in given.items()})
     check_equal(expected._replace(second=second, end=end, poses=poses), expected)
+    assert_identical(copies, second.for_envs(COPIES), skip={"time"})
 
 
 def recorded(case):

@@ -52,23 +52,10 @@ def test_control_by_effort_is_given_effort_limits(name, request):
     np.testing.assert_array_equal(params.effort_max, np.atleast_2d(robot.effort_limit))
 
 
-@pytest.mark.parametrize("control", ["pid", "drive"])
-def test_a_robot_that_is_not_bundled_reaches_its_setpoint_without_params(hinge, control):
-    with Runner(hinge, 2, workers=0, control=control, ground=False) as runner:
-        rollout = runner.rollout(np.full((200, 1), 0.5))
-    np.testing.assert_allclose(rollout.qpos[-1], 0.5, atol=1e-3)
-    assert rollout.qpos.max() < 0.55
-
-
 def test_a_bundled_robot_reaches_the_tutorials_target_without_params(panda):
     with Runner(panda, 1, workers=0) as runner:
         rollout = runner.rollout(np.broadcast_to(panda.settings.target, (200, panda.dof)))
     np.testing.assert_allclose(rollout.qpos[-1, 0], panda.settings.target, atol=1e-3)
-
-
-def test_a_floating_robot_needs_no_params():
-    with Runner(Robot.load("panda", fixed_base=False), 1, workers=0) as runner:
-        assert runner.step(runner.robot.start).ok.all()
 
 
 def test_its_repr_has_robot_size_control_and_time(panda):

@@ -33,29 +33,15 @@ def wheel(folder, kind="", multiplier=0.0):
     [("continuous", 0.25), ("revolute", -1.0), ("prismatic", 0.01), ("continuous", np.sqrt(2))],
 )
 def test_a_follower_stays_with_its_leader_over_many_turns(kind, multiplier, tmp_path):
-    """q = tau t^2 / (2 J), with J = J_leader + m^2 J_follower; half way the robot is saved and
-    restored.
-    """
-    robot, effort, ticks = wheel(tmp_path, kind, multiplier), np.tile([0.5, 0.0], (60, 1)), 120
+    """q = tau t^2 / (2 J), with J = J_leader + m^2 J_follower."""
+    robot, ticks = wheel(tmp_path, kind, multiplier), 120
     inertia = 0.02 + multiplier**2 * (0.2 if kind == "prismatic" else 0.002)
-    options = {
-        "control": "effort",
-        "workers": 0,
-        "ground": False,
-        "compensate": "none",
-        "engine": "sapien",
-    }
-    with Runner(robot, 1, **options) as runner:
+    options = {"control": "effort", "compensate": "none", "engine": "sapien"}
+    with Runner(robot, 1, workers=0, ground=False, **options) as runner:
         runner.reset([2.0, 0.0])
-        first = runner.rollout(effort)
-        kept = runner.snapshot()
-        second = runner.rollout(effort)
-    with Runner(robot, 1, **options) as runner:
-        runner.restore(kept)
-        again = runner.rollout(effort)
-    np.testing.assert_array_equal(again.qpos[-1], second.qpos[-1])
-    qvel = np.concatenate([first.qvel, second.qvel])[:, 0]
-    assert second.ok.all()
+        seen = runner.rollout(np.tile([0.5, 0.0], (ticks, 1)))
+    assert seen.ok.all()
+    qvel = seen.qvel[:, 0]
     np.testing.assert_allclose(qvel[:, 1], multiplier * qvel[:, 0], rtol=2e-3, atol=0.01)
     np.testing.assert_allclose(qvel[-1, 0], 0.5 / inertia * ticks * 0.01, rtol=3e-3)
 

@@ -78,6 +78,9 @@ def test_it_holds_faults_params_and_time():
         other.restore(snapshot)
         assert (other.time, other.params.kp.max(), other.faults) == (time, 30.0, ())
         seen = other.step(GOAL)
+        for envs in ([N], [0.0]):
+            with pytest.raises(IndexError):
+                snapshot.for_envs(envs)
     assert seen.ok.tolist() == [True, False]
     assert_identical(seen, expected)
 
@@ -87,69 +90,56 @@ def test_it_holds_faults_params_and_time():
 
 
 def read(path):
-    """Return the head of a file and its arrays."""
+    """Return the arrays of a file by name, and its head as a mapping."""
     with np.load(path) as file:
-        tables = dict(file)
-    return json.loads(str(tables.pop("head"))), tables
+        content = dict(file)
+    return content | {"head": json.loads(str(content["head"]))}
 
 
-def write(path, head, tables, save=np.savez):
-    save(path, head=np.array(json.dumps(head)), **tables)
+def write(path, content):
+    np.savez(path, **content | {"head": np.array(json.dumps(content["head"]))})
     return path
 
 
-def head(**changes):
-    return lambda head, tables: head.update(changes)
+def damage(content, *place):
+    """Change the entry of a content at a place, whose last part is a function of the entry or its
+    value; without one the entry is removed.
+    """
+    *folders, name, change = place
+    for folder in folders:
+        content = content[folder]
+    entry = content.pop(name, None)
+    if change is not ...:
+        content[name] = change(entry) if callable(change) else change
 
 
-def about(**changes):
-    return lambda head, tables: head["about"].update(changes)
+def gains(text):
+    """Return a function that replaces kp in the text of the params."""
+    return lambda params: re.sub(r'(?<="kp": )([-\d.]+|\[[^]]*\])', text, params)
 
 
-def array(name, change):
-    """Return a damage that changes an array, or removes it."""
-
-    def damage(head, tables):
-        if change is None:
-            del tables[name]
-        else:
-            tables[name] = change(tables.get(name))
-
-    return damage
-
-
-def params(pattern, text):
-    """Return a damage that changes the text of the params."""
-
-    def damage(head, tables):
-        head["params"], count = re.subn(pattern, text, head["params"])
-        assert count
-
-    return damage
-
-
-KP = r'(?<="kp": )([-\d.]+|\[[^]]*\])'
+ABOUT, TEXT = ("head", "about"), ("head", "params")
 DAMAGES = {
-    "an older format": head(format=2),
-    "negative steps": head(steps=-1),
-    "an unknown choice": params('"explicit"', '"evil"'),
-    "no params": head(params=None),
-    "more envs than memory": about(num_envs=10**12),
-    "fewer joints": about(joints=["a"]),
-    "a randomization without episodes": about(randomization={}),
-    "no integral": array("control/law/integral", None),
-    "an unknown array": array("more", lambda rows: np.zeros(1)),
-    "text": array("engine", lambda rows: rows.astype("U8")),
-    "no options": head(about=None),
-    "short rows": array("engine", lambda rows: rows[:, 1:]),
-    "rows of other content": array("engine", lambda rows: rows * np.nan),
-    "an effort of one env": array("effort", lambda rows: rows[:1]),
-    "negative gains": params(KP, "-1"),
-    "another precision": array("engine", np.float32),
-    "one env": array("engine", lambda rows: rows[:1]),
-    "long rows": array("engine", lambda rows: np.pad(rows, ((0, 0), (0, 1)))),
-    "gains that are not numbers": params(KP, "NaN"),
-    "a motion of one row": array("motion", lambda rows: rows[:1]),
+    "an older format": ("head", "format", 2),
+    "negative steps": ("head", "steps", -1),
+    "an unknown choice": (*TEXT, lambda params: params.replace('"explicit"', '"evil"')),
+    "no params": (*TEXT, None),
+    "more envs than memory": (*ABOUT, "num_envs", 10**12),
+    "fewer joints": (*ABOUT, "joints", ["a"]),
+    "a randomization without episodes": (*ABOUT, "randomization", {}),
+    "no integral": ("control/law/integral", ...),
+    "an unknown array": ("more", np.zeros(1)),
+    "text": ("engine", lambda rows: rows.astype("U8")),
+    "no options": (*ABOUT, None),
+    "short rows": ("engine", lambda rows: rows[:, 1:]),
+    "rows of other content": ("engine", lambda rows: rows * np.nan),
+    "an effort of one env": ("effort", lambda rows: rows[:1]),
+    "negative gains": (*TEXT, gains("-1")),
+    "another precision": ("engine", np.float32),
+    "one env": ("engine", lambda rows: rows[:1]),
+    "long rows": ("engine", lambda rows: np.pad(rows, ((0, 0), (0, 1)))),
+    "gains that are not numbers": (*TEXT, gains("NaN")),
+    "a motion of one row": ("motion", lambda rows: rows[:1]),
 }
 
 
@@ -161,34 +151,29 @@ def runner():
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_a_damaged_snapshot_is_refused_before_anything_changes(good, runner, name, tmp_path):
-    runner.restore(Snapshot.load(write(tmp_path / "rewritten.npz", *read(good))))
-    parts, before = read(good), runner.observe()
-    DAMAGES[name](*parts)
+    runner.restore(Snapshot.load(write(tmp_path / "rewritten.npz", read(good))))
+    content, before = read(good), runner.observe()
+    damage(content, *DAMAGES[name])
     with pytest.raises(InvalidArgumentError) as caught:
-        runner.restore(Snapshot.load(write(tmp_path / "bad.npz", *parts)))
+        runner.restore(Snapshot.load(write(tmp_path / "bad.npz", content)))
     assert caught.value.argument in ("path", "snapshot")
     assert_identical(before, runner.observe())
     assert runner.step(GOAL).ok.all()
 
 
 @pytest.mark.parametrize(
-    "damage",
-    [
-        array("episodes", lambda rows: rows[:1]),
-        array("episodes", lambda rows: rows.astype(float)),
-        array("episodes", lambda rows: rows - 9),
-        array("episodes", None),
-    ],
+    "change",
+    [lambda rows: rows[:1], lambda rows: rows.astype(float), lambda rows: rows - 9, ...],
 )
-def test_episodes_that_do_not_agree_are_refused(damage, tmp_path):
+def test_episodes_that_do_not_agree_are_refused(change, tmp_path):
     path = tmp_path / "drawn.npz"
     with make(randomization=Randomization(payload=Uniform(0, 0.5)), params=None) as runner:
         runner.snapshot().save(path)
-        parts = read(path)
-        runner.restore(Snapshot.load(write(path, *parts)))
-        damage(*parts)
+        content = read(path)
+        runner.restore(Snapshot.load(write(path, content)))
+        damage(content, "episodes", change)
         with pytest.raises(InvalidArgumentError):
-            runner.restore(Snapshot.load(write(path, *parts)))
+            runner.restore(Snapshot.load(write(path, content)))
 
 
 def test_what_is_no_snapshot_is_refused_and_not_executed(good, tmp_path):
