@@ -28,6 +28,7 @@ from batchpid.sim.identification.regression import (
     LogData,
     Motion,
     better_reading,
+    cost_of,
     regress,
     smooth,
 )
@@ -281,10 +282,9 @@ def _own_timestep(log: Log) -> float:
     long one.
     """
     period = float(np.median(np.diff(log.time)))
-    parts = 1
     if period > LONGEST_STEP:
-        parts = int(np.ceil(period / USUAL_STEP))
-    return float(np.clip(period / parts, 1e-4, LONGEST_STEP))
+        return float(period / np.ceil(period / USUAL_STEP))
+    return max(period, 1e-4)
 
 
 def _resting(robot: Robot, start: Float64) -> Robot:
@@ -359,7 +359,7 @@ def _regress(
             drive = part.drive._replace(powered=none, further=(Exact(),))
             exact.append(part._replace(drive=drive))
         other = regress(_fitted(exact))
-        if other.cost < guess.cost - DETOUR:
+        if cost_of(other) < cost_of(guess) - DETOUR:
             data = exact
             guess = other
     words = better_reading(robot, _fitted(data)[0], guess, progress)
@@ -388,7 +388,7 @@ def _unknowns(
     """
     data = _fitted(data)
     log, _, plant, drive = data[0]
-    starts = dict(guess.values)
+    starts = dict(guess)
     kinds = list(BASIC)
     if drive.mode == "pid":
         kinds += SENDER

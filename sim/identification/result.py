@@ -269,8 +269,7 @@ class Identification:
         tables = []
         for problem in (self._described, self.fit.problem):
             point = self.fit.point[: len(problem.unknowns.entries)]
-            first = replace(problem, windows=windows)
-            tables.append(first.evaluate(point, free_states=False, held_out=True))
+            tables.append(problem.evaluate(windows, point, free_states=False))
         errors = []
         for window, before, after in zip(windows, *tables, strict=True):
             errors.append((window.time, window.fitted, before[..., 0], after[..., 0]))

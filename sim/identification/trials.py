@@ -29,7 +29,7 @@ from batchpid.sim.identification.fit import (
     triangle_of,
     with_certainty,
 )
-from batchpid.sim.identification.problem import Problem
+from batchpid.sim.identification.problem import Problem, size_of
 from batchpid.sim.identification.unknowns import SENDER, kinds_of
 
 TRIAL = 5
@@ -82,7 +82,7 @@ def _best_start(starts: Sequence[Problem], solver: Solver) -> tuple[Problem, Flo
             evaluations=TRIAL,
             tolerance=ROUGH_TOLERANCE,
         ).point
-        error = float(np.linalg.norm(coarse.size(coarse.evaluate(end))))
+        error = float(np.linalg.norm(size_of(coarse.fitted(end))))
         if error < least:
             problem = start
             point = end
