@@ -39,7 +39,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Bool, Float64
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.problem import Problem, size_of
 from batchpid.sim.identification.regression import bounded_solution
 
@@ -97,40 +97,24 @@ class Iterate(NamedTuple):
     """Residuals and their changes (rows, joints, 1 + n)."""
 
 
-class Certainty(NamedTuple):
-    """Certainty of the unknowns of a fit."""
-
-    deviation: Float64
-    """Standard deviations (unknowns,) of the values, in their units."""
-    root: Float64
-    """Root L of their covariance L L^T (unknowns, unknowns), at most as wide as the prior."""
-    shown: Bool
-    """Mask (unknowns,) of those that the logs show."""
-    alike: Bool
-    """Pairs (unknowns, unknowns) that cannot be told from one another."""
-    colored: float
-    """Correlation of neighbouring residuals, 0 for white noise."""
-
-    def only(self, mask: Bool) -> Certainty:
-        """Return the certainty of the unknowns of a mask (unknowns,)."""
-        both = np.ix_(mask, mask)
-        vectors = self.deviation[mask], self.root[mask], self.shown[mask]
-        return Certainty(*vectors, self.alike[both], self.colored)
-
-
-UNCERTAIN = Certainty(np.zeros(0), np.zeros((0, 0)), np.zeros(0, bool), np.zeros((0, 0), bool), 0)
-"""Certainty of no unknowns."""
-
-
 class Fit(NamedTuple):
-    """End of a fit, and what was left out of it or added to it."""
+    """End of a fit, the certainty of its unknowns, and what was left out or added."""
 
     problem: Problem
     point: Float64
     size: Float64
     """Size of the residuals that the fit was weighted with (joints,)."""
     converged: bool
-    certainty: Certainty = UNCERTAIN
+    deviation: Any = None
+    """Standard deviations (unknowns,) of the values, in their units."""
+    root: Any = None
+    """Root L of their covariance L L^T (unknowns, unknowns), at most as wide as the prior."""
+    shown: Any = None
+    """Mask (unknowns,) of those that the logs show."""
+    alike: Any = None
+    """Pairs (unknowns, unknowns) that cannot be told from one another."""
+    colored: float = 0.0
+    """Correlation of neighbouring residuals, 0 for white noise."""
     dropped: Sequence[str] = ()
     """"setpoint_delay" and "setpoint_lag", where the logs do not need them."""
     effects: Mapping[str, float] = {}
@@ -291,7 +275,13 @@ def with_certainty(fit: Fit) -> Fit:
     alone = inverse(data + FAINT_WEIGHT * np.eye(len(point)))
     faint = np.sqrt(np.diagonal(alone))
     alike = np.abs(alone) > ALIKE_CORRELATION * np.outer(faint, faint)
-    return fit._replace(certainty=Certainty(deviation, root, faint < SHOWN, alike, colored))
+    return fit._replace(
+        deviation=deviation,
+        root=root,
+        shown=faint < SHOWN,
+        alike=alike,
+        colored=colored,
+    )
 
 
 def _information(

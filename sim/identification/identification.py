@@ -310,32 +310,29 @@ def _option(
 
 def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
     """Return the params that drove a log, of its joints, one row; None for efforts."""
-    laws = [_of_joints(law, robot, log) for law in (params, log.params) if law is not None]
-    law = laws[-1] if laws else None
+    laws = list[bp.PIDParams]()
+    for law in (params, log.params):
+        if law is not None and law.num_joints != len(log.joints):
+            if law.num_joints != robot.dof or law.num_envs != 1:
+                problem = f"hold {law.num_joints} joints of {law.num_envs} envs"
+                remedy = f"give one gain for each of the robot's {robot.dof} joints"
+                raise InvalidArgumentError("params", problem, remedy=remedy)
+            law = law.for_joints(list(log.joints))
+        if law is not None:
+            laws.append(law)
+    if bool(laws) != (log.kind == "setpoint"):
+        remedy = "give no params" if laws else "give the params that drove the robot"
+        raise log.error(f"holds {log.kind}s", remedy)
     for name in ("kp", "ki", "kd"):
-        gains = [0.0 if getattr(table, name) is None else getattr(table, name) for table in laws]
+        gains = [0.0 if getattr(law, name) is None else getattr(law, name) for law in laws]
         if not np.allclose(gains[:1], gains[-1:], rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
             remedy = "leave them out, and give params to logs without"
             raise InvalidArgumentError("params", problem, remedy=remedy)
-    if (law is None) != (log.kind == "effort"):
-        remedy = "give the params that drove the robot" if law is None else "give no params"
-        raise log.error(f"holds {log.kind}s", remedy)
-    if law is not None and law.gain_units is not None:
+    if laws and laws[-1].gain_units is not None:
         problem = "have gains per inertia or mass matrix, which a fit does not simulate"
         raise InvalidArgumentError("params", problem, remedy="log the efforts, and give no params")
-    return law
-
-
-def _of_joints(params: bp.PIDParams, robot: Robot, log: Log) -> bp.PIDParams:
-    """Return the params of the joints of a log."""
-    if params.num_joints == len(log.joints):
-        return params
-    if params.num_joints != robot.dof or params.num_envs != 1:
-        problem = f"hold {params.num_joints} joints of {params.num_envs} envs"
-        remedy = f"give one gain for each of the robot's {robot.dof} joints"
-        raise InvalidArgumentError("params", problem, remedy=remedy)
-    return params.for_joints(list(log.joints))
+    return laws[-1] if laws else None
 
 
 def _regress(

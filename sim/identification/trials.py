@@ -60,7 +60,7 @@ def fit(starts: Sequence[Problem], solver: Solver) -> Fit:
         point = solver(coarse, point, tolerance=ROUGH_TOLERANCE).point
     result = with_certainty(solver(problem, point))
     # The effects that lower the held-out error, the most helpful first.
-    while result.certainty.colored > COLORED:
+    while result.colored > COLORED:
         trial = _with_effect(result, solver)
         if trial is result:
             break
@@ -106,7 +106,10 @@ def _without_sender(result: Fit, solver: Solver) -> Fit:
         smaller = solver(problem, result.point[is_kept])
         if _left(smaller._replace(size=result.size)) * KEPT <= error:
             return smaller._replace(
-                certainty=result.certainty.only(is_kept),
+                deviation=result.deviation[is_kept],
+                root=result.root[is_kept],
+                shown=result.shown[is_kept],
+                alike=result.alike[np.ix_(is_kept, is_kept)],
                 dropped=kinds,
                 effects=result.effects,
             )
