@@ -130,14 +130,7 @@ def _read(
     columns, numbers = read_csv(path, (*LOG_QUANTITIES, "time"))
     sources = _sources(robot, str(path), columns, reading.columns)
     columns = {name: scale * columns[column] for name, (column, scale) in sources.items()}
-    log = _build(
-        robot,
-        str(path),
-        columns,
-        columns,
-        kind,
-        reading,
-    )
+    log = _build(robot, str(path), columns, kind, reading)
     return checked(robot, replace(log, lines=np.array(numbers)))
 
 
@@ -197,13 +190,14 @@ def _build(
     robot: Robot,
     source: str,
     columns: dict[str, Float64],
-    commands: dict[str, Float64],
     kind: CommandKind | None,
     reading: Reading,
+    commands: dict[str, Float64] | None = None,
 ) -> Log:
     """Return the log that the columns of a file hold; ``commands`` are columns with their own
     times.
     """
+    commands = commands or columns
     by = columns_by_joint(robot, source, columns | commands, LOG_QUANTITIES)
     if by["feedforward"]:
         remedy = "log the complete efforts, without the columns of the feedforward"
@@ -315,9 +309,9 @@ def _read_bag(
         robot,
         str(path),
         positions,
-        commands,
         kind,
         reading,
+        commands,
     )
     for remark in remarks:
         log = log.with_remark(remark)
