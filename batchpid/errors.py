@@ -22,6 +22,11 @@ class BatchPIDError(Exception):
     """Root of the errors that this project raises on purpose."""
 
 
+def _reduced(error: BatchPIDError) -> tuple[Any, ...]:
+    """Pickle by message and fields, so that the error crosses process borders whole."""
+    return copyreg.__newobj__, (type(error), *error.args), error.__dict__  # type: ignore[attr-defined]
+
+
 class InvalidArgumentError(BatchPIDError, ValueError):
     """An argument has a wrong type, shape, dtype, range or a non-finite entry.
 
@@ -58,9 +63,7 @@ class InvalidArgumentError(BatchPIDError, ValueError):
             got = f" (got {_SHORT.repr(value)})"
         super().__init__(f"{argument}{where}: {problem}{got}; {remedy}")
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle by message and fields, so that the error crosses process borders whole."""
-        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
+    __reduce__ = _reduced
 
 
 class ControllerError(InvalidArgumentError):
@@ -123,8 +126,7 @@ class MissingDependencyError(BatchPIDError, ImportError):
             f"{purpose} needs the package {package!r}; install it with: pip install {source}"
         )
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (type(self), (self.package, self.purpose, self.extra))
+    __reduce__ = _reduced
 
 
 class WorkerError(BatchPIDError, RuntimeError):

@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 from batchpid.errors import RobotError, warn
 
@@ -158,6 +158,14 @@ class Finding:
     detail: str = ""
     envs: tuple[int, ...] = ()
     time: float | None = None
+
+    @classmethod
+    def of(cls, code: str, **facts: Any) -> Self:
+        """Return a finding of a kind, with its text and remedy unless others are among the
+        ``facts``.
+        """
+        kind = FINDING_KINDS[code]
+        return cls(code, **{"text": kind.when, "remedy": kind.done} | facts)
 
     @property
     def severity(self) -> str:

@@ -140,6 +140,9 @@ class Record(tuple[Any, ...]):
                 problem = f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}"
                 remedy = "give one row, or one row per env"
                 raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy=remedy)
+            if leaf.dtype != self.dtype:
+                problem = f"is {leaf.dtype}, another one is {self.dtype}"
+                raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy="use one dtype")
             if not is_traced(leaf):
                 field = self.FIELDS.get(name, Field(low=-math.inf))
                 values = np.asarray(leaf)

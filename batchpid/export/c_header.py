@@ -41,6 +41,8 @@ RATES = {
 }
 """Optional inputs of a step."""
 
+TREE = "use robot.kinematic_tree()"
+
 NO_ACCELERATION = (
     "plan: its acceleration is no input of the law; add M(q) times the change of the rate per second"
     " to the feedforward"
@@ -90,135 +92,90 @@ def to_c(
         Params for several envs, options that exclude each other, names that C does not allow, or a
         tree with other joints.
     """
-    header = Header(
-        params,
+    check_one_env(params)
+    dt = time_step("dt", dt)
+    joints = [f"joint {at}" for at in range(params.num_joints)]
+    if joint_names is not None:
+        joints = names("joint_names", joint_names, params.num_joints)
+    if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
+        problem = "cannot be a name in C"
+        remedy = "use letters, digits and _"
+        raise InvalidArgumentError("prefix", problem, value=prefix, remedy=remedy)
+    check_gain_units(params)
+    # All parts have to belong to the same joints, in the same order.
+    for part in (params, guard, plan):
+        if part is not None:
+            part.check(1, joints)
+    if tree is not None and list(instance("tree", tree, RigidTree, TREE).joint_names) != joints:
+        problem = f"has the joints {', '.join(tree.joint_names)}, not {', '.join(joints)}"
+        remedy = "pass joint_names=, in the tree's order"
+        raise InvalidArgumentError("tree", problem, remedy=remedy)
+    if plan is not None and plan.dtype != params.dtype:
+        problem = f"is {plan.dtype}, but the params are {params.dtype}"
+        raise InvalidArgumentError("plan", problem, remedy="use one dtype")
+    c = Dialect(prefix, np.dtype(params.dtype), len(joints))
+    arguments = ["setpoint", "measurement", *_optional(params, inputs, plan)]
+    if params.gain_units is not None:
+        arguments.append("mass_matrix")
+    # init runs on a measurement of NaN: an entry that is NaN afterwards copies the measurement.
+    nan = np.full((1, len(joints)), math.nan, params.dtype)
+    state = pid.init(params, nan), None if guard is None else guard_model.init(guard, nan)
+    fields = state[0].leaves()
+    if state[1] is not None:
+        fields |= {f"guarded_{name}": leaf for name, leaf in state[1]._asdict().items()}
+    code = _step_code(
+        c,
+        (discretise(params, dt), guard or Guard()),
+        state,
+        arguments,
         dt,
-        joint_names,
-        guard,
-        inputs,
-        prefix,
-        tree,
-        plan,
+        list(fields),
     )
-    return Exported(header.text(), () if plan is None else (NO_ACCELERATION,))
+    functions = "".join(helpers(c, code))
+    if tree is not None:
+        functions += rigid_body(c, tree)
+    if plan is not None:
+        functions += plan_functions(c, plan, functions)
+    listed = "".join(f" *   {at}: {comment(joint)}\n" for at, joint in enumerate(joints))
+    text = _frame(
+        c,
+        f"every {dt!r} s",
+        listed,
+        functions,
+        fields,
+        arguments,
+        code,
+    )
+    return Exported(text, () if plan is None else (NO_ACCELERATION,))
 
 
-class Header:
-    """Text of a header, from the trace of one step. Parameters and errors are as in
-    :func:`to_c`.
+def _optional(params: PIDParams, inputs: Sequence[str] | None, plan: Plan | None) -> list[str]:
+    """Return the optional inputs of a step, in the order of RATES."""
+    measures = isinstance(params.measurement_rate, MeasuredRate)
+    if inputs is None:
+        inputs = ["feedforward", *["measurement_rate"] * measures]
+        inputs += ["setpoint_rate"] * (plan is not None)
+    chosen = {choice("inputs", name, RATES) for name in inputs}
+    if measures and "measurement_rate" not in chosen:
+        remedy = "add it, or use params.replace(measurement_rate='difference')"
+        problem = "lack measurement_rate, which the params use"
+        raise InvalidArgumentError("inputs", problem, remedy=remedy)
+    return [name for name in RATES if name in chosen]
+
+
+def _step_code(
+    c: Dialect,
+    constants: tuple[Coefficients, Guard],
+    state: tuple[PIDState, GuardState | None],
+    arguments: list[str],
+    dt: float,
+    fields: list[str],
+) -> str:
+    """Return the statements of a step, which is traced once, with placeholders for everything that
+    is not a constant.
     """
 
-    def __init__(
-        self,
-        params: PIDParams,
-        dt: float,
-        joint_names: Sequence[str] | None,
-        guard: Guard | None,
-        inputs: Sequence[str] | None,
-        prefix: str,
-        tree: RigidTree | None,
-        plan: Plan | None,
-    ) -> None:
-        check_one_env(params)
-        self.params = params
-        self.dt = time_step("dt", dt)
-        self.guard = guard
-        self.tree = tree
-        self.plan = plan
-        joints = params.num_joints
-        self.joints = [f"joint {at}" for at in range(joints)]
-        if joint_names is not None:
-            self.joints = names("joint_names", joint_names, joints)
-        if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
-            problem = "cannot be a name in C"
-            remedy = "use letters, digits and _"
-            raise InvalidArgumentError("prefix", problem, value=prefix, remedy=remedy)
-        params.check(1, self.joints)
-        check_gain_units(params)
-        # Guard and tree have to belong to the same joints, in the same order.
-        if guard is not None:
-            guard.check(1, self.joints)
-        if tree is not None:
-            self._check_tree(tree)
-        if plan is not None:
-            plan.check(1, self.joints)
-            if plan.dtype != params.dtype:
-                problem = f"is {plan.dtype}, but the params are {params.dtype}"
-                raise InvalidArgumentError("plan", problem, remedy="use one dtype")
-        self.names = Dialect(prefix, np.dtype(params.dtype), joints)
-        if params.gain_units is None:
-            matrix = []
-        else:
-            matrix = ["mass_matrix"]
-        self.inputs = ["setpoint", "measurement", *self._optional(inputs), *matrix]
-        """Inputs of a step, in their order."""
-        # init runs on a measurement of NaN: an entry that is NaN afterwards copies the measurement.
-        nan = np.full((1, joints), math.nan, params.dtype)
-        if guard is None:
-            held = None
-        else:
-            held = guard_model.init(guard, nan)
-        self.state = pid.init(params, nan), held
-        """State after init; NaN where it is the measurement."""
-
-    def _check_tree(self, tree: RigidTree) -> None:
-        instance("tree", tree, RigidTree, "use robot.kinematic_tree()")
-        if list(tree.joint_names) != self.joints:
-            joints = ", ".join(self.joints)
-            problem = f"has the joints {', '.join(tree.joint_names)}, not {joints}"
-            remedy = "pass joint_names=, in the tree's order"
-            raise InvalidArgumentError("tree", problem, remedy=remedy)
-
-    def _optional(self, inputs: Sequence[str] | None) -> list[str]:
-        """Return the optional inputs of a step, in the order of RATES."""
-        measures = isinstance(self.params.measurement_rate, MeasuredRate)
-        if inputs is None:
-            if measures:
-                inputs = ("measurement_rate", "feedforward")
-            else:
-                inputs = ("feedforward",)
-            if self.plan is not None:
-                inputs = (*inputs, "setpoint_rate")
-        chosen = {choice("inputs", name, RATES) for name in inputs}
-        if measures and "measurement_rate" not in chosen:
-            remedy = "add it, or use params.replace(measurement_rate='difference')"
-            problem = "lack measurement_rate, which the params use"
-            raise InvalidArgumentError("inputs", problem, remedy=remedy)
-        return [name for name in RATES if name in chosen]
-
-    def text(self) -> str:
-        """Return the header."""
-        # The step is traced once, with placeholders for everything that is not a constant.
-        constants = discretise(self.params, self.dt), self.guard or Guard()
-        trees = constants, self.state, (...,) * len(self.inputs)
-        traced = trace_trees(self._step, *map(structure, trees), dtype=self.params.dtype)
-        k, limits = constants
-        labels = [f"k_{name}" for name, leaf in parts(k).items() if is_leaf(leaf)]
-        labels += [f"guard_{name}" for name in limits.leaves()]
-        fields = self._fields()
-        read = [f"{label}[j]" for label in labels]
-        read += [self.names.number(literal) for literal in traced.literals]
-        state = [f"state->{name}[j]" for name in fields]
-        arguments = [f"{name}[j]" for name in self.inputs]
-        body = statements(
-            self.names, traced, [*read, *state, *arguments], len(read), [*state, "effort[j]"]
-        )
-        # Constants that no statement names would be warnings of the compiler.
-        tables = [
-            self.names.table(label, leaf[0])
-            for label, leaf in zip(labels, leaves(constants), strict=True)
-            if re.search(rf"\b{label}\b", body)
-        ]
-        return self._frame("".join(tables), body, fields)
-
-    def _fields(self) -> Document:
-        """Return the initial state of law and guard by the names of the fields in C."""
-        law, held = self.state
-        guarded = {} if held is None else held._asdict()
-        return law.leaves() | {f"guarded_{name}": leaf for name, leaf in guarded.items()}
-
-    def _step(
-        self,
+    def step(
         constants: tuple[Coefficients, Guard],
         state: tuple[PIDState, GuardState | None],
         inputs: Sequence[Array],
@@ -226,17 +183,17 @@ class Header:
         """Return the leaves of the new state, and the effort: the control step of one robot."""
         k, limits = constants
         law, held = state
-        named = dict(zip(self.inputs, inputs, strict=True))
+        named = dict(zip(arguments, inputs, strict=True))
         setpoint = named["setpoint"]
         rate = named.get("setpoint_rate")
         # The guard comes before the law, as in a Runner.
         if held is not None:
-            held, changed = guard_model.advance(limits, held, setpoint, self.dt)
+            held, changed = guard_model.advance(limits, held, setpoint, dt)
             setpoint = held.setpoint
             if rate is not None:
                 rate = namespace(rate).where(changed, held.rate, rate)
-        optional = named.get("measurement_rate"), rate, named.get("feedforward")
-        measurement = named["measurement"]
+        rates = named.get("measurement_rate"), rate
+        measurement, feedforward = named["measurement"], named.get("feedforward")
         if "mass_matrix" in named:
             law, terms = advance_with_mass_matrix(
                 k,
@@ -244,52 +201,71 @@ class Header:
                 setpoint,
                 measurement,
                 named["mass_matrix"],
-                *optional[:2],
+                *rates,
                 None,
-                optional[2],
+                feedforward,
             )
         else:
-            law, terms = pid.advance(k, law, setpoint, measurement, *optional)
+            law, terms = pid.advance(k, law, setpoint, measurement, *rates, feedforward)
         return [*leaves((law, held)), terms.effort]
 
-    def _frame(self, tables: str, body: str, state: Document) -> str:
-        """Return the whole header around the code of a step."""
-        p = self.names.prefix
-        t = self.names.type
-        n = self.names.size
-        units = {
-            "setpoint": "r [rad or m]",
-            "measurement": "y [rad or m]",
-            "mass_matrix": "M at about y [kg m^2 or kg], by rows",
-            **RATES,
-        }
-        sizes = {"mass_matrix": f"{n} * {n}"}
-        arguments = "".join(
-            f",\n    const {t} {name}[{sizes.get(name, n)}] /* {units[name]} */"
-            for name in self.inputs
-        )
-        functions = "".join(helpers(self.names, body))
-        if self.tree is not None:
-            functions += rigid_body(self.names, self.tree)
-        if self.plan is not None:
-            functions += plan_functions(self.names, self.plan, functions)
-        # A class of C++ wraps the same functions.
-        passed = "".join(f", {name}" for name in self.inputs)
-        pointers = "".join(f"const {t} *{name}, " for name in self.inputs)
-        fields = "".join(f"  {t} {name}[{n}];\n" for name in state) or "  char unused;\n"
-        # A restart keeps the integral; a start sets it to 0, within its limits.
-        every = self._started(state)
-        lasting = self._started({name: leaf for name, leaf in state.items() if name != "integral"})
-        # An input without effect would be a warning of the compiler.
-        unused = "".join(
-            f"  (void){name};\n"
-            for name in ("state", *self.inputs)
-            if not re.search(rf"\b{name}\b", body)
-        )
-        joints = "".join(f" *   {at}: {comment(joint)}\n" for at, joint in enumerate(self.joints))
-        return f"""/* PID control of one robot, generated by batchpid. Do not edit.
+    trees = constants, state, (...,) * len(arguments)
+    traced = trace_trees(step, *map(structure, trees), dtype=c.dtype)
+    k, limits = constants
+    labels = [f"k_{name}" for name, leaf in parts(k).items() if is_leaf(leaf)]
+    labels += [f"guard_{name}" for name in limits.leaves()]
+    read = [f"{label}[j]" for label in labels]
+    read += [c.number(literal) for literal in traced.literals]
+    places = [f"state->{name}[j]" for name in fields]
+    inputs = [f"{name}[j]" for name in arguments]
+    body = statements(c, traced, [*read, *places, *inputs], len(read), [*places, "effort[j]"])
+    # Constants that no statement names would be warnings of the compiler, as inputs without effect.
+    tables = [
+        c.table(label, leaf[0])
+        for label, leaf in zip(labels, leaves(constants), strict=True)
+        if re.search(rf"\b{label}\b", body)
+    ]
+    unused = [
+        f"  (void){name};\n"
+        for name in ("state", *arguments)
+        if not re.search(rf"\b{name}\b", body)
+    ]
+    return "".join([*tables, body, *unused])
+
+
+def _frame(
+    c: Dialect,
+    period: str,
+    joints: str,
+    functions: str,
+    state: Document,
+    inputs: list[str],
+    code: str,
+) -> str:
+    """Return the whole header around the ``code`` of a step and further ``functions``."""
+    p = c.prefix
+    t = c.type
+    n = c.size
+    units = {
+        "setpoint": "r [rad or m]",
+        "measurement": "y [rad or m]",
+        "mass_matrix": "M at about y [kg m^2 or kg], by rows",
+        **RATES,
+    }
+    sizes = {"mass_matrix": f"{n} * {n}"}
+    arguments = "".join(
+        f",\n    const {t} {name}[{sizes.get(name, n)}] /* {units[name]} */" for name in inputs
+    )
+    # A class of C++ wraps the same functions.
+    passed = "".join(f", {name}" for name in inputs)
+    pointers = "".join(f"const {t} *{name}, " for name in inputs)
+    fields = "".join(f"  {t} {name}[{n}];\n" for name in state) or "  char unused;\n"
+    # A restart keeps the integral; a start sets it to 0, within its limits.
+    every = _started(c, state)
+    lasting = _started(c, {name: leaf for name, leaf in state.items() if name != "integral"})
+    return f"""/* PID control of one robot, generated by batchpid. Do not edit.
  *
- * Call {p}_init once at the first measurement, then {p}_step every {self.dt!r} s; {p}_reset restarts
+ * Call {p}_init once at the first measurement, then {p}_step {period}; {p}_reset restarts
  * the law and keeps the integral. The functions allocate no memory and share no state. Compile with
  * -ffp-contract=off for efforts that are bit-identical to batchpid's.
  *
@@ -305,7 +281,7 @@ class Header:
 extern "C" {{
 #endif
 
-enum {{ {n} = {self.names.joints} }};
+enum {{ {n} = {c.joints} }};
 
 /* Memory of the law between steps. */
 typedef struct {{
@@ -323,7 +299,7 @@ static inline void {p}_reset({p}_state *state, const {t} measurement[{n}]) {{
 static inline void {p}_step(
     {p}_state *state{arguments},
     {t} effort[{n}]) {{
-{tables}{body}{unused}}}
+{code}}}
 
 #ifdef __cplusplus
 }}
@@ -342,21 +318,22 @@ class {p}_controller {{
 #endif
 """
 
-    def _started(self, leaves: Document) -> str:
-        """Return the statements that start ``leaves`` of the state."""
-        unused = "  (void)state;\n  (void)measurement;\n"
-        lines = []
-        for name, leaf in leaves.items():
-            # NaN marks an entry that starts at the measurement. Equal numbers are written once.
-            numbers = [
-                "measurement[j]" if math.isnan(number) else self.names.number(number)
-                for number in leaf[0].tolist()
-            ]
-            value = numbers[0]
-            if len(set(numbers)) > 1:
-                value = f"{name}[j]"
-                lines.append(f"  {self.names.table(name, leaf[0])}")
-            lines.append(f"    state->{name}[j] = {value};\n")
-        if lines:
-            return "".join([self.names.loop, *lines, "  }\n", unused])
-        return unused
+
+def _started(c: Dialect, leaves: Document) -> str:
+    """Return the statements that start ``leaves`` of the state."""
+    unused = "  (void)state;\n  (void)measurement;\n"
+    lines = []
+    for name, leaf in leaves.items():
+        # NaN marks an entry that starts at the measurement. Equal numbers are written once.
+        numbers = [
+            "measurement[j]" if math.isnan(number) else c.number(number)
+            for number in leaf[0].tolist()
+        ]
+        value = numbers[0]
+        if len(set(numbers)) > 1:
+            value = f"{name}[j]"
+            lines.append(f"  {c.table(name, leaf[0])}")
+        lines.append(f"    state->{name}[j] = {value};\n")
+    if lines:
+        return "".join([c.loop, *lines, "  }\n", unused])
+    return unused

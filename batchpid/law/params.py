@@ -148,16 +148,6 @@ class PIDParams(Record, _ParamsFields):
         params.check(params.num_envs)
         return params
 
-    def check(self, num_envs: int, joint_names: Sequence[str] | None = None) -> None:
-        """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits
-        by hand.
-        """
-        super().check(num_envs, joint_names)
-        for name, leaf in self.leaves().items():
-            if leaf.dtype != self.dtype:
-                problem = f"is {leaf.dtype}, but kp is {self.dtype}"
-                raise InvalidArgumentError(f"params.{name}", problem, remedy="use one dtype")
-
 
 @with_fields(*LAW_FIELDS, *DEFAULTS)
 def make_params(

@@ -91,20 +91,6 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments, Fused const *t
     if (!added) return misfit();
   }
   Index const given = count + program->inputs;
-  auto const known = [&](std::int32_t number) { return number >= 0 && number < program->registers; };
-  bool fits = program->inputs >= 0 && given <= program->registers;
-  for (Operation const &each : program->operations) {
-    bool const writes_input = each.code == PUSH && each.out == each.operands[0] && each.out >= count;
-    fits = fits && known(each.out) && (each.out >= given || writes_input) && each.code >= ADD &&
-           each.code < NUMBER_OF_CODES && std::all_of(each.operands, each.operands + 3, known);
-  }
-  fits = fits && std::all_of(program->results.begin(), program->results.end(), known);
-  for (Segment const &each : program->segments) {
-    fits = fits && each.first >= 0 && each.first + each.count <= static_cast<Index>(program->operations.size()) &&
-           std::all_of(each.operands.begin(), each.operands.end(), known) &&
-           std::all_of(each.results.begin(), each.results.end(), known);
-  }
-  if (!fits) return misfit();
   auto const made_by = [&](std::int32_t number) {
     Index found = -1;
     for (std::size_t i = 0; i < program->operations.size(); ++i) {

@@ -84,27 +84,11 @@ inline void eigen(Symmetric &a, Lanes (&vectors)[AXES][AXES]) {
   }
 }
 
-// Eigenvectors, as columns, and weights: a symmetric matrix.
-struct Weighted {
-  // Add the product with a vector to `out`.
-  void add(Lanes const *vector, Lanes *out) const {
-    for (int c = 0; c < AXES; ++c) {
-      Lanes sum{};
-      for (int i = 0; i < AXES; ++i) sum += vectors[i][c] * vector[i];
-      sum = weights[c] * sum;
-      for (int i = 0; i < AXES; ++i) out[i] += vectors[i][c] * sum;
-    }
-  }
-
-  Lanes vectors[AXES][AXES], weights[AXES];
-};
-
-// Write the bounded inverses by eigenvalues in the lanes of `unsure`; `near` gets 1.0 where any is below s0, and `more`
-// the smooth inverse with the bound SPRING_BOUND * s0 less this one, of any value in the other lanes.
-inline void bound_inverses(Lanes const *matrix, Lanes s0, Lanes unsure, Lanes *out, Lanes &near, Weighted &more) {
+// Write the inverses with the bounds s0 and SPRING_BOUND * s0, by eigenvalues, in the lanes of `unsure`; `near` gets 1.0
+// where any is below s0.
+inline void bound_inverses(Lanes const *matrix, Lanes s0, Lanes unsure, Lanes *out, Lanes *springs, Lanes &near) {
   Symmetric a;
-  Lanes(&vectors)[AXES][AXES] = more.vectors;
-  Lanes scaled[AXES][AXES], low{};
+  Lanes vectors[AXES][AXES], scaled[AXES][AXES], smooth[AXES][AXES], low{};
   for (int i = 0; i < AXES; ++i) {
     // The lanes that are left out are diagonal, and end at once.
     for (int j = i; j < AXES; ++j) a(i, j) = where_positive(unsure, matrix[i * AXES + j], i == j ? 1.0 : 0.0);
@@ -112,45 +96,47 @@ inline void bound_inverses(Lanes const *matrix, Lanes s0, Lanes unsure, Lanes *o
   eigen(a, vectors);
   Lanes const s1 = SPRING_BOUND * s0, steepest = 1.0 / (s0 * s0), steepest_of_springs = 1.0 / (s1 * s1);
   for (int c = 0; c < AXES; ++c) {
-    Lanes const s = a(c, c), large = at_least_mask(s, s0);
-    Lanes const exact = 1.0 / s, least = at_least(s, 0.0), scale = where_positive(large, exact, least * steepest);
-    Lanes const smooth = least * (2.0 - least * least * steepest_of_springs) * steepest_of_springs;
-    more.weights[c] = where_positive(large, 0.0, where_positive(at_least_mask(s, s1), exact, smooth) - scale);
+    Lanes const s = a(c, c), large = at_least_mask(s, s0), exact = 1.0 / s, least = at_least(s, 0.0);
+    Lanes const scale = where_positive(large, exact, least * steepest);
+    Lanes const below = least * (2.0 - least * least * steepest_of_springs) * steepest_of_springs;
+    Lanes const scale_of_springs = where_positive(at_least_mask(s, s1), exact, below);
     low = where_positive(large, low, 1.0);
-    for (int i = 0; i < AXES; ++i) scaled[i][c] = scale * vectors[i][c];
+    for (int i = 0; i < AXES; ++i) {
+      scaled[i][c] = scale * vectors[i][c];
+      smooth[i][c] = scale_of_springs * vectors[i][c];
+    }
   }
   near = where_positive(unsure * low, 1.0, near);
   for (int i = 0; i < AXES; ++i) {
     for (int j = 0; j <= i; ++j) {
-      Lanes sum{};
-      for (int c = 0; c < AXES; ++c) sum += scaled[i][c] * vectors[j][c];
-      Lanes const entry = where_positive(unsure, sum, out[i * AXES + j]);
-      out[i * AXES + j] = out[j * AXES + i] = entry;
+      Lanes const first = along(scaled[i], vectors[j], AXES), second = along(smooth[i], vectors[j], AXES);
+      out[i * AXES + j] = out[j * AXES + i] = where_positive(unsure, first, out[i * AXES + j]);
+      springs[i * AXES + j] = springs[j * AXES + i] = where_positive(unsure, second, springs[i * AXES + j]);
     }
   }
 }
 
-// Write the bounded inverses of mobilities over the selected axes; `near` gets 1.0 in the lanes where it is bounded,
-// where `more` is as in bound_inverses, with 0 for the other axes.
-inline void selected_inverse(Lanes const (&mobility)[AXES * AXES], Lanes const *axes, Lanes s0,
-                             Lanes (&out)[AXES * AXES], Lanes &near, Weighted &more) {
-  Lanes matrix[AXES * AXES], room[AXES * AXES];
-  std::copy(mobility, mobility + AXES * AXES, matrix);
+// Write the inverses of mobilities over the selected axes with both bounds, with 0 for the other axes; `near` gets 1.0 in
+// the lanes where they are bounded. `springs` may be the mobility.
+inline void selected_inverses(Lanes const *mobility, Lanes const *axes, Lanes s0, Lanes *out, Lanes *springs,
+                              Lanes &near) {
+  constexpr int SIZE = AXES * AXES;
+  Lanes matrix[SIZE], room[SIZE];
+  std::copy(mobility, mobility + SIZE, matrix);
   for (int i = 0; i < AXES && axes != nullptr; ++i) {
     for (int j = 0; j < AXES; ++j) {
       Lanes const alone = i == j ? (1.0 - axes[i]) * at_least(2.0 * s0, 1.0) : Lanes{};
       matrix[i * AXES + j] = where_positive(axes[i] * axes[j], matrix[i * AXES + j], alone);
     }
   }
-  std::copy(matrix, matrix + AXES * AXES, out);
+  std::copy(matrix, matrix + SIZE, out);
   invert(AXES, out, room);
-  Lanes square{};
-  for (Lanes const &entry : out) square += entry * entry;
-  Lanes const sure = at_least_mask(1.0, root(square) * s0);  // no eigenvalue is below s0; 0.0 for nan
-  if (any_positive(1.0 - sure)) bound_inverses(matrix, s0, 1.0 - sure, out, near, more);
+  std::copy(out, out + SIZE, springs);
+  Lanes const sure = at_least_mask(1.0, root(along(out, out, SIZE)) * s0);  // no eigenvalue is below s0; 0.0 for nan
+  if (any_positive(1.0 - sure)) bound_inverses(matrix, s0, 1.0 - sure, out, springs, near);
   for (int i = 0; i < AXES && axes != nullptr; ++i) {
     for (int j = 0; j < AXES; ++j) {
-      out[i * AXES + j] = where_positive(axes[i] * axes[j], out[i * AXES + j], Lanes{});
+      for (Lanes *of : {out, springs}) of[i * AXES + j] = where_positive(axes[i] * axes[j], of[i * AXES + j], Lanes{});
     }
   }
 }

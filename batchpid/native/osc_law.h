@@ -13,14 +13,10 @@ namespace batchpid {
 class Given {
  public:
   explicit Given(Tables const &table) : table_(table) {
-    std::size_t size = 0;
-    for (int i = 0; i < LAW_EFFORT; ++i) size += table[i] ? static_cast<std::size_t>(table[i].columns) : 0;
-    of_.resize(size);
-    Lanes *next = of_.data();
     for (int i = 0; i < LAW_EFFORT; ++i) {
       if (!table[i]) continue;
-      at_[i] = next;
-      next += table[i].columns;
+      of_[i].resize(static_cast<std::size_t>(table[i].columns));
+      at_[i] = of_[i].data();
       if (i >= LAW_KP && table[i].rows == 1) {
         table[i].load(0, at_[i]);
       } else {
@@ -39,7 +35,7 @@ class Given {
   Tables const &table_;
   Lanes *at_[LAW_EFFORT] = {};
   std::vector<int> each_;
-  std::vector<Lanes> of_;
+  std::vector<Lanes> of_[LAW_EFFORT];
 };
 
 // Return the share of an effort, added to efforts `at`, with which the joints within their limits stay there.
@@ -68,11 +64,8 @@ class OSCLaw {
     auto const n = static_cast<std::size_t>(dof), links = chain_.size();
     factor_.resize(links * links);
     white_.resize(links * AXES);
-    both_.resize(links * 2);
-    for (auto *leaf : {&a_n_, &a_s_, &base_, &task_, &posture_, &of_task_, &of_posture_, &effort_, &whole_, &limited_,
-                       &friction_}) {
-      leaf->resize(n);
-    }
+    moved_.resize(links);
+    for (auto *leaf : {&a_n_, &a_s_, &base_, &task_, &posture_, &effort_, &whole_, &limited_, &friction_}) leaf->resize(n);
     if (table[LAW_COULOMB]) given_.set(LAW_FEEDFORWARD, friction_.data());
     if (dynamics == nullptr) return;
     given_.set(LAW_POSE, dynamics->pose);
@@ -92,11 +85,9 @@ class OSCLaw {
       step[axis] = -*given_[LAW_LEFT] * (twist[axis] - 0.5 * change);
       twist[axis] -= change;
     }
-    Lanes const angle = length_of(step + 3);
-    for (int k = 0; k < WIDTH; ++k) {
-      cosine.of[k] = std::cos(0.5 * angle.of[k]);
-      sine.of[k] = angle.of[k] > 0 ? std::sin(0.5 * angle.of[k]) / angle.of[k] : 0.5;
-    }
+    Lanes const angle = length_of(step + 3), half = 0.5 * angle;
+    write_cosines(1, &half, &cosine, &sine);
+    sine = where_positive(angle, sine / angle, 0.5);
     Lanes const w = q[0], a = q[1], b = q[2], c = q[3];
     Lanes const x = sine * step[3], y = sine * step[4], z = sine * step[5];
     for (int k = 0; k < 3; ++k) pose[k] += step[k];
@@ -225,44 +216,33 @@ class OSCLaw {
     }
     Lanes const s0 = *given_[LAW_SMALLEST_EIGENVALUE];
     near_ = {};
-    selected_inverse(mobility, axes == nullptr ? nullptr : allowed, s0, null_inertia_, near_, more_of_springs_);
-    null_near_ = near_;
+    selected_inverses(mobility, axes == nullptr ? nullptr : allowed, s0, null_inertia_, spring_inertia_, near_);
     inertia_ = null_inertia_;
     if (!force_too) return;
-    Weighted unused;
-    selected_inverse(mobility, axes, s0, task_inertia_, near_, unused);
+    selected_inverses(mobility, axes, s0, task_inertia_, mobility, near_);
     inertia_ = task_inertia_;
   }
 
   // Set the efforts of base, task and posture.
   void set_efforts() {
     Lanes const *jacobian = given_[LAW_JACOBIAN], *mass = given_[LAW_MASS_MATRIX];
-    Lanes moved[AXES], pulled[AXES];
+    Lanes moved[AXES], pulled[AXES], sprung[AXES];
+    add_moved(a_n_.data(), pulled);
+    add_moved(a_s_.data(), sprung);
     for (int axis = 0; axis < AXES; ++axis) {
       moved[axis] = a_[axis] - given_[LAW_JACOBIAN_RATE][axis];
+      pulled[axis] = sprung[axis] - pulled[axis];  // J a_d
     }
-    add_moved(a_n_.data(), pulled);
     Lanes drop[AXES];
     for (int axis = 0; axis < AXES; ++axis) {
       force_[axis] = along(inertia_ + axis * AXES, moved, AXES);
       if (given_[LAW_WRENCH] != nullptr) force_[axis] += given_[LAW_WRENCH][axis];
-      drop[axis] = along(null_inertia_ + axis * AXES, pulled, AXES);
+      drop[axis] = along(spring_inertia_ + axis * AXES, sprung, AXES) - along(null_inertia_ + axis * AXES, pulled, AXES);
     }
-    if (any_positive(null_near_)) {  // (L_s - L_n) J a_s
-      Lanes sprung[AXES], held[AXES];
-      add_moved(a_s_.data(), sprung);
-      more_of_springs_.add(sprung, held);
-      for (int axis = 0; axis < AXES; ++axis) {
-        drop[axis] = where_positive(null_near_, drop[axis] + held[axis], drop[axis]);
-      }
-    }
-    for (std::size_t c = 0; c < chain_.size(); ++c) {
-      std::int64_t const i = chain_[c];
-      Lanes const x = along(jacobian + i, force_, AXES, dof_);
-      Lanes y = -along(jacobian + i, drop, AXES, dof_);
-      for (std::int64_t const j : chain_) y += mass[i * dof_ + j] * a_n_[j];
-      task_[i] = both_[2 * c] = x;
-      posture_[i] = both_[2 * c + 1] = y;
+    for (std::int64_t const i : chain_) {
+      task_[i] = along(jacobian + i, force_, AXES, dof_);
+      posture_[i] = -along(jacobian + i, drop, AXES, dof_);
+      for (std::int64_t const j : chain_) posture_[i] += mass[i * dof_ + j] * a_n_[j];
     }
     for (std::int64_t i = 0; i < dof_; ++i) {
       Lanes sum = given_[LAW_BIAS][i];
@@ -270,17 +250,6 @@ class OSCLaw {
       if (given_[LAW_FEEDFORWARD] != nullptr) sum += given_[LAW_FEEDFORWARD][i];
       if (given_[LAW_DAMPING] != nullptr) sum += given_[LAW_DAMPING][i] * given_[LAW_QVEL][i];
       base_[i] = sum;
-    }
-    if (others_.empty()) return;
-    solve_both<2>(links(), factor_.data(), both_.data());  // M_oc M_cc^-1 of task and posture
-    for (std::int64_t const i : others_) {
-      Lanes x{}, y{};
-      for (std::size_t c = 0; c < chain_.size(); ++c) {
-        x += mass[i * dof_ + chain_[c]] * both_[2 * c];
-        y += mass[i * dof_ + chain_[c]] * both_[2 * c + 1];
-      }
-      of_task_[i] = x;
-      of_posture_[i] = y;
     }
   }
 
@@ -290,15 +259,24 @@ class OSCLaw {
     Lanes const s1 = share_within(dof_, task_.data(), base_.data(), base_.data(), low, high);
     for (std::int64_t i = 0; i < dof_; ++i) effort_[i] = base_[i] + s1 * task_[i];
     Lanes const s2 = share_within(dof_, posture_.data(), effort_.data(), base_.data(), low, high);
+    for (std::int64_t i = 0; i < dof_; ++i) {
+      whole_[i] = base_[i] + task_[i] + posture_[i];
+      effort_[i] += s2 * posture_[i];
+    }
+    // The other joints hold against the acceleration of the chain.
+    for (std::size_t c = 0; c < chain_.size(); ++c) moved_[c] = s1 * task_[chain_[c]] + s2 * posture_[chain_[c]];
+    if (!others_.empty()) solve_both<1>(links(), factor_.data(), moved_.data());
+    for (std::int64_t const i : others_) {
+      Lanes rest{};
+      for (std::size_t c = 0; c < chain_.size(); ++c) rest += given_[LAW_MASS_MATRIX][i * dof_ + chain_[c]] * moved_[c];
+      whole_[i] += rest;
+      effort_[i] += rest;
+    }
     Lanes held = near_;
     for (std::int64_t i = 0; i < dof_; ++i) {
-      Lanes const rest = s1 * of_task_[i] + s2 * of_posture_[i];
-      whole_[i] = base_[i] + task_[i] + posture_[i] + rest;
-      Lanes sum = effort_[i] + s2 * posture_[i] + rest;
-      if (low != nullptr) sum = at_least(sum, low[i]);
-      if (high != nullptr) sum = at_most(sum, high[i]);
-      effort_[i] = sum;
-      limited_[i] = differs_mask(sum, whole_[i]);
+      if (low != nullptr) effort_[i] = at_least(effort_[i], low[i]);
+      if (high != nullptr) effort_[i] = at_most(effort_[i], high[i]);
+      limited_[i] = differs_mask(effort_[i], whole_[i]);
       held = where_positive(limited_[i], 1.0, held);
     }
     table_[LAW_EFFORT].store(first, effort_.data());
@@ -329,13 +307,12 @@ class OSCLaw {
   Tables const &table_;
   Given given_;
   std::vector<std::int64_t> chain_, others_;
-  std::vector<Lanes> factor_, white_, both_;
-  std::vector<Lanes> a_n_, a_s_, base_, task_, posture_, of_task_, of_posture_;  // 0 for joints without a part in an effort
+  std::vector<Lanes> factor_, white_, moved_;
+  std::vector<Lanes> a_n_, a_s_, base_, task_, posture_;  // 0 for joints without a part in an effort
   std::vector<Lanes> effort_, whole_, limited_, friction_;
-  Lanes error_[AXES], near_error_[AXES], turned_[2][AXES], a_[AXES], force_[AXES], near_, null_near_;
+  Lanes error_[AXES], near_error_[AXES], turned_[2][AXES], a_[AXES], force_[AXES], near_;
   Lanes const *target_ = nullptr;  // twist of the setpoint in the law's axes
-  Lanes task_inertia_[AXES * AXES], null_inertia_[AXES * AXES], *inertia_ = null_inertia_;
-  Weighted more_of_springs_;  // L_s - L_n, in the lanes of null_near_
+  Lanes task_inertia_[AXES * AXES], null_inertia_[AXES * AXES], spring_inertia_[AXES * AXES], *inertia_ = null_inertia_;
 };
 
 }  // namespace batchpid

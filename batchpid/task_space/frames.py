@@ -288,3 +288,43 @@ def total(parts: Sequence[SpatialInertia]) -> SpatialInertia:
         d = part.center - center
         tensor += part.tensor + part.mass * (d @ d * np.eye(3) - np.outer(d, d))
     return SpatialInertia(mass, center, tensor)
+
+
+Inertias = Sequence[Array]
+"""Inertias about the origin of the world, in its axes: mass, first moment x, y, z, and entries xx,
+yy, zz, xy, xz, yz of the inertia tensor; arrays (dof, rows).
+"""
+_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def inertias_in(mass: Array, center: Array, tensor: Array, frames: Array) -> Inertias:
+    """Return the inertias of bodies with ``center`` (n, 3, rows) and ``tensor`` (n, 3, 3, rows) in
+    their ``frames`` (n, 3, 4, rows).
+    """
+    axes = range(3)
+    turn = [[frames[:, i, k] for k in axes] for i in axes]
+    r = [dotted(turn[i], [center[:, k] for k in axes]) + frames[:, i, 3] for i in axes]
+    half = [[dotted(row, [tensor[:, k, j] for k in axes]) for j in axes] for row in turn]
+    square = dotted(r, r)
+    # R I R^T + m (r.r 1 - r r^T)
+    entries = [
+        dotted(half[i], turn[j]) + mass * ((square if i == j else 0.0) - r[i] * r[j])
+        for i, j in _ENTRIES
+    ]
+    return mass + 0.0 * square, *[mass * at for at in r], *entries
+
+
+def dotted(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    """Return the sum of the products of components, in their order."""
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+def momenta(inertias: Inertias, v: Vector, w: Vector) -> tuple[Vector, Vector]:
+    """Return the momenta p = m v + w x c and k = I w + c x v."""
+    mass, cx, cy, cz, xx, yy, zz, xy, xz, yz = inertias
+    c = cx, cy, cz
+    spin = dotted((xx, xy, xz), w), dotted((xy, yy, yz), w), dotted((xz, yz, zz), w)
+    return added(scaled(v, mass), crossed(w, c)), added(spin, crossed(c, v))

@@ -35,13 +35,24 @@ The results for coupled joints are reduced to their leaders, G^T M G and G^T h
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace
 from batchpid.task_space import native_rows
-from batchpid.task_space.frames import Vector, added, components, crossed, pose_of, scaled
+from batchpid.task_space.frames import (
+    Inertias,
+    added,
+    components,
+    crossed,
+    dotted,
+    inertias_in,
+    momenta,
+    pose_of,
+    scaled,
+)
 from batchpid.task_space.rigid_tree import Bodies, RigidTree
 from batchpid.task_space.symmetric import gram, product, quiet, solve
 from batchpid.task_space.tree_kinematics import (
@@ -58,48 +69,9 @@ from batchpid.task_space.tree_kinematics import (
     velocities_of,
 )
 
-Inertias = Sequence[Array]
-"""Inertias about the origin of the world, in its axes: mass, first moment x, y, z, and entries xx,
-yy, zz, xy, xz, yz of the inertia tensor; arrays (dof, rows).
-"""
-_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
-
-def _inertias(mass: Array, center: Array, tensor: Array, frames: Array) -> Inertias:
-    """Return the inertias of bodies with ``center`` (n, 3, rows) and ``tensor`` (n, 3, 3, rows) in
-    their ``frames`` (n, 3, 4, rows).
-    """
-    axes = range(3)
-    turn = [[frames[:, i, k] for k in axes] for i in axes]
-    r = [_products(turn[i], [center[:, k] for k in axes]) + frames[:, i, 3] for i in axes]
-    half = [[_products(row, [tensor[:, k, j] for k in axes]) for j in axes] for row in turn]
-    square = _products(r, r)
-    # R I R^T + m (r.r 1 - r r^T)
-    entries = [
-        _products(half[i], turn[j]) + mass * ((square if i == j else 0.0) - r[i] * r[j])
-        for i, j in _ENTRIES
-    ]
-    return mass + 0.0 * square, *[mass * at for at in r], *entries
-
 
 def _of_bodies(bodies: Bodies, frames: Array) -> Inertias:
-    return _inertias(bodies.mass[:-1], bodies.center[:-1], bodies.tensor[:-1], frames)
-
-
-def _products(a: Sequence[Array], b: Sequence[Array]) -> Array:
-    """Return the sum of the products of components, in their order."""
-    total = a[0] * b[0]
-    for x, y in zip(a[1:], b[1:], strict=True):
-        total = total + x * y
-    return total
-
-
-def _momenta(inertias: Inertias, v: Vector, w: Vector) -> tuple[Vector, Vector]:
-    """Return the momenta p = m v + w x c and k = I w + c x v."""
-    mass, cx, cy, cz, xx, yy, zz, xy, xz, yz = inertias
-    c = cx, cy, cz
-    spin = _products((xx, xy, xz), w), _products((xy, yy, yz), w), _products((xz, yz, zz), w)
-    return added(scaled(v, mass), crossed(w, c)), added(spin, crossed(c, v))
+    return inertias_in(bodies.mass[:-1], bodies.center[:-1], bodies.tensor[:-1], frames)
 
 
 def _on_base(tree: RigidTree, part: Array) -> Array:
@@ -117,13 +89,13 @@ def _of_base(
     momenta of the whole robot under the motions of its base.
     """
     frame = xp.eye(3, 4, dtype=bodies.mass.dtype)[None, ..., None]
-    base = _inertias(bodies.mass[-1:], bodies.center[-1:], bodies.tensor[-1:], frame)
+    base = inertias_in(bodies.mass[-1:], bodies.center[-1:], bodies.tensor[-1:], frame)
     # Composites of the joints on the base contain all bodies but the base itself.
     robot = [
         _on_base(tree, part)[None] + of_base for part, of_base in zip(whole, base, strict=True)
     ]
     unit = xp.eye(6, dtype=bodies.mass.dtype)[..., None]
-    p, k = _momenta(robot, (unit[0], unit[1], unit[2]), (unit[3], unit[4], unit[5]))
+    p, k = momenta(robot, (unit[0], unit[1], unit[2]), (unit[3], unit[4], unit[5]))
     return base, _by_row(xp.stack((*p, *k)), xp)
 
 
@@ -141,17 +113,17 @@ def mass_matrix_of(
     """Return the mass matrices (rows, dof, dof) at given motions of the joints."""
     frames, linear, angular = motions
     whole = summed(tree, bodies, _of_bodies(bodies, frames), xp, outwards=False)
-    p, k = _momenta(whole, linear, angular)
+    p, k = momenta(whole, linear, angular)
     twists = [part[:, None] for part in (*linear, *angular)]
-    table = _products(twists, [part[None] for part in (*p, *k)])
+    table = dotted(twists, [part[None] for part in (*p, *k)])
     # Only entries of joints on one branch differ from 0: one of them moves the other.
     moves = bodies.moves[..., None] > 0
     rest = xp.where(moves, xp.swapaxes(table, 0, 1), xp.zeros_like(table))
     matrix = _by_row(xp.where(xp.swapaxes(moves, 0, 1), table, rest), xp)
     if not tree.fixed_base:
         # The free base yields to each joint's momentum.
-        momenta = _by_row(xp.stack((*p, *k)), xp)
-        matrix = matrix - gram(momenta, solve(_of_base(tree, bodies, whole, xp)[1], momenta))
+        of_joints = _by_row(xp.stack((*p, *k)), xp)
+        matrix = matrix - gram(of_joints, solve(_of_base(tree, bodies, whole, xp)[1], of_joints))
     matrix = matrix + bodies.armature[None] * xp.eye(tree.dof, dtype=matrix.dtype)[None]
     return xp.asarray(tree.coupling.mass_matrix(matrix), dtype=matrix.dtype)
 
@@ -176,21 +148,21 @@ def effort_of(
     if tree.fixed_base:
         weight = -bodies.gravity[:, None]
         acceleration = added(acceleration, (weight[0], weight[1], weight[2]))
-    p, k = _momenta(inertias, v, w)
-    p_rate, k_rate = _momenta(inertias, acceleration, turning_rate)
+    p, k = momenta(inertias, v, w)
+    p_rate, k_rate = momenta(inertias, acceleration, turning_rate)
     force = added(p_rate, crossed(w, p))
     torque = added(k_rate, added(crossed(w, k), crossed(v, p)))
     wrench = summed(tree, bodies, (*force, *torque), xp, outwards=False)
-    effort = _products((*linear, *angular), wrench).T
+    effort = dotted((*linear, *angular), wrench).T
     if not tree.fixed_base:
         whole = summed(tree, bodies, inertias, xp, outwards=False)
         base, matrix = _of_base(tree, bodies, whole, xp)
         on_base = xp.stack([_on_base(tree, part) for part in wrench], axis=-1)
         if turning is not None:
             turn = components(turning[None])
-            p, k = _momenta(base, scaled(turn, 0.0), turn)
+            p, k = momenta(base, scaled(turn, 0.0), turn)
             on_base = on_base + xp.stack((*crossed(turn, p), *crossed(turn, k)), axis=-1)[0]
-        p, k = _momenta(whole, linear, angular)
+        p, k = momenta(whole, linear, angular)
         falls = solve(matrix, on_base[..., None])
         effort = effort - gram(_by_row(xp.stack((*p, *k)), xp), falls)[..., 0]
     return tree.efforts(effort)
@@ -210,10 +182,7 @@ def evaluated(
     """Return quantities by name: "pose", "jacobian" and "jacobian_rate" of a ``point`` of ``link``,
     "mass_matrix" and "bias"; "jacobian_rate" and "bias" need ``qvel``.
     """
-    if qvel is None:
-        inputs = {"qpos": qpos}
-    else:
-        inputs = {"qpos": qpos, "qvel": qvel}
+    inputs = {"qpos": qpos} if qvel is None else {"qpos": qpos, "qvel": qvel}
     (q, *rates), nominal, xp = prepared(tree, **inputs)
     v = rates[0] if rates else None
     index = 0 if link is None else tree.index(link)
@@ -244,12 +213,10 @@ def evaluated(
     of_robots = Bodies(*parts)._replace(moves=nominal.moves)
     of_robots = of_robots._replace(slides=nominal.slides, mass=of_robots.mass[:, 0])
     place, turning = by_rows(point), by_rows(turning)
-    results: dict[str, Array] = {}
     with quiet():
         motions = motions_of(tree, of_robots, columns, xp)
-        if v is None:
-            velocities = None
-        else:
+        velocities: Any = None
+        if v is not None:
             speeds = v.reshape(-1, tree.dof).T
             velocities = velocities_of(
                 tree,
@@ -259,25 +226,23 @@ def evaluated(
                 xp,
                 turning,
             )
-        if link is not None:
-            tool = tool_frame(tree, of_robots, motions, index, place)
-            results["pose"] = pose_of(tool)
-            place = tool[..., 3]
-            if "jacobian" in names:
-                results["jacobian"] = jacobian_at(tree, of_robots, motions, index, place)
-            if "jacobian_rate" in names and velocities is not None:
-                results["jacobian_rate"] = rate_at(tree, velocities, index, place)
-        if "mass_matrix" in names:
-            results["mass_matrix"] = mass_matrix_of(tree, of_robots, motions, xp)
-        if "bias" in names and velocities is not None:
-            results["bias"] = effort_of(
+        tool = tool_frame(tree, of_robots, motions, index, place)
+        place = tool[..., 3]
+        by_name = {
+            "pose": lambda: pose_of(tool),
+            "jacobian": lambda: jacobian_at(tree, of_robots, motions, index, place),
+            "jacobian_rate": lambda: rate_at(tree, velocities, index, place),
+            "mass_matrix": lambda: mass_matrix_of(tree, of_robots, motions, xp),
+            "bias": lambda: effort_of(
                 tree,
                 of_robots,
                 motions,
                 velocities,
                 xp,
                 turning,
-            )
+            ),
+        }
+        results = {name: by_name[name]() for name in names}
     return {name: rows.reshape(*leading, *rows.shape[1:]) for name, rows in results.items()}
 
 
@@ -295,17 +260,7 @@ def link_poses(
     """
     prepared(tree, qpos=qpos)
     names = tree.links if links is None else links
-    poses = [
-        evaluated(
-            tree,
-            ("pose",),
-            qpos,
-            None,
-            link,
-            point,
-        )["pose"]
-        for link in names
-    ]
+    poses = [evaluated(tree, ("pose",), qpos, link=link, point=point)["pose"] for link in names]
     return namespace(*poses).stack(poses, axis=-2)
 
 
@@ -321,14 +276,7 @@ def jacobian(
 
     ``point`` is in the link's frame, (3,) or (..., 3) [m]; default its origin.
     """
-    return evaluated(
-        tree,
-        ("jacobian",),
-        qpos,
-        None,
-        link,
-        point,
-    )["jacobian"]
+    return evaluated(tree, ("jacobian",), qpos, link=link, point=point)["jacobian"]
 
 
 def jacobian_rate(

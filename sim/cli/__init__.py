@@ -16,8 +16,6 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-import tyro
-
 import batchpid
 from batchpid.checks import choice
 from batchpid.errors import BatchPIDError
@@ -36,6 +34,15 @@ SUMMARIES = {
     "view": "Show moving robots in the browser.",
 }
 """Every command, with its line in the overview."""
+OVERVIEW = "\n".join(
+    [
+        "usage: batchpid COMMAND ...\n",
+        "Joint-level PID control for many robots at once, in SAPIEN or MuJoCo.\n",
+        *(f"  {name:10}{summary}" for name, summary in SUMMARIES.items()),
+        "\n`batchpid COMMAND --help` lists the flags of a command.",
+    ]
+)
+"""Help of the whole."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -70,38 +77,24 @@ def parse(arguments: Sequence[str]) -> tuple[str, object]:
     """
     if os.environ.get("NO_COLOR"):
         os.environ["TERM"] = "dumb"  # tyro colours its help on every other terminal
-    config = (
-        tyro.conf.DisallowNone,  # a flag is left out, not given None
-        tyro.conf.FlagCreatePairsOff,  # --force without --no-force
-        tyro.conf.PositionalMetavarFromFieldName,
-        # Without a help of the choice itself, tyro looks for one in the source of `typing`, which
-        # takes 0.05 s.
-        tyro.conf.arg(help="`batchpid COMMAND --help` lists the flags of a command."),
-    )
     # A command is parsed alone, so that a message names its help.
     if arguments and not arguments[0].startswith("-"):
         name, *words = arguments
         choice("command", name, SUMMARIES)
+        import tyro
+
         from batchpid.sim.cli.commands import COMMANDS
 
-        record = COMMANDS[name].record()
-        return name, tyro.cli(
-            record,
-            prog=f"batchpid {name}",
-            args=words,
-            config=config,
+        config = (
+            tyro.conf.DisallowNone,  # a flag is left out, not given None
+            tyro.conf.FlagCreatePairsOff,  # --force without --no-force
+            tyro.conf.PositionalMetavarFromFieldName,
         )
-    app = tyro.extras.SubcommandApp()
-    for name, summary in SUMMARIES.items():
-        app.command(name=name, help=summary)(_nothing)
-    about = "Joint-level PID control for many robots at once, in SAPIEN or MuJoCo."
-    app.cli(
-        prog="batchpid",
-        description=about,
-        args=arguments,
-        config=config,
-    )
-    raise SystemExit(0)
+        record = COMMANDS[name].record()
+        return name, tyro.cli(record, prog=f"batchpid {name}", args=words, config=config)
+    is_help = not {"-h", "--help"}.isdisjoint(arguments)
+    print(OVERVIEW, file=sys.stdout if is_help else sys.stderr)
+    raise SystemExit(0 if is_help else INPUT_ERROR)
 
 
 def _run(arguments: list[str]) -> int:
@@ -131,7 +124,3 @@ def _fail(status: int, message: str) -> int:
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     print(f"batchpid: warning: {message}", file=sys.stderr)
-
-
-def _nothing() -> None:
-    """Stand for a command in the overview."""

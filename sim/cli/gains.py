@@ -35,7 +35,7 @@ ENDINGS = {
 """Suffix of the file of each target."""
 USED = {
     "c": ("gains", "limits", "dynamics", "plan"),
-    "ros2_control": ("gains", "limits"),
+    "ros2_control": ("gains",),
     "mjcf": ("gains",),
     "urdf": (),
 }
@@ -184,19 +184,36 @@ def export(
     if to == "mjcf":
         exported = _mjcf(robot, gains, timestep)
         return ExportedFile(to, lambda folder: exported)
+    # The law: its joints are all of them in C, and the leaders alone in ros2_control.
+    from batchpid.export import to_c, to_ros2_control
+    from batchpid.plan import load_plan
+
     params = law_gains(robot, gains)
+    leaders = robot.independent
+    names = np.array(robot.joint_names)
     if to == "c":
-        exported = _c_header(
-            robot,
+        exported = to_c(
             params,
             timestep,
-            limits,
-            prefix,
-            dynamics,
-            plan,
+            joint_names=robot.joint_names,
+            guard=robot.guard() if limits else None,
+            prefix=prefix,
+            tree=robot.kinematic_tree() if dynamics else None,
+            plan=None if plan is None else load_plan(plan, robot.joint_names)[0],
         )
+        place = "separate joints in the file; ignore their efforts"
     else:
-        exported = _controllers(robot, params, timestep, limits, prefix)
+        exported = to_ros2_control(
+            params.for_joints(leaders),
+            names[leaders].tolist(),
+            timestep,
+            name=prefix,
+            inertia=_inertia(robot)[leaders],
+        )
+        place = "not in the file"
+    if not leaders.all():
+        text = f"{', '.join(names[~leaders])}: followers are {place}"
+        exported = exported._replace(differences=(*exported.differences, text))
     return ExportedFile(to, lambda folder: exported)
 
 
@@ -208,64 +225,6 @@ def law_gains(robot: Robot, gains: str | None) -> bp.PIDParams:
         problem = "belong to a drive, and not to the law"
         raise InvalidArgumentError("gains", problem, value=chosen.name, remedy=remedy)
     return chosen.params
-
-
-def _c_header(
-    robot: Robot,
-    params: bp.PIDParams,
-    dt: float,
-    limits: bool,
-    prefix: str,
-    dynamics: bool,
-    plan: Path | None,
-) -> Exported:
-    """Return the C header."""
-    from batchpid.export import to_c
-    from batchpid.plan import load_plan
-
-    exported = to_c(
-        params,
-        dt,
-        joint_names=robot.joint_names,
-        guard=robot.guard() if limits else None,
-        prefix=prefix,
-        tree=robot.kinematic_tree() if dynamics else None,
-        plan=None if plan is None else load_plan(plan, robot.joint_names)[0],
-    )
-    return _with_followers(robot, exported, "separate joints in the file; ignore their efforts")
-
-
-def _controllers(
-    robot: Robot,
-    params: bp.PIDParams,
-    dt: float,
-    limits: bool,
-    name: str,
-) -> Exported:
-    """Return the file of controllers for ros2_control."""
-    from batchpid.export import to_ros2_control
-
-    leaders = robot.independent
-    exported = to_ros2_control(
-        params.for_joints(leaders),
-        [robot.joint_names[joint] for joint in np.flatnonzero(leaders)],
-        dt,
-        name=name or "joint_trajectory_controller",
-        inertia=_inertia(robot)[leaders],
-    )
-    if limits:
-        text = "guard: setpoints are not limited in the target"
-        exported = exported._replace(differences=(*exported.differences, text))
-    return _with_followers(robot, exported, "not in the file")
-
-
-def _with_followers(robot: Robot, exported: Exported, place: str) -> Exported:
-    """Return the file with a difference about followers, if there are any."""
-    names = [robot.joint_names[joint] for joint in np.flatnonzero(~robot.independent)]
-    if not names:
-        return exported
-    text = f"{', '.join(names)}: followers are {place}"
-    return exported._replace(differences=(*exported.differences, text))
 
 
 def _mjcf(robot: Robot, gains: str | None, dt: float) -> Exported:

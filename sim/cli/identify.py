@@ -218,11 +218,8 @@ def _gains(robot: Robot, name: str) -> bp.PIDParams:
     import batchpid as bp
     from batchpid.sim.tuning.gain_sets import gain_set
 
-    try:
+    if not Path(name).is_file():
         return gain_set(robot, name).params
-    except InvalidArgumentError:
-        if Path(name).suffix.lower() not in (".yaml", ".yml", ".json") or not Path(name).is_file():
-            raise
-        # The log may be of some joints: the file names them.
-        joints = [joint for joint in robot.joint_names if joint in bp.load_params(name)[1]]
-        return bp.load_params(name, joints)[0]
+    # The log may be of some joints: the file names them.
+    joints = [joint for joint in robot.joint_names if joint in bp.load_params(name)[1]]
+    return bp.load_params(name, joints)[0]

@@ -212,11 +212,12 @@ class Recording:
         """Draw the run."""
         from batchpid.sim import plots
 
-        if self.kind == "responses":
-            return plots.step_responses(self.rollout)
-        if self.kind == "efforts":
-            return plots.efforts(self.rollout)
-        return plots.following_errors(self.rollout)
+        draw = {
+            "responses": plots.step_responses,
+            "efforts": plots.efforts,
+            "following": plots.following_errors,
+        }
+        return draw[self.kind](self.rollout)
 
     def film(self, path: Path, progress: Progress[int]) -> None:
         """Film the first :data:`SHOWN_ENVS` envs in real time."""

@@ -6,9 +6,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -336,8 +335,7 @@ class RunReport:
             return 0
         return NOT_SETTLED
 
-    @cached_property
-    def columns(self) -> tuple[Sequence[str], Sequence[str], dict[str, Rows]]:
+    def _columns(self) -> tuple[Sequence[str], Sequence[str], dict[str, Rows]]:
         """Names and units of the joints, or of the axes of the tool, and their figures (envs,
         joints).
 
@@ -371,7 +369,7 @@ class RunReport:
 
     def report(self) -> str:
         """Return the speed, a table of the joints, failed and unsettled envs, and causes."""
-        names, units, figures = self.columns
+        names, units, figures = self._columns()
         shown = [column for column in COLUMNS if column in figures]
         rows = []
         for joint, (name, unit) in enumerate(zip(names, units, strict=True)):
@@ -385,33 +383,20 @@ class RunReport:
             speed_line(self.rollout.num_envs, self.seconds, self.timestep, self.wall) + "\n",
             table(rows, headers, "l" + "r" * len(shown)),
             ROLLOUT_NOTES,
-            *self._unsettled_lines(),
+            *self._settling_lines(),
             *(f"Note: {note}" for note in self.notes),
         ]
         return "\n".join(lines)
 
-    def _unsettled_lines(self) -> list[str]:
-        """Return lines about joints that did not settle, and the causes."""
-        rollout = self.rollout
-        causes = rollout.findings(self.robot)
+    def _settling_lines(self) -> Iterator[str]:
+        """Yield lines about the causes for which joints did not settle, or one that all did."""
+        causes = list(self.rollout.findings(self.robot))
         # A trajectory ends where it ends: its last setpoint need not be reached.
         if not self.is_held:
-            return list(cause_lines([cause for cause in causes if cause.code == "failed"]))
-        lines = []
-        settling = self.columns[2].get("settling_time")
-        if settling is not None:
-            # Joints of failed envs are not counted; followers do what their leaders do.
-            counts = np.isinf(settling[rollout.ok.all(0)]).sum(0) * self.robot.independent
-            named = zip(self.robot.joint_names, counts, strict=True)
-            joints = [f"{name} ({count})" for name, count in named if count]
-            within = f"within {self.seconds:g} s to 2 % of"
-            if joints:
-                lines.append(
-                    f"NOT SETTLED {within} the move, with the number of envs: {', '.join(joints)}."
-                )
-            elif rollout.ok.all():
-                lines.append(f"Every joint of every env settled {within} its move.")
-        return [*lines, *cause_lines(causes)]
+            causes = [cause for cause in causes if cause.code == "failed"]
+        elif not causes and self.rollout.tool_pose is None:
+            yield f"Every joint of every env settled within {self.seconds:g} s to 2 % of its move."
+        yield from cause_lines(causes)
 
     def save(self, path: Path) -> None:
         """Write the recording."""

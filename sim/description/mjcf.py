@@ -23,7 +23,6 @@ from batchpid.motors import make_actuators
 from batchpid.sim.description.mjcf_bodies import (
     PLANE,
     RobotInFile,
-    TableReader,
     can_collide,
     excluded_pairs,
     label,
@@ -108,8 +107,7 @@ def _read(
         fixed_base = not (robot.base and model.body_jntnum[robot.base])
     couplings = read_couplings(robot)
     motors = read_motors(robot, couplings)
-    reader = TableReader(robot, motors)
-    tables = reader.read(couplings, is_held=fixed_base)
+    tables = robot.read(couplings, motors, is_held=fixed_base)
     _report_unused(robot)
     # The start pose is that of the keyframe, else the reference pose.
     key = home(model)
@@ -139,7 +137,7 @@ def _read(
         # A file of motors alone has no gains to offer.
         gains if (motors.kp + motors.kd).any() else None,
         mjcf=_file(path, compiled, robot, fixed_base),
-        disabled=excluded_pairs(model, reader.solid),
+        disabled=excluded_pairs(model, robot.solid),
         actuators=actuators if actuators is not None and actuators.num_joints else None,
     )
 

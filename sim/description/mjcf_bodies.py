@@ -17,6 +17,8 @@ A mesh collides as its convex hull, in MuJoCo and in PhysX, and an ellipsoid as 
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -75,7 +77,8 @@ class RobotInFile:
 
     ``bodies`` has all bodies of the file, ``joints`` the hinges and slides of the robot, ``base``
     is the body of the root, 0 for the world. ``moments`` are the moment arms of the outputs of
-    actuators on the degrees of freedom, at the reference pose. ``link_names`` and ``joint_names`` are all names in
+    actuators on the degrees of freedom, at the reference pose. After :meth:`read` ``solid`` is the
+    row of each body that has shapes, by the body's number. ``link_names`` and ``joint_names`` are all names in
     use. ``repairs`` are findings of what is simulated otherwise than the file says. ``lost`` has names
     of contents, by kind, that only an engine simulates that reads the file itself.
 
@@ -104,6 +107,10 @@ class RobotInFile:
             for joint in range(model.njnt)
             if int(model.jnt_type[joint]) not in (_FREE, _BALL)
         }
+        self._anchors = {0: ORIGIN}  # origin of each body's row, in the frame of the body
+        self._bodies: list[Body] = []
+        self._shapes: list[Shape] = []
+        self.solid: dict[int, str] = {}
         self.base = self._find_base(joints, path)
         self.joints = {
             joint: name
@@ -164,48 +171,35 @@ class RobotInFile:
                 return 0
         return only
 
-
-class TableReader:
-    """Reader of the tables of ``robot``.
-
-    ``solid`` is the row of each body that has shapes, by the body's number.
-    """
-
-    def __init__(self, robot: RobotInFile, motors: JointMotors) -> None:
-        self._model = robot.model
-        self._robot = robot
-        self._motors = motors
-        self._anchors = {0: ORIGIN}  # origin of each body's row, in the frame of the body
-        self._bodies: list[Body] = []
-        self._shapes: list[Shape] = []
-        self.solid: dict[int, str] = {}
-
-    def read(self, couplings: Couplings, is_held: bool) -> Tables:
+    def read(self, couplings: Couplings, motors: JointMotors, is_held: bool) -> Tables:
         """Return the tables; ``is_held`` says whether a base on a free joint is fixed."""
-        model, robot = self._model, self._robot
+        model = self.model
+        read_joint = partial(self._read_joint, couplings, motors)
         root = None
-        if robot.base == 0:
-            self._add(0, Body(robot.bodies[0], None), ORIGIN)
+        if self.base == 0:
+            self._add(0, Body(self.bodies[0], None), ORIGIN)
         # A free joint that is held keeps its turn: a row above the base has it.
-        elif is_held and model.body_quat[robot.base][0] != 1:
-            root = unique(f"{robot.bodies[robot.base]}_frame", robot.link_names)
+        elif is_held and model.body_quat[self.base][0] != 1:
+            root = unique(f"{self.bodies[self.base]}_frame", self.link_names)
             self._bodies.append(Body(root, None))
-        rows = {robot.base}
+        rows = {self.base}
         for body in range(1, model.nbody):
             above = int(model.body_parentid[body])
-            if body == robot.base:
-                self._read_body(body, root, couplings)
-            elif above in rows and robot.is_of_robot(body):
-                self._read_body(body, robot.bodies[above], couplings)
+            if body == self.base:
+                self._read_body(body, root, read_joint)
+            elif above in rows and self.is_of_robot(body):
+                self._read_body(body, self.bodies[above], read_joint)
                 rows.add(body)
         self._report_absent(rows)
         return breadth_first(self._bodies, self._shapes)
 
-    def _read_body(self, body: int, parent: str | None, couplings: Couplings) -> None:
+    def _read_body(
+        self, body: int, parent: str | None, read_joint: Callable[[int, str, str], Joint]
+    ) -> None:
         """Read a body, and the joints between it and the row ``parent``; None for the root."""
-        model = self._model
-        name = self._robot.bodies[body]
-        joints = [joint for joint in self._robot.joints if model.jnt_bodyid[joint] == body]
+        model = self.model
+        name = self.bodies[body]
+        joints = [joint for joint in self.joints if model.jnt_bodyid[joint] == body]
         place = model.body_pos[body] - self._anchors[int(model.body_parentid[body])]
         turn = model.body_quat[body].copy()
         anchor = ORIGIN
@@ -213,7 +207,7 @@ class TableReader:
             place = ORIGIN
         row = Body(name, None)
         if parent is not None and not joints:
-            fixed = unique(f"{name}_fixed", self._robot.joint_names)
+            fixed = unique(f"{name}_fixed", self.joint_names)
             row = Body(name, Joint(fixed, "fixed", parent, name), place, turn)
         for number in joints:
             axis = model.jnt_axis[number]
@@ -227,8 +221,8 @@ class TableReader:
                 turn = compose(turn, about(axis, np.asarray(-rest)))
             link = name
             if number != joints[-1]:
-                link = unique(f"{name}_{self._robot.joints[number]}", self._robot.link_names)
-            row = Body(link, self._read_joint(number, str(parent), link, couplings), place, turn)
+                link = unique(f"{name}_{self.joints[number]}", self.link_names)
+            row = Body(link, read_joint(number, str(parent), link), place, turn)
             if number != joints[-1]:
                 self._bodies.append(row)
             # The next joint of the body begins where this one ends.
@@ -239,14 +233,14 @@ class TableReader:
 
     def _read_joint(
         self,
+        couplings: Couplings,
+        motors: JointMotors,
         number: int,
         parent: str,
         link: str,
-        couplings: Couplings,
     ) -> Joint:
-        model = self._model
-        motors = self._motors
-        name = self._robot.joints[number]
+        model = self.model
+        name = self.joints[number]
         dof = model.jnt_dofadr[number]
         lower, upper = -np.inf, np.inf
         if model.jnt_limited[number]:
@@ -262,11 +256,11 @@ class TableReader:
             text = "its servo in the file limits the setpoint"
             remedy = "pass guard=True to a runner for these limits"
             detail = f"{soft_lower:g} to {soft_upper:g}"
-            self._robot.repairs.append(Finding("limits", text, remedy, name, detail=detail))
+            self.repairs.append(Finding("limits", text, remedy, name, detail=detail))
         mimic = None
         if number in couplings:
             leader, *law = couplings[number]
-            mimic = Mimic(self._robot.joints[leader], *law)
+            mimic = Mimic(self.joints[leader], *law)
         return Joint(
             name,
             kind,
@@ -286,7 +280,7 @@ class TableReader:
 
     def _add(self, body: int, row: Body, anchor: Float64) -> None:
         """Add a row with inertia and shapes of a body, in a frame with its origin at ``anchor``."""
-        model = self._model
+        model = self.model
         self._anchors[body] = anchor
         for geom in self._geoms(body):
             if (shape := self._read_shape(geom, row.name, anchor)) is not None:
@@ -300,18 +294,18 @@ class TableReader:
             center = model.body_ipos[body] - anchor
             inertia = np.diag(model.body_inertia[body])
             turn = model.body_iquat[body].copy()
-            row = with_mass(row, mass, center, inertia, turn, self._robot.repairs)
+            row = with_mass(row, mass, center, inertia, turn, self.repairs)
         self._bodies.append(row)
 
     def _geoms(self, body: int) -> list[int]:
         """Return the geoms of a body that can collide."""
-        first = int(self._model.body_geomadr[body])
-        geoms = range(first, first + int(self._model.body_geomnum[body]))
-        return [geom for geom in geoms if can_collide(self._model, geom)]
+        first = int(self.model.body_geomadr[body])
+        geoms = range(first, first + int(self.model.body_geomnum[body]))
+        return [geom for geom in geoms if can_collide(self.model, geom)]
 
     def _read_shape(self, geom: int, link: str, anchor: Float64) -> Shape | None:
         """Return the shape of a geom of ``link``, None for a plane or a height field."""
-        model = self._model
+        model = self.model
         shape_type = int(model.geom_type[geom])
         place = model.geom_pos[geom] - anchor
         turn = model.geom_quat[geom].copy()
@@ -346,8 +340,8 @@ class TableReader:
         """Report the shapes of the robot and of the world that are no shapes of the tables. A level
         plane at height 0 is the ground of the engines.
         """
-        model = self._model
-        absent = self._robot.lost["planes, height fields and shapes of the world"]
+        model = self.model
+        absent = self.lost["planes, height fields and shapes of the world"]
         for geom in [geom for body in sorted({0, *rows}) for geom in self._geoms(body)]:
             body = int(model.geom_bodyid[geom])
             kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()

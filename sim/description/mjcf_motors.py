@@ -39,15 +39,6 @@ _OF_TENDONS = (
 """Effects of a tendon by itself."""
 
 
-class Servo(NamedTuple):
-    """Law of an actuator, in units of its transmission. Without gains it is a motor."""
-
-    kp: float = 0.0
-    kv: float = 0.0
-    input_gain: float = 1.0
-    """Setpoint per unit of the control."""
-
-
 class JointMotors(NamedTuple):
     """Motors of the joints (joints,), in N m or N, by the joints' numbers in the file."""
 
@@ -107,8 +98,9 @@ def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
     arms = moments @ shares
     for actuator, row in enumerate(arms):
         moved = np.flatnonzero(row).tolist()
-        servo = _servo(model, actuator) if len(moved) == 1 else Servo()
-        if len(moved) != 1 or not _is_plain(model, actuator):
+        stiffness, damping = _gains(model, actuator) * (len(moved) == 1)
+        is_read = len(moved) == 1 and _is_plain(model, actuator)
+        if not is_read:
             text = f"actuator {label(model.actuator(actuator))} has effects that are not simulated"
             text += ": only motors and servos of one joint are"
             remedy = "check gains and limits of the joint"
@@ -118,13 +110,14 @@ def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
             force = _largest_force(model, actuator, robot.joints[joint], findings)
             limits[joint] += abs(row[joint]) * force
             armature[joint] += row[joint] ** 2 * np.ravel(model.actuator_armature[actuator])[0]
-            kp[joint] += row[joint] ** 2 * servo.kp
-            kd[joint] += row[joint] ** 2 * servo.kv
+            kp[joint] += row[joint] ** 2 * stiffness
+            kd[joint] += row[joint] ** 2 * damping
         # The range of a servo's setpoints, where it moves with one joint alone.
         alone = np.flatnonzero(moments[actuator]).tolist()
         control = int(model.actuator_ctrladr[actuator])
-        if servo.kp and len(alone) == 1 and model.actuator_ctrllimited[control]:
-            ends = servo.input_gain * model.actuator_ctrlrange[control]
+        if is_read and stiffness and len(alone) == 1 and model.actuator_ctrllimited[control]:
+            gain = model.actuator_gainprm[actuator, 0] / stiffness
+            ends = gain * model.actuator_ctrlrange[control]
             setpoints[:, alone[0]] = np.sort(ends / moments[actuator, alone[0]])
     unmoved = np.zeros(model.njnt, bool)
     for joint, name in robot.joints.items():
@@ -200,16 +193,14 @@ def _is_plain(model: MjModel, actuator: int) -> bool:
     return bool(bias == _BIAS.mjBIAS_NONE or is_law)
 
 
-def _servo(model: MjModel, actuator: int) -> Servo:
-    """Return the law of an actuator; that of a motor for unknown laws."""
+def _gains(model: MjModel, actuator: int) -> Float64:
+    """Return stiffness and damping (2,) of an actuator; 0 for a motor and unknown laws."""
     # A plugin's parameters have other meanings.
     is_affine = model.actuator_biastype[actuator] == _BIAS.mjBIAS_AFFINE
     if model.actuator_plugin[actuator] >= 0 or not is_affine:
-        return Servo()
-    kp, kv = np.maximum(-model.actuator_biasprm[actuator, 1:3], 0.0).tolist()
-    if model.actuator_gaintype[actuator] == _GAIN.mjGAIN_FIXED and kp:
-        return Servo(kp, kv, float(model.actuator_gainprm[actuator, 0]) / kp)
-    return Servo(kp, kv)
+        return np.zeros(2)
+    gains: Float64 = np.maximum(-model.actuator_biasprm[actuator, 1:3], 0.0)
+    return gains
 
 
 def _largest_force(model: MjModel, actuator: int, name: str, findings: list[Finding]) -> float:
@@ -221,7 +212,7 @@ def _largest_force(model: MjModel, actuator: int, name: str, findings: list[Find
     control = int(model.actuator_ctrladr[actuator])
     is_fixed = model.actuator_gaintype[actuator] == _GAIN.mjGAIN_FIXED
     is_force = is_fixed and int(model.actuator_dyntype[actuator]) in _FILTERS
-    is_motor = not any(_servo(model, actuator)[:2])
+    is_motor = not _gains(model, actuator).any()
     if is_motor and is_force and model.actuator_ctrllimited[control]:
         forces = float(model.actuator_gainprm[actuator, 0]) * model.actuator_ctrlrange[control]
         low = max(low, float(forces.min()))

@@ -22,7 +22,7 @@ from batchpid.arrays.elementwise import TURN, wrap
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import SETTLING_SHARE
 from batchpid.sim.diagnosis.preflight import touching_links
-from batchpid.sim.findings import FINDING_KINDS, LIMIT_TOLERANCE, Finding, Findings
+from batchpid.sim.findings import LIMIT_TOLERANCE, Finding, Findings
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.robot import Robot
@@ -105,18 +105,12 @@ def _finding(
     for fault in run.info.faults:
         if run.failed[first] and fault.env == first:
             detail = f"{fault.joint}: {fault.cause}"
-    numbers = tuple(envs[rows].tolist())
-    time = times.min()
-    kind = FINDING_KINDS[code]
-    return Finding(
-        kind.code,
-        kind.when,
-        kind.done,
-        name,
-        None,
-        detail,
-        numbers,
-        time,
+    return Finding.of(
+        code,
+        joint=name,
+        detail=detail,
+        envs=tuple(envs[rows].tolist()),
+        time=times.min(),
     )
 
 

@@ -22,7 +22,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.diagnosis.loop_stability import NEAR_BOUND, stability_report
-from batchpid.sim.findings import FINDING_KINDS, LIMIT_TOLERANCE, SEVERITIES, Finding, Findings
+from batchpid.sim.findings import LIMIT_TOLERANCE, SEVERITIES, Finding, Findings
 from batchpid.sim.geometry.shapes import (
     LEAST_MASS,
     extent,
@@ -91,26 +91,6 @@ def check(
     return Findings(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
-def _found(
-    code: str,
-    joint: str | None = None,
-    link: str | None = None,
-    detail: str = "",
-    text: str = "",
-    remedy: str = "",
-) -> Finding:
-    """Return a finding; text and remedy are those of the kind where they are not given."""
-    kind = FINDING_KINDS[code]
-    return Finding(
-        code,
-        text or kind.when,
-        remedy or kind.done,
-        joint,
-        link,
-        detail,
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class _Plan:
     """Robot, and what it is to do."""
@@ -160,11 +140,11 @@ def _odd_sizes(plan: _Plan) -> Iterator[Finding]:
     of_chain = f"the robot's chain of joints is {plan.chain:.3g} m long"
     for name, size in sizes.items():
         if size > LARGEST_SHAPES * max(plan.chain, SHORTEST_CHAIN):
-            yield _found("units", link=name, detail=f"shapes of {size:.3g} m; {of_chain}")
+            yield Finding.of("units", link=name, detail=f"shapes of {size:.3g} m; {of_chain}")
     # A single small link is common, such as a sensor.
     largest = max(sizes.values(), default=math.inf)
     if largest < SMALLEST_SHAPES * plan.chain:
-        yield _found("units", detail=f"shapes of at most {largest:.2g} m; {of_chain}")
+        yield Finding.of("units", detail=f"shapes of at most {largest:.2g} m; {of_chain}")
 
 
 def _odd_angles(plan: _Plan) -> Iterator[Finding]:
@@ -178,7 +158,7 @@ def _odd_angles(plan: _Plan) -> Iterator[Finding]:
             if MOST_RADIANS < abs(angle) <= PLACEHOLDER
         ]
         if large and joint.unit == "rad":
-            yield _found("units", joint.name, detail=", ".join(large))
+            yield Finding.of("units", joint=joint.name, detail=", ".join(large))
 
 
 def _odd_inertia(plan: _Plan) -> Iterator[Finding]:
@@ -186,15 +166,13 @@ def _odd_inertia(plan: _Plan) -> Iterator[Finding]:
     for link in plan.robot.tables.bodies:
         excess = triangle_excess(link.inertia) if link.mass else 0.0
         if excess > LEAST_EXCESS:
-            text = "no body has such an inertia tensor, a moment above the sum of the others"
-            detail = f"by {100 * excess:.0f} %"
-            yield _found(
+            yield Finding.of(
                 "inertia",
-                None,
-                link.name,
-                detail,
-                f"{text}: simulated as given",
-                "correct <inertia>",
+                text="no body has such an inertia tensor, a moment above the sum of the others:"
+                " simulated as given",
+                remedy="correct <inertia>",
+                link=link.name,
+                detail=f"by {100 * excess:.0f} %",
             )
 
 
@@ -218,24 +196,21 @@ def _massless(plan: _Plan) -> Iterator[Finding]:
         if robot.fixed_base and bodies[name] == root:
             continue
         if name in shaped:
-            yield _found("no-inertia", link=name, detail=f"{shaped[name]:.3g} kg")
+            yield Finding.of("no-inertia", link=name, detail=f"{shaped[name]:.3g} kg")
         elif name == bodies[name] and name not in loaded:
-            yield _found("no-inertia", link=name, detail="1e-6 kg")
+            yield Finding.of("no-inertia", link=name, detail="1e-6 kg")
 
 
 def _changed_meshes(plan: _Plan) -> Iterator[Finding]:
     """Yield links with a mesh that is much smaller than the hull that collides in its place."""
     for shape in plan.robot.tables.shapes:
         if (share := hull_share(shape)) > LARGEST_HULL:
-            text = "a collision mesh is not convex, and collides as its convex hull"
-            detail = f"{share:.3g} times its volume"
-            yield _found(
+            yield Finding.of(
                 "collision",
-                None,
-                shape.owner,
-                detail,
-                text,
-                "divide the mesh into convex parts",
+                text="a collision mesh is not convex, and collides as its convex hull",
+                remedy="divide the mesh into convex parts",
+                link=shape.owner,
+                detail=f"{share:.3g} times its volume",
             )
 
 
@@ -249,7 +224,7 @@ def _touching(plan: _Plan) -> Iterator[Finding]:
         pairs = touching_links(robot, qpos, ground, 0.0)
         if pairs:
             *_, nearest = pairs
-            yield _found("touching", detail=f"{name}: {nearest}")
+            yield Finding.of("touching", detail=f"{name}: {nearest}")
 
 
 def _outside(plan: _Plan) -> Iterator[Finding]:
@@ -259,9 +234,11 @@ def _outside(plan: _Plan) -> Iterator[Finding]:
             for joint, value in zip(plan.robot.joints, qpos.tolist(), strict=True):
                 if joint.lower - LIMIT_TOLERANCE <= value <= joint.upper + LIMIT_TOLERANCE:
                     continue
-                limits = f"limits [{joint.lower:g}, {joint.upper:g}]"
-                yield _found(
-                    "out-of-limits", joint.name, detail=f"{name} {value:g} {joint.unit}, {limits}"
+                yield Finding.of(
+                    "out-of-limits",
+                    joint=joint.name,
+                    detail=f"{name} {value:g} {joint.unit}, limits [{joint.lower:g},"
+                    f" {joint.upper:g}]",
                 )
 
 
@@ -270,16 +247,12 @@ def _without_range(plan: _Plan) -> Iterator[Finding]:
     reported = {repair.joint for repair in plan.robot.repairs if repair.code == "limits"}
     for joint in plan.robot.joints:
         if joint.lower == joint.upper and not joint.continuous and joint.name not in reported:
-            text = "lower and upper limit are equal: no motion"
-            limits = f"[{joint.lower:g}, {joint.upper:g}]"
-            remedy = "give <limit lower= upper=>, or make it fixed"
-            yield _found(
+            yield Finding.of(
                 "limits",
-                joint.name,
-                None,
-                limits,
-                text,
-                remedy,
+                text="lower and upper limit are equal: no motion",
+                remedy="give <limit lower= upper=>, or make it fixed",
+                joint=joint.name,
+                detail=f"[{joint.lower:g}, {joint.upper:g}]",
             )
 
 
@@ -291,9 +264,9 @@ def _weak(plan: _Plan) -> Iterator[Finding]:
     share = (load + robot.friction >= limits).mean(0)
     for index in np.flatnonzero((share > 0) & (limits > 0)):
         joint = robot.joints[index]
-        yield _found(
+        yield Finding.of(
             "effort-limit",
-            joint.name,
+            joint=joint.name,
             detail=f"{joint.effort_limit:g} {joint.effort_unit}, gravity up to"
             f" {load[:, index].max():.3g}, friction {joint.friction:g},"
             f" {100 * share[index]:.0f} % of poses",
@@ -305,7 +278,9 @@ def _without_effort_limit(plan: _Plan) -> Iterator[Finding]:
     robot = plan.robot
     for joint, limit in zip(robot.joints, robot.design_effort_limit, strict=True):
         if math.isinf(joint.effort_limit) and joint.mimic is None:
-            yield _found("no-effort-limit", joint.name, detail=f"{limit:.3g} {joint.effort_unit}")
+            yield Finding.of(
+                "no-effort-limit", joint=joint.name, detail=f"{limit:.3g} {joint.effort_unit}"
+            )
 
 
 def _wrong_turns(plan: _Plan) -> Iterator[Finding]:
@@ -316,14 +291,11 @@ def _wrong_turns(plan: _Plan) -> Iterator[Finding]:
     if plan.params.continuous is not None:
         wraps |= np.asarray(plan.params.continuous).any(axis=0)
     for joint, is_wrapped in zip(plan.robot.joints, wraps, strict=True):
-        if joint.continuous and not is_wrapped:
-            yield _found(
-                "continuous", joint.name, detail="in the file: the error jumps where qpos wraps"
-            )
-        if is_wrapped and not joint.continuous:
-            yield _found(
-                "continuous", joint.name, detail="in params: the short way round may exceed limits"
-            )
+        if joint.continuous != is_wrapped:
+            detail = "in params: the short way round may exceed limits"
+            if joint.continuous:
+                detail = "in the file: the error jumps where qpos wraps"
+            yield Finding.of("continuous", joint=joint.name, detail=detail)
 
 
 def _unstable(plan: _Plan) -> Iterator[Finding]:
@@ -342,7 +314,7 @@ def _unstable(plan: _Plan) -> Iterator[Finding]:
         effect = motion
     joint = robot.joint_names[int(np.argmax(participation))]
     detail = f"{ratio:.3g} times the bound at the start pose: {effect}"
-    yield _found("unstable", joint, detail=detail, remedy=remedy)
+    yield Finding.of("unstable", joint=joint, detail=detail, remedy=remedy)
 
 
 ODDITIES: tuple[Callable[[_Plan], Iterator[Finding]], ...] = (

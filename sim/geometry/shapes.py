@@ -16,7 +16,7 @@ import os
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import mujoco
 import numpy as np
@@ -134,38 +134,33 @@ def extent(shape: Shape) -> float:
 def mesh_hull(file: str, content: str) -> Triangles:
     """Return the convex hull of a mesh file with this digest, unscaled [m]. Raises RobotError."""
     try:
-        hull_of_mesh = convex_hull(_mesh_surface(file, content).vertices)
+        return convex_hull(_mesh_surface(file, content).vertices)
     except ValueError as error:
-        raise RobotError(
-            f"{file}: cannot be read: {error}; repair the file, or remove that <collision>"
-        ) from error
-    return hull_of_mesh
+        raise _unreadable(file, error) from error
 
 
-def _mesh_surface(file: str, content: str) -> Triangles:
-    """Return the triangles of a mesh file, without copies of vertices, unscaled [m]."""
+def _unreadable(file: str, error: Exception) -> RobotError:
+    return RobotError(
+        f"{file}: cannot be read: {error}; repair the file, or remove that <collision>"
+    )
+
+
+def _mesh_surface(file: str, content: str) -> Any:
+    """Return the mesh of a file as of ``trimesh``, without copies of vertices, unscaled [m]."""
     data = mesh_bytes(file, content)
     try:
         mesh = read_mesh(file, data)
-        rows = np.ascontiguousarray(mesh.vertices, float) + 0.0  # no -0.0
-        # Unique by their bytes, which is much faster than along an axis.
-        vertices, numbers = np.unique(rows.view("V24"), return_inverse=True)
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
     except Exception as error:
-        raise RobotError(
-            f"{file}: cannot be read: {error}; repair the file, or remove that <collision>"
-        ) from error
-    return Triangles(vertices.view(float).reshape(-1, 3), numbers.ravel()[mesh.faces])
+        raise _unreadable(file, error) from error
+    return mesh
 
 
 @lru_cache(maxsize=256)
 def mesh_solid(file: str, content: str) -> Triangles | None:
     """Return the surface of a mesh file that encloses a volume, unscaled [m]; None for others."""
-    surface = _mesh_surface(file, content)
-    edges = surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    forth, back = ({*map(tuple, rows.tolist())} for rows in (edges, edges[:, ::-1]))
-    # Around a volume every edge is one of two triangles, once in each direction.
-    is_closed = len(forth) == len(edges) and forth == back
-    return surface if is_closed and surface.volume > 0 else None
+    mesh = _mesh_surface(file, content)
+    return Triangles(mesh.vertices, mesh.faces) if mesh.is_volume else None
 
 
 def hull_share(shape: Shape) -> float:

@@ -153,6 +153,7 @@ def solve(
     point = np.clip(point, low, high)
     place = iterate(problem, point, FIRST_CHANGE * np.eye(len(point)))
     weight = problem.size(place.evaluation)
+    count = len(problem.weighted(place.evaluation, weight))
     damping = DAMPING
     growth = GROWTH
     rounds = 1
@@ -166,7 +167,7 @@ def solve(
         trial = Iterate(further, place.changes[:0], problem.evaluate(further))
         gain = before - cost(problem, trial, weight)
         if gain > 0:
-            square = max(float(triangle[:, 0] @ triangle[:, 0]) / rows_of(problem), 1e-6)
+            square = max(float(triangle[:, 0] @ triangle[:, 0]) / count, 1e-6)
             hessian = triangle[:, 1:].T @ triangle[:, 1:] / square
             axes, _ = axes_of(hessian, np.maximum(abs(further), 1))
             place = iterate(problem, further, inward(further, axes, low, high))
@@ -257,11 +258,6 @@ def inward(
     ahead, back = (np.clip(point + sign * axes, low, high) - point for sign in (1, -1))
     is_short = np.linalg.norm(ahead, axis=1) < np.linalg.norm(back, axis=1)
     return np.where(is_short[:, None], back, ahead)
-
-
-def rows_of(problem: Problem) -> int:
-    """Return the number of fitted residuals."""
-    return sum(int(window.fitted.sum()) * window.measured.shape[1] for window in problem.windows)
 
 
 def with_certainty(fit: Fit) -> Fit:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 from multiprocessing import get_context
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -235,10 +235,7 @@ def _prepared(
     """
     recorded = [log.compensate for log in logs]
     forces = _option("compensate", compensate, recorded, "gravity+coriolis+friction")
-    choice(
-        "compensate", forces, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none")
-    )
-    compensated = forces.split("+")
+    compensated = choice("compensate", forces, get_args(Compensation)).split("+")
     dt = _option("timestep", timestep, [log.timestep for log in logs], _own_timestep(logs[0]))
     dt = number("timestep", dt, 1e-5, 0.01, "seconds")
     # Joints that did not move are held at their mean position, with the unlogged ones.
@@ -412,9 +409,8 @@ def _unknowns(
         starts["gain"] = starts["strength"]
     motion = Motion(*map(np.concatenate, zip(*(part.motion for part in data), strict=True)))
     # The mean inertia of the links, on 200 poses of the motion.
-    poses = np.ascontiguousarray(motion.qpos[:: 1 + len(motion.qpos) // 200])
-    matrices = mass_matrix(plant.tree, plant.spread(poses))
-    links = np.diagonal(matrices, axis1=1, axis2=2).mean(0)[plant.columns]
+    poses = plant.spread(motion.qpos[:: 1 + len(motion.qpos) // 200])
+    links = np.einsum("nii->i", mass_matrix(plant.tree, poses))[plant.columns] / len(poses)
     speed = np.maximum(np.sqrt((motion.qvel**2).mean(0)), 1e-3)
     acceleration = np.maximum(np.sqrt((motion.qacc**2).mean(0)), 0.1)
     friction = starts["friction"]

@@ -54,8 +54,8 @@ MEANINGS = {
 }
 """Words in the names of columns by which a pattern is proposed, the clearest first."""
 JOINT_STATE = "sensor_msgs/msg/JointState"
-SILENT_PERIODS, LEAST_SILENCE = 3, 10_000_000
-"""Silence of a topic that divides a log: in median periods of its messages, and at least [ns]."""
+SILENT_PERIODS, LEAST_SILENCE = 3, 0.01
+"""Silence of a topic that divides a log: in median periods of its messages, and at least [s]."""
 CLOCK_OFFSET = 0.05
 """Difference of two topics' times from stamp to receipt from which their clocks differ [s]."""
 A_LOG = "a log is a .csv file with the columns time, qpos:JOINT and setpoint:JOINT or effort:JOINT"
@@ -126,19 +126,7 @@ def _read(
             raise RecordingError(f"{bad}; {A_LOG}, or a recording of a Runner") from bad
         return logs_of_rollout(robot, rollout, kind, source=str(path))
     if path.exists() and (suffix in BAGS or path.is_dir()):
-        remarks = list[str]()
-        columns, commands, cuts = _read_bag(robot, path, reading, remarks)
-        log = _build(
-            robot,
-            str(path),
-            columns,
-            commands,
-            kind,
-            reading,
-        )
-        for remark in remarks:
-            log = log.with_remark(remark)
-        return checked(robot, log, cuts)
+        return _read_bag(robot, path, kind, reading)
     file_path("log", path, (".csv", ".txt", *HDF5, *BAGS))
     columns, numbers = read_csv(path, (*LOG_QUANTITIES, "time"))
     sources = _sources(robot, str(path), columns, reading.columns)
@@ -164,10 +152,8 @@ def _sources(
     name, and the others as they are.
     """
     matched = dict[str, tuple[str, float]]()
-    for unit in ("ms", "us", "ns"):
-        if f"time_{unit}" in columns and "time" not in columns:
-            matched["time"] = f"time_{unit}", UNITS[unit]
-    for text in patterns:
+    times = [f"time: time_{unit} {unit}" for unit in ("ms", "us", "ns")]
+    for text in [*[text for text in times if text.split()[1] in columns], *patterns]:
         name, _, right = text.partition(": ")
         pattern, *units = right.split() or [""]
         try:
@@ -177,17 +163,15 @@ def _sources(
             raise error(f"columns {text!r}", "has an unknown unit", remedy, units[0]) from None
         if pattern.startswith("-"):
             scale = -scale
-            pattern = pattern[1:]
-        names = {pattern: name}
-        if "{joint}" in pattern:
-            joints = robot.joint_names
-            names = {pattern.replace("{joint}", joint): f"{name}:{joint}" for joint in joints}
-        present = [column for column in columns if column in names]
+        present = dict[str, tuple[str, float]]()
+        for joint in robot.joint_names if "{joint}" in pattern else [""]:
+            column = pattern.removeprefix("-").replace("{joint}", joint)
+            if column in columns:
+                present[f"{name}:{joint}" if joint else name] = column, scale
         if not present:
             problem = f"has no column of the pattern {text!r}"
             raise error(source, problem, f"its columns are {', '.join(columns)}")
-        for column in present:
-            matched[names[column]] = column, scale
+        matched |= present
     used = {column for column, _ in matched.values()}
     return {column: (column, 1.0) for column in columns if column not in used} | matched
 
@@ -235,14 +219,14 @@ def logs_of_rollout(
         "was made with setpoints that are not of joints": info.own_command is not None,
         f"was made under control {info.control!r}": info.control not in (None, "pid", "effort"),
         f"holds {recorded}s": kind not in (None, recorded),
-        "was made with setpoint rates": bool(info.rates) and follows,
+        "was made with setpoint rates": info.rates and follows,
         "was made with a feedforward": rollout.feedforward is not None,
-        "has setpoints that a guard changed": bool(np.any(rollout.guarded)),
-        "was made with a randomization": bool(info.randomization),
-        "has params that were changed": bool((within & PARAMS).any()) and follows,
-        "has actuators that were changed": bool((within & ACTUATORS).any()),
-        "has a snapshot that was restored": bool((within & RESTORE).any()),
-        "has ticks of varied length": bool((lengths > 1e-9 + 1e-6 * rollout.tick).any()),
+        "has setpoints that a guard changed": np.any(rollout.guarded),
+        "was made with a randomization": info.randomization,
+        "has params that were changed": (within & PARAMS).any() and follows,
+        "has actuators that were changed": (within & ACTUATORS).any(),
+        "has a snapshot that was restored": (within & RESTORE).any(),
+        "has ticks of varied length": (lengths > 1e-9 + 1e-6 * rollout.tick).any(),
         "has failed": not rollout.ok.all(),
     }
     for problem, holds in obstacles.items():
@@ -284,12 +268,6 @@ def _build(
     """Return the log that the columns of a file hold; ``commands`` are columns with their own
     times.
     """
-    if "time" not in columns:
-        problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
-        remedy = "begin the header with time, in seconds, or time_ms, time_us, time_ns"
-        if proposed := _proposed(robot, columns):
-            remedy = f"name its columns (--columns {proposed})"
-        raise error(source, problem, remedy)
     by = columns_by_joint(robot, source, columns | commands, LOG_QUANTITIES)
     if by["feedforward"]:
         remedy = "log the complete efforts, without the columns of the feedforward"
@@ -298,28 +276,35 @@ def _build(
     measured = not by["effort"]
     by["effort"] = by["effort"] or by["measured_effort"]
     kind = kind or ("effort" if by["effort"] else "setpoint")
-    joints = list[int]()
-    for joint, name in enumerate(robot.joint_names):
-        if robot.independent[joint] and name in by["qpos"] | by[kind]:
-            joints.append(joint)
+    logged = by["qpos"] | by[kind]
+    joints = [
+        joint
+        for joint in np.flatnonzero(robot.independent).tolist()
+        if robot.joint_names[joint] in logged
+    ]
     names = [robot.joint_names[joint] for joint in joints]
-    tables = dict[str, Float64]()
+    needed = {"time": columns.get("time")}
     for quantity in ("qpos", kind):
         for name in names or ["JOINT"]:
-            if name not in by[quantity]:
-                remedy = "positions and commands are needed; a joint without both rests"
-                if not names and (proposed := _proposed(robot, columns)):
-                    remedy = f"name its columns (--columns {proposed})"
-                raise error(f"{source}: column {quantity}:{name}", "is missing", remedy)
-        tables[quantity] = np.stack([by[quantity][name] for name in names], axis=1)
+            needed[f"{quantity}:{name}"] = by[quantity].get(name)
+    for column, values in needed.items():
+        if values is None:
+            remedy = f"{A_LOG}; a joint without both rests"
+            proposed = _proposed(robot, columns)
+            if proposed and not names:
+                remedy = f"name its columns (--columns {proposed})"
+            raise error(f"{source}: column {column}", "is missing", remedy)
+    qpos, command = (
+        np.stack([by[quantity][name] for name in names], axis=1) for quantity in ("qpos", kind)
+    )
     return Log(
         source,
         tuple(joints),
         kind,
         columns["time"],
-        tables["qpos"],
+        qpos,
         commands["time"],
-        tables[kind],
+        command,
         held=reading.hold,
         measured=measured and kind == "effort",
     )
@@ -328,81 +313,85 @@ def _build(
 def _read_bag(
     robot: Robot,
     path: Path,
+    kind: CommandKind | None,
     reading: Reading,
-    remarks: list[str],
-) -> tuple[dict[str, Float64], dict[str, Float64], list[int]]:
-    """Return the columns of positions and those of commands in a bag by name, in seconds since the
-    first row, and the rows before which a topic was silent; append to ``remarks`` what is left out.
+) -> list[Log]:
+    """Return the logs of a bag.
 
     Messages are merged by the names of joints: each joint has the samples of all messages that name
-    it. Rows are at the stamps of the joint with most positions.
+    it. Rows are at the stamps of the joint with most positions, in seconds since the first one;
+    commands act from their own stamps on.
     """
-    columns = _samples(path, reading)
-    samples = dict[str, dict[int, float]]()
+    samples = _samples(path, reading)
+    stamps = dict[str, Float64]()
+    values = dict[str, Float64]()
     # Other devices publish joints of their own.
     others = set[str]()
-    for name, (column, scale) in _sources(robot, str(path), columns, reading.columns).items():
+    for name, (column, scale) in _sources(robot, str(path), samples, reading.columns).items():
         joint = name.partition(":")[2]
         if joint in robot.joint_names:
-            samples[name] = {stamp: scale * value for stamp, value in columns[column].items()}
+            stamps[name], values[name] = samples[column] * [[1.0], [scale]]
         else:
             others.add(joint)
     quantities = ("setpoint:", "effort:") if reading.command_topic else ("measured_effort:",)
-    moved = {column: stamps for column, stamps in samples.items() if column.startswith("qpos:")}
-    driven = {column: stamps for column, stamps in samples.items() if column.startswith(quantities)}
-    topics = {reading.topic: moved}
-    if reading.command_topic:
-        topics[reading.command_topic] = driven
-    for topic, columns in topics.items():
-        if not columns:
+    moved = [column for column in stamps if column.startswith("qpos:")]
+    driven = [column for column in stamps if column.startswith(quantities)]
+    for topic, columns in ((reading.topic, moved), (reading.command_topic, driven)):
+        if topic and not columns:
             problem = f"has no values of the robot's joints in the topic {topic!r}"
             remedy = f"its topics of {JOINT_STATE}: {', '.join(_topics(path)) or 'none'}; other"
             remedy += f" joints: {', '.join(sorted(others)) or 'none'}"
             raise error(str(path), problem, remedy)
-    if others:
-        remarks.append(f"{', '.join(sorted(others))}: no joint of the robot, left out")
-    # Nanoseconds since 1970 have more digits than a float.
-    origin = min(min(rows) for rows in samples.values())
-    tables = dict[str, Float64]()
-    for column, rows in samples.items():
-        tables[column] = np.array([(stamp - origin, rows[stamp]) for stamp in sorted(rows)]).T
-    used = {column: tables[column][0] for column in (*moved, *driven)}
-    first = max(stamps[0] for stamps in used.values())
-    last = min(stamps[-1] for stamps in used.values())
+    used = {column: stamps[column] for column in moved + driven}
+    first = max(times[0] for times in used.values())
+    last = min(times[-1] for times in used.values())
     if first >= last:
         remedy = "record all topics at the same time"
         raise error(str(path), f"has no time in which {', '.join(used)} all have values", remedy)
-    times = max((used[column] for column in moved), key=len)
-    cuts = list[float]()
-    outside = (first - times[0]) / 1e9, (times[-1] - last) / 1e9
+    remarks = []
+    if others:
+        remarks.append(f"{', '.join(sorted(others))}: no joint of the robot, left out")
+    times = max((stamps[column] for column in moved), key=len)
+    outside = first - times[0], times[-1] - last
     if max(outside) > GAP:
         words = f"first {max(outside[0], 0):.3f} s and last {max(outside[1], 0):.3f} s"
         remarks.append(f"{words} without values of all columns: left out")
     times = times[(times >= first) & (times <= last)]
-    for begin, end, silent in _silences(used, first, last):
-        words = f"is silent from {(begin - first) / 1e9:.3f} to {(end - first) / 1e9:.3f} s"
-        remarks.append(f"{', '.join(silent)} {words}: the log is divided there")
+    cuts = list[float]()
+    for (begin, end), columns in sorted(_silences(used, first, last).items()):
+        words = f"is silent from {begin - first:.3f} to {end - first:.3f} s"
+        remarks.append(f"{', '.join(columns)} {words}: the log is divided there")
         times = times[(times <= begin) | (times >= end)]
         cuts.append(end)
-    positions = {"time": (times - first) / 1e9}
+    positions = {"time": times - first}
     for column in moved:
-        positions[column] = np.interp(times, *tables[column])
-    # Commands act from their own stamps on.
-    stamps = np.unique(np.concatenate([[first, last], *(used[column] for column in driven)]))
-    stamps = stamps[(stamps >= first) & (stamps <= last)]
-    commands = {"time": (stamps - first) / 1e9}
+        positions[column] = np.interp(times, stamps[column], values[column])
+    sent = np.unique(np.concatenate([[first, last], *(stamps[column] for column in driven)]))
+    sent = sent[(sent >= first) & (sent <= last)]
+    commands = {"time": sent - first}
     for column in driven:
-        sent, values = tables[column]
-        commands[column] = np.interp(stamps, sent, values)
         if reading.hold:
-            commands[column] = values[np.searchsorted(sent, stamps, "right") - 1]
-    return positions, commands, np.searchsorted(times, cuts).tolist()
+            place = np.searchsorted(stamps[column], sent, "right") - 1
+            commands[column] = values[column][place]
+        else:
+            commands[column] = np.interp(sent, stamps[column], values[column])
+    log = _build(
+        robot,
+        str(path),
+        positions,
+        commands,
+        kind,
+        reading,
+    )
+    for remark in remarks:
+        log = log.with_remark(remark)
+    return checked(robot, log, np.searchsorted(times, cuts).tolist())
 
 
 def _silences(
     used: dict[str, Float64], first: float, last: float
-) -> list[tuple[float, float, list[str]]]:
-    """Return begin, end and columns of the silences between two stamps."""
+) -> dict[tuple[float, float], list[str]]:
+    """Return the columns by begin and end of their silences between two stamps."""
     silences = defaultdict[tuple[float, float], list[str]](list)
     for column, stamps in used.items():
         steps = np.diff(stamps)
@@ -411,11 +400,11 @@ def _silences(
             begin, end = stamps[row : row + 2].tolist()
             if begin < last and end > first:
                 silences[begin, end].append(column)
-    return [(begin, end, columns) for (begin, end), columns in sorted(silences.items())]
+    return silences
 
 
-def _samples(path: Path, reading: Reading) -> dict[str, dict[int, float]]:
-    """Return the values of the columns of a bag by stamp [ns]."""
+def _samples(path: Path, reading: Reading) -> dict[str, Float64]:
+    """Return stamps [s], since the first one, and values of the columns of a bag: (2, samples)."""
     topics = {reading.topic: ("qpos:", "measured_effort:")}
     if reading.command_topic:
         topics[reading.command_topic] = ("setpoint:", "effort:")
@@ -441,7 +430,12 @@ def _samples(path: Path, reading: Reading) -> dict[str, dict[int, float]]:
     except Exception as bad:  # a damaged file can make the library raise anything
         raise error(str(path), f"cannot be read: {bad}", "correct or record it again") from None
     _check_clocks(path, {key: float(np.median(times)) / 1e9 for key, times in delays.items()})
-    return samples
+    # Nanoseconds since 1970 have more digits than a float.
+    origin = min(map(min, samples.values()), default=0)
+    tables = dict[str, Float64]()
+    for column, rows in samples.items():
+        tables[column] = np.array([(1e-9 * (at - origin), rows[at]) for at in sorted(rows)]).T
+    return tables
 
 
 def _check_clocks(path: Path, delays: dict[tuple[str, bool], float]) -> None:
@@ -449,15 +443,15 @@ def _check_clocks(path: Path, delays: dict[tuple[str, bool], float]) -> None:
 
     ``delays`` are the times from stamp to receipt [s], by topic and whether it has stamps.
     """
-    remedy = "stamp the messages of both topics by one clock, when they are measured or sent"
-    if len({is_stamped for _, is_stamped in delays}) > 1:
-        words = [f"{topic!r} {'with' if has else 'without'} stamps" for topic, has in delays]
-        problem = f"has messages of two clocks, the sender's and the recorder's: {', '.join(words)}"
-        raise error(str(path), problem, remedy)
-    if delays and max(delays.values()) - min(delays.values()) > CLOCK_OFFSET:
-        words = [f"{topic!r} {delay:.3f} s" for (topic, _), delay in delays.items()]
-        problem = f"has stamps of two clocks: before receipt by {', '.join(words)}"
-        raise error(str(path), problem, remedy)
+    kinds = {is_stamped for _, is_stamped in delays}
+    times = delays.values()
+    if len(kinds) > 1 or (delays and max(times) - min(times) > CLOCK_OFFSET):
+        words = []
+        for (topic, is_stamped), delay in delays.items():
+            when = f"{delay:.3f} s before receipt" if is_stamped else "without stamps"
+            words.append(f"{topic!r} {when}")
+        remedy = "stamp the messages of both topics by one clock, when they are measured or sent"
+        raise error(str(path), f"has stamps of two clocks: {', '.join(words)}", remedy)
 
 
 def _topics(path: Path) -> list[str]:

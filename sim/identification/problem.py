@@ -16,9 +16,7 @@ from typing import Any
 
 import numpy as np
 
-import batchpid as bp
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.trees import structure
 from batchpid.sim.identification.regression import LogData
 from batchpid.sim.identification.simulator import Stretch, simulate
 from batchpid.sim.identification.unknowns import Unknowns
@@ -108,19 +106,15 @@ class Problem:
         points = np.vstack([moved, np.tile(point, (len(shifts), 1))])
         states = np.zeros((len(points), 2, joints))
         states[count:] = shifts.reshape(-1, 2, joints)
-        # Windows of the same robot and law are simulated at once.
-        alike = defaultdict[Any, list[int]](list)
-        for number, window in enumerate(self.windows):
-            part = self.data[window.log]
-            if held_out or window.fitted.any():
-                alike[id(part.plant), structure(part.drive.params)].append(number)
+        # Windows of one log are simulated at once, as many as are fast together.
         many = max(1, ENVS // len(points))
-        groups = []
-        for numbers in alike.values():
-            groups += [numbers[first : first + many] for first in range(0, len(numbers), many)]
-        tasks = [self._task(group, points, states) for group in groups]
+        groups = defaultdict[Any, list[int]](list)
+        for number, window in enumerate(self.windows):
+            if held_out or window.fitted.any():
+                groups[window.log, number // many].append(number)
+        tasks = [self._task(group, points, states) for group in groups.values()]
         tables = [np.zeros((0, joints, count))] * len(self.windows)
-        for group, positions in zip(groups, self.run(_simulated, tasks), strict=True):
+        for group, positions in zip(groups.values(), self.run(_simulated, tasks), strict=True):
             for number, table in zip(group, positions, strict=True):
                 errors = np.clip(
                     self.windows[number].measured - table, -RESIDUAL_BOUND, RESIDUAL_BOUND
@@ -130,20 +124,12 @@ class Problem:
         return tables
 
     def _task(self, group: list[int], points: Float64, states: Float64) -> Any:
-        """Return the arguments of :func:`simulate` for a group of windows, each at all points."""
-        parts = [self.data[self.windows[number].log] for number in group]
+        """Return the arguments of :func:`simulate` for windows of a log, each at all points."""
         stretches = [self.windows[number] for number in group]
-        drive = parts[0].drive
-        if drive.mode == "pid":
-            # A column of rows: other options are equal in all logs of a group.
-            rows: Any = zip(*[part.drive.params for part in parts * len(points)], strict=True)
-            leaves: Any = [
-                np.concatenate(row) if isinstance(row[0], np.ndarray) else row[0] for row in rows
-            ]
-            drive = drive._replace(params=bp.PIDParams(*leaves))
+        _, _, plant, drive = self.data[stretches[0].log]
         points, states = (np.repeat(table, len(group), axis=0) for table in (points, states))
         robots = self.unknowns.candidates(self.unknowns.values(points))
-        return parts[0].plant, drive, robots, states, stretches
+        return plant, drive, robots, states, stretches
 
     def weighted(self, evaluation: Sequence[Float64], size: Float64) -> Float64:
         """Return residuals and their changes (n, 1 + changes) of the fitted rows over their

@@ -281,14 +281,13 @@ def bounded_solution(
     most (P. B. Stark and R. L. Parker, "Bounded-variable least squares", 1995).
     """
     x = np.zeros(len(low))
-    free = low < high
-    movable = free.copy()
+    free = np.ones(len(low), bool)
     for _ in range(10 * len(x)):
         aim = x.copy()
         rest = target - rows[:, ~free] @ x[~free]
         aim[free] = np.linalg.lstsq(rows[:, free], rest, rcond=None)[0]
-        ends = np.where(aim < low, low, high)
-        beyond = free & ((aim < low) | (aim > high))
+        ends = np.clip(aim, low, high)
+        beyond = ends != aim
         if beyond.any():
             steps = np.full(len(x), np.inf)
             steps[beyond] = ((ends - x)[beyond] / (aim - x)[beyond]).clip(0.0)
@@ -299,7 +298,7 @@ def bounded_solution(
             continue
         x = aim
         push = rows.T @ (target - rows @ x)
-        inward = movable & ~free & np.where(x <= low, push > 0, push < 0)
+        inward = ~free & np.where(x <= low, push > 0, push < 0)
         size = np.linalg.norm(rows, axis=0) * np.linalg.norm(target)
         if not (np.abs(push)[inward] > 1e-12 * size[inward]).any():
             break

@@ -300,7 +300,7 @@ class Identification:
 def _of_all_joints(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
     """Return the fields of actuators (n, dof) with ``values`` (n, unknowns)."""
     fields = dict[str, Float64]()
-    neutral = {kind.field: kind.neutral for kind in UNKNOWN_KINDS.values()}
+    neutral = {kind.field or name: kind.neutral for name, kind in UNKNOWN_KINDS.items()}
     for name, table in unknowns.tables(values, "motor").items():
         fields[name] = np.full((len(values), unknowns.robot.dof), neutral[name])
         fields[name][:, unknowns.joints] = table

@@ -69,7 +69,7 @@ class Stretch(NamedTuple):
     start on.
     """
     past: int
-    """Number of steps before the start, equal in all stretches of a simulation."""
+    """Number of steps before the start."""
     step: Any
     """First sim step that ends at or after each row (rows,)."""
     before: Float64
@@ -141,11 +141,9 @@ class LogPlant:
         self.tree = replace(tree, coupling=Coupling.of(tree.dof, followers))
         """Rigid tree of the logged joints and their followers."""
         self.joints = len(logged)
-        # A slice is not copied, as it is for indices.
-        self.columns: Any = number[logged] if followers else slice(None)
+        self.columns = number[logged]
         """Joints of the tree that are logged."""
-        leaders = [logged.index(joint) for joint in coupling.leader[moves].tolist()]
-        self._leaders = np.array(leaders) if followers else None
+        self._leaders = [logged.index(joint) for joint in coupling.leader[moves].tolist()]
         self._friction = robot.friction[logged], robot.damping[logged]
         free = free | robot.continuous[logged]
         self.low = self.spread(np.where(free, -np.inf, robot.lower[logged]))
@@ -157,9 +155,9 @@ class LogPlant:
         """Return a table (..., joints) of logged joints as one of the tree (..., dof), with the
         columns of leaders for followers.
         """
-        if self._leaders is None or np.shape(table)[-1:] != (self.joints,):
+        if np.shape(table)[-1:] != (self.joints,):
             return table
-        return table[..., self._leaders]
+        return np.take(table, self._leaders, axis=-1)
 
     @property
     def heavy_links(self) -> list[str]:
@@ -249,9 +247,9 @@ def simulate(
     stretches: Sequence[Stretch],
 ) -> list[Float64]:
     """Return the positions (candidates, rows, joints) of all candidates at the rows of each
-    stretch.
+    stretch; all stretches have the same length.
 
-    ``candidates`` and params have each candidate once for each stretch, one after the other. Their
+    ``candidates`` has each candidate once for each stretch, one after the other. Their
     ``states`` (n, 2, joints) are added to positions and velocities at the starts. Positions are
     inf where a simulation has diverged.
     """
@@ -263,15 +261,12 @@ def simulate(
     offset: Any = candidates.actuators.position_offset
     if offset is None:
         offset = np.zeros((1, plant.joints))
-    # Shorter stretches hold their last command.
-    steps = np.arange(max(len(stretch.command) for stretch in stretches))
-    tables = [stretch.command[np.minimum(steps, len(stretch.command) - 1)] for stretch in stretches]
-    commands = np.stack(tables, axis=1)
+    commands = np.stack([stretch.command for stretch in stretches], axis=1)
     # Setpoints of each candidate are late by whole steps and a share of a step.
     late = candidates.setpoint_delay / drive.timestep
     whole = np.floor(late).astype(int)
     share = (late - whole)[:, None]
-    total = len(steps) - past
+    total = len(commands) - past
     most = int(np.clip(TABLE_ROWS // len(states), 16, total))
     first = commands[past, stretch_of]
     qpos, qvel, setpoint = map(plant.spread, (begin[:, 0] - offset, begin[:, 1], first))

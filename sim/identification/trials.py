@@ -23,9 +23,7 @@ from batchpid.sim.identification.fit import (
     FIRST_CHANGE,
     ROUGH_TOLERANCE,
     Fit,
-    axes_of,
     bounded_step,
-    inverse,
     inward,
     iterate,
     triangle_of,
@@ -132,9 +130,7 @@ def _with_effect(result: Fit, solver: Solver) -> Fit:
     wide = replace(problem.coarse(judged=True), unknowns=wider)
     count = len(present)
     point = np.append(result.point, wider.start[count:])
-    changes = FIRST_CHANGE * np.eye(len(point))
-    changes[:count, :count] = _axes(result)
-    changes = inward(point, changes, *wider.bounds)
+    changes = inward(point, FIRST_CHANGE * np.eye(len(point)), *wider.bounds)
     triangle = triangle_of(wide, iterate(wide, point, changes), result.size)
     low, high = wider.bounds - point
     names = np.array([entry.kind for entry in wider.entries])
@@ -159,14 +155,6 @@ def _with_effect(result: Fit, solver: Solver) -> Fit:
     further = solver(trial, further.point)
     added = {**result.effects, effects[best]: share}
     return with_certainty(further._replace(effects=added))
-
-
-def _axes(result: Fit) -> Float64:
-    """Return changes (unknowns, unknowns) along the axes of the covariance."""
-    root = result.certainty.root / result.problem.unknowns.sizes[:, None]
-    scale = np.maximum(np.abs(result.point), 1.0)
-    axes, _ = axes_of(inverse(root @ root.T), scale)
-    return axes
 
 
 def _left(fit: Fit) -> float:

@@ -34,7 +34,7 @@ class Kind(NamedTuple):
     neutral: float = 0.0
     """Value without effect."""
     field: str = ""
-    """Field of :class:`batchpid.Actuators`."""
+    """Field of :class:`batchpid.Actuators`, where it has another name."""
     least: float = 0.0
     """Least value."""
     most: float = np.inf
@@ -47,7 +47,7 @@ class Kind(NamedTuple):
 
 
 UNKNOWN_KINDS = {
-    "armature": Kind("motor", "joint", "inertia", 4.0, field="armature"),
+    "armature": Kind("motor", "joint", "inertia", 4.0),
     "damping": Kind("motor", "joint", "damping", 4.0, field="viscous"),
     "friction": Kind("motor", "joint", "effort", 4.0, field="coulomb"),
     "strength": Kind(
@@ -56,8 +56,7 @@ UNKNOWN_KINDS = {
         1.0,
         0.3,
         1.0,
-        "strength",
-        1e-3,
+        least=1e-3,
     ),
     "effort_scale": Kind(
         "sensor",
@@ -73,7 +72,6 @@ UNKNOWN_KINDS = {
         "joint",
         "effort",
         10.0,
-        field="bias",
         least=-np.inf,
     ),
     "delay": Kind(
@@ -92,11 +90,10 @@ UNKNOWN_KINDS = {
         "joint",
         0.05,
         2.0,
-        field="load_friction",
         most=0.9,
     ),
-    "static": Kind("motor", "joint", "friction", 2.0, field="static"),
-    "stribeck": Kind("motor", "joint", "speed", 2.0, field="stribeck"),
+    "static": Kind("motor", "joint", "friction", 2.0),
+    "stribeck": Kind("motor", "joint", "speed", 2.0),
     "offset": Kind(
         "motor",
         "joint",

@@ -1,11 +1,9 @@
-"""Robot: a URDF or MJCF file, parsed once and checked: joints, limits and defaults, checks and
-gains.
-"""
+"""Robot: a URDF or MJCF file, parsed once: joints, limits and defaults, checks and gains."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -129,17 +127,17 @@ class Robot:
     @property
     def lower(self) -> Float64:
         """Lower position limits (dof,) [rad or m]."""
-        return np.array([joint.lower for joint in self.joints])
+        return self._column("lower")
 
     @property
     def upper(self) -> Float64:
         """Upper position limits (dof,) [rad or m]."""
-        return np.array([joint.upper for joint in self.joints])
+        return self._column("upper")
 
     @property
     def effort_limit(self) -> Float64:
         """Effort limits (dof,) [N m or N], infinite where the URDF gives none."""
-        return np.array([joint.effort_limit for joint in self.joints])
+        return self._column("effort_limit")
 
     @cached_property
     def design_effort_limit(self) -> Float64:
@@ -153,23 +151,25 @@ class Robot:
     @property
     def velocity_limit(self) -> Float64:
         """Velocity limits (dof,) [rad/s or m/s], infinite where the URDF gives none."""
-        return np.array([joint.velocity_limit for joint in self.joints])
+        return self._column("velocity_limit")
 
     @property
     def continuous(self) -> Bool:
         """Mask (dof,) of the joints whose position wraps at a full turn."""
-        return np.array([joint.continuous for joint in self.joints])
+        return self._column("continuous")
 
     @property
     def damping(self) -> Float64:
         """Viscous damping of the joints (dof,) [N m s/rad or N s/m]."""
-        return np.array([joint.damping for joint in self.joints])
+        return self._column("damping")
 
     @property
     def friction(self) -> Float64:
         """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien"."""
-        modelled = self.source.dissipation == "urdf"
-        return np.array([joint.friction for joint in self.joints]) * modelled
+        return self._column("friction") * (self.source.dissipation == "urdf")
+
+    def _column(self, name: str) -> np.ndarray:
+        return np.array([getattr(joint, name) for joint in self.joints])
 
     @cached_property
     def coupling(self) -> Coupling:
@@ -318,11 +318,12 @@ class Robot:
         folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
         source = reading.read_robot(path, fixed_base, folders, missing_meshes)
         report(path, source.repairs, strict)
-        joints = couple([joint for joint in source.tables.joints if joint.moves])
-        if not joints:
+        moving = [joint for joint in source.tables.joints if joint.moves]
+        if not moving:
             raise RobotError(
                 f"{path}: a robot without moving joints cannot be controlled; check the joint types"
             )
+        joints = couple(moving)
         source = reading.with_srdf(source)
         source = source._replace(self_collision=self_collision, dissipation=dissipation)
         robot = cls(source, joints, reading.read_settings(path, joints))
@@ -346,8 +347,7 @@ class Robot:
         control: str = "pid",
         engine: str | None = None,
     ) -> Findings:
-        """Return the findings of the preflight, most severe first: oddities of this robot and of
-        running it this way.
+        """Return the findings of the preflight, most severe first: oddities of robot and run.
 
         Parameters
         ----------
@@ -363,9 +363,7 @@ class Robot:
         """
         if params is None and self.settings is not None and control == "pid":
             params = self.params()
-        of_engine: Iterable[Finding] = ()
-        if engine is not None:
-            of_engine = engine_findings(self, engine, timestep)
+        of_engine = engine_findings(self, engine, timestep)
         return check(
             self,
             params,

@@ -26,7 +26,7 @@ from batchpid.motors.coupling import Coupling
 from batchpid.sim.description.merging import body_tree, merge_links, rigid_bodies
 from batchpid.sim.description.tables import DisabledPair, Tables
 from batchpid.sim.geometry.distances import Contacts
-from batchpid.task_space.frames import matrix_of
+from batchpid.task_space.frames import SpatialInertia, matrix_of, spatial_matrix
 from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:
@@ -106,45 +106,36 @@ class RobotModel:
 
         The feet F are pinned. Velocities q' of the joints move the base at V = A q', A = -J_b^+
         J_j, where J_b and J_j are the Jacobians of F with respect to the base and the joints. The
-        mass matrix of this motion is the sum of J^T I J of all bodies, with J = J_j + J_b A. The
-        result is the sum of the absolute values in each of its rows: diagonal gains for these sums
-        are at least as stiff as gains for the matrix (Gershgorin's theorem).
+        mass matrix of this motion is the sum of J^T I J of all bodies, with J = J_j + A for twists
+        and inertias at the origin of the world. The result is the sum of the absolute values in
+        each of its rows: diagonal gains for these sums are at least as stiff as gains for the
+        matrix (Gershgorin's theorem).
         """
         tree = self.tree
         joints = np.asarray(qpos, np.float64)
+        poses = ts.link_poses(tree, joints, tree.links)
 
-        def jacobians(link: str, point: Float64) -> tuple[Float64, Float64]:
-            """Return the Jacobians of a point of the world in a link (6, dof), and with respect to
-            the base (6, 6).
-            """
-            x, y, z = point
-            # A twist of the base moves each point of the world by v + w x p.
-            crossed = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # -(p x)
-            of_base = np.block([[np.eye(3), crossed], [np.zeros((3, 3)), np.eye(3)]])
-            pose = ts.link_poses(tree, joints, (link,))[0]
-            local = matrix_of(pose[3:]).T @ (point - pose[:3])
-            return np.asarray(ts.jacobian(tree, joints, link, point=local)), of_base
+        def jacobian(at: int) -> Float64:
+            """Return the Jacobian (6, dof) of the point of a link at the origin of the world."""
+            origin = -matrix_of(poses[at, 3:]).T @ poses[at, :3]
+            return np.asarray(ts.jacobian(tree, joints, tree.links[at], point=origin))
 
-        feet = [jacobians(link, point) for link, point in self.contacts.feet(joints)]
+        of_base, of_joints = [], []
+        for link, (x, y, z) in self.contacts.feet(joints):
+            # A twist of the base moves each point p of the world by v + w x p.
+            point = np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
+            of_base.append(point)
+            of_joints.append(point @ jacobian(tree.index(link)))
         follow = np.zeros((6, tree.dof))
-        if feet:
-            of_joints, of_base = (
-                np.concatenate([foot[:3] for foot in part]) for part in zip(*feet, strict=True)
-            )
+        if of_base:
             # Directions that the feet leave free are cut off, not followed.
-            follow = -np.linalg.pinv(of_base, rcond=1e-3) @ of_joints
+            pinned = np.linalg.pinv(np.concatenate(of_base), rcond=1e-3)
+            follow = -pinned @ np.concatenate(of_joints)
         matrix = np.zeros((tree.dof, tree.dof))
-        for at, link in enumerate(tree.links):
-            pose = ts.link_poses(tree, joints, (link,))[0]
-            turn = matrix_of(pose[3:])
-            of_joints, of_base = jacobians(link, pose[:3] + turn @ tree.center[at])
-            moving = of_joints + of_base @ follow
-            linear = moving[:3]
-            angular = moving[3:]
-            matrix += (
-                tree.mass[at] * linear.T @ linear
-                + angular.T @ turn @ tree.inertia[at] @ turn.T @ angular
-            )
+        for at, pose in enumerate(poses):
+            body = SpatialInertia(tree.mass[at], tree.center[at], tree.inertia[at])
+            moving = jacobian(at) + follow
+            matrix += moving.T @ spatial_matrix(body.moved(pose[:3], pose[3:])) @ moving
         inertia: Float64 = np.abs(matrix).sum(1)
         return inertia
 

@@ -227,8 +227,12 @@ def scene_of(
     )
 
 
-def engine_findings(robot: Robot, name: str, timestep: float) -> Iterator[Finding]:
-    """Yield what of ``robot`` an engine cannot run, or runs otherwise than the file says."""
+def engine_findings(robot: Robot, name: str | None, timestep: float) -> Iterator[Finding]:
+    """Yield what of ``robot`` an engine, if any, cannot run, or runs otherwise than the file
+    says.
+    """
+    if name is None:
+        return
     engine = load_engine(name)
     ground = {"ground": robot.has_ground, "mjcf": robot.mjcf}
     scene = scene_of(robot, timestep, engine.physics["accurate"], **ground)

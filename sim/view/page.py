@@ -41,13 +41,6 @@ SETPOINT_CURVE = {
 SCALES = {
     # Without a fixed range the axis drifts in viser 1.1.
     "x": {"time": False, "range": (-HISTORY_SECONDS, 0.0)},
-    # The smallest range [rad or m] keeps noise alone from filling a chart.
-    "y": {
-        "range": {
-            "min": {"pad": 0.1, "soft": -0.012, "mode": 1},
-            "max": {"pad": 0.1, "soft": 0.012, "mode": 1},
-        }
-    },
 }
 
 
@@ -121,7 +114,7 @@ class View(AbstractContextManager["View"]):
         """Serve the page for ``seconds`` of wall time, or until :meth:`stop` or Ctrl-C."""
         data = self.data
         panel = self.panel
-        began = deadline = lap = time.monotonic()
+        began = deadline = time.monotonic()
         count = 0
         self._show_robots()
         while not self._stopped and (seconds is None or time.monotonic() - began < seconds):
@@ -135,8 +128,7 @@ class View(AbstractContextManager["View"]):
             # Also while the page is paused, where another joint may be chosen.
             if count % CHART_FRAMES == 0:
                 self._draw_chart()
-                panel.update_status(data.frame(), CHART_FRAMES / (now - lap))
-                lap = now
+                panel.update_status(data.frame())
             # A late frame is not caught up, which would only hurry the next ones.
             deadline = max(deadline + data.period / panel.speed, now)
             time.sleep(deadline - now)

@@ -285,17 +285,14 @@ class Panel:
                 self._problem = _plain(str(error))
         return count > 0
 
-    def update_status(self, frame: Rollout, rate: float) -> None:
-        """Show time, real-time factor, frame ``rate`` [1/s], and how many robots diverged or
-        saturate.
-        """
+    def update_status(self, frame: Rollout) -> None:
+        """Show the time, and how many robots diverged or saturate."""
         data = self._data
-        pace = f"{rate * data.period:.2f} x real time · {rate:.0f} frames/s"
         saturated = int(frame.saturated.any(-1).sum())
         diverged = int((~frame.ok).sum())
         lines = [
             f"**{data.num_envs} x {_plain(data.robot.name)}**",
-            f"t = {frame.time[0]:.2f} s · {pace if self.running else 'paused'}",
+            f"t = {frame.time[0]:.2f} s{'' if self.running else ', paused'}",
             f"{saturated} saturated, {diverged} diverged",
             self._problem,
         ]

@@ -56,11 +56,11 @@ def test_followers_are_reported_and_left_out_of_controllers(batchpid, tmp_path):
 def test_controllers_of_ros2_control_are_written(batchpid, tmp_path):
     out = tmp_path / "controllers.yaml"
     status, said, _ = batchpid(
-        "export", "panda", "--to", "ros2_control", "--prefix", "arm", "--limits", "--out", out
+        "export", "panda", "--to", "ros2_control", "--prefix", "arm", "--out", out
     )
     assert (status, said.splitlines()[-1]) == (0, f"written: {out}")
     listed = {line.split(":")[1].strip() for line in said.splitlines()[1:-1]}
-    assert {"gain_units", "guard", "effort_limit"} <= listed
+    assert {"gain_units", "effort_limit"} <= listed
     assert all(f"# {line}\n" in out.read_text() for line in said.splitlines()[1:-1])
     assert "arm" in yaml.safe_load(out.read_text())
 

@@ -63,9 +63,9 @@ def raises(failure):
 def test_the_overview_lists_every_command(batchpid):
     status, out, _ = batchpid("--help")
     assert status == 0
-    text = " ".join(out.replace("│", " ").split())
     assert cli.SUMMARIES.keys() == COMMANDS.keys()
-    assert all(f"• {name} {summary}" in text for name, summary in cli.SUMMARIES.items())
+    text = " ".join(out.split())
+    assert all(f" {name} {summary}" in text for name, summary in cli.SUMMARIES.items())
 
 
 def test_a_missing_or_unknown_command_lists_those_there_are(batchpid):

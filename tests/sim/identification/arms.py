@@ -51,16 +51,16 @@ def gains():
     return bp.make_params(2, [120.0, 40.0], kd=[8.0, 2.0])
 
 
-def run(robot, setpoints, control="pid", compensate="none", **options):
-    """Return the rollout of a runner that begins at the first setpoint, or at FALLING for
-    efforts.
+def run(robot, setpoints, control="pid", compensate="none", commands=None, **options):
+    """Return the rollout of a runner, with further ``commands``, that begins at the first setpoint,
+    or at FALLING for efforts.
     """
     actuators = bp.make_actuators(2, **(TRUTH | options.pop("actuators", {})))
     options = OPTIONS | {"control": control, "compensate": compensate} | options
     params = None if control == "effort" else gains()
     with Runner(robot, 1, params=params, actuators=actuators, **options) as runner:
         runner.reset(FALLING if control == "effort" else setpoints[0])
-        return runner.rollout(setpoints)
+        return runner.rollout(setpoints, **(commands or {}))
 
 
 def log_of(robot, rollout, noise=0.0, **settings):
@@ -70,19 +70,16 @@ def log_of(robot, rollout, noise=0.0, **settings):
     return replace(log, qpos=shaken, **settings)
 
 
-def effort_run(robot, driven=(1.0, 1.0)):
+def effort_run(robot):
     """Return the rollout of efforts that follow :func:`motion` in a loop at the rate of the
     ticks.
     """
-    setpoints, rows = motion(), []
-    actuators = bp.make_actuators(2, **TRUTH)
+    rows = []
     options = OPTIONS | {"control": "effort", "compensate": "none"}
-    with Runner(robot, 1, actuators=actuators, **options) as runner:
+    with Runner(robot, 1, actuators=bp.make_actuators(2, **TRUTH), **options) as runner:
         seen = runner.reset(np.zeros(2))
-        for setpoint in setpoints:
-            rows.append(
-                driven * ([60.0, 20.0] * (setpoint - seen.qpos[0]) - [5.0, 1.0] * seen.qvel[0])
-            )
+        for setpoint in motion():
+            rows.append([60.0, 20.0] * (setpoint - seen.qpos[0]) - [5.0, 1.0] * seen.qvel[0])
             seen = runner.step(rows[-1])
         runner.reset(np.zeros(2))
         return runner.rollout(np.array(rows))

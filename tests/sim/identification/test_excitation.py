@@ -35,26 +35,23 @@ BAR = """<inertial><origin xyz="0.15 0 0"/><mass value="1"/>
 <collision><origin xyz="0.15 0 0"/><geometry><box size="0.24 0.05 0.05"/></geometry></collision>"""
 
 
-def arm(folder, height=0.15, effort=60.0, bend=60.0, wall=None):
+def arm(folder, height=0.15, effort=60.0, bend=60.0, wall=""):
     """Return an arm of two bars that turn about y above the ground; a wall in front of it is fixed
     to its base.
     """
-
-    def joint(name, parent, child, place, effort):
-        links = f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{place}"/>'
-        limit = f'<limit lower="-2" upper="2" effort="{effort}" velocity="9"/>'
-        return f'<joint name="{name}" type="revolute">{links}<axis xyz="0 1 0"/>{limit}</joint>'
-
+    joint = """<joint name="{}" type="revolute"><parent link="{}"/><child link="{}"/>
+    <origin xyz="{}"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="{}" velocity="9"/></joint>"""
     parts = [f'<link name="base"/><link name="upper">{BAR}</link><link name="lower">{BAR}</link>']
-    parts.append(joint("lift", "base", "upper", f"0 0 {height}", effort))
-    parts.append(joint("bend", "upper", "lower", "0.3 0 0", bend))
-    if wall is not None:
-        shape = '<collision><geometry><box size="0.1 1 4"/></geometry></collision>'
-        parts.append(f'<link name="wall">{shape}</link><joint name="hold" type="fixed">')
-        parts.append(f'<parent link="base"/><child link="wall"/><origin xyz="{wall} 0 0"/></joint>')
+    parts.append(joint.format("lift", "base", "upper", f"0 0 {height}", effort))
+    parts.append(joint.format("bend", "upper", "lower", "0.3 0 0", bend))
     path = folder / "arm.urdf"
-    path.write_text(f'<robot name="arm">{"".join(parts)}</robot>')
+    path.write_text(f'<robot name="arm">{"".join(parts)}{wall}</robot>')
     return bp.sim.Robot.load(path, self_collision="urdf")
+
+
+# In the middle of the upper bar, whatever the joints do but at their ends.
+WALL = """<link name="wall"><collision><geometry><box size="0.1 1 4"/></geometry></collision></link>
+<joint name="hold" type="fixed"><parent link="base"/><child link="wall"/><origin xyz="0.03 0 0"/></joint>"""
 
 
 def test_joints_that_would_touch_the_ground_move_less(tmp_path):
@@ -68,8 +65,7 @@ def test_joints_that_would_touch_the_ground_move_less(tmp_path):
 @pytest.mark.parametrize(
     ("words", "options"),
     [
-        # The wall is in the middle of the upper bar, whatever the joints do but at their ends.
-        ("'upper' and 'wall' touch|'wall' and 'upper' touch", {"wall": 0.03}),
+        ("'upper' and 'wall' touch|'wall' and 'upper' touch", {"wall": WALL}),
         ("joint 'lift' is too weak", {"effort": 0.01, "bend": 0.01}),
     ],
 )

@@ -47,10 +47,12 @@ def test_motions_are_those_of_a_runner_in_mujoco_without_contact(case):
     robot, options = CASES[case]
     target = target_of(robot, options)
     loop = closed_loop(robot, N, **options)
-    state = loop.init()
+    # Fingers that rest at their limit of 0 m would meet it or not by rounding.
+    start = robot.start + np.where(np.char.find(robot.joint_names, "finger") > 0, 0.01, 0.0)
+    state = loop.init(start)
     options = {"engine": "mujoco", "collisions": False, "workers": 0, **options}
     with Runner(robot, N, **options) as runner:
-        runner.reset(robot.start)
+        runner.reset(start)
         for _ in range(TICKS):
             state, seen = loop.step(state, target, substeps=SUBSTEPS)
             expected = runner.step(target)
