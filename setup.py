@@ -108,14 +108,17 @@ extensions = []
 if os.environ.get("BATCHPID_NATIVE") != "0":
     sys.path.insert(0, str(ROOT))
     from batchpid.native import extensions as programs
-    from batchpid.native.compiled import header
+    from batchpid.native.compiled import header, law_segments
     from batchpid.sim.engine import native
+    from batchpid.stages import control_segments
 
     write("batchpid/native/codes.h", programs.codes())
     # One pass for each of the commonest laws, from their traces.
-    write("batchpid/native/passes.h", header())
+    write("batchpid/native/passes.h", header(law_segments(), ("float", "double")))
+    write("batchpid/sim/engine/native/passes.h", header(control_segments(), ("double",)))
     folder = ROOT / "batchpid/sim/engine/native"
-    sources = [path for path in sorted(folder.glob("*.h")) if path.name != "structures.h"]
+    written = "passes.h", "structures.h"
+    sources = [path for path in sorted(folder.glob("*.h")) if path.name not in written]
     sources.append(ROOT / "batchpid/native/rigid_body.h")
     write(
         "batchpid/sim/engine/native/structures.h",

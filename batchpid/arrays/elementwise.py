@@ -5,7 +5,7 @@ views; and the precision of JAX in programs of batchpid. All other settings of J
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache, wraps
 from importlib.util import find_spec
@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from batchpid.arrays.array_types import CHOICE_TYPES, Array, ArrayModule, DType
-from batchpid.arrays.trees import parts, rebuilt_as
+from batchpid.arrays.trees import flatten, walked
 from batchpid.errors import MissingDependencyError
 
 T = TypeVar("T")
@@ -145,20 +145,15 @@ def replace_envs(state: T, fresh: T, mask: Array) -> T:
     """Return ``state``, a tree of arrays (envs, ...), with the envs of ``mask`` (envs,) bool as in
     ``fresh``, which has the same structure.
     """
-    if state is None:
-        return state
-    if isinstance(state, Mapping | tuple):
-        new = parts(fresh)  # by name: JAX sorts the keys of a mapping
-        rebuilt: T = rebuilt_as(
-            state, [replace_envs(old, new[name], mask) for name, old in parts(state).items()]
-        )
-        return rebuilt
-    old: Any = state
-    xp = namespace(old, fresh, mask)
-    rows = xp.asarray(mask)
-    rows = rows.reshape(*rows.shape, *[1] * (old.ndim - rows.ndim))
-    chosen: T = xp.where(rows, fresh, old)
-    return chosen
+    new = flatten(fresh, read=lambda leaf: leaf)  # by name: JAX sorts the keys of a mapping
+
+    def chosen(name: str, old: Array) -> Array:
+        xp = namespace(old, new[name], mask)
+        rows = xp.asarray(mask)
+        return xp.where(rows.reshape(*rows.shape, *[1] * (old.ndim - rows.ndim)), new[name], old)
+
+    replaced: T = walked(chosen, state)
+    return replaced
 
 
 def wrap(angle: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:

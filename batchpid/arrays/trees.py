@@ -3,7 +3,7 @@ symbol, or a placeholder (``...``).
 
 Programs take the leaves of a tree of tuples, mappings and dataclasses in order: :func:`leaves`,
 :func:`mapped`, :func:`structure` and :func:`filled`. Numbers and other values are constants there, not leaves.
-Files and snapshots take all values by name: :func:`flatten` and :func:`unflatten`. None is a tree
+Files and snapshots take all values by name: :func:`walked`, :func:`flatten` and :func:`unflatten`. None is a tree
 without leaves.
 
 A :func:`digest` of values is equal for equal content, in any process and memory layout. It is a
@@ -71,46 +71,36 @@ def filled(tree: Pytree, given: Iterator[Pytree]) -> Pytree:
     return mapped(lambda _: next(given), tree)
 
 
-def flatten(
-    tree: Pytree,
-    separator: str = "/",
-    read: Callable[[Pytree], Array] = np.asarray,
-    name: str = "",
-) -> Document:
-    """Return all values in a tree by name, converted to arrays by ``read``.
+def walked(function: Callable[[str, Pytree], Pytree], tree: Pytree, name: str = "") -> Pytree:
+    """Return a tree with ``function(name, value)`` in place of each value; None stays.
 
-    A name consists of the keys and fields on the way to the value, joined by ``separator``. A tree
-    that is one value has the name "state".
+    A name consists of the keys and fields on the way to the value, joined by "/". A tree that is one
+    value has the name "state".
     """
     if tree is None:
-        return {}
+        return None
     if not isinstance(tree, Mapping | tuple | list):
-        return {name or "state": read(tree)}
+        return function(name or "state", tree)
     # Keys on the way become the name.
+    rebuilt = [
+        walked(function, part, f"{name}/{key}" if name else key)
+        for key, part in parts(tree).items()
+    ]
+    return rebuilt_as(tree, rebuilt)
+
+
+def flatten(tree: Pytree, read: Callable[[Pytree], Array] = np.asarray) -> Document:
+    """Return all values in a tree by the names of :func:`walked`, converted to arrays by ``read``."""
     named: Document = {}
-    for key, part in parts(tree).items():
-        named |= flatten(part, separator, read, f"{name}{separator}{key}" if name else key)
+    walked(lambda name, value: named.update({name: read(value)}), tree)
     return named
 
 
-def unflatten(
-    like: Pytree,
-    named: Mapping[str, Array],
-    separator: str = "/",
-    name: str = "",
-) -> Pytree:
+def unflatten(like: Pytree, named: Mapping[str, Array], name: str = "") -> Pytree:
     """Return a tree with the structure of ``like`` from the arrays that :func:`flatten`
     returned.
     """
-    if like is None:
-        return None
-    if not isinstance(like, Mapping | tuple | list):
-        return named[name or "state"]
-    rebuilt = [
-        unflatten(part, named, separator, f"{name}{separator}{key}" if name else key)
-        for key, part in parts(like).items()
-    ]
-    return rebuilt_as(like, rebuilt)
+    return walked(lambda name, _: named[name], like, name)
 
 
 def parts(tree: Pytree) -> Document:

@@ -20,7 +20,7 @@ slow would reduce the damping, the bandwidth is reduced.
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,27 +44,6 @@ with a larger inertia, that damping does less.
 """
 BACK_OFF = 0.8
 """Factor by which the bandwidth is reduced, until the filter is fast enough."""
-
-
-class Designable(Protocol):
-    """Robot that :func:`design_gains` can work on, such as :class:`batchpid.sim.Robot`.
-
-    A ``design_effort_limit`` (dof,), if it has one, becomes the effort limit of the designed
-    params.
-    """
-
-    def mass_matrix(self, qpos: ArrayLike) -> Float64:
-        """Return the joint-space mass matrices (n, dof, dof) at ``qpos`` (n, dof)."""
-
-    def sample(self, count: int, seed: int) -> Float64:
-        """Return ``count`` poses (count, dof) spread over the joints' ranges."""
-
-    def params(self, **options: Any) -> PIDParams:
-        """Return params with the robot's limits filled in."""
-
-    @property
-    def damping(self) -> Float64:
-        """Viscous damping of the joints (dof,)."""
 
 
 def pid_from_inertia(
@@ -105,7 +84,7 @@ def pid_from_inertia(
 
 
 def design_gains(
-    robot: Designable,
+    robot: Any,
     bandwidth_hz: float = 3.0,
     damping_ratio: float = DAMPING_RATIO,
     *,
@@ -124,7 +103,8 @@ def design_gains(
     Parameters
     ----------
     robot
-        A :class:`batchpid.sim.Robot`, or another :class:`Designable`. If it has a ``coupling``
+        A :class:`batchpid.sim.Robot`, or another object with its ``mass_matrix(poses)``,
+        ``sample(count, seed=)``, ``params(**options)`` and ``damping``. If it has a ``coupling``
         (:mod:`batchpid.motors.coupling`), the gains are for the inertia that moves with each
         leader. Followers get the same, which have no effect.
     bandwidth_hz, damping_ratio
@@ -218,7 +198,8 @@ def design_gains(
     limit = getattr(robot, "design_effort_limit", None)
     if limit is not None and not {"effort_limit", "effort_min", "effort_max"} & set(options):
         designed["effort_limit"] = limit
-    return robot.params(**(designed | options))
+    params: PIDParams = robot.params(**(designed | options))
+    return params
 
 
 def _filter_time(

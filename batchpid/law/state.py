@@ -111,16 +111,15 @@ def checked_inputs(
     arrays |= {
         name: None if value is None else _as_array(name, value) for name, value in inputs.items()
     }
-    # Shapes are compared as sets: one look suffices where all are (envs, joints).
-    of_params = {leaf.shape for leaf in params if leaf is not None and not isinstance(leaf, tuple)}
-    shapes = {"state": [leaf.shape for leaf in state if leaf is not None]}
-    shapes |= {name: [array.shape] for name, array in arrays.items() if array is not None}
-    (whole,) = shapes["measurement"]
+    named = [("params", leaf) for leaf in params if not isinstance(leaf, tuple)]
+    named += [*(("state", leaf) for leaf in state), *arrays.items()]
+    shapes = [(name, array.shape) for name, array in named if array is not None]
+    whole = arrays["measurement"].shape
     joints = params.num_joints
-    # One look saves most of the time.
+    # One look suffices where all are (envs, joints), and saves most of the time.
     usual = {whole, (1, joints)}
-    if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*shapes.values())):
-        _check_shapes(np.broadcast_shapes(*of_params), joints, shapes)
+    if whole[-1:] != (joints,) or not usual.issuperset(shape for _, shape in shapes):
+        _check_shapes(shapes, joints)
     return in_dtype_of(params, *arrays.values())
 
 
@@ -163,22 +162,20 @@ def check_drive(params: PIDParams) -> None:
         )
 
 
-def _check_shapes(
-    shape: tuple[int, ...], joints: int, known: dict[str, list[tuple[int, ...]]]
-) -> None:
-    """Raise InvalidArgumentError for the first of ``known`` that does not broadcast with those
-    before and ``shape``.
+def _check_shapes(shapes: list[tuple[str, tuple[int, ...]]], joints: int) -> None:
+    """Raise InvalidArgumentError for the first of the named ``shapes`` that does not broadcast with
+    those before.
     """
-    for name, shapes in known.items():
+    whole: tuple[int, ...] = (joints,)
+    for name, shape in shapes:
         try:
-            shape = np.broadcast_shapes(shape, *shapes)
-            fits = shape[-1] == joints and (name != "measurement" or shapes[0][-1:] == (joints,))
+            whole = np.broadcast_shapes(whole, shape)
+            fits = whole[-1] == joints and (name != "measurement" or shape[-1:] == (joints,))
         except ValueError:
             fits = False
         if not fits:
             problem = (
-                f"has shape {shapes[0]}, which does not fit {shape} of the params and the other"
-                " inputs"
+                f"has shape {shape}, which does not fit {whole} of the params and the other inputs"
             )
             raise InvalidArgumentError(name, problem, remedy=f"give (envs, {joints})")
 

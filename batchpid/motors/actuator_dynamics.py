@@ -326,7 +326,7 @@ def advance_measurement(
         if drawn is None:
             drawn = measurement_noise(k, key, step, qpos, xp)
         step = step + _ONE
-    # Native programs have the noise, and no keys.
+    # Native programs have the noise drawn, and no key.
     if drawn is not None:
         position, velocity = drawn
         qpos = qpos if position is None else qpos + position

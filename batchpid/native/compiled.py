@@ -1,15 +1,16 @@
 """The law as a native program, traced from its only definition. Results are bit-identical.
 
-The interpreter (program.h) makes a pass over a block for each operation, which
-loads and stores every value in between. A law whose segments
-(:class:`batchpid.native.tracing.Segment`) :func:`law_segments` yields is one loop. ``setup.py``
-writes ``passes.h`` from the traces when it builds the extensions. The interpreter runs
-all other programs. It has the same operations in the same order, so all bits are equal.
+The interpreter (program.h) makes a pass over a block for each operation, which loads and stores
+every value in between. A program whose segments (:class:`batchpid.native.tracing.Segment`) are those
+of :func:`law_segments`, or in the sim's extension of :func:`batchpid.stages.control_segments`, has
+one loop for each: ``setup.py`` writes them into headers ``passes.h`` when it builds the extensions.
+The interpreter runs all other programs. It has the same operations in the same order, so all bits
+are equal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import product
 from typing import Any
 
@@ -157,19 +158,23 @@ def law_segments() -> Iterator[Segment]:
         yield from trace_change(law_with_effort, histories, *trees).program.segments
 
 
-def header() -> str:
-    """Return the text of passes.h."""
-    codes = dict.fromkeys(segment.code for segment in law_segments())
-    functions = [_function(number, code) for number, code in enumerate(codes)]
-    rows = [
-        f"    {{{len(code) // 4}, detail::code_{number}, detail::float_{number},"
-        f" detail::double_{number}}},"
-        for number, code in enumerate(codes)
-    ]
+def header(segments: Iterable[Segment], dtypes: tuple[str, ...]) -> str:
+    """Return the text of a header with a pass for each of the segments and ``dtypes``, "float" and
+    "double".
+    """
+    codes = dict.fromkeys(segment.code for segment in segments)
+    functions = [_function(number, code, dtypes) for number, code in enumerate(codes)]
+    rows = []
+    for number, code in enumerate(codes):
+        passes = [
+            f"detail::{dtype}_{number}" if dtype in dtypes else "nullptr"
+            for dtype in ("float", "double")
+        ]
+        rows.append(f"    {{{len(code) // 4}, detail::code_{number}, {', '.join(passes)}}},")
     return _HEADER.format(functions="\n".join(functions), rows="\n".join(rows))
 
 
-def _function(number: int, packed: bytes) -> str:
+def _function(number: int, packed: bytes, dtypes: Iterable[str]) -> str:
     """Return the pass of a segment."""
     read, count, *code = np.frombuffer(packed, np.int32).tolist()
     operations = [code[start : start + 4] for start in range(0, len(code) - count, 4)]
@@ -187,7 +192,7 @@ def _function(number: int, packed: bytes) -> str:
         pointers=", ".join(pointers),
         results=", ".join(results),
         lines="\n      ".join(lines),
-    )
+    ) + "".join(_TYPED.format(number=number, dtype=dtype) for dtype in dtypes)
 
 
 _PASS = """
@@ -203,17 +208,16 @@ BATCHPID_INLINE void pass_{number}(Operand<T> const *x, T *const *y, Index n, In
     }}
   }}
 }}
-BATCHPID_CLONES static void float_{number}(Operand<float> const *x, float *const *y, Index n, Index chunk) {{
-  pass_{number}(x, y, n, chunk);
-}}
-BATCHPID_CLONES static void double_{number}(Operand<double> const *x, double *const *y, Index n, Index chunk) {{
+"""
+_TYPED = """
+BATCHPID_CLONES static void {dtype}_{number}(Operand<{dtype}> const *x, {dtype} *const *y, Index n, Index chunk) {{
   pass_{number}(x, y, n, chunk);
 }}"""
-_HEADER = """// Written by setup.py: compiled.py.
+_HEADER = """// Written by setup.py: batchpid/native/compiled.py.
 
 #pragma once
 
-#include "program.h"
+#include "batchpid/native/program.h"
 
 namespace batchpid {{
 namespace detail {{

@@ -17,6 +17,8 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <limits>
+#include <type_traits>
 #include <vector>
 
 #if defined(__x86_64__) && defined(__ELF__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
@@ -31,10 +33,6 @@ namespace batchpid {
 using Index = std::ptrdiff_t;
 
 // Codes of operations beside those of array libraries; masks are 1 and 0.
-// MULTIPLY_ADD       a b + c, rounded twice
-// ADD_SUBTRACT       (a + b) - c
-// SUBTRACT_MULTIPLY  (a - b) c
-// CLIP               min(max(a, b), c)
 // PUSH               history, in place: b as its latest sample; the oldest one is lost
 // GATHER             columns b of each row of a
 // TAKE_ROW           numbers of a table, in row b of the rows of each env and column
@@ -110,15 +108,21 @@ namespace detail {
 // 0 plus the sum of n products, in NumPy's order for n <= 128: sequential below eight terms, else eight partial sums.
 template <class T>
 BATCHPID_INLINE T sum_of_products(T const *a, T const *b, Index n) {
+  typedef T Four __attribute__((vector_size(4 * sizeof(T))));
+  typedef std::conditional_t<sizeof(T) == sizeof(float), std::int32_t, std::int64_t> Place;
+  typedef Place Places __attribute__((vector_size(4 * sizeof(T))));
   T sum = T(-0.0);
   Index i = 0;
   if (n >= 8) {
-    T s[8];
-    for (; i < 8; ++i) s[i] = a[i] * b[i];
+    Four low{}, high{}, x[2], y[2];
     for (; i + 8 <= n; i += 8) {
-      for (Index k = 0; k < 8; ++k) s[k] += a[i + k] * b[i + k];
+      std::memcpy(x, a + i, sizeof x);
+      std::memcpy(y, b + i, sizeof y);
+      low += x[0] * y[0];
+      high += x[1] * y[1];
     }
-    sum = ((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7]));
+    Four const s = __builtin_shuffle(low, high, Places{0, 4, 2, 6}) + __builtin_shuffle(low, high, Places{1, 5, 3, 7});
+    sum = (s[0] + s[2]) + (s[1] + s[3]);
   }
   for (; i < n; ++i) sum += a[i] * b[i];
   return T(0) + sum;
@@ -155,10 +159,6 @@ BATCHPID_INLINE T result_of(T a, T b, T c) {
     case SIGN: return a > 0 ? 1 : a < 0 ? -1 : a == 0 ? 0 : a;
     case ISFINITE: return a - a == 0 ? 1 : 0;
     case WHERE: return a != 0 ? b : c;
-    case MULTIPLY_ADD: return a * b + c;
-    case ADD_SUBTRACT: return a + b - c;
-    case SUBTRACT_MULTIPLY: return (a - b) * c;
-    case CLIP: return smaller(larger(a, b), c);
     default: return a;
   }
 }
@@ -182,12 +182,13 @@ BATCHPID_INLINE void apply(Program const &program, Code code, Index first, Index
     EACH(ADD) EACH(SUBTRACT) EACH(MULTIPLY) EACH(DIVIDE) EACH(MAXIMUM) EACH(MINIMUM) EACH(GREATER) EACH(GREATER_EQUAL)
     EACH(LESS) EACH(LESS_EQUAL) EACH(EQUAL) EACH(NOT_EQUAL) EACH(AND) EACH(OR) EACH(NOT) EACH(NEGATIVE) EACH(ABSOLUTE)
     EACH(RINT) EACH(CEIL) EACH(FLOOR) EACH(SQRT) EACH(EXP) EACH(TANH) EACH(SIN) EACH(SIGN) EACH(ISFINITE) EACH(WHERE)
-    EACH(MULTIPLY_ADD) EACH(ADD_SUBTRACT) EACH(SUBTRACT_MULTIPLY) EACH(CLIP)
     case ROW_MINIMUM:
       for (Index row = 0; row < n; row += columns) {
         T const *a = x.data + (x.step ? row : row % program.chunk);
         T least = a[0];
-        for (Index i = 1; i < columns; ++i) least = result_of<MINIMUM>(least, a[i], T(0));
+        bool is_nan = false;  // counted apart, so that the loop has no branch
+        for (Index i = 0; i < columns; ++i) is_nan |= a[i] != a[i], least = least < a[i] ? least : a[i];
+        if (is_nan) least = std::numeric_limits<T>::quiet_NaN();
         std::fill_n(out + row, columns, least);
       }
       break;

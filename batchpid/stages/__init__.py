@@ -24,15 +24,20 @@ Each stage has a file. A stage of the caller's stands behind the one that it nam
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import is_dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from batchpid.arrays.elementwise import read_only
-from batchpid.arrays.trees import mapped
+from batchpid.arrays.trees import leaves, mapped, structure
 from batchpid.errors import InvalidArgumentError
+from batchpid.law.params import make_params
+from batchpid.motors.coupling import Coupling
+from batchpid.motors.friction import Friction as JointFriction
+from batchpid.native.tracing import Segment, trace_change
 from batchpid.stages.control import Control
 from batchpid.stages.feedforward import Feedforward, Passive
 from batchpid.stages.friction import Friction, Inertia
@@ -42,10 +47,19 @@ from batchpid.stages.motors import Limits, Motors
 from batchpid.stages.plan import Plan
 from batchpid.stages.sensors import Sensors
 from batchpid.stages.setpoint import Setpoint
-from batchpid.stages.stage import Last, Stage
-from batchpid.stages.values import Told, Values
+from batchpid.stages.stage import Last, Stage, outputs_after, running, started
+from batchpid.stages.values import Command, Measured, Model, Step, Told, Values
 
-__all__ = ["STAGES", "Control", "Stage", "Told", "Values", "fit_stages", "stages_of"]
+__all__ = [
+    "STAGES",
+    "Control",
+    "Stage",
+    "Told",
+    "Values",
+    "control_segments",
+    "fit_stages",
+    "stages_of",
+]
 
 STAGES: tuple[type[Stage], ...] = (
     *(Sensors, Passive, Inertia, Matrix),
@@ -63,6 +77,53 @@ def stages_of(control: Control) -> tuple[Any, ...]:
         kinds.insert(len(names) - names[::-1].index(stage.after), stage)
     made = [kind if isinstance(kind, Stage) else kind.of(control) for kind in kinds]
     return tuple([stage for stage in made if stage is not None])
+
+
+def control_segments() -> Iterator[Segment]:
+    """Yield the segments of gains per mass matrix with and without friction and damping of the
+    joints, and with and without rates of setpoints.
+    """
+    row = np.ones((1, 1))
+    params = make_params(
+        1,
+        kp=1.0,
+        ki=1.0,
+        kd=1.0,
+        effort_limit=1.0,
+        derivative_filter_time=0.01,
+        setpoint_weight=0.5,
+        anti_windup="conditional",
+        measurement_rate="measured",
+        gain_units="mass_matrix",
+    )
+    frictions = JointFriction(), JointFriction(viscous=row), JointFriction(row, row)
+    for friction, moves in product(frictions, (False, True)):
+        control = Control(
+            1.0,
+            1,
+            Coupling.of(1),
+            params,
+            friction=friction,
+            gravity=True,
+            modelled=friction.coulomb,
+            band=row,
+            damping=friction.viscous,
+        )
+        stages = [stage for stage in stages_of(control) if not stage.native]
+        command, seen = Command(row, row, row, row), Measured(row, row, row)
+        values = Values(
+            command if moves else command.resting(),
+            seen,
+            seen,
+            step=Step(0, 1, row),
+            inertia=(row, row),
+            matrix=np.ones((1, 1, 1)),
+            model=Model(load=lambda: row),
+        )
+        states = started(stages, values)
+        trees = running(stages), states, values._replace(model=Model())
+        histories = (False,) * len(leaves(states))
+        yield from trace_change(outputs_after, histories, *map(structure, trees)).program.segments
 
 
 def fit_stages(stages: Sequence[Stage]) -> tuple[Stage, ...]:

@@ -190,7 +190,7 @@ def bind_stages(
     constants = mapped(_split, running(stages))
     # Programs have no keys of noise, counts, or state of a controller.
     states = mapped(_number, tuple(states))
-    function: Callable[..., tuple[States, Outputs, Any]] = _outputs_after
+    function: Callable[..., tuple[States, Outputs, Any]] = outputs_after
     if renews:
         function = _renewed_states
     elif passes:
@@ -206,7 +206,8 @@ def _values_after(stages: Any, states: States, values: Values) -> tuple[States, 
     return states, values.outputs, values._replace(outputs=Outputs())
 
 
-def _outputs_after(stages: Any, states: States, values: Values) -> tuple[States, Outputs, Any]:
+def outputs_after(stages: Any, states: States, values: Values) -> tuple[States, Outputs, Any]:
+    """Return the states and results of a sim step, as for :class:`.TreeProgram`."""
     return *_values_after(stages, states, values)[:2], ()
 
 

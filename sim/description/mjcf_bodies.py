@@ -161,15 +161,7 @@ class RobotInFile:
         self.lost["bodies apart from the robot"] += [repr(self.bodies[body]) for body in apart]
         if floating:
             return floating.pop()
-        # The only body, if it is held at the origin, is the root in place of the world.
-        only, *others = sorted(tops - self._left_out) or [0]
-        pose = [*model.body_pos[only], *model.body_quat[only]]
-        if others or model.body_jntnum[only] or pose != [0, 0, 0, 1, 0, 0, 0]:
-            return 0
-        for geom in np.flatnonzero(model.geom_bodyid == 0).tolist():
-            if model.geom_type[geom] != PLANE and can_collide(model, geom):
-                return 0
-        return only
+        return 0
 
     def read(self, couplings: Couplings, motors: JointMotors, is_held: bool) -> Tables:
         """Return the tables; ``is_held`` says whether a base on a free joint is fixed."""

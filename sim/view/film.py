@@ -18,7 +18,7 @@ from matplotlib.transforms import Bbox, IdentityTransform
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, Progress, Rows
-from batchpid.checks import file_path, integer, number
+from batchpid.checks import file_path
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import replacing
 from batchpid.sim.robot.robot import Robot
@@ -144,11 +144,14 @@ def coarse(surface: Surface, cell: float) -> Surface:
     return surface._replace(vertices=surface.vertices[first], faces=faces[np.sort(distinct)])
 
 
+SIZE = (960, 540)
+"""Width and height of a film [pixels]; the formats need even ones."""
+FPS = 30.0
+"""Frames of a film per second."""
 MOST_FRAMES = 100_000
 """Largest number of frames of a film, nearly an hour."""
 ENCODERS = {
-    # Colours are halved on both sides, which are therefore even.
-    ".mp4": "-vf pad=ceil(iw/2)*2:ceil(ih/2)*2 -pix_fmt yuv420p",
+    ".mp4": "-pix_fmt yuv420p",
     ".gif": "-vf split[a][b];[a]palettegen[p];[b][p]paletteuse -loop 0",
 }
 """Options of ffmpeg for each format."""
@@ -159,9 +162,6 @@ def write_film(
     out: str | Path,
     *,
     robot: Robot | None = None,
-    fps: float = 30.0,
-    width: int = 960,
-    height: int = 540,
     progress: Progress[int] | None = None,
 ) -> Path:
     """Write a film of ``rollout`` in real time, all envs next to each other, and return its path.
@@ -172,34 +172,30 @@ def write_film(
         File that ends in .mp4 or .gif.
     robot
         Robot of the run; default :func:`batchpid.sim.view.view_data.recorded_robot`.
-    fps, width, height
-        Frames per second; size in pixels.
     progress
         Wraps the rows that are filmed, e.g. ``tqdm.tqdm``.
 
     Raises
     ------
     InvalidArgumentError
-        An argument is out of range, or the run has another number of joints, or no robot.
+        Another suffix, a run that is too long, has another number of joints, or has no robot.
     MissingDependencyError
         The package imageio-ffmpeg is missing.
     BatchPIDError
         ffmpeg failed.
     """
     path = file_path("out", out, ENCODERS)
-    rate = number("fps", fps, 1.0, 120.0, "frames per second")
-    size = integer("width", width, 16, 8192), integer("height", height, 16, 8192)
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError:
         raise MissingDependencyError("imageio-ffmpeg", "a film", "view") from None
     recorded = Playback(rollout, robot)
-    painter = Painter(recorded.robot, rollout.num_envs, recorded.ground, size)
-    if not recorded.duration * rate <= MOST_FRAMES:
+    painter = Painter(recorded.robot, rollout.num_envs, recorded.ground, SIZE)
+    if not recorded.duration * FPS <= MOST_FRAMES:
         problem = f"lasts {recorded.duration:g} s, more than {MOST_FRAMES} frames"
-        remedy = "film a part: rollout.for_ticks(slice(...)), or fewer frames per second"
+        remedy = "film a part: rollout.for_ticks(slice(...))"
         raise InvalidArgumentError("rollout", problem, remedy=remedy)
-    times = np.arange(0.0, recorded.duration + 0.5 / rate, 1 / rate)
+    times = np.arange(0.0, recorded.duration + 0.5 / FPS, 1 / FPS)
     rows = rows_at(rollout, times).tolist()
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
@@ -211,7 +207,7 @@ def write_film(
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
-        encode(pictures(), temporary, get_ffmpeg_exe(), size, rate)
+        encode(pictures(), temporary, get_ffmpeg_exe())
     return path
 
 
@@ -219,13 +215,11 @@ def encode(
     pictures: Iterable[NDArray[np.uint8]],
     path: Path,
     ffmpeg: str,
-    size: tuple[int, int],
-    fps: float,
 ) -> None:
-    """Write RGB ``pictures`` (height, width, 3) of ``size`` (width, height) to a film, by the
-    program ``ffmpeg``.
+    """Write RGB ``pictures`` (height, width, 3) of :data:`SIZE` to a film, by the program
+    ``ffmpeg``.
     """
-    source = "-v error -f rawvideo -pix_fmt rgb24 -s {}x{} -r {} -i -".format(*size, fps)
+    source = "-v error -f rawvideo -pix_fmt rgb24 -s {}x{} -r {} -i -".format(*SIZE, FPS)
     options = ENCODERS[path.suffix.lower()]
     command = [ffmpeg, *source.split(), *options.split(), "-y", f"file:{path}"]
     with tempfile.TemporaryFile() as messages:

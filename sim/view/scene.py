@@ -6,7 +6,6 @@ The triangles are made, or read from mesh files, by ``trimesh``.
 from __future__ import annotations
 
 import math
-import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,7 +38,7 @@ _REMEDY = (
     ", or set ROS_PACKAGE_PATH"
 )
 
-_PALETTE = ((0.62, 0.65, 0.70, 1.0), (0.42, 0.46, 0.53, 1.0), (0.80, 0.81, 0.83, 1.0))
+_GREY = (0.62, 0.65, 0.70, 1.0)
 _CYLINDER = (
     (0.0, -0.5),
     (1.0, -0.5),
@@ -148,7 +147,7 @@ def surfaces(robot: Robot, segments: int = 24) -> tuple[list[Surface], list[Find
             try:
                 for visual in visuals:
                     mesh = _mesh(visual, robot, segments)
-                    parts.setdefault(visual.rgba or _default_colour(name), []).append(mesh)
+                    parts.setdefault(visual.rgba or _GREY, []).append(mesh)
             except OSError as error:
                 shape, reason = error.args
                 text = f"cannot be drawn ({reason}): collision shapes are drawn, if any"
@@ -214,8 +213,3 @@ def _mesh(visual: Visual, robot: Robot, segments: int) -> Any:
             mesh.vertices *= radius
     mesh.vertices = rotate(matrix_of(shape.wxyz), np.asarray(mesh.vertices)) + shape.position
     return mesh
-
-
-def _default_colour(link: str) -> Rgba:
-    # The same in every run, unlike hash().
-    return _PALETTE[zlib.crc32(link.encode()) % len(_PALETTE)]

@@ -42,8 +42,7 @@ class LiveSimulation:
     period
         Simulated time between frames [s], rounded to whole sim steps.
     spread
-        Largest distance of a joint from the robot's start pose at the beginning [rad or m];
-        ``seed`` determines it.
+        Largest distance of a joint from the robot's start pose at the beginning [rad or m].
     options
         Of :class:`batchpid.sim.Runner`: params, workers, engine, physics, compensate, timestep, ...
 
@@ -60,7 +59,6 @@ class LiveSimulation:
         *,
         period: float = 1 / 30,
         spread: float = 0.2,
-        seed: int = 0,
         **options: Any,
     ) -> None:
         self.robot = robot
@@ -69,7 +67,7 @@ class LiveSimulation:
         period = number("period", period, timestep, 1.0, "seconds between frames")
         substeps = round(period / timestep)
         self.period = substeps * timestep
-        self._random = np.random.default_rng(seed)
+        self._random = np.random.default_rng(0)
         offsets = self._random.uniform(-spread, spread, (num_envs, robot.dof))
         self.start = np.clip(robot.start + offsets, robot.lower, robot.upper)
         """Joint positions at the beginning (envs, dof) [rad or m]."""

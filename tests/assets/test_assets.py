@@ -3,19 +3,16 @@ touch each other.
 """
 
 import importlib.resources
-import warnings
 
 import numpy as np
 import pytest
 import yaml
 from lxml import etree
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # sapien warns on import where no system Vulkan library exists
-    import sapien
+import batchpid.task_space as ts
+from batchpid.sim import Robot
 
 ROBOTS = ("panda", "jaco2")
-TIMESTEP = 1 / 2000
 
 # Total mass of the sources that assets/README.md names [kg].
 MASS = {"panda": 17.451901, "jaco2": 5.55724}
@@ -40,45 +37,14 @@ def settings(name):
     )
 
 
-class World:
-    """Scene of one robot, built without its visuals."""
-
-    def __init__(self, root, folder):
-        for visual in list(root.iter("visual")):
-            visual.getparent().remove(visual)
-        path = folder / "robot.urdf"
-        path.write_bytes(etree.tostring(root))
-        self.scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
-        self.scene.timestep = TIMESTEP
-        self.scene.add_ground(0, render=False)
-        self.robot = self.scene.create_urdf_loader().load(str(path))
-        self.joints = self.robot.get_active_joints()
-
-    def passive(self, qpos, qvel):
-        self.robot.set_qpos(np.array(qpos, np.float32))
-        self.robot.set_qvel(np.array(qvel, np.float32))
-        return self.robot.compute_passive_force()
-
-    def touching(self, qpos):
-        """Return the pairs of bodies whose shapes overlap at ``qpos``."""
-        self.robot.set_qpos(np.asarray(qpos, np.float32))
-        self.robot.set_qvel(np.zeros(self.robot.dof, np.float32))
-        self.scene.step()
-        return {
-            tuple(sorted(body.entity.name for body in contact.bodies))
-            for contact in self.scene.get_contacts()
-            if any(point.separation < 0 for point in contact.points)
-        }
+def passive(robot, qpos, qvel):
+    """Return the passive force of a robot at one pose and rate (dof,)."""
+    return ts.bias(robot.kinematic_tree(), np.array([qpos]), np.array([qvel]))[0]
 
 
 @pytest.fixture(params=ROBOTS)
 def name(request):
     return request.param
-
-
-@pytest.fixture
-def world(name, tmp_path):
-    return World(xml(name), tmp_path)
 
 
 def test_shapes_are_primitives_and_materials_exist(name):
@@ -106,15 +72,16 @@ def test_every_link_has_a_material_a_collision_shape_and_a_possible_inertia(name
         assert small + middle >= large, "no solid has these moments"
 
 
-def test_the_total_mass_is_that_of_the_source_and_no_link_is_massless(name, world):
-    masses = [link.mass for link in world.robot.links]
+def test_the_total_mass_is_that_of_the_source_and_no_link_is_massless(name):
+    masses = [float(mass.get("value")) for mass in xml(name).iter("mass")]
     assert sum(masses) == pytest.approx(MASS[name], abs=1e-6)
     assert min(masses) == pytest.approx(0.01 if name == "jaco2" else 0.015)
 
 
-def test_panda_passive_force_is_that_of_the_source(tmp_path):
+def test_panda_passive_force_is_that_of_the_source():
     # Expected values: SAPIEN 3.0.3 on the source description, without mimic and meshes.
-    passive = World(xml("panda"), tmp_path).passive(
+    found = passive(
+        Robot.load("panda"),
         [0.3, -0.4, 0.5, -1.6, 0.7, 1.8, -0.9, 0.01, 0.03],
         [0.5, -1, 1.5, 0.8, -1.2, 2, -0.7, 0.05, -0.02],
     )
@@ -129,7 +96,7 @@ def test_panda_passive_force_is_that_of_the_source(tmp_path):
         0.028486,
         -0.038695,
     ]
-    np.testing.assert_allclose(passive, expected, atol=5e-5)
+    np.testing.assert_allclose(found, expected, atol=5e-5)
 
 
 def test_jaco2_passive_force_without_the_additions_is_that_of_the_source(tmp_path):
@@ -142,7 +109,9 @@ def test_jaco2_passive_force_without_the_additions_is_that_of_the_source(tmp_pat
             root.remove(element)
         elif element.tag == "joint" and "tip" in label:
             element.set("type", "fixed")
-    passive = World(root, tmp_path).passive(
+    (path := tmp_path / "jaco2.urdf").write_bytes(etree.tostring(root))
+    found = passive(
+        Robot.load(path),
         [0.3, 2.6, 0.5, 1.9, -0.7, 2.4, 0.9, 0.4, 0.8],
         [0.5, -1, 1.5, 0.8, -1.2, 2, -0.7, 0.6, -0.4],
     )
@@ -157,23 +126,21 @@ def test_jaco2_passive_force_without_the_additions_is_that_of_the_source(tmp_pat
         0.007114,
         -0.004496,
     ]
-    np.testing.assert_allclose(passive, expected, atol=5e-5)
+    np.testing.assert_allclose(found, expected, atol=5e-5)
 
 
-def test_no_links_touch_at_start_or_target_or_between(name, world):
-    rows = settings(name)["joints"].values()
-    start, target = (np.array([row[key] for row in rows]) for key in ("start", "target"))
-    for share in np.linspace(0, 1, 21):
-        assert not world.touching(start + share * (target - start))
+def test_no_links_touch_at_start_or_target_or_between(name):
+    robot = Robot.load(name)
+    start, target = robot.settings.start, robot.settings.target
+    poses = start + np.linspace(0, 1, 21)[:, None] * (target - start)
+    assert not robot.dynamics(ground=True).in_contact(poses).any()
 
 
-def test_settings_are_the_tutorials_and_within_limits(name, world):
-    data = settings(name)
+def test_settings_are_the_tutorials_and_within_limits(name):
+    data, robot = settings(name), Robot.load(name)
     rows = data["joints"].values()
     assert data["drive"] == {"stiffness": 20, "damping": 5}
     assert [(row["kp"], row["ki"], row["kd"]) for row in rows] == GAINS[name]
-    lower, upper = np.array([joint.limits[0] for joint in world.joints]).T
-    for key in ("start", "target"):
-        values = np.array([row[key] for row in rows])
-        assert (values >= lower - 1e-6).all()
-        assert (values <= upper + 1e-6).all()
+    for values in (robot.settings.start, robot.settings.target):
+        assert (values >= robot.lower - 1e-6).all()
+        assert (values <= robot.upper + 1e-6).all()

@@ -143,6 +143,11 @@ def test_the_inertia_of_friction_is_renewed_by_the_age_of_each_env():
         ages = [1 if age == REFRESH_STEPS else age + 1 for age in ages]
         assert state.age.tolist() == ages
     assert len(calls) == expected
+    # Friction that has changed in one env renews its inertia alone.
+    drawn = control._replace(friction=Friction(coulomb=np.array([[0.2, 0.2], [0.2, 0.3]])))
+    other = next(one for one in stages_of(drawn) if one.name == "inertia")
+    part = type(state)(*(rows[:2] for rows in state))
+    assert other.adopt(stage, part, at(model=model)).age.tolist() == [ages[0], REFRESH_STEPS]
 
 
 def test_a_late_sensor_shows_a_law_the_state_from_which_it_starts():

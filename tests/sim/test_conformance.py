@@ -14,6 +14,7 @@ import functools
 import os
 import signal
 import tempfile
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from identical import assert_identical
 from option_values import ARM, FRICTION, LINE, MOTORS, NOISE, SENSORS, SIGNALS, box
 from robots import load_bundled
 from thermal import Thermal
+from tiny_urdf import write
 
 import batchpid as bp
 from batchpid.sim import (
@@ -144,6 +146,13 @@ PUSHES = {
     },
     "gravity": {"x": Uniform(-1, 1), "z": Uniform(-1, 1)},
 }
+SCENE = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
+  <body name="arm" pos="0 0 .05"><joint name="turn" axis="0 0 1" damping=".5"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/></body>
+  <body name="cube" pos=".3 .03 .1"><freejoint/><geom type="box" size=".04 .04 .04"/></body>
+  <body name="lamp" pos="-1 0 1" quat="1 .5 0 0"><joint type="ball"/><geom size=".05" pos="0 0 -.1"/></body>
+</worldbody><actuator><motor joint="turn" ctrlrange="-20 20"/></actuator></mujoco>"""
+"""Arm that pushes a falling cube, beside a lamp that swings."""
 EACH = np.arange(1.0, N + 1)[:, None] * [1.0, 0.5]
 GUARD = bp.make_guard(2, rate=0.5, acceleration=20.0)
 PLAN = bp.make_plan(2, period=0.02, horizon=4, blend="average", acceleration=30.0)
@@ -216,6 +225,7 @@ FEATURES = {
     "a reset at a fault": Feature({"on_fault": "reset", "speed_limit": 2.0}),
     "contact sensors": Feature({"contacts": ["hand"], "wrenches": ["arm"]}),
     "user content": Feature({"build": functools.partial(box, 0.05)}, engines=SAPIEN),
+    "objects of a scene": Feature({"robot": "scene"}, engines=MUJOCO, alike=False),
     "links in contact": Feature({"robot": "jaco2", "control": "effort"}, exact=True, alike=False),
     "mimic joints": Feature({"robot": "chain of mimics"}),
     "mimic joints under a drive": Feature({"robot": "mimic", "control": "drive"}, alike=False),
@@ -260,6 +270,9 @@ def robot_of(name):
     """Return a robot by its name in the features; "arm" has two joints, and links with shapes."""
     if name == "arm":
         return ARM
+    if name == "scene":
+        # Kept, since MuJoCo reads the file again.
+        return Robot.load(write(Path(tempfile.mkdtemp()), SCENE, "scene.xml"))
     if name == "worn":
         return dataclasses.replace(ARM, actuators=MOTORS)
     return load_bundled(name) if name in Robot.bundled() else robot_with(name)

@@ -61,6 +61,10 @@ def test_a_reset_draws_for_the_envs_of_its_mask():
         for name, rows in after.items():
             np.testing.assert_array_equal(rows[~mask], before[name][~mask], name)
         assert (after["payload"][mask] != before["payload"][mask]).all()
+        runner.reset(mask=mask, seed=10)
+        assert runner.episodes.tolist() == [[10, 0], [11, 0], *([env, 0] for env in range(2, N))]
+        runner.reset(seed=[5] * N)
+        assert np.ptp(runner.draws["payload"]) == 0
         runner.reset(seed=0)
         for name, rows in runner.draws.items():
             np.testing.assert_array_equal(rows, before[name], name)

@@ -103,7 +103,7 @@ _NAMES = (
         "constraint.h",
         "refresh.h",
     ),
-    *("sim_step.h", "tick.h", "structures.h", "__init__.py"),
+    *("sim_step.h", "tick.h", "structures.h", "passes.h", "__init__.py"),
 )
 
 EXTENSIONS = {

@@ -6,6 +6,7 @@
 #define BATCHPID_WIDTH 8  // WIDTH in __init__.py: the doubles of an instruction of AVX-512
 #include "tick.h"
 
+#include "passes.h"
 #include "structures.h"
 
 using namespace batchpid;
@@ -43,7 +44,7 @@ PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
 // numbers in each row of a table (0: it is (rows, columns), -1: one number), and arrays.
 PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto bound = std::make_unique<BoundProgram>();
-  bound->program = make_program(arguments[0]);
+  bound->program = make_program(arguments[0], PASSES, std::size(PASSES));
   if (bound->program == nullptr) return nullptr;
   Program const &program = *bound->program;
   Index const numbers = program.rows * program.columns;

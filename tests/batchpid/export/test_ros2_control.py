@@ -117,50 +117,34 @@ def test_the_file_is_that_of_a_controller_manager():
     }
 
 
-GAINS = dict.fromkeys(
-    ("p", "i", "d", "u_clamp_max", "u_clamp_min", "i_clamp_max", "i_clamp_min"), float
-)
-GAINS |= {"antiwindup_strategy": ("back_calculation", "conditional_integration", "none")}
-GAINS |= {"tracking_time_constant": float, "error_deadband": float}
-SCHEMA = {
-    "joints": [str],
-    "command_interfaces": ("position", "velocity", "acceleration", "effort"),
-    "state_interfaces": ("position", "velocity", "acceleration"),
-    "gains": GAINS | {"ff_velocity_scale": float},
-}
-"""Types, or values, of the parameters that the files use, after those that
-generate_parameter_library declares in ros2_controllers 6.9. Its lists are not empty and without
-repetition, its doubles refuse integers.
+STRATEGIES = {"back_calculation", "conditional_integration", "none"}
+FLOATS = [
+    "p",
+    "i",
+    "d",
+    "u_clamp_max",
+    "u_clamp_min",
+    "i_clamp_max",
+    "i_clamp_min",
+    "tracking_time_constant",
+]
+FLOATS += ["error_deadband", "ff_velocity_scale"]
+"""Parameters of a joint that generate_parameter_library declares in ros2_controllers 6.9; its
+doubles refuse integers.
 """
 
 
-def fits(value, kind):
-    if isinstance(kind, type):
-        return type(value) is kind and not (kind is float and math.isnan(value))
-    if isinstance(kind, tuple) and isinstance(value, str):
-        return value in kind
-    entry = kind[0] if isinstance(kind, list) else kind
-    return (
-        isinstance(value, list)
-        and len(set(value)) == len(value) > 0
-        and all(fits(each, entry) for each in value)
-    )
-
-
 def check_schema(text):
-    body = yaml.safe_load(text)[CONTROLLER]["ros__parameters"]
-    schema = SCHEMA
-    assert body.keys() == schema.keys()
-    assert set(body["gains"]) == set(body["joints"])
-    for key in body.keys() - {"gains"}:
-        assert fits(body[key], schema[key]), (key, body[key])
-    for gains in body["gains"].values():
-        assert set(gains) <= set(schema["gains"])
-        assert all(fits(value, schema["gains"][key]) for key, value in gains.items()), gains
+    gains = gains_of(text)
+    assert list(gains) == JOINTS
+    for row in gains.values():
+        assert row.pop("antiwindup_strategy") in STRATEGIES
+        assert {name: type(value) for name, value in row.items()} == dict.fromkeys(FLOATS, float)
+        assert not any(map(math.isnan, row.values()))
         # Checks of control_toolbox's gains.
-        assert gains["i_clamp_min"] <= 0 <= gains["i_clamp_max"]
-        assert gains["u_clamp_min"] < gains["u_clamp_max"]
-        assert gains["tracking_time_constant"] >= 0
+        assert row["i_clamp_min"] <= 0 <= row["i_clamp_max"]
+        assert row["u_clamp_min"] < row["u_clamp_max"]
+        assert row["tracking_time_constant"] >= 0
 
 
 @given(random_params())

@@ -18,6 +18,7 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.native import extensions
 from batchpid.native.compiled import header, law_segments
+from batchpid.stages import control_segments
 
 NATIVE = bp.BatchPID(bp.make_params(1, 1.0), 1, 0.01).native
 needs_extension = pytest.mark.skipif(not NATIVE, reason="there are no native programs")
@@ -191,12 +192,19 @@ def test_out_is_for_numpy():
 
 @needs_extension
 def test_the_commonest_laws_are_one_pass_and_compiled():
-    """Each has one segment of all its operations, and the extension was built from these."""
+    """Each has one segment of all its operations, and the extensions were built from these, and
+    from those of the commonest control loops.
+    """
     found = list(law_segments())
     assert found
     assert {segment.first for segment in found} == {0}
-    file = Path(extensions.ROOT) / "batchpid" / "native" / "passes.h"
-    assert not file.is_file() or file.read_text() == header()
+    texts = {
+        "batchpid/native/passes.h": header(found, ("float", "double")),
+        "sim/engine/native/passes.h": header(control_segments(), ("double",)),
+    }
+    for name, text in texts.items():
+        file = Path(extensions.ROOT) / name
+        assert not file.is_file() or file.read_text() == text
 
 
 @needs_extension

@@ -1,7 +1,5 @@
 """Native kinematics, dynamics and law against NumPy's, over random trees, rows and options."""
 
-from __future__ import annotations
-
 import dataclasses
 from unittest import mock
 

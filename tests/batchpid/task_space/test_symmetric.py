@@ -1,7 +1,5 @@
 """Solutions and bounded inverses of small symmetric matrices against numpy.linalg, row by row."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

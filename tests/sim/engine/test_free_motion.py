@@ -11,6 +11,8 @@ from robots import load_bundled
 from tiny_urdf import random_tree, robot, write
 
 from batchpid.sim import MujocoSolver, Randomization, Robot, Runner, Uniform
+from batchpid.sim.engine import native
+from batchpid.stages import control_segments
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::UserWarning"),
@@ -85,3 +87,23 @@ def test_a_motion_is_that_of_mujoco(name, to_limits, options, tmp_path, monkeypa
         np.testing.assert_allclose(
             one.effort, other.effort, rtol=1e-7, atol=(tolerance or 1e-9) * largest
         )
+
+
+def test_default_controls_are_passes(monkeypatch):
+    """Programs of arms under default gains have no segment that the interpreter runs."""
+    gateway, used = native.extension("_gateway"), set()
+
+    def bind(arguments, *arrays):
+        used.update(segment[2] for segment in arguments[2])
+        return bound(arguments, *arrays)
+
+    bound = gateway.bind
+    monkeypatch.setattr(gateway, "bind", bind)
+    for name in ("panda", "jaco2"):
+        of = load_bundled(name)
+        with Runner(of, 2, engine="mujoco", workers=0) as runner:
+            runner.reset()
+            runner.step(of.target)
+            runner.step(of.target, setpoint_rate=0.0)
+    assert used
+    assert used <= {segment.code for segment in control_segments()}

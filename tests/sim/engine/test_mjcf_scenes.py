@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from batchpid.errors import InvalidArgumentError, RobotError
-from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform
+from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Uniform
 from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.mujoco.mujoco_pack import ENGINE
 from batchpid.sim.engine.scene_spec import SOLVERS, SceneSpec, Variation
@@ -161,41 +161,6 @@ def test_the_law_drives_the_joints_and_the_arm_pushes_the_cube(load, control):
         0.05 if control == "pid" else 0.1
     )  # a drive has no integral
     assert np.linalg.norm((after - before)[0, 0, :2]) > 0.01
-
-
-def test_objects_belong_to_snapshots_resets_and_faults(load, tmp_path):
-    robot = load(ARM)
-    push, wrong = np.tile([0.6, 0.25, 0.1], (3, 1)), np.tile([0.6, 0.25, 0.1], (3, 1))
-    wrong[1] = np.nan
-    with Runner(robot, 3, workers=0, engine="mujoco", on_invalid_input="contain") as runner:
-        start = runner.bodies(OBJECTS)
-        np.testing.assert_allclose(start[0, 0], [0.3, 0.09, 0.05, 1, 0, 0, 0])
-        for _ in range(40):
-            runner.step(push)
-        runner.snapshot().save(tmp_path / "kept.npz")
-
-        def go_on(tick=push):
-            seen = []
-            for each in (tick, push, push):
-                obs = runner.step(each)
-                seen.append((runner.bodies(OBJECTS), obs.qpos))
-            return seen, obs
-
-        first, _ = go_on()
-        runner.restore(Snapshot.load(tmp_path / "kept.npz"))
-        again, _ = go_on()
-        for one, other in zip(first, again, strict=True):
-            np.testing.assert_array_equal(one[0], other[0])
-        runner.restore(Snapshot.load(tmp_path / "kept.npz"))
-        runner.reset(mask=[False, True, False])
-        np.testing.assert_array_equal(runner.bodies(OBJECTS)[1], start[1])
-        runner.restore(Snapshot.load(tmp_path / "kept.npz"))
-        with pytest.warns(FaultWarning):
-            held, obs = go_on(wrong)
-        assert list(obs.ok) == [True, False, True]
-        for (poses, _), (expected, _) in zip(held, first, strict=True):
-            np.testing.assert_array_equal(poses[1], start[1])  # where a reset puts them
-            np.testing.assert_array_equal(poses[[0, 2]], expected[[0, 2]])
 
 
 def test_an_object_that_diverges_is_a_fault_of_its_env(load):

@@ -1,7 +1,5 @@
 """Motors from logs of an arm whose motors are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

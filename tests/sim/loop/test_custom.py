@@ -155,68 +155,43 @@ def test_inputs_are_read_only(panda, number):
         rollout(panda, Writes(number))
 
 
-class Keeps:
-    """Has its last inputs as its state, as views or as copies; their changes are its effort."""
+class Thrifty:
+    """Has views of its inputs and a count as its state, and returns the same arrays for every group
+    and call; or copies of all.
+    """
 
-    def __init__(self, keep):
-        self.keep = keep
+    def __init__(self, copies):
+        self.copies, self.arrays = copies, {}
+
+    def own(self, *shape):
+        if self.copies:
+            return np.zeros(shape)
+        return self.arrays.setdefault(shape, np.zeros(shape))
 
     def init(self, robot, num_envs, timestep):
-        return [np.zeros((num_envs, robot.dof))] * 4
+        return [self.own(num_envs, 1), *[np.zeros((num_envs, robot.dof))] * 4]
 
     def __call__(self, state, *inputs):
-        changes = [new - old for new, old in zip(inputs, state, strict=True)]
-        return [self.keep(rows) for rows in inputs], inputs[3] + 20 * changes[0] + 5 * changes[
-            1
-        ] + changes[2]
+        before, *old = state
+        changes = [new - kept for new, kept in zip(inputs, old, strict=True)]
+        count, effort = self.own(len(before), 1), self.own(*inputs[0].shape)
+        count[...] = before + inputs[0][:, :1]
+        effort[...] = inputs[3] + count + 20 * changes[0] + 5 * changes[1] + changes[2]
+        return [count, *(map(np.copy, inputs) if self.copies else inputs)], effort
 
 
 @pytest.mark.parametrize("compensate", ["gravity", "none"])
-def test_inputs_may_be_kept(panda, compensate):
+def test_inputs_may_be_kept_and_arrays_used_again(panda, compensate):
+    """By a controller of several groups of envs."""
     seen = []
-    for keep in (lambda rows: rows, np.copy):
-        with Runner(
-            panda, N, control=Keeps(keep), workers=0, substeps=3, compensate=compensate
-        ) as runner:
-            steps = range(4)
-            seen.append(
-                [runner.step(0.01 * np.full((N, 9), k), feedforward=np.full(9, k)) for k in steps][
-                    -1
-                ]
-            )
+    options = {"workers": 0, "substeps": 3, "compensate": compensate, "engine": "sapien"}
+    for copies in (False, True):
+        with Runner(panda, 8, control=Thrifty(copies), **options) as runner:
+            for tick in range(4):
+                setpoints = np.outer(0.01 * tick + np.linspace(0, 0.03, 8), np.ones(9))
+                observation = runner.step(setpoints, feedforward=np.full(9, tick))
+            seen.append(observation)
     assert_identical(*seen)
-
-
-class Reuses(Counter):
-    """Returns the same arrays at every call, for every group of envs: a state that counts, and an
-    effort.
-    """
-
-    def __init__(self, reuse):
-        self.reuse, self.arrays = reuse, {}
-
-    def _own(self, *shape):
-        return self.arrays.setdefault(shape, np.zeros(shape)) if self.reuse else np.zeros(shape)
-
-    def init(self, robot, num_envs, timestep):
-        return self._own(num_envs, 1)
-
-    def __call__(self, state, setpoint, qpos, qvel, passive):
-        count, effort = self._own(len(qpos), 1), self._own(*qpos.shape)
-        count[...] = state + setpoint[:, :1]
-        effort[...] = passive + count
-        return count, effort
-
-
-def test_arrays_of_the_controller_may_be_used_again(panda):
-    def run(reuse):
-        options = {"workers": 0, "substeps": 3, "control": Reuses(reuse), "collisions": False}
-        with Runner(panda, 32, **options) as runner:
-            return [runner.step(np.outer(np.linspace(0, 0.03, 32), np.ones(9))) for _ in range(3)][
-                -1
-            ]
-
-    assert_identical(run(True), run(False))
 
 
 class Changes(Counter):

@@ -106,22 +106,6 @@ def test_what_is_drawn_once_for_each_env_does_not_depend_on_the_episode():
     assert values["payload"][0] != values["payload"][2]
 
 
-def test_a_redraw_changes_the_envs_of_its_mask_alone():
-    randomization = Randomization(**FIELDS)
-    first = randomization.first(PANDA, 4)
-    mask = np.array([True, False, False, True])
-    second = randomization.redraw(PANDA, first, mask, None)
-    assert second.episodes.tolist() == [[0, 1], [1, 0], [2, 0], [3, 1]]
-    reseeded = randomization.redraw(PANDA, second, mask, 10)
-    assert reseeded.episodes.tolist() == [[10, 0], [1, 0], [2, 0], [13, 0]]
-    listed = randomization.redraw(PANDA, second, mask, [5, 5, 5, 5])
-    for draws in (second, reseeded, listed):
-        for name, rows in draws.values.items():
-            np.testing.assert_array_equal(rows[1:3], first.values[name][1:3], name)
-        assert (draws.values["payload"][mask] != first.values["payload"][mask]).all()
-    np.testing.assert_array_equal(listed.values["payload"][0], listed.values["payload"][3])
-
-
 def test_draws_are_applied_by_their_operation():
     randomization = Randomization(**FIELDS)
     draws = randomization.first(PANDA, 3)

@@ -2,11 +2,10 @@
 a finding.
 """
 
-from __future__ import annotations
-
 import random
 import re
 from contextlib import suppress
+from itertools import combinations
 
 import mujoco
 import numpy as np
@@ -160,51 +159,24 @@ def test_joints_are_those_of_the_file(load):
     )
 
 
-# of a geom in directions u (n, 3) in its frame, by type: capsule, ellipsoid, cylinder, box, mesh
-EXTENT = {
-    3: lambda u, size, vertices: size[0] + size[1] * np.abs(u[:, 2]),
-    4: lambda u, size, vertices: np.linalg.norm(u * size, axis=1),
-    5: lambda u, size, vertices: size[0] * np.hypot(u[:, 0], u[:, 1]) + size[1] * np.abs(u[:, 2]),
-    6: lambda u, size, vertices: np.abs(u) @ size,
-    7: lambda u, size, vertices: (u @ vertices.T).max(1),
-}
-
-
-def reach_of(model, data):
-    """Return how far the geoms that can collide reach in 60 directions (geoms, 60) [m], the
-    shortest first.
-    """
-    directions = np.random.default_rng(0).normal(size=(60, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    rows = []
-    for geom in np.flatnonzero(
-        (model.geom_contype > 0) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
-    ):
-        mesh = model.geom_dataid[geom]
-        vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
-        local = directions @ data.geom_xmat[geom].reshape(3, 3)
-        extent = EXTENT[int(model.geom_type[geom])](local, model.geom_size[geom], vertices)
-        rows.append(directions @ data.geom_xpos[geom] + extent)
-    return np.array(sorted(rows, key=lambda row: row[0]))
+def gaps(model, places, qpos):
+    """Return the distances (pairs,) [m] of the geoms that can collide, in their order."""
+    data = mujoco.MjData(model)
+    data.qpos[places] = qpos
+    mujoco.mj_forward(model, data)
+    pairs = combinations(np.flatnonzero(model.geom_contype), 2)
+    return [mujoco.mj_geomDistance(model, data, *pair, 9.0, None) for pair in pairs]
 
 
 def test_shapes_are_where_they_are_in_the_file(load):
     robot = load(ARM, self_collision="none")
-    built = robot_model(spec_of(robot))
+    built = robot_model(spec_of(robot, ground=True))
     original = mujoco.MjModel.from_xml_string(ARM)
-    reach = []
-    for model, places in (
-        (original, [original.joint(name).id for name in robot.joint_names]),
-        (built.model, built.qpos),
-    ):
-        data = mujoco.MjData(model)
-        data.qpos[places] = [0.7, -0.05, 1.2]
-        mujoco.mj_forward(model, data)
-        reach.append(reach_of(model, data))
-    assert len(reach[0]) == 5
-    errors = np.abs(reach[0] - reach[1]).max(1)
-    assert np.count_nonzero(errors < 1e-6) == 4
-    assert errors.max() < 0.03 * 0.05  # the ellipsoid's
+    places = [original.jnt_qposadr[original.joint(name).id] for name in robot.joint_names]
+    qpos = [0.7, -0.05, 1.2]
+    errors = np.abs(gaps(original, places, qpos) - np.array(gaps(built.model, built.qpos, qpos)))
+    assert np.count_nonzero(errors < 1e-6) == 10
+    assert errors.max() < 0.03 * 0.05  # the ellipsoid's, to the other five
 
 
 def test_pairs_that_do_not_collide(load):

@@ -1,7 +1,5 @@
 """Every actuator of an MJCF file acts as in MuJoCo, or a finding names it."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest
