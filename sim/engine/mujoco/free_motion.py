@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel, Rows
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
+from batchpid.sim.engine.mujoco.mujoco_sensors import wrench_tables
 from batchpid.sim.engine.native import FARTHEST, WIDTH, number, structure
 from batchpid.sim.engine.native_model import NativeModel, aligned, table
 
@@ -278,7 +279,8 @@ def place_of_contacts() -> int | None:
 
 
 class FreeMotions:
-    """States of ``size`` robots of ``robot``, whose rigid bodies are those of ``model``.
+    """States of robots of ``robot``, whose rigid bodies are those of ``model``; ``sensed`` (M,
+    sensors) are the sums of their sensors.
 
     Attributes
     ----------
@@ -290,8 +292,8 @@ class FreeMotions:
         Inputs of the drives (M, dof); not used without drives.
     """
 
-    def __init__(self, robot: RobotMj, size: int, model: NativeModel) -> None:
-        dof = len(robot.joints)
+    def __init__(self, robot: RobotMj, model: NativeModel, sensed: Float64) -> None:
+        dof, size = len(robot.joints), len(sensed)
         scene = robot.model
         self.size = size
         self._robot, self._rigid = robot, model
@@ -311,6 +313,7 @@ class FreeMotions:
             "high": ends[1].copy(),
             "contact": self.contact,
             "time": self.time,
+            "sums": sensed,
             **dict(zip(("qpos", "qvel", "acceleration"), self._states, strict=True)),
         }
         least, most, width, *_ = scene.jnt_solimp[joints[0]]
@@ -325,6 +328,8 @@ class FreeMotions:
             timestep=scene.opt.timestep,
             has_pairs=len(touching_pairs(scene)) > 0,
             robots=size,
+            wrenches=(scene.sensor_type == mujoco.mjtSensor.mjSENS_FORCE).sum(),
+            sensed=sensed.shape[1],
         )
 
     def use(self, models: Sequence[MjModel]) -> None:
@@ -344,6 +349,8 @@ class FreeMotions:
                 "drive_limit": [model.actuator_forcerange[:, 1] for model in kinds],
             }
         self._arrays |= {name: table(np.array(rows), self.size) for name, rows in columns.items()}
+        if self._structure.wrenches:
+            self._arrays |= wrench_tables(self._robot, self._rigid.tables, models)
         # In place, since native code has the address.
         self._structure.model = self._rigid.address
         for name, array in self._arrays.items():
