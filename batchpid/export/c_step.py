@@ -53,11 +53,7 @@ _EXPRESSIONS = {
     "sign": "{0} > {zero} ? {one} : {0} < {zero} ? -{one} : {0}",
     "isfinite": "{0} - {0} == {zero} ? {one} : {zero}",
     "where": "{0} != {zero} ? {1} : {2}",
-    "multiply_add": "{0} * {1} + {2}",
-    "add_subtract": "{0} + {1} - {2}",
-    "subtract_multiply": "({0} - {1}) * {2}",
     "take_row": "{0}[(int){1}]",
-    "clip": "{p}_min({p}_max({0}, {1}), {2})",
 }
 """Elementwise operations in C. A mask is 1 or 0. A NaN propagates through max and min, as in
 NumPy.

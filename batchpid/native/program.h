@@ -33,10 +33,6 @@ namespace batchpid {
 using Index = std::ptrdiff_t;
 
 // Codes of operations beside those of array libraries; masks are 1 and 0.
-// MULTIPLY_ADD       a b + c, rounded twice
-// ADD_SUBTRACT       (a + b) - c
-// SUBTRACT_MULTIPLY  (a - b) c
-// CLIP               min(max(a, b), c)
 // PUSH               history, in place: b as its latest sample; the oldest one is lost
 // GATHER             columns b of each row of a
 // TAKE_ROW           numbers of a table, in row b of the rows of each env and column
@@ -163,10 +159,6 @@ BATCHPID_INLINE T result_of(T a, T b, T c) {
     case SIGN: return a > 0 ? 1 : a < 0 ? -1 : a == 0 ? 0 : a;
     case ISFINITE: return a - a == 0 ? 1 : 0;
     case WHERE: return a != 0 ? b : c;
-    case MULTIPLY_ADD: return a * b + c;
-    case ADD_SUBTRACT: return a + b - c;
-    case SUBTRACT_MULTIPLY: return (a - b) * c;
-    case CLIP: return smaller(larger(a, b), c);
     default: return a;
   }
 }
@@ -190,7 +182,6 @@ BATCHPID_INLINE void apply(Program const &program, Code code, Index first, Index
     EACH(ADD) EACH(SUBTRACT) EACH(MULTIPLY) EACH(DIVIDE) EACH(MAXIMUM) EACH(MINIMUM) EACH(GREATER) EACH(GREATER_EQUAL)
     EACH(LESS) EACH(LESS_EQUAL) EACH(EQUAL) EACH(NOT_EQUAL) EACH(AND) EACH(OR) EACH(NOT) EACH(NEGATIVE) EACH(ABSOLUTE)
     EACH(RINT) EACH(CEIL) EACH(FLOOR) EACH(SQRT) EACH(EXP) EACH(TANH) EACH(SIN) EACH(SIGN) EACH(ISFINITE) EACH(WHERE)
-    EACH(MULTIPLY_ADD) EACH(ADD_SUBTRACT) EACH(SUBTRACT_MULTIPLY) EACH(CLIP)
     case ROW_MINIMUM:
       for (Index row = 0; row < n; row += columns) {
         T const *a = x.data + (x.step ? row : row % program.chunk);

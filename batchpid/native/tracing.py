@@ -4,7 +4,6 @@ function.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from itertools import groupby
@@ -214,8 +213,6 @@ def trace(
         is_early = fixed.issuperset(entry[1])
         (early if is_early else late).append(entry)
         fixed.update([entry[2]] * is_early)
-    # Pairs are fused after that: a constant part needs no speed.
-    late = _fused(late, results)
     used = {*results, *(operand for _, operands, _ in late for operand in operands)}
     shared = [result for _, _, result in early if result in used]
     if shared:
@@ -305,39 +302,6 @@ def _needed(noted: Iterable[_Operation], results: list[Symbol]) -> list[_Operati
             needed.update(operands)
             operations.insert(0, (name, operands, result))
     return operations
-
-
-_PAIRS = {
-    ("multiply", "add"): "multiply_add",
-    ("add", "subtract"): "add_subtract",
-    ("subtract", "multiply"): "subtract_multiply",
-    ("maximum", "minimum"): "clip",
-}
-"""Pairs of operations that are fused, each still rounded, for fewer passes over a block."""
-
-
-def _fused(operations: list[_Operation], results: list[Symbol]) -> list[_Operation]:
-    """Return the operations with pairs fused, where the result of the first is used only by the
-    second.
-    """
-    uses = Counter(operand for _, operands, _ in operations for operand in operands) + Counter(
-        results
-    )
-    fused: dict[Symbol, _Operation] = {}
-    for name, operands, result in operations:
-        fused[result] = (name, operands, result)
-        # Operands of sums and products may be exchanged, others not.
-        for at in range(2 if name in ("add", "multiply") else 1):
-            before = fused.get(operands[at])
-            if before is None or uses[operands[at]] > 1:
-                pair = None
-            else:
-                pair = _PAIRS.get((before[0], name))
-            if before is not None and pair is not None:
-                del fused[operands[at]]
-                fused[result] = (pair, (*before[1], operands[1 - at]), result)
-                break
-    return list(fused.values())
 
 
 def _assembled(
