@@ -6,9 +6,9 @@ Native code steps a robot if and only if its state has no contact, so the bits o
 nothing else. The arrays of a pack hold the state of every robot, and ``mujoco.MjData`` is working memory.
 Native code steps vectors of robots, so a table has the shape (blocks, columns, WIDTH).
 
-A model with proofs has at most one joint a body, through the body's origin; bodies without one are
-welded to their parents. It has shapes of the kinds in ``clearance.h``, and nothing moves but the
-robot. Models of MJCF files can hold any element, so MuJoCo checks all of their contacts.
+A model with proofs has at most one joint a body, through its origin; others are welded to their
+parents. It has shapes of the kinds in ``clearance.h``, and nothing moves but the robot. Models of
+MJCF files can hold any element, so MuJoCo checks all of their contacts.
 """
 
 from __future__ import annotations
@@ -391,10 +391,9 @@ class FreeMotions:
     def show(self, row: int, model: MjModel, data: MjData) -> None:
         """Bring the data of a robot up to date."""
         at = row // WIDTH, slice(None), row % WIDTH
-        data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = (
-            array[at] for array in self._states[:2]
-        )
-        data.qacc_warmstart[self._robot.qvel] = self._states[2][at]
+        qpos, qvel, acceleration = [array[at] for array in self._states]
+        data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = qpos, qvel
+        data.qacc_warmstart[self._robot.qvel] = acceleration
         data.time = self.time[row]
         data.ctrl[:] = self.ctrl[row, : len(data.ctrl)]
         if (np.abs(data.qpos) <= FARTHEST).all():
