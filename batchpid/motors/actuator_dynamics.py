@@ -326,6 +326,8 @@ def advance_measurement(
         if drawn is None:
             drawn = measurement_noise(k, key, step, qpos, xp)
         step = step + _ONE
+    # Native programs have the noise drawn, and no key.
+    if drawn is not None:
         position, velocity = drawn
         qpos = qpos if position is None else qpos + position
         qvel = qvel if velocity is None else qvel + velocity
