@@ -7,7 +7,7 @@ The algorithm is in ``ppo.py``. The robots step in worker processes, policy and 
 one. docs/training.md explains the choices.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from batchpid.sim import Robot, plots
 
 SCORES = ("success", "error")  # of the learning curve
-NEAR = 0.15
+SLOWEST = 0.15  # slope at 0 of a chunk's increments over the action
 FINE = 0.2  # scale on which the agent sees small errors [rad or m]
 
 
@@ -47,10 +47,13 @@ def make_envs(config):
         kp=900.0, kd=60.0, ki=0.0, gain_units="mass_matrix", measurement_rate="measured"
     )
     options = {"params": params, "workers": config.workers, "collisions": False}
-    steps = config.episode // (config.chunk or 1)
-    task = {"robot": robot, "actions": "increment", "max_episode_steps": steps}
-    if config.chunk is not None:
-        task |= {"chunk": config.chunk, "latency": config.latency}
+    task = {
+        "robot": robot,
+        "actions": "increment",
+        "max_episode_steps": config.episode // (config.chunk or 1),
+        "chunk": config.chunk,
+        "latency": config.latency,
+    }
     envs = gymnasium.make_vec(
         "batchpid.sim.gym:batchpid/Reach-v0", config.num_envs, **task, **options
     )
@@ -59,14 +62,16 @@ def make_envs(config):
     # The agent gives one increment, which each row of the chunk repeats.
     single = gymnasium.spaces.Box(-1.0, 1.0, envs.single_action_space.shape[1:])
     return gymnasium.wrappers.vector.TransformAction(
-        envs, lambda action: np.repeat(eased(action)[:, None], config.chunk, 1), None, single
+        envs, lambda action: np.repeat(increment(action)[:, None], config.chunk, 1), None, single
     )
 
 
-def eased(action):
-    """Return increments for actions in [-1, 1]: finer near 0."""
+def increment(action):
+    """Return the increments of a chunk for actions in [-1, 1]. They are finer near 0, where a chunk
+    of up to 0.4 rad has to meet a goal within 0.02 rad.
+    """
     action = np.clip(action, -1.0, 1.0)
-    return action * (NEAR + (1.0 - NEAR) * np.abs(action))
+    return action * (SLOWEST + (1.0 - SLOWEST) * np.abs(action))
 
 
 def split(observation, config):
@@ -80,15 +85,14 @@ def split(observation, config):
 
 
 def features(observation, config):
-    """Return the inputs of the agent: velocity, error of the setpoint, its size, and the error on a
-    fine scale; with chunks the way that the robot still has to the setpoint, too.
+    """Return the inputs of the agent: velocity, error, its size, and the error on a fine scale; with
+    chunks it is the error of the setpoint, and the way of the robot to the setpoint is an input.
     """
     qpos, qvel, goal, setpoint = split(observation, config)
     error = goal - setpoint
     rows = [qvel, error, np.abs(error), np.tanh(error / FINE)]
     if config.chunk is not None:
         rows.append(setpoint - qpos)
-        rows.append(np.sign(error) * np.sqrt(np.tanh(np.abs(error) / FINE)))
     return np.concatenate(rows, axis=1)
 
 
@@ -100,12 +104,9 @@ def potential(envs, observation, config):
 
 
 def shaping(envs, config):
-    """Return the shaping by a potential, which keeps the best policy (A. Y. Ng, 1999), for two
-    observations.
-    """
+    """Return the shaping for two observations, the change of the potential: reward for progress."""
     return lambda before, after: (
-        config.shaping
-        * (config.discount * potential(envs, after, config) - potential(envs, before, config))
+        config.shaping * (potential(envs, after, config) - potential(envs, before, config))
     )
 
 
@@ -115,7 +116,7 @@ def evaluate(envs, act, config):
     """
     raw, _ = envs.reset(seed=config.seed + 1_000_000)  # other goals than in the training
     rewards = []
-    for _ in range(config.episode // (config.chunk or 1)):
+    for _ in range(envs.unwrapped.max_episode_steps):
         raw, reward, *_, info = envs.step(act(raw))
         rewards.append(reward)
     return info["success"], info["error"], np.mean(rewards)
@@ -138,6 +139,8 @@ def draw(curve, config):
 
 def main(config: Config):
     """Train, evaluate, and draw the learning curve."""
+    if config.chunk is not None:
+        config = replace(config, discount=config.discount**config.chunk)
     envs, inputs = make_envs(config), partial(features, config=config)
     if config.policy is None:
         act, curve = ppo.train(envs, config, SCORES, inputs, shaping(envs, config))
@@ -146,10 +149,9 @@ def main(config: Config):
     success, error, reward = evaluate(envs, act, config)
     envs.close()
     print(
-        f"without exploration {success.mean():.1%} of {len(success)} episodes end at the goal,",
-        end=" ",
+        f"without exploration {success.mean():.1%} of {len(success)} episodes end at the goal,"
+        f" the worst joint within {np.median(error):.4f} rad (median); mean reward {reward:.3f}"
     )
-    print(f"the worst joint within {np.median(error):.4f} rad (median); mean reward {reward:.3f}")
     if config.out is not None:
         act.save(config.out)
     if config.picture is not None and curve is not None:

@@ -317,8 +317,7 @@ def plan_functions(c: Dialect, plan: Plan, functions: str) -> str:
     starts = {place: c.number(0.0) if "rate" in place else "qpos[j]" for place in held}
     segment = [f"state->segment[{i}][j]" for i in range(4)]
     # Leaves of the state by the names that they have in C.
-    tables = ("knots", "rates", "weights")[: 2 if like.weights is None else 3]
-    names = [f"state->{name}[j]" for name in tables]
+    names = [f"state->{name}[j]" for name in ("knots", "rates", "weights")]
     names += ["begin0", "last0", *segment, "end0", "now0", "starved0", *held]
 
     def sampled(k: Plan, state: PlanState, t: Array, dt: Array) -> Pytree:
@@ -330,10 +329,6 @@ def plan_functions(c: Dialect, plan: Plan, functions: str) -> str:
 
     def joined(k: Plan, _: PlanState, *knots: Array) -> Pytree:
         return model.cubic(k, *knots)
-
-    def blended(k: Plan, state: PlanState, *row: Array) -> Pytree:
-        position, weight = model.blend(k, state, *row)
-        return position, row[0] * 0.0 if weight is None else weight
 
     def body(step: Callable[..., Pytree], inputs: list[str], *places: str) -> str:
         return _body(
@@ -358,7 +353,7 @@ def plan_functions(c: Dialect, plan: Plan, functions: str) -> str:
         sampled=body(sampled, ["t", "dt"], *held, "setpoint[j]", "rate[j]"),
         present=body(present, [], "position[j]", "speed[j]"),
         later=body(model.curve, ["joined"], "offset[j]", "slope[j]"),
-        blended=body(blended, row, "blended[k][j]", "weights[k][j]"),
+        blended=body(model.blend, row, "blended[k][j]", "weights[k][j]"),
         joined=body(joined, knots, *segment),
     )
     helped = "".join(helper for helper in helpers(c, text) if helper not in functions)

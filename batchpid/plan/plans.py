@@ -99,11 +99,6 @@ class Plan(Record, _PlanFields):
         """Most rows of a chunk."""
         return int(self.rows[0, 0]) + 1 - SPARE_ROWS
 
-    @property
-    def is_mean(self) -> bool:
-        """Whether chunks are averaged, with weights."""
-        return self.forgotten is not None or self.share is not None
-
     def options(self) -> Document:
         """Return the options that are on, as arguments of :func:`make_plan` that build this plan
         again.

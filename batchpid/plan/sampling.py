@@ -71,7 +71,7 @@ class PlanState(NamedTuple):
     rates: Array
     """Rates in these rows, 0 behind them [rad/s or m/s]."""
     weights: Array
-    """Weights W of these rows, 0 behind them; None but for an ensemble or average."""
+    """Weights W of these rows, 0 behind them and where chunks are not averaged."""
     begin: Array
     """Time of the first row [s]."""
     last: Array
@@ -101,14 +101,13 @@ def init(plan: Plan, qpos: Array, time: Array = 0.0) -> PlanState:
     start, at = zeros + qpos, zeros + _column(time)
     knots = xp.repeat(start[..., None, :], plan.horizon + SPARE_ROWS, axis=-2)
     empty = xp.zeros_like(knots)
-    weights = empty if plan.is_mean else None
     rest = start, zeros, zeros, zeros
     limits = _guard(plan)
     guard = None if limits is None else guard_model.init(limits, start)
     return PlanState(
         knots,
         empty,
-        weights,
+        empty,
         at,
         at,
         rest,
@@ -141,21 +140,8 @@ def add(
         raise InvalidArgumentError("chunk", problem, remedy="give rows of all joints, in order")
     chunk = xp.broadcast_to(chunk, (*state.now.shape[:-1], rows, joints))
     # All rows at once: plan and state have an axis more.
-    options, wide = (
-        _wide(plan),
-        _wide(
-            state._replace(
-                knots=None,
-                rates=None,
-                weights=None,
-            )
-        ),
-    )
-    wide = wide._replace(
-        knots=state.knots,
-        rates=state.rates,
-        weights=state.weights,
-    )
+    options, wide = _wide(plan), _wide(state)
+    wide = wide._replace(knots=state.knots, rates=state.rates, weights=state.weights)
     period, now = options.period, wide.now
     begin = xp.zeros_like(now) + _column(_column(time))
     # Rows that have passed are dropped; if all have, the last one is still the newest wish.
@@ -195,7 +181,7 @@ def add(
     return state._replace(
         knots=xp.concatenate((blended, *rest), -2),
         rates=rates,
-        weights=None if weights is None else xp.concatenate((weights, *behind), -2),
+        weights=xp.concatenate((weights, *behind), -2),
         begin=begin[..., 0, :],
         last=(begin + (rows - 1.0) * period)[..., 0, :],
         segment=mapped(lambda leaf: leaf[..., 0, :], segment),
@@ -236,7 +222,7 @@ def blend(
     rows: Array,
 ) -> tuple[Array, Array]:
     """Return row number ``step`` of a chunk that begins at ``begin`` [s], blended with the plan,
-    and its weight, None without weights.
+    and its weight, 0 where chunks are not averaged.
 
     ``offset`` is that of the alignment, in row ``first``, and ``slope`` its rate; ``rows`` is the
     number of rows. Arrays have the shape of the times of ``state``, or one that broadcasts with it.
@@ -247,9 +233,10 @@ def blend(
         u = xp.minimum(s / EASE, 1.0)
         rest = 1.0 - u
         eased = u * (rest * rest) * (EASE * (offset + plan.fade * slope))
-        return chunk + plan.blended * (xp.maximum(1.0 - s, 0.0) * offset + eased), None
-    if not plan.is_mean:
-        return chunk, None
+        faded = plan.blended * (xp.maximum(1.0 - s, 0.0) * offset + eased)
+        return chunk + faded, 0.0 * chunk
+    if plan.forgotten is None and plan.share is None:
+        return chunk, 0.0 * chunk
     time = begin + step * plan.period
     present, _ = curve(plan, state, time)
     near = xp.rint((time - state.begin) / plan.period)

@@ -545,9 +545,10 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """
         info: Document = {}
         further = self.info(self._observation)
+        for value in further.values():
+            self._returned("info", value, mask.shape)
         values = {"success": self._success, **further, "diverged": self._diverged}
         for key, value in values.items():
-            self._returned("info", value, mask.shape)
             info[key] = value * mask
             info[f"_{key}"] = mask
         return info

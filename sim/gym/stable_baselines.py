@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -74,7 +73,7 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of the task for each env."""
-        return [getattr(self.envs, attr_name) for _ in self._places(indices)]
+        return self._for_envs(getattr(self.envs, attr_name), indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of the task, which all envs share."""
@@ -82,16 +81,15 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> Any:
         """Call a method of the task, and return the result for each env."""
-        result = getattr(self.envs, method_name)(*args, **options)
-        return [result for _ in self._places(indices)]
+        return self._for_envs(getattr(self.envs, method_name)(*args, **options), indices)
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Return False for each env: a task has no wrappers of single envs."""
-        return [False for _ in self._places(indices)]
+        return self._for_envs(False, indices)
 
-    def _places(self, indices: Any) -> Iterable[int]:
-        places: Iterable[int] = self._get_indices(indices)
-        return places
+    def _for_envs(self, value: Any, indices: Any) -> list[Any]:
+        """Return what all envs share for each of some envs."""
+        return [value] * len(self._get_indices(indices))
 
 
 def _of_env(info: Document, env: int) -> Document:

@@ -147,8 +147,7 @@ class Identification:
         :data:`batchpid.sim.identification.unknowns.UNKNOWN_KINDS`.
         """
         unknowns = self.unknowns
-        certainty = self.fit.certainty
-        halves = INTERVAL * certainty.deviation
+        halves = INTERVAL * self.fit.deviation
         least = [entry.least for entry in unknowns.entries]
         lows = np.maximum(self.values - halves, least)
         rows = np.array([self.values, lows, self.values + halves]) + unknowns.described
@@ -157,8 +156,8 @@ class Identification:
         names = [f"{self._place(entry)}: {entry.kind}" for entry in unknowns.entries]
         estimates: dict[str, dict[str, Estimate]] = {}
         for at, entry in enumerate(unknowns.entries):
-            is_shown = bool(certainty.shown[at])
-            others = [names[other] for other in np.flatnonzero(certainty.alike[at]) if other != at]
+            is_shown = bool(self.fit.shown[at])
+            others = [names[other] for other in np.flatnonzero(self.fit.alike[at]) if other != at]
             remark = "at its bound" if is_held[at] else ""
             if others and not is_shown:
                 remark = f"cannot be told from {', '.join(others)}"
@@ -215,7 +214,7 @@ class Identification:
         region = {
             "unknowns": [[entry.kind, self._place(entry)] for entry in self.unknowns.entries],
             "estimate": self.values.tolist(),
-            "root": self.fit.certainty.root.tolist(),
+            "root": self.fit.root.tolist(),
         }
         about = self.document() | {KEY: region}
         bp.save_actuators(path, self.actuators(), self.unknowns.robot.joint_names, about)
@@ -269,8 +268,7 @@ class Identification:
         tables = []
         for problem in (self._described, self.fit.problem):
             point = self.fit.point[: len(problem.unknowns.entries)]
-            first = replace(problem, windows=windows)
-            tables.append(first.evaluate(point, free_states=False, held_out=True))
+            tables.append(problem.evaluate(windows, point, free_states=False))
         errors = []
         for window, before, after in zip(windows, *tables, strict=True):
             errors.append((window.time, window.fitted, before[..., 0], after[..., 0]))

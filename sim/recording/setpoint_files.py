@@ -226,33 +226,22 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float |
         start = tables["setpoint"][0]
         tables = {quantity: rows[1:] for quantity, rows in tables.items()}
     position = tables["setpoint"]
-    acceleration = tables.get("setpoint_acceleration")
-    if "setpoint_rate" in tables:
+    period, steps = substeps * timestep, 0
+    has_rates = "setpoint_rate" in tables
+    if has_rates:
         rate = tables["setpoint_rate"]
-        return Setpoints(
-            start,
-            position,
-            rate,
-            acceleration,
-            substeps,
-            True,
-            0,
-            substeps * timestep,
-        )
-    if start is None:
-        first = robot.start
     else:
-        first = start
-    rate, steps = _rates(robot, np.vstack([first, position]), substeps * timestep)
+        first = robot.start if start is None else start
+        rate, steps = _rates(robot, np.vstack([first, position]), period)
     return Setpoints(
         start,
         position,
         rate,
-        acceleration,
+        tables.get("setpoint_acceleration"),
         substeps,
-        False,
+        has_rates,
         steps,
-        substeps * timestep,
+        period,
     )
 
 

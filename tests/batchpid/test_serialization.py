@@ -1,4 +1,4 @@
-"""Params survive a file exactly, and a malformed or malicious file is refused."""
+"""Params and motors survive a file exactly, and a malformed or malicious file is refused."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from law_cases import JOINTS
+from motor_cases import ALL
 
 import batchpid as bp
 from batchpid.io import documents
@@ -107,9 +108,9 @@ def test_a_save_that_is_refused_changes_no_file(tmp_path):
     path = tmp_path / "params.json"
     path.write_text("precious")
     params = bp.make_params(JOINTS, 1.0)
-    for names in (NAMES[:2], ["a", "a", "b"]):
-        with pytest.raises(bp.InvalidArgumentError, match="joint_names"):
-            bp.save_params(path, params, names)
+    for names in ((), (NAMES[:2],), (["a", "a", "b"],)):
+        with pytest.raises(bp.InvalidArgumentError, match=r"^joint_names: "):
+            bp.save_params(path, params, *names)
     with pytest.raises(bp.InvalidArgumentError, match=r"\.yaml"):
         bp.save_params(tmp_path / "params.toml", params, NAMES)
     assert path.read_text() == "precious"
@@ -165,3 +166,28 @@ def test_files_that_cannot_be_opened_are_named(tmp_path):
 def test_a_file_of_another_version_is_refused():
     with pytest.raises(bp.InvalidArgumentError, match=r"batchpid-params-2; this one reads"):
         bp.loads_params("format: batchpid-params-2\njoints: {a: {kp: 1.0}}")
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".json"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_every_effect_of_motors_survives_a_file(suffix, dtype, tmp_path):
+    joints = {"coulomb": [0.0, 0.1, 0.2, 0.3], "static": 0.4, "armature": 0.1}
+    actuators, names = bp.make_actuators(4, **ALL, **joints, dtype=dtype), [*NAMES, "wrist"]
+    bp.save_actuators(tmp_path / f"a{suffix}", actuators, names, about={"log": "chirp.csv"})
+    loaded, read = bp.load_actuators(tmp_path / f"a{suffix}")
+    assert read == names
+    assert same(loaded, actuators)
+
+
+def test_a_file_of_motors_written_by_hand(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("""
+format: batchpid-actuators-1
+joints:
+  elbow: {strength: 0.9}
+  shoulder: {coulomb: [0.1, 0.2]}
+""")
+    actuators, names = bp.load_actuators(path, ["shoulder", "wrist", "elbow"])
+    assert names == ["shoulder", "wrist", "elbow"]
+    assert actuators.strength.tolist() == [[1.0, 1.0, 0.9]]
+    assert actuators.coulomb.tolist() == [[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]]

@@ -185,15 +185,16 @@ SMALL = (
 @needs_training
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_compilation")
-def test_a_short_training_ends_with_a_picture(run, tmp_path):
+@pytest.mark.parametrize("way", [(), ("--chunk", "2", "--latency", "0.0", "0.02")])
+def test_a_short_training_ends_with_a_picture(run, tmp_path, way):
     picture = tmp_path / "curve.png"
     policy = str(tmp_path / "policy.npz")
     files = ("--picture", str(picture), "--out", policy)
-    text = run("train_reach.py", *SMALL, "--epochs", "1", *files)
+    text = run("train_reach.py", *SMALL, *way, "--epochs", "1", *files)
     assert "of 4 episodes end at the goal" in text
     assert picture.stat().st_size > 10_000
     # The file holds the policy: it does the same once more, without a training.
-    again = run("train_reach.py", *SMALL, "--policy", policy)
+    again = run("train_reach.py", *SMALL, *way, "--policy", policy)
     assert again.splitlines()[-1] == text.splitlines()[-2]
 
 

@@ -20,3 +20,10 @@ def assert_identical(first, second, envs=slice(None), skip=()):
         np.testing.assert_array_equal(ours, theirs, name)
         assert ours.dtype == theirs.dtype, name
         assert ours.tobytes() == theirs.tobytes(), f"{name} differs in NaNs or in the sign of zeros"
+
+
+def are_same_params(first, second):
+    """Return whether params have the same options with equal values."""
+    return first.options().keys() == second.options().keys() and all(
+        np.array_equal(value, second.options()[name]) for name, value in first.options().items()
+    )

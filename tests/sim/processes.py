@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 import time
 
 import psutil
@@ -14,6 +15,18 @@ def send(pid, number):
     """Send a signal to a process, if it still runs."""
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, number)
+
+
+@contextlib.contextmanager
+def handler(number, act):
+    """Let ``act`` handle a signal; one of SIGALRM comes 0.2 s later."""
+    before = signal.signal(number, act)
+    signal.setitimer(signal.ITIMER_REAL, 0.2 if number == signal.SIGALRM else 0)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(number, before)
 
 
 def have_ended(pids, seconds=PATIENCE):

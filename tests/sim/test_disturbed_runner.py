@@ -18,7 +18,7 @@ import numpy as np
 import psutil
 import pytest
 from identical import assert_identical
-from processes import have_ended, send
+from processes import handler, have_ended, send
 from robots import load_bundled
 
 from batchpid.errors import ClosedError, WorkerError
@@ -394,18 +394,6 @@ def test_a_second_ctrl_c_ends_the_tick_and_closes_the_runner(workers):
         assert runner.time == SUBSTEPS * runner.timestep
         with pytest.raises(ClosedError, match="since a call failed"):
             runner.step(NEAR)
-
-
-@contextlib.contextmanager
-def handler(number, act):
-    """Let ``act`` handle a signal; one of SIGALRM comes 0.2 s later."""
-    before = signal.signal(number, act)
-    signal.setitimer(signal.ITIMER_REAL, 0.2 if number == signal.SIGALRM else 0)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(number, before)
 
 
 def test_a_handler_of_the_callers_own_is_called_when_the_tick_is_done():

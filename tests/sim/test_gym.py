@@ -44,8 +44,8 @@ def test_pictures_show_each_env(panda):
 
 def test_chunks_that_come_late_are_executed_whole():
     """What passes during the latency of an env is made up for, and a step is as long as its rows."""
-    options = {"actions": "increment", "chunk": 4, "latency": (0.03, 0.07), "workers": 0}
-    envs = ReachVectorEnv(3, max_episode_steps=None, **options)
+    options = {"actions": "increment", "chunk": 6, "execute": 4, "latency": (0.02, 0.07)}
+    envs = ReachVectorEnv(4, max_episode_steps=None, workers=0, **options)
     start, _ = envs.reset(seed=0)
     assert envs.step_seconds == pytest.approx(0.08)
     moves = np.full(envs.action_space.shape, 0.1)
@@ -53,7 +53,11 @@ def test_chunks_that_come_late_are_executed_whole():
     assert envs.runner.time - begin == pytest.approx(envs.step_seconds)
     joints = len(envs.joint_names)
     change = np.abs(first - start)[:, :joints] / envs.max_increment
-    assert (change.max(1) < 0.3).all()  # of 0.4: it came late
+    # Until its first chunk an env has no row ahead.
+    waits = envs.observed.starved / envs.runner.substeps
+    assert set(waits) <= {1.0, 2.0, 3.0}
+    moved = change.max(1)
+    assert moved[waits == waits.max()].max() < moved[waits == waits.min()].min() < 0.4
     # The observation ends in the pose that the chunk leads to.
     reached = np.minimum(start[:, :joints] + 0.4 * envs.max_increment, envs.high)
     np.testing.assert_allclose(start[:, 3 * joints :], start[:, :joints], atol=1e-6)
@@ -173,16 +177,6 @@ def test_gymnasiums_vector_wrappers_wrap_the_vector_env():
     for _ in range(3):
         *_, info = env.step(env.action_space.sample())
     assert info["episode"]["l"].tolist() == [3, 3]
-    env.close()
-
-
-def test_dlpack_shares_observations_without_a_copy():
-    jax = pytest.importorskip("jax")
-    env = ReachVectorEnv(2, workers=0)
-    obs, _ = env.reset(seed=0)
-    theirs = jax.dlpack.from_dlpack(obs)
-    np.testing.assert_array_equal(np.asarray(theirs), obs)
-    assert np.from_dlpack(obs).__array_interface__["data"] == obs.__array_interface__["data"]
     env.close()
 
 
@@ -352,19 +346,3 @@ def test_stable_baselines3_gets_the_same_steps_and_the_last_observations():
             np.testing.assert_array_equal(infos[1]["terminal_observation"], info["final_obs"][1])
     adapted.close()
     plain.close()
-
-
-def test_chunks_take_effect_after_the_latency_of_each_env():
-    options = {"chunk": 6, "execute": 4, "latency": (0.02, 0.07), "workers": 0}
-    envs = gymnasium.make_vec("batchpid/Reach-v0", num_envs=4, **options)
-    envs.reset(seed=1)
-    task = envs.unwrapped
-    start = task.observed.qpos.copy()
-    assert envs.action_space.shape == (4, 6, *task.action.shape[1:])
-    envs.step(np.full(envs.action_space.shape, 0.5))
-    # Until its first chunk an env has no row ahead.
-    waits = task.observed.starved / task.runner.substeps
-    assert set(waits) <= {1.0, 2.0, 3.0}
-    moved = np.abs(task.observed.qpos - start).max(1)
-    assert moved[waits == waits.max()].max() < moved[waits == waits.min()].min()
-    envs.close()

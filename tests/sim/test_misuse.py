@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from identical import assert_identical
 from option_values import ARM
-from processes import have_ended
+from processes import handler, have_ended
 
 from batchpid.errors import CallOrderError, ClosedError, InUseError, InvalidArgumentError
 from batchpid.sim import Runner
@@ -28,20 +28,6 @@ def make(workers=0):
 def runner(request):
     with make(request.param) as made:
         yield made
-
-
-@pytest.fixture
-def on_alarm():
-    """Function that makes another one the handler of a signal that arrives 0.1 s later."""
-
-    def on_alarm(act):
-        signal.signal(signal.SIGALRM, lambda *_: act())
-        signal.setitimer(signal.ITIMER_REAL, 0.1)
-
-    before = signal.getsignal(signal.SIGALRM)
-    yield on_alarm
-    signal.setitimer(signal.ITIMER_REAL, 0)
-    signal.signal(signal.SIGALRM, before)
 
 
 def test_calls_out_of_order_are_named(runner):
@@ -95,25 +81,24 @@ def test_a_call_from_another_thread_raises(runner):
     assert runner.step(TABLE[0]).ok.all(), "they may take turns"
 
 
-def test_a_call_from_a_signal_handler_raises(runner, on_alarm):
+def test_a_call_from_a_signal_handler_raises(runner):
     raised = []
 
-    def handler():
+    def call(*_):
         for _ in range(2):  # the first error does not end the call that is in progress
             with pytest.raises(InUseError, match="that this one interrupted"):
                 runner.step(TABLE[0])
         raised.append(True)
 
-    on_alarm(handler)
-    # Long steps: the signal comes during one of them.
-    while not raised:
-        seen = runner.step(TABLE[0], substeps=LONG)
+    with handler(signal.SIGALRM, call):
+        # Long steps: the signal comes during one of them.
+        while not raised:
+            seen = runner.step(TABLE[0], substeps=LONG)
     assert seen.ok.all()
 
 
-def test_a_signal_handler_may_close_the_runner(runner, on_alarm):
-    on_alarm(runner.close)
-    with pytest.raises(ClosedError):  # noqa: PT012
+def test_a_signal_handler_may_close_the_runner(runner):
+    with handler(signal.SIGALRM, lambda *_: runner.close()), pytest.raises(ClosedError):  # noqa: PT012
         while True:
             runner.step(TABLE[0], substeps=500)
     with pytest.raises(ClosedError):

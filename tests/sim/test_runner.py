@@ -3,14 +3,9 @@
 import numpy as np
 import pytest
 import tiny_urdf
+from identical import are_same_params
 
 from batchpid.sim import Robot, Runner
-
-
-def same(first, second):
-    return first.options().keys() == second.options().keys() and all(
-        np.array_equal(value, second.options()[name]) for name, value in first.options().items()
-    )
 
 
 @pytest.fixture
@@ -21,12 +16,12 @@ def hinge(tmp_path):
 
 def test_a_bundled_robot_is_given_its_tuned_params(panda):
     with Runner(panda, 1, workers=0) as runner:
-        assert same(runner.params, panda.tuned())
+        assert are_same_params(runner.params, panda.tuned())
 
 
 def test_another_robot_is_given_designed_params(hinge):
     with Runner(hinge, 1, workers=0) as runner:
-        assert same(runner.params, hinge.designed())
+        assert are_same_params(runner.params, hinge.designed())
 
 
 def params_of(robot, control):
@@ -41,7 +36,7 @@ def test_a_drive_is_given_the_bundled_gains_or_designed_ones(panda, hinge):
     designed = hinge.designed("effort").replace(
         ki=0.0, setpoint_weight=None, derivative_filter_time=None
     )
-    assert same(params_of(hinge, "drive"), designed)
+    assert are_same_params(params_of(hinge, "drive"), designed)
 
 
 @pytest.mark.parametrize("name", ["panda", "hinge"])
@@ -50,12 +45,6 @@ def test_control_by_effort_is_given_effort_limits(name, request):
     params = params_of(robot, "effort")
     assert not params.kp.any()
     np.testing.assert_array_equal(params.effort_max, np.atleast_2d(robot.effort_limit))
-
-
-def test_a_bundled_robot_reaches_the_tutorials_target_without_params(panda):
-    with Runner(panda, 1, workers=0) as runner:
-        rollout = runner.rollout(np.broadcast_to(panda.settings.target, (200, panda.dof)))
-    np.testing.assert_allclose(rollout.qpos[-1, 0], panda.settings.target, atol=1e-3)
 
 
 def test_its_repr_has_robot_size_control_and_time(panda):

@@ -199,8 +199,9 @@ def check_random_fault(case):
     if cause != "state":
         assert fault.step == tick * runner.substeps + 1
         assert fault.joint == PANDA.joint_names[joint]
-        before = broken.qpos[tick - 1, env] if tick else PANDA.start
-        np.testing.assert_allclose(broken.qpos[tick:, env], before + 0 * broken.qpos[tick:, env])
+        before = broken.qpos[tick - 1, env] if tick else np.float32(PANDA.start)
+        held = broken.qpos[tick:, env]
+        np.testing.assert_array_equal(held, np.broadcast_to(before, held.shape))
     for rows in (broken.qvel, broken.effort):
         assert not rows[tick:, env].any()
     assert np.isfinite(broken.qpos).all()

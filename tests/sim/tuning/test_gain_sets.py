@@ -2,18 +2,12 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
+from identical import are_same_params
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.tuning.gain_sets import gain_set
-
-
-def same(one, other):
-    return one.options().keys() == other.options().keys() and all(
-        np.array_equal(value, other.options()[name]) for name, value in one.options().items()
-    )
 
 
 def test_names_stand_for_the_robots_own_gains(panda):
@@ -24,7 +18,7 @@ def test_names_stand_for_the_robots_own_gains(panda):
     ):
         gains = gain_set(panda, name)
         assert (gains.name, gains.control) == (name, "pid")
-        assert same(gains.params, params)
+        assert are_same_params(gains.params, params)
 
 
 def test_default_is_tuned_where_shipped_and_designed_otherwise(panda):
@@ -51,7 +45,7 @@ def test_params_file_is_named_after_the_file(panda, tmp_path):
     bp.save_params(path, panda.designed(), panda.joint_names)
     gains = gain_set(panda, str(path))
     assert (gains.name, gains.control) == ("mine.yaml", "pid")
-    assert same(gains.params, panda.designed())
+    assert are_same_params(gains.params, panda.designed())
 
 
 def test_tuned_gains_of_a_robot_without_are_refused(panda):
