@@ -302,16 +302,12 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     friction, damping = np.zeros((2, len(joints)))
     np.add.at(friction, coupling.leader, share * [joint.friction for joint in joints])
     np.add.at(damping, coupling.leader, share**2 * [joint.damping for joint in joints])
-    columns = {
-        "lower": lower,
-        "upper": upper,
-        "friction": friction,
-        "damping": damping,
-    }
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    columns = lower, upper, friction, damping
     return tuple(
-        replace(joint, **dict(zip(columns, row, strict=True)))
-        for joint, row in zip(joints, rows, strict=True)
+        replace(joint, lower=low, upper=high, friction=force, damping=rate)
+        for joint, low, high, force, rate in zip(
+            joints, *(column.tolist() for column in columns), strict=True
+        )
     )
 
 

@@ -20,8 +20,6 @@ from batchpid.sim.geometry.shapes import Shape, add_geom
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 
-NEAR_DISTANCE = 0.02
-"""Distance [m] below which two shapes are near each other."""
 GROUND = ""
 """Name of the ground."""
 _ANY = 1e6
@@ -92,11 +90,11 @@ class Contacts:
         names = [*(shape.owner for shape in self._shapes), GROUND]
         self._owners = [(names[a], names[b]) for a, b in pairs]
 
-    def near(self, qpos: Rows, within: float = NEAR_DISTANCE) -> Iterator[tuple[str, str, float]]:
+    def near(self, qpos: Rows, within: float) -> Iterator[tuple[str, str, float]]:
         """Yield the links, or GROUND, of the shapes that are closer than ``within`` [m] at one pose
         (dof,), and their distance [m].
         """
-        gaps = self._gaps(np.asarray(qpos)[None], max(within, NEAR_DISTANCE))[0]
+        gaps = self._gaps(np.asarray(qpos)[None], within)[0]
         for row in np.flatnonzero(gaps < within).tolist():
             yield *self._owners[row], float(gaps[row])
 
@@ -104,7 +102,7 @@ class Contacts:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground
         (n,).
         """
-        gaps = self._gaps(np.asarray(qpos), max(clearance, NEAR_DISTANCE))
+        gaps = self._gaps(np.asarray(qpos), clearance)
         return np.asarray((gaps < clearance).any(axis=1))
 
     def height(self, qpos: Rows, base_too: bool = False) -> float:

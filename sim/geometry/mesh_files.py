@@ -89,12 +89,11 @@ def _ros_packages(package: str) -> Iterator[Path]:
             yield from sorted(root.glob(pattern))
 
 
-def read_mesh(path: str | Path, data: bytes | None = None) -> Any:
-    """Return the result of ``trimesh`` for a mesh file, or for its bytes ``data``, in metres.
+def read_mesh(path: str | Path, data: bytes) -> Any:
+    """Return the result of ``trimesh`` for the bytes of a mesh file, in metres.
 
     Raises errors of many types.
     """
-    data = Path(path).read_bytes() if data is None else data
     kind = Path(path).suffix.lower().removeprefix(".")
     # Materials are textures to decode, of which nothing here needs any.
     load = imported("trimesh").load

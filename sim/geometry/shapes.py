@@ -291,10 +291,7 @@ def possible_inertia(mass: float, tensor: Float64) -> tuple[Float64, tuple[str, 
     moments = np.linalg.eigvalsh(tensor)
     if moments[0] >= max(SMALLEST, SMALLEST_RATIO * moments[2]):
         return tensor, None
-    if moments[2] >= SMALLEST:
-        changed = nearest_physical(tensor)
-    else:
-        changed = np.zeros((3, 3))
+    changed = nearest_physical(tensor)
     done = "the nearest possible one is used"
     if changed.max() < SMALLEST:
         changed = ball(mass)

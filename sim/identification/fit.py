@@ -39,8 +39,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Bool, Float64
-from batchpid.sim.identification.problem import Problem
+from batchpid.arrays.array_types import Float64
+from batchpid.sim.identification.problem import Problem, size_of
 from batchpid.sim.identification.regression import bounded_solution
 
 OUTLIER = 2.0
@@ -93,43 +93,28 @@ class Iterate(NamedTuple):
     point: Float64
     changes: Float64
     """Changes of the point (n, unknowns)."""
-    evaluation: list[Float64]
-
-
-class Certainty(NamedTuple):
-    """Certainty of the unknowns of a fit."""
-
-    deviation: Float64
-    """Standard deviations (unknowns,) of the values, in their units."""
-    root: Float64
-    """Root L of their covariance L L^T (unknowns, unknowns), at most as wide as the prior."""
-    shown: Bool
-    """Mask (unknowns,) of those that the logs show."""
-    alike: Bool
-    """Pairs (unknowns, unknowns) that cannot be told from one another."""
-    colored: float
-    """Correlation of neighbouring residuals, 0 for white noise."""
-
-    def only(self, mask: Bool) -> Certainty:
-        """Return the certainty of the unknowns of a mask (unknowns,)."""
-        both = np.ix_(mask, mask)
-        vectors = self.deviation[mask], self.root[mask], self.shown[mask]
-        return Certainty(*vectors, self.alike[both], self.colored)
-
-
-UNCERTAIN = Certainty(np.zeros(0), np.zeros((0, 0)), np.zeros(0, bool), np.zeros((0, 0), bool), 0)
-"""Certainty of no unknowns."""
+    table: Float64
+    """Residuals and their changes (rows, joints, 1 + n)."""
 
 
 class Fit(NamedTuple):
-    """End of a fit, and what was left out of it or added to it."""
+    """End of a fit, the certainty of its unknowns, and what was left out or added."""
 
     problem: Problem
     point: Float64
     size: Float64
     """Size of the residuals that the fit was weighted with (joints,)."""
     converged: bool
-    certainty: Certainty = UNCERTAIN
+    deviation: Any = None
+    """Standard deviations (unknowns,) of the values, in their units."""
+    root: Any = None
+    """Root L of their covariance L L^T (unknowns, unknowns), at most as wide as the prior."""
+    shown: Any = None
+    """Mask (unknowns,) of those that the logs show."""
+    alike: Any = None
+    """Pairs (unknowns, unknowns) that cannot be told from one another."""
+    colored: float = 0.0
+    """Correlation of neighbouring residuals, 0 for white noise."""
     dropped: Sequence[str] = ()
     """"setpoint_delay" and "setpoint_lag", where the logs do not need them."""
     effects: Mapping[str, float] = {}
@@ -152,8 +137,8 @@ def solve(
     low, high = problem.unknowns.bounds
     point = np.clip(point, low, high)
     place = iterate(problem, point, FIRST_CHANGE * np.eye(len(point)))
-    weight = problem.size(place.evaluation)
-    count = len(problem.weighted(place.evaluation, weight))
+    weight = size_of(place.table)
+    count = place.table[..., 0].size
     damping = DAMPING
     growth = GROWTH
     rounds = 1
@@ -164,7 +149,7 @@ def solve(
         triangle = triangle_of(problem, place, weight)
         step, expected = bounded_step(triangle, damping, low - place.point, high - place.point)
         further = place.point + step
-        trial = Iterate(further, place.changes[:0], problem.evaluate(further))
+        trial = Iterate(further, place.changes[:0], problem.fitted(further))
         gain = before - cost(problem, trial, weight)
         if gain > 0:
             square = max(float(triangle[:, 0] @ triangle[:, 0]) / count, 1e-6)
@@ -177,7 +162,7 @@ def solve(
             damping *= growth
             growth *= GROWTH
         settled = expected < tolerance * before or damping > MOST_DAMPING
-        size = problem.size(place.evaluation)
+        size = size_of(place.table)
         shrunk = rounds < ROUNDS and bool(np.median(size / weight) < SETTLED)
         if shrunk and (settled or gain > 0):
             weight = size
@@ -191,14 +176,14 @@ def solve(
 
 def iterate(problem: Problem, point: Float64, changes: Float64) -> Iterate:
     """Return the evaluation of a point and of ``changes`` (n, unknowns) of it."""
-    return Iterate(point, changes, problem.evaluate(point, changes))
+    return Iterate(point, changes, problem.fitted(point, changes))
 
 
-def linearised(problem: Problem, place: Iterate, size: Float64) -> Float64:
+def linearised(place: Iterate, size: Float64) -> Float64:
     """Return residuals over their ``size`` and derivatives by the unknowns (rows, 1 + unknowns),
     with the weights of the loss.
     """
-    table = problem.weighted(place.evaluation, size)
+    table = (place.table / size[:, None]).reshape(-1, place.table.shape[2])
     table *= (1 + (table[:, :1] / OUTLIER) ** 2) ** -0.25
     slopes = table[:, 1:] @ np.linalg.pinv(place.changes, rcond=1e-12).T
     return np.column_stack([table[:, 0], slopes])
@@ -219,7 +204,7 @@ def axes_of(hessian: Float64, scale: Float64) -> tuple[Float64, Float64]:
 
 def cost(problem: Problem, place: Iterate, size: Float64) -> float:
     """Return half the loss of all residuals, the prior's distances included."""
-    residual = problem.weighted(place.evaluation, size)[:, 0]
+    residual = place.table[..., 0] / size
     loss = 2 * OUTLIER**2 * (np.sqrt(1 + (residual / OUTLIER) ** 2) - 1).sum()
     mean, spread = problem.unknowns.prior
     return 0.5 * float(loss + (((place.point - mean) / spread) ** 2).sum())
@@ -229,7 +214,7 @@ def triangle_of(problem: Problem, place: Iterate, size: Float64) -> Any:
     """Return the triangle of residuals and derivatives, the prior's rows included."""
     mean, spread = problem.unknowns.prior
     prior = np.column_stack([(place.point - mean) / spread, np.diag(1 / spread)])
-    return np.linalg.qr(np.vstack([linearised(problem, place, size), prior]), mode="r")
+    return np.linalg.qr(np.vstack([linearised(place, size), prior]), mode="r")
 
 
 def bounded_step(
@@ -290,7 +275,13 @@ def with_certainty(fit: Fit) -> Fit:
     alone = inverse(data + FAINT_WEIGHT * np.eye(len(point)))
     faint = np.sqrt(np.diagonal(alone))
     alike = np.abs(alone) > ALIKE_CORRELATION * np.outer(faint, faint)
-    return fit._replace(certainty=Certainty(deviation, root, faint < SHOWN, alike, colored))
+    return fit._replace(
+        deviation=deviation,
+        root=root,
+        shown=faint < SHOWN,
+        alike=alike,
+        colored=colored,
+    )
 
 
 def _information(
@@ -307,7 +298,7 @@ def _information(
     for _ in range(PASSES):
         changes = np.clip(np.vstack([point + axes, point - axes]), low, high) - point
         place: Iterate = iterate(problem, point, changes)
-        table = linearised(problem, place, size)
+        table = linearised(place, size)
         residual, matrix = table[:, 0], table[:, 1:] * prior
         data = matrix.T @ matrix / _mean_square(residual, len(point))
         hessian = data + PRIOR_WEIGHT * np.eye(len(point))

@@ -28,6 +28,7 @@ from batchpid.sim.identification.regression import (
     LogData,
     Motion,
     better_reading,
+    cost_of,
     regress,
     smooth,
 )
@@ -281,10 +282,9 @@ def _own_timestep(log: Log) -> float:
     long one.
     """
     period = float(np.median(np.diff(log.time)))
-    parts = 1
     if period > LONGEST_STEP:
-        parts = int(np.ceil(period / USUAL_STEP))
-    return float(np.clip(period / parts, 1e-4, LONGEST_STEP))
+        return float(period / np.ceil(period / USUAL_STEP))
+    return max(period, 1e-4)
 
 
 def _resting(robot: Robot, start: Float64) -> Robot:
@@ -310,32 +310,29 @@ def _option(
 
 def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
     """Return the params that drove a log, of its joints, one row; None for efforts."""
-    laws = [_of_joints(law, robot, log) for law in (params, log.params) if law is not None]
-    law = laws[-1] if laws else None
+    laws = list[bp.PIDParams]()
+    for law in (params, log.params):
+        if law is not None and law.num_joints != len(log.joints):
+            if law.num_joints != robot.dof or law.num_envs != 1:
+                problem = f"hold {law.num_joints} joints of {law.num_envs} envs"
+                remedy = f"give one gain for each of the robot's {robot.dof} joints"
+                raise InvalidArgumentError("params", problem, remedy=remedy)
+            law = law.for_joints(list(log.joints))
+        if law is not None:
+            laws.append(law)
+    if bool(laws) != (log.kind == "setpoint"):
+        remedy = "give no params" if laws else "give the params that drove the robot"
+        raise log.error(f"holds {log.kind}s", remedy)
     for name in ("kp", "ki", "kd"):
-        gains = [0.0 if getattr(table, name) is None else getattr(table, name) for table in laws]
+        gains = [0.0 if getattr(law, name) is None else getattr(law, name) for law in laws]
         if not np.allclose(gains[:1], gains[-1:], rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
             remedy = "leave them out, and give params to logs without"
             raise InvalidArgumentError("params", problem, remedy=remedy)
-    if (law is None) != (log.kind == "effort"):
-        remedy = "give the params that drove the robot" if law is None else "give no params"
-        raise log.error(f"holds {log.kind}s", remedy)
-    if law is not None and law.gain_units is not None:
+    if laws and laws[-1].gain_units is not None:
         problem = "have gains per inertia or mass matrix, which a fit does not simulate"
         raise InvalidArgumentError("params", problem, remedy="log the efforts, and give no params")
-    return law
-
-
-def _of_joints(params: bp.PIDParams, robot: Robot, log: Log) -> bp.PIDParams:
-    """Return the params of the joints of a log."""
-    if params.num_joints == len(log.joints):
-        return params
-    if params.num_joints != robot.dof or params.num_envs != 1:
-        problem = f"hold {params.num_joints} joints of {params.num_envs} envs"
-        remedy = f"give one gain for each of the robot's {robot.dof} joints"
-        raise InvalidArgumentError("params", problem, remedy=remedy)
-    return params.for_joints(list(log.joints))
+    return laws[-1] if laws else None
 
 
 def _regress(
@@ -359,7 +356,7 @@ def _regress(
             drive = part.drive._replace(powered=none, further=(Exact(),))
             exact.append(part._replace(drive=drive))
         other = regress(_fitted(exact))
-        if other.cost < guess.cost - DETOUR:
+        if cost_of(other) < cost_of(guess) - DETOUR:
             data = exact
             guess = other
     words = better_reading(robot, _fitted(data)[0], guess, progress)
@@ -388,7 +385,7 @@ def _unknowns(
     """
     data = _fitted(data)
     log, _, plant, drive = data[0]
-    starts = dict(guess.values)
+    starts = dict(guess)
     kinds = list(BASIC)
     if drive.mode == "pid":
         kinds += SENDER

@@ -1,4 +1,4 @@
-"""Log of a robot in motion, and the checks that every log passes once.
+"""Log of a robot in motion, the checks that every log passes once, and logs of a rollout.
 
 A log is divided where its times have a gap, because the commands within it are unknown. Positions
 and setpoints of revolute joints that were logged modulo 2 pi become continuous.
@@ -17,7 +17,9 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.recording.setpoint_files import error
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
 
 CommandKind = Literal["setpoint", "effort"]
 LIMIT_MARGINS = 0.3, 0.05
@@ -169,17 +171,13 @@ def checked(robot: Robot, log: Log, resets: Sequence[int] = ()) -> list[Log]:
 
 
 def _check_finite(robot: Robot, log: Log) -> None:
-    tables = {
-        "time": log.time[:, None],
-        "command_time": log.command_time[:, None],
-        "qpos": log.qpos,
-        log.kind: log.command,
-    }
+    tables = {"time": log.time, "command_time": log.command_time, "qpos": log.qpos}
+    tables[log.kind] = log.command
     for quantity, table in tables.items():
-        for row, column in np.argwhere(~np.isfinite(table)):
-            if quantity in ("qpos", log.kind):
-                quantity += f":{robot.joint_names[log.joints[column]]}"
-            problem = f"{log.place(row)}, column {quantity!r} is empty or not finite"
+        for row, *columns in np.argwhere(~np.isfinite(table)).tolist():
+            joints = [robot.joint_names[log.joints[column]] for column in columns]
+            name = ":".join([quantity, *joints])
+            problem = f"{log.place(row)}, column {name!r} is empty or not finite"
             raise log.error(problem, "remove the row")
 
 
@@ -245,3 +243,66 @@ def _unwrapped(robot: Robot, log: Log) -> Log:
         command=command,
         is_checked=True,
     )
+
+
+def logs_of_rollout(
+    robot: Robot,
+    rollout: Rollout,
+    kind: CommandKind | None = None,
+    source: str = "rollout",
+) -> list[Log]:
+    """Return a log for each env of ``rollout`` and each stretch between its resets. Setpoints are
+    efforts under control "effort".
+
+    Raises InvalidArgumentError if the simulation of a fit lacks an effect of the run.
+    """
+    info = rollout.info
+    recorded: CommandKind = "effort" if info.control == "effort" else "setpoint"
+    follows = recorded == "setpoint"
+    lengths = np.abs(np.diff(rollout.time) - rollout.tick)
+    # Changes before the first row are before the log.
+    within = np.zeros((0, rollout.num_envs), np.uint8)
+    if rollout.changes is not None:
+        within = rollout.changes[1:]
+    obstacles = {
+        f"is of the joints {', '.join(info.joint_names)}": info.joint_names != robot.joint_names,
+        "was made with a plan": info.plan is not None,
+        "was made with setpoints that are not of joints": info.own_command is not None,
+        f"was made under control {info.control!r}": info.control not in (None, "pid", "effort"),
+        f"holds {recorded}s": kind not in (None, recorded),
+        "was made with setpoint rates": info.rates and follows,
+        "was made with a feedforward": rollout.feedforward is not None,
+        "has setpoints that a guard changed": np.any(rollout.guarded),
+        "was made with a randomization": info.randomization,
+        "has params that were changed": (within & PARAMS).any() and follows,
+        "has actuators that were changed": (within & ACTUATORS).any(),
+        "has a snapshot that was restored": (within & RESTORE).any(),
+        "has ticks of varied length": (lengths > 1e-9 + 1e-6 * rollout.tick).any(),
+        "has failed": not rollout.ok.all(),
+    }
+    for problem, holds in obstacles.items():
+        if holds:
+            remedy = "record another run under control pid or effort"
+            raise error(source, f"{problem}, which a fit cannot use", remedy)
+    joints = np.flatnonzero(robot.independent)
+    logs = []
+    for env in range(rollout.num_envs):
+        params = None
+        if info.params is not None and follows:
+            params = info.params.for_envs(slice(env, env + 1))
+        log = Log(
+            source if rollout.num_envs == 1 else f"{source}, env {env}",
+            tuple(joints.tolist()),
+            recorded,
+            rollout.time,
+            rollout.qpos[:, env, joints].astype(float),
+            rollout.time - rollout.tick,
+            np.asarray(rollout.setpoint)[:, env, joints].astype(float),
+            held=True,
+            timestep=info.timestep,
+            compensate=info.compensate,
+            params=params,
+        )
+        resets = np.flatnonzero(within[:, env] & RESET) + 1
+        logs += checked(robot, log, resets.tolist())
+    return logs

@@ -28,11 +28,10 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.checks import file_path
 from batchpid.errors import BatchPIDError, MissingDependencyError
-from batchpid.sim.identification.log import GAP, CommandKind, Log, checked
+from batchpid.sim.identification.log import GAP, CommandKind, Log, checked, logs_of_rollout
 from batchpid.sim.recording.recording_files import RecordingError, read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
 
 LOG_QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
@@ -131,14 +130,7 @@ def _read(
     columns, numbers = read_csv(path, (*LOG_QUANTITIES, "time"))
     sources = _sources(robot, str(path), columns, reading.columns)
     columns = {name: scale * columns[column] for name, (column, scale) in sources.items()}
-    log = _build(
-        robot,
-        str(path),
-        columns,
-        columns,
-        kind,
-        reading,
-    )
+    log = _build(robot, str(path), columns, kind, reading)
     return checked(robot, replace(log, lines=np.array(numbers)))
 
 
@@ -194,80 +186,18 @@ def _proposed(robot: Robot, columns: Iterable[str]) -> str:
     return " ".join(f'"{pattern}"' for pattern in patterns)
 
 
-def logs_of_rollout(
-    robot: Robot,
-    rollout: Rollout,
-    kind: CommandKind | None = None,
-    source: str = "rollout",
-) -> list[Log]:
-    """Return a log for each env of ``rollout`` and each stretch between its resets. Setpoints are
-    efforts under control "effort".
-
-    Raises InvalidArgumentError if the simulation of a fit lacks an effect of the run.
-    """
-    info = rollout.info
-    recorded: CommandKind = "effort" if info.control == "effort" else "setpoint"
-    follows = recorded == "setpoint"
-    lengths = np.abs(np.diff(rollout.time) - rollout.tick)
-    # Changes before the first row are before the log.
-    within = np.zeros((0, rollout.num_envs), np.uint8)
-    if rollout.changes is not None:
-        within = rollout.changes[1:]
-    obstacles = {
-        f"is of the joints {', '.join(info.joint_names)}": info.joint_names != robot.joint_names,
-        "was made with a plan": info.plan is not None,
-        "was made with setpoints that are not of joints": info.own_command is not None,
-        f"was made under control {info.control!r}": info.control not in (None, "pid", "effort"),
-        f"holds {recorded}s": kind not in (None, recorded),
-        "was made with setpoint rates": info.rates and follows,
-        "was made with a feedforward": rollout.feedforward is not None,
-        "has setpoints that a guard changed": np.any(rollout.guarded),
-        "was made with a randomization": info.randomization,
-        "has params that were changed": (within & PARAMS).any() and follows,
-        "has actuators that were changed": (within & ACTUATORS).any(),
-        "has a snapshot that was restored": (within & RESTORE).any(),
-        "has ticks of varied length": (lengths > 1e-9 + 1e-6 * rollout.tick).any(),
-        "has failed": not rollout.ok.all(),
-    }
-    for problem, holds in obstacles.items():
-        if holds:
-            remedy = "record another run under control pid or effort"
-            raise error(source, f"{problem}, which a fit cannot use", remedy)
-    joints = np.flatnonzero(robot.independent)
-    logs = []
-    for env in range(rollout.num_envs):
-        params = None
-        if info.params is not None and follows:
-            params = info.params.for_envs(slice(env, env + 1))
-        log = Log(
-            source if rollout.num_envs == 1 else f"{source}, env {env}",
-            tuple(joints.tolist()),
-            recorded,
-            rollout.time,
-            rollout.qpos[:, env, joints].astype(float),
-            rollout.time - rollout.tick,
-            np.asarray(rollout.setpoint)[:, env, joints].astype(float),
-            held=True,
-            timestep=info.timestep,
-            compensate=info.compensate,
-            params=params,
-        )
-        resets = np.flatnonzero(within[:, env] & RESET) + 1
-        logs += checked(robot, log, resets.tolist())
-    return logs
-
-
 def _build(
     robot: Robot,
     source: str,
     columns: dict[str, Float64],
-    commands: dict[str, Float64],
     kind: CommandKind | None,
     reading: Reading,
+    commands: dict[str, Float64] | None = None,
 ) -> Log:
     """Return the log that the columns of a file hold; ``commands`` are columns with their own
     times.
     """
+    commands = commands or columns
     by = columns_by_joint(robot, source, columns | commands, LOG_QUANTITIES)
     if by["feedforward"]:
         remedy = "log the complete efforts, without the columns of the feedforward"
@@ -379,9 +309,9 @@ def _read_bag(
         robot,
         str(path),
         positions,
-        commands,
         kind,
         reading,
+        commands,
     )
     for remark in remarks:
         log = log.with_remark(remark)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -86,18 +87,17 @@ class Problem:
 
     def evaluate(
         self,
+        windows: Sequence[Stretch],
         point: Float64,
         changes: Float64 | None = None,
         free_states: bool = True,
-        held_out: bool = False,
     ) -> list[Float64]:
         """Return the residuals of each window at a point (unknowns,), and their changes by
         ``changes`` (n, unknowns) of the point: (rows, joints, 1 + n).
 
-        Initial states of windows of efforts are projected out if they are free. Windows without
-        fitted rows are evaluated if ``held_out``, and are empty otherwise.
+        Initial states of windows of efforts are projected out if they are free.
         """
-        joints = self.windows[0].measured.shape[1]
+        joints = windows[0].measured.shape[1]
         free = free_states and self.data[0].drive.mode == "effort"
         shifts = np.diag(np.repeat(STATE_STEPS, joints * free))
         # Rows: the point, each change of it, a change of each initial state.
@@ -108,47 +108,30 @@ class Problem:
         states[count:] = shifts.reshape(-1, 2, joints)
         # Windows of one log are simulated at once, as many as are fast together.
         many = max(1, ENVS // len(points))
-        groups = defaultdict[Any, list[int]](list)
-        for number, window in enumerate(self.windows):
-            if held_out or window.fitted.any():
-                groups[window.log, number // many].append(number)
+        groups = defaultdict[Any, list[Stretch]](list)
+        for number, window in enumerate(windows):
+            groups[window.log, number // many].append(window)
         tasks = [self._task(group, points, states) for group in groups.values()]
-        tables = [np.zeros((0, joints, count))] * len(self.windows)
-        for group, positions in zip(groups.values(), self.run(_simulated, tasks), strict=True):
-            for number, table in zip(group, positions, strict=True):
-                errors = np.clip(
-                    self.windows[number].measured - table, -RESIDUAL_BOUND, RESIDUAL_BOUND
-                )
-                errors[1:] -= errors[0]
-                tables[number] = _projected(np.moveaxis(errors, 0, 2), count)
+        tables = []
+        results = chain(*self.run(simulate, *zip(*tasks, strict=True)))
+        for window, table in zip(windows, results, strict=True):
+            errors = np.clip(window.measured - table, -RESIDUAL_BOUND, RESIDUAL_BOUND)
+            errors[1:] -= errors[0]
+            tables.append(_projected(np.moveaxis(errors, 0, 2), count))
         return tables
 
-    def _task(self, group: list[int], points: Float64, states: Float64) -> Any:
+    def _task(self, windows: list[Stretch], points: Float64, states: Float64) -> Any:
         """Return the arguments of :func:`simulate` for windows of a log, each at all points."""
-        stretches = [self.windows[number] for number in group]
-        _, _, plant, drive = self.data[stretches[0].log]
-        points, states = (np.repeat(table, len(group), axis=0) for table in (points, states))
+        _, _, plant, drive = self.data[windows[0].log]
+        points, states = (np.repeat(table, len(windows), axis=0) for table in (points, states))
         robots = self.unknowns.candidates(self.unknowns.values(points))
-        return plant, drive, robots, states, stretches
+        return plant, drive, robots, states, windows
 
-    def weighted(self, evaluation: Sequence[Float64], size: Float64) -> Float64:
-        """Return residuals and their changes (n, 1 + changes) of the fitted rows over their
-        ``size``.
-        """
-        pairs = zip(self.windows, evaluation, strict=True)
-        tables = [table[window.fitted] / size[:, None] for window, table in pairs if len(table)]
-        table = np.concatenate(tables)
-        return table.reshape(-1, table.shape[2])
-
-    def size(self, evaluation: Sequence[Float64]) -> Float64:
-        """Return the size of fitted residuals (joints,): the root mean square, the largest tenth of
-        each joint cut.
-        """
-        joints = self.windows[0].measured.shape[1]
-        errors = self.weighted(evaluation, np.ones(joints))[:, 0].reshape(-1, joints)
-        errors = np.minimum(np.abs(errors), np.quantile(np.abs(errors), 0.9, axis=0))
-        size: Float64 = np.sqrt((errors**2).mean(0)) + RESOLUTION
-        return size
+    def fitted(self, point: Float64, changes: Float64 | None = None) -> Float64:
+        """Return residuals of the fitted rows and their changes (rows, joints, 1 + n)."""
+        windows = [window for window in self.windows if window.fitted.any()]
+        pairs = zip(windows, self.evaluate(windows, point, changes), strict=True)
+        return np.concatenate([table[window.fitted] for window, table in pairs])
 
     def errors(
         self,
@@ -161,18 +144,23 @@ class Problem:
 
         Windows of efforts begin at the logged state, or at the best one if states are free.
         """
-        evaluation = self.evaluate(point, changes, free_states, held_out=True)
-        table = np.concatenate(evaluation)
-        held_out = ~np.concatenate([window.fitted for window in self.windows])
-        if held_out.any():
-            table = table[held_out]
+        held_out = [window for window in self.windows if not window.fitted.all()]
+        windows = held_out or self.windows
+        pairs = zip(windows, self.evaluate(windows, point, changes, free_states), strict=True)
+        table = np.concatenate([table[window.fitted ^ bool(held_out)] for window, table in pairs])
         table[..., 1:] += table[..., :1]
         size: Float64 = np.sqrt((table**2).mean(0)).T
         return size
 
 
-def _simulated(task: Any) -> list[Float64]:
-    return simulate(*task)
+def size_of(table: Float64) -> Float64:
+    """Return the size of residuals (rows, joints, 1 + n) by joint: the root mean square, the largest
+    tenth cut.
+    """
+    errors = np.abs(table[..., 0])
+    errors = np.minimum(errors, np.quantile(errors, 0.9, axis=0))
+    size: Float64 = np.sqrt((errors**2).mean(0)) + RESOLUTION
+    return size
 
 
 def _projected(table: Float64, count: int) -> Float64:

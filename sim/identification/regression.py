@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,8 +31,8 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control
 from batchpid.task_space.tree_quantities import inverse_dynamics
 
-VALUES = "armature", "damping", "friction", "strength", "bias"
-"""Values of a joint."""
+VALUES = "armature", "damping", "friction", "strength", "bias", "cost"
+"""Results of a joint."""
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
 EFFORT_DELAYS = np.arange(0.0, 0.03, 1e-3)
@@ -92,18 +91,10 @@ class LogData(NamedTuple):
     drive: Control
 
 
-class Guess(NamedTuple):
-    """Motors by a regression."""
-
-    values: dict[str, Float64]
-    """Values (joints,) or (1,) by kind of unknown."""
-    costs: Float64
-    """log(mean square of the residual / mean square of the motor's effort) of each joint."""
-
-    @property
-    def cost(self) -> float:
-        """Mean of the costs."""
-        return float(self.costs.mean())
+Guess = dict[str, Float64]
+"""Motors by a regression: values (joints,) or (1,) by kind of unknown, and "cost": log(mean square of
+the residual / mean square of the motor's effort) of each joint.
+"""
 
 
 def smooth(log: Log, timestep: float) -> Motion:
@@ -160,15 +151,19 @@ def regress(data: Sequence[LogData]) -> Guess:
         for joint, fast in enumerate(moves.T):
             table = [column[fast, joint] for column in (*columns, efforts[shift, delay])]
             joints.append(_solve(table))
-        *values, costs = np.array(joints).T
-        named = dict(zip(VALUES, values, strict=True))
-        named |= {"delay": delays[[delay]], "setpoint_delay": shifts[[shift]]}
-        guesses.append(Guess(named, costs))
-    best = min(guesses, key=attrgetter("cost"))
+        guess = dict(zip(VALUES, np.array(joints).T, strict=True))
+        guess |= {"delay": delays[[delay]], "setpoint_delay": shifts[[shift]]}
+        guesses.append(guess)
+    least = min(map(cost_of, guesses))
     # Logs show the sum of both delays; armature and damping can hide how it is divided.
-    alike = [guess for guess in guesses if guess.cost < best.cost + ALIKE_COSTS]
-    usual = [guess for guess in alike if guess.values["setpoint_delay"][0] > -1e-9]
-    return min(usual or alike, key=attrgetter("cost"))
+    alike = [guess for guess in guesses if cost_of(guess) < least + ALIKE_COSTS]
+    usual = [guess for guess in alike if guess["setpoint_delay"] > -1e-9]
+    return min(usual or alike, key=cost_of)
+
+
+def cost_of(guess: Guess) -> float:
+    """Return the mean cost of the joints."""
+    return float(guess["cost"].mean())
 
 
 def _table(
@@ -319,9 +314,9 @@ def better_reading(
     robot's limits.
     """
     log = data.log
-    strength = guess.values["strength"]
+    strength = guess["strength"]
     # The motor explains little of the efforts, or its strength is far from 1.
-    odd = (guess.costs > WORST) | (strength < STRENGTHS[0]) | (strength > STRENGTHS[1])
+    odd = (guess["cost"] > WORST) | (strength < STRENGTHS[0]) | (strength > STRENGTHS[1])
     limits = robot.effort_limit[list(log.joints)]
     beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > OTHER_UNIT_RATIO * limits
     if odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
@@ -334,12 +329,12 @@ def better_reading(
             progress()
             other = replace(begin, qpos=begin.qpos @ on_qpos, command=begin.command @ on_command)
             motion = smooth(other, data.drive.timestep)
-            costs[words] = regress([data._replace(log=other, motion=motion)]).cost
+            costs[words] = cost_of(regress([data._replace(log=other, motion=motion)]))
         present = costs.pop("")
         best = min(costs.values())
         if best < min(present - EVIDENCE, WORST):
             return next(words for words, cost in costs.items() if cost < best + ALIKE_COSTS)
-    delay = float(guess.values["setpoint_delay"][0])
+    delay = float(guess["setpoint_delay"][0])
     if delay < -1e-9:
         return f"setpoints that were logged about {-1e3 * delay:.0f} ms late"
     return ""

@@ -29,7 +29,7 @@ from batchpid.sim.robot.urdf_export import to_urdf
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ROBOT = "robot"
+WHOLE_ROBOT = "robot"
 """Place of unknowns of the whole robot."""
 KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
@@ -99,8 +99,8 @@ class Identification:
         logs, simulated from the logged state: of the robot as described and as identified.
         """
         described = self._described.errors(np.zeros(0), free_states=False)
-        found = self.fit.problem.errors(self.fit.point, free_states=False)
-        return described[0], found[0]
+        identified = self.fit.problem.errors(self.fit.point, free_states=False)
+        return described[0], identified[0]
 
     @property
     def held_out_error(self) -> tuple[float, float]:
@@ -147,8 +147,7 @@ class Identification:
         :data:`batchpid.sim.identification.unknowns.UNKNOWN_KINDS`.
         """
         unknowns = self.unknowns
-        certainty = self.fit.certainty
-        halves = INTERVAL * certainty.deviation
+        halves = INTERVAL * self.fit.deviation
         least = [entry.least for entry in unknowns.entries]
         lows = np.maximum(self.values - halves, least)
         rows = np.array([self.values, lows, self.values + halves]) + unknowns.described
@@ -157,8 +156,8 @@ class Identification:
         names = [f"{self._place(entry)}: {entry.kind}" for entry in unknowns.entries]
         estimates: dict[str, dict[str, Estimate]] = {}
         for at, entry in enumerate(unknowns.entries):
-            is_shown = bool(certainty.shown[at])
-            others = [names[other] for other in np.flatnonzero(certainty.alike[at]) if other != at]
+            is_shown = bool(self.fit.shown[at])
+            others = [names[other] for other in np.flatnonzero(self.fit.alike[at]) if other != at]
             remark = "at its bound" if is_held[at] else ""
             if others and not is_shown:
                 remark = f"cannot be told from {', '.join(others)}"
@@ -169,7 +168,9 @@ class Identification:
     def _place(self, entry: Unknown) -> str:
         """Return the joint of an unknown, the link of a mass, or "robot"."""
         return (
-            self.joint_names[entry.place] if isinstance(entry.place, int) else entry.place or ROBOT
+            self.joint_names[entry.place]
+            if isinstance(entry.place, int)
+            else entry.place or WHOLE_ROBOT
         )
 
     def interval(
@@ -190,7 +191,7 @@ class Identification:
         if kind in self.fit.dropped and joint is None:
             return None
         try:
-            place = self.joint_names[joint] if isinstance(joint, int) else joint or ROBOT
+            place = self.joint_names[joint] if isinstance(joint, int) else joint or WHOLE_ROBOT
             estimate = self.estimates[place][kind]
         except (IndexError, KeyError):
             problem = f"is no unknown of {joint!r}"
@@ -215,7 +216,7 @@ class Identification:
         region = {
             "unknowns": [[entry.kind, self._place(entry)] for entry in self.unknowns.entries],
             "estimate": self.values.tolist(),
-            "root": self.fit.certainty.root.tolist(),
+            "root": self.fit.root.tolist(),
         }
         about = self.document() | {KEY: region}
         bp.save_actuators(path, self.actuators(), self.unknowns.robot.joint_names, about)
@@ -269,8 +270,7 @@ class Identification:
         tables = []
         for problem in (self._described, self.fit.problem):
             point = self.fit.point[: len(problem.unknowns.entries)]
-            first = replace(problem, windows=windows)
-            tables.append(first.evaluate(point, free_states=False, held_out=True))
+            tables.append(problem.evaluate(windows, point, free_states=False))
         errors = []
         for window, before, after in zip(windows, *tables, strict=True):
             errors.append((window.time, window.fitted, before[..., 0], after[..., 0]))

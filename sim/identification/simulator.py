@@ -132,11 +132,9 @@ class LogPlant:
         coupling = robot.coupling
         moves = np.isin(coupling.leader, joints)
         number = np.cumsum(moves) - 1
-        followers = []
-        for joint in np.flatnonzero(moves & ~coupling.independent):
-            leader = number[coupling.leader[joint]]
-            ratio = coupling.multiplier[joint]
-            followers.append(Follower(number[joint], leader, ratio, coupling.offset[joint]))
+        follows = moves & ~coupling.independent
+        rows = number, number[coupling.leader], coupling.multiplier, coupling.offset
+        followers = [Follower(*row) for row in zip(*(part[follows] for part in rows), strict=True)]
         tree = link_tree(robot).fixed_at(coupling.positions(robot.start), moves)
         self.tree = replace(tree, coupling=Coupling.of(tree.dof, followers))
         """Rigid tree of the logged joints and their followers."""
@@ -200,7 +198,7 @@ class LogPlant:
             further=further,
             **{name: self.spread(getattr(drive, name)) for name in OF_JOINTS},
         )
-        inertia = dt * np.zeros((envs, tree.dof)) + dt * control.friction.viscous
+        inertia = np.zeros((envs, tree.dof)) + dt * control.friction.viscous
         if actuators.armature is not None:
             inertia = inertia + actuators.armature
         limits = self.low, self.high, self._weight, 2 * dt, dt
@@ -260,7 +258,7 @@ def simulate(
     begin = starts[stretch_of] + states
     offset: Any = candidates.actuators.position_offset
     if offset is None:
-        offset = np.zeros((1, plant.joints))
+        offset = 0.0
     commands = np.stack([stretch.command for stretch in stretches], axis=1)
     # Setpoints of each candidate are late by whole steps and a share of a step.
     late = candidates.setpoint_delay / drive.timestep
@@ -296,12 +294,10 @@ def simulate(
         at = np.flatnonzero((steps >= begun) & (steps < begun + size))
         qpos, qvel = (
             table.reshape(most, -1, many, table.shape[2])[steps[at] - begun, :, owner[at]]
-            for table in (run.qpos, run.qvel)
+            for table in (run.qpos + plant.spread(offset), run.qvel)
         )
         # Rows lie before the ends of their steps.
         positions[at] = (qpos - before[at, None, None] * qvel)[..., plant.columns]
-    offsets = np.broadcast_to(offset, (len(states), plant.joints)).reshape(-1, many, plant.joints)
-    positions += offsets[:, owner].swapaxes(0, 1)
     positions[~(np.abs(positions) < DIVERGED)] = np.inf
     parts = np.split(positions, np.cumsum(sizes)[:-1])
     return [np.ascontiguousarray(part.swapaxes(0, 1)) for part in parts]

@@ -29,7 +29,7 @@ from batchpid.sim.identification.fit import (
     triangle_of,
     with_certainty,
 )
-from batchpid.sim.identification.problem import Problem
+from batchpid.sim.identification.problem import Problem, size_of
 from batchpid.sim.identification.unknowns import SENDER, kinds_of
 
 TRIAL = 5
@@ -60,7 +60,7 @@ def fit(starts: Sequence[Problem], solver: Solver) -> Fit:
         point = solver(coarse, point, tolerance=ROUGH_TOLERANCE).point
     result = with_certainty(solver(problem, point))
     # The effects that lower the held-out error, the most helpful first.
-    while result.certainty.colored > COLORED:
+    while result.colored > COLORED:
         trial = _with_effect(result, solver)
         if trial is result:
             break
@@ -82,7 +82,7 @@ def _best_start(starts: Sequence[Problem], solver: Solver) -> tuple[Problem, Flo
             evaluations=TRIAL,
             tolerance=ROUGH_TOLERANCE,
         ).point
-        error = float(np.linalg.norm(coarse.size(coarse.evaluate(end))))
+        error = float(np.linalg.norm(size_of(coarse.fitted(end))))
         if error < least:
             problem = start
             point = end
@@ -106,7 +106,10 @@ def _without_sender(result: Fit, solver: Solver) -> Fit:
         smaller = solver(problem, result.point[is_kept])
         if _left(smaller._replace(size=result.size)) * KEPT <= error:
             return smaller._replace(
-                certainty=result.certainty.only(is_kept),
+                deviation=result.deviation[is_kept],
+                root=result.root[is_kept],
+                shown=result.shown[is_kept],
+                alike=result.alike[np.ix_(is_kept, is_kept)],
                 dropped=kinds,
                 effects=result.effects,
             )

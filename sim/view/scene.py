@@ -172,7 +172,7 @@ def _read_mesh(name: str, robot: Robot) -> Any:
     if path is None:
         raise OSError(name, "not found")
     try:
-        loaded = read_mesh(path)
+        loaded = read_mesh(path, path.read_bytes())
     except Exception as error:
         raise OSError(name, f"{type(error).__name__}: {error}") from error
     if not len(loaded.faces):

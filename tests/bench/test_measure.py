@@ -5,7 +5,7 @@ import importlib.util
 
 import numpy as np
 import pytest
-from measure import CASES, MUJOCO_LOOPS, OURS, measure_phases, measure_rates
+from measure import CASES, MUJOCO_LOOPS, OURS, measure_rates
 from peers import PEERS
 from robots import load_bundled
 from workload import Workload, run_round
@@ -32,14 +32,6 @@ def test_every_case_moves_and_has_a_rate(workload):
 def test_robots_that_rest_are_refused(workload):
     with pytest.raises(RuntimeError, match=r"did not move.*run more ticks"):
         measure_rates(dataclasses.replace(workload, ticks=1), [OURS])
-
-
-@pytest.mark.slow
-def test_phases_are_positive_and_the_engine_takes_most(workload):
-    spent = measure_phases(workload)
-    assert list(spent) == ["read", "control", "passive", "write", "step", "waiting"]
-    assert all(value > 0 for value in spent.values())
-    assert spent["step"] == max(spent[phase] for phase in ("read", "passive", "write", "step"))
 
 
 @pytest.mark.parametrize(

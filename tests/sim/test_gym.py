@@ -180,16 +180,6 @@ def test_gymnasiums_vector_wrappers_wrap_the_vector_env():
     env.close()
 
 
-def test_dlpack_shares_observations_without_a_copy():
-    jax = pytest.importorskip("jax")
-    env = ReachVectorEnv(2, workers=0)
-    obs, _ = env.reset(seed=0)
-    theirs = jax.dlpack.from_dlpack(obs)
-    np.testing.assert_array_equal(np.asarray(theirs), obs)
-    assert np.from_dlpack(obs).__array_interface__["data"] == obs.__array_interface__["data"]
-    env.close()
-
-
 def test_actions_and_observations_are_those_of_independent_joints(tmp_path):
     hand = Robot.load(write(tmp_path, gripper()))
     env = ReachVectorEnv(2, hand, workers=0)

@@ -47,12 +47,6 @@ def test_control_by_effort_is_given_effort_limits(name, request):
     np.testing.assert_array_equal(params.effort_max, np.atleast_2d(robot.effort_limit))
 
 
-def test_a_bundled_robot_reaches_the_tutorials_target_without_params(panda):
-    with Runner(panda, 1, workers=0) as runner:
-        rollout = runner.rollout(np.broadcast_to(panda.settings.target, (200, panda.dof)))
-    np.testing.assert_allclose(rollout.qpos[-1, 0], panda.settings.target, atol=1e-3)
-
-
 def test_its_repr_has_robot_size_control_and_time(panda):
     with Runner(panda, 2, params=panda.params(), workers=0) as runner:
         runner.step(panda.start)

@@ -6,9 +6,9 @@ Native code steps a robot if and only if its state has no contact, so the bits o
 nothing else. The arrays of a pack hold the state of every robot, and ``mujoco.MjData`` is working memory.
 Native code steps vectors of robots, so a table has the shape (blocks, columns, WIDTH).
 
-A model with proofs has at most one joint a body, through the body's origin; bodies without one are
-welded to their parents. It has shapes of the kinds in ``clearance.h``, and nothing moves but the
-robot. Models of MJCF files can hold any element, so MuJoCo checks all of their contacts.
+A model with proofs has at most one joint a body, through its origin; others are welded to their
+parents. It has shapes of the kinds in ``clearance.h``, and nothing moves but the robot. Models of
+MJCF files can hold any element, so MuJoCo checks all of their contacts.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel, Rows
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
+from batchpid.sim.engine.mujoco.mujoco_sensors import wrench_tables
 from batchpid.sim.engine.native import FARTHEST, WIDTH, number, structure
 from batchpid.sim.engine.native_model import NativeModel, aligned, table
 
@@ -278,7 +279,8 @@ def place_of_contacts() -> int | None:
 
 
 class FreeMotions:
-    """States of ``size`` robots of ``robot``, whose rigid bodies are those of ``model``.
+    """States of robots of ``robot``, whose rigid bodies are those of ``model``; ``sensed`` (M,
+    sensors) are the sums of their sensors.
 
     Attributes
     ----------
@@ -290,8 +292,8 @@ class FreeMotions:
         Inputs of the drives (M, dof); not used without drives.
     """
 
-    def __init__(self, robot: RobotMj, size: int, model: NativeModel) -> None:
-        dof = len(robot.joints)
+    def __init__(self, robot: RobotMj, model: NativeModel, sensed: Float64) -> None:
+        dof, size = len(robot.joints), len(sensed)
         scene = robot.model
         self.size = size
         self._robot, self._rigid = robot, model
@@ -311,6 +313,7 @@ class FreeMotions:
             "high": ends[1].copy(),
             "contact": self.contact,
             "time": self.time,
+            "sums": sensed,
             **dict(zip(("qpos", "qvel", "acceleration"), self._states, strict=True)),
         }
         least, most, width, *_ = scene.jnt_solimp[joints[0]]
@@ -325,6 +328,8 @@ class FreeMotions:
             timestep=scene.opt.timestep,
             has_pairs=len(touching_pairs(scene)) > 0,
             robots=size,
+            wrenches=(scene.sensor_type == mujoco.mjtSensor.mjSENS_FORCE).sum(),
+            sensed=sensed.shape[1],
         )
 
     def use(self, models: Sequence[MjModel]) -> None:
@@ -344,6 +349,8 @@ class FreeMotions:
                 "drive_limit": [model.actuator_forcerange[:, 1] for model in kinds],
             }
         self._arrays |= {name: table(np.array(rows), self.size) for name, rows in columns.items()}
+        if self._structure.wrenches:
+            self._arrays |= wrench_tables(self._robot, self._rigid.tables, models)
         # In place, since native code has the address.
         self._structure.model = self._rigid.address
         for name, array in self._arrays.items():
@@ -384,10 +391,9 @@ class FreeMotions:
     def show(self, row: int, model: MjModel, data: MjData) -> None:
         """Bring the data of a robot up to date."""
         at = row // WIDTH, slice(None), row % WIDTH
-        data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = (
-            array[at] for array in self._states[:2]
-        )
-        data.qacc_warmstart[self._robot.qvel] = self._states[2][at]
+        qpos, qvel, acceleration = [array[at] for array in self._states]
+        data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = qpos, qvel
+        data.qacc_warmstart[self._robot.qvel] = acceleration
         data.time = self.time[row]
         data.ctrl[:] = self.ctrl[row, : len(data.ctrl)]
         if (np.abs(data.qpos) <= FARTHEST).all():

@@ -87,7 +87,7 @@ class MujocoPack(EnginePack):
         self._at, self._moves = robot.qpos, robot.qvel
         self._free: FreeMotions | None = None
         if self.steps_natively and self._moves_freely:
-            self._free = FreeMotions(robot, self.size, self.joint_model)
+            self._free = FreeMotions(robot, self.joint_model, self._sensed)
         if self._constraint is not None and self.steps_natively:
             reads = self.spec.fixed_base and self.steps_read_force(True, True)
             self._constraint.use(self.joint_model, None if reads else self._bias_model)
@@ -102,7 +102,7 @@ class MujocoPack(EnginePack):
         """
         spec = self.spec
         is_tree = spec.fixed_base and spec.mjcf is None and self.dof > 0
-        return is_tree and not spec.wrenches and place_of_contacts() is not None
+        return is_tree and place_of_contacts() is not None
 
     @property
     def data(self) -> list[MjData]:

@@ -34,6 +34,13 @@ struct FOR_PYTHON FreeMotion {
   Lanes const *position_gain, *drive_rate_gain, *drive_limit;  // (blocks, dof): effort = ctrl + gains (q, q'), limited
   std::int64_t robots;
   double stiffness, rate_gain;        // of a limit's reference acceleration
+  // Links whose wrenches are measured: the joint whose body carries each, or -1; (wrenches, dof): 1 for joints that hang
+  // on it; (wrenches, 12): axes and position of its frame on that body; (robots, wrenches, 13): BodyInertia, there, of all
+  // that moves with it; and (robots, sensed): sums of sensors over sim steps, which end with force and torque of each.
+  std::int32_t const *carriers, *hanging;
+  double const *frames, *carried;
+  double *sums;
+  std::int64_t wrenches, sensed;
   double least, most, width;          // impedance of limits: MuJoCo's solimp
   double timestep;
   std::int32_t has_pairs;             // whether shapes may touch
@@ -80,23 +87,38 @@ inline __attribute__((always_inline)) void solve_along_tree(Model const &model, 
   }
 }
 
+// Set the motions of the bodies of a block at its state, with the wrenches that move them, for accelerations (dof,) of
+// the joints, or null for none; return the motion of the base.
+inline __attribute__((always_inline)) BodyMotion<Lanes> move(FreeMotion const &of, std::int64_t block, FreeRoom &room,
+                                                             Lanes const *acceleration) {
+  Model const &model = *of.model;
+  std::int64_t const dof = model.dof;
+  Lanes const *qpos = of.qpos + block * dof, *qvel = of.qvel + block * dof, *gravity = of.gravity + 3 * block;
+  BodyMotion<Lanes> root{};
+  root.moving_change = {-gravity[0], -gravity[1], -gravity[2]};
+  room.posed.place(dof, model.tree, model.rows, qpos, [&](std::int64_t j, BodyState<Lanes> &body) {
+    std::int32_t const above = model.tree[2 * j];
+    bool const slides = model.tree[2 * j + 1] != 0;
+    model.weigh(j, block * WIDTH, of.robots, body);
+    BodyMotion<Lanes> motion = move_body(above < 0 ? root : room.motions[above], body, slides, qvel[j]);
+    if (acceleration != nullptr) {
+      motion.turning_change = motion.turning_change + acceleration[j] * turning(body, slides);
+      motion.moving_change = motion.moving_change + acceleration[j] * body.moving;
+    }
+    motion.accelerate(body.inertia);
+    room.motions[j] = motion;
+  });
+  return root;
+}
+
 // Write mass matrix and bias of a block at its state.
 FOR_EACH_PROCESSOR static void evaluate(FreeMotion const &of, std::int64_t block, FreeRoom &room) {
   Model const &model = *of.model;
   std::int64_t const dof = model.dof;
-  Lanes const *qpos = of.qpos + block * dof, *qvel = of.qvel + block * dof;
-  Lanes const *armature = of.armature + block * dof, *gravity = of.gravity + 3 * block;
+  Lanes const *armature = of.armature + block * dof;
   Lanes *bias = of.bias + block * dof, *mass = of.mass + block * (dof * (dof + 1) / 2);
   Posed &posed = room.posed;
-  BodyMotion<Lanes> root{};
-  root.moving_change = {-gravity[0], -gravity[1], -gravity[2]};
-  posed.place(dof, model.tree, model.rows, qpos, [&](std::int64_t j, BodyState<Lanes> &body) {
-    std::int32_t const above = model.tree[2 * j];
-    model.weigh(j, block * WIDTH, of.robots, body);
-    BodyMotion<Lanes> motion = move_body(above < 0 ? root : room.motions[above], body, model.tree[2 * j + 1] != 0, qvel[j]);
-    motion.accelerate(body.inertia);
-    room.motions[j] = motion;
-  });
+  move(of, block, room, nullptr);
   efforts_of_wrenches(dof, model.tree, posed.bodies.data(), room.motions.data(), bias);
   composite_mass_matrix(dof, model.tree, posed.bodies.data(), [&](std::int64_t i, std::int64_t j, Lanes product) {
     mass[j * (j + 1) / 2 + i] = product;
@@ -180,6 +202,43 @@ inline __attribute__((always_inline)) Lanes const *solve_with_drives(FreeMotion 
   return room.rate.data();
 }
 
+// Add the wrenches on links of the robots of the mask `free`, under accelerations (dof,), to the sums.
+FOR_EACH_PROCESSOR static void add_wrenches(FreeMotion const &of, std::int64_t block, FreeRoom &room, Lanes const *acceleration,
+                                            Lanes free) {
+  constexpr std::int64_t FRAME = 12, INERTIA = sizeof(BodyInertia<double>) / sizeof(double);
+  std::int64_t const dof = of.model->dof, first = block * WIDTH;
+  BodyMotion<Lanes> const root = move(of, block, room, acceleration);
+  efforts_of_wrenches(dof, of.model->tree, room.posed.bodies.data(), room.motions.data(), room.inverse.data());
+  for (std::int64_t i = 0; i < of.wrenches; ++i) {
+    std::int32_t const carrier = of.carriers[i];
+    double const *frame = of.frames + FRAME * i;
+    BodyState<Lanes> body = carrier < 0 ? body_of_base<Lanes>() : room.posed.bodies[carrier];
+    BodyMotion<Lanes> const &of_body = carrier < 0 ? root : room.motions[carrier];
+    BodyMotion<Lanes> own{of_body.turning, of_body.moving, of_body.turning_change, of_body.moving_change, {}, {}};
+    BodyInertia<Lanes> inertia;
+    for (std::int64_t k = 0; k < INERTIA; ++k) {
+      reinterpret_cast<Lanes *>(&inertia)[k] = gather(of.carried, of.wrenches * INERTIA, i * INERTIA + k, first, of.robots);
+    }
+    weigh(inertia, body);
+    own.accelerate(body.inertia);
+    for (std::int64_t j = 0; j < dof; ++j) {
+      if (of.hanging[i * dof + j] == 0) continue;
+      own.force = own.force + room.motions[j].force;
+      own.torque = own.torque + room.motions[j].torque;
+    }
+    own.torque = own.torque - cross(body.origin + in_axes(body.axes, frame[9], frame[10], frame[11]), own.force);
+    for (int axis = 0; axis < 3; ++axis) {
+      Vector<Lanes> const along = in_axes(body.axes, frame[3 * axis], frame[3 * axis + 1], frame[3 * axis + 2]);
+      Lanes const values[2] = {dot(along, own.force), dot(along, own.torque)};
+      for (std::int64_t at = 0; at < 2 * WIDTH; ++at) {
+        std::int64_t const k = at % WIDTH;
+        if (!(free.of[k] > 0.0)) continue;
+        of.sums[(first + k + 1) * of.sensed - 6 * (of.wrenches - i) + at / WIDTH * 3 + axis] += values[at / WIDTH].of[k];
+      }
+    }
+  }
+}
+
 // Advance the robots of the mask `free`, which loses those whose limits were not solved. Return whether all were.
 FOR_EACH_PROCESSOR static bool advance_freely(FreeMotion const &of, std::int64_t block, Efforts const &efforts,
                                               FreeRoom &room, Lanes &free) {
@@ -210,6 +269,7 @@ FOR_EACH_PROCESSOR static bool advance_freely(FreeMotion const &of, std::int64_t
     solve_along_tree(*of.model, mass, room.inverse.data(), a);
   }
   if (of.ctrl != nullptr) change = solve_with_drives(of, block, room, any_positive(beyond));
+  if (of.wrenches > 0) add_wrenches(of, block, room, a, free);
   for (std::int64_t j = 0; j < dof; ++j) {
     Lanes const rate = qvel[j] + of.timestep * change[j], place = qpos[j] + of.timestep * rate;
     before[j] = where_positive(free, a[j], before[j]);

@@ -28,6 +28,9 @@ VARIED = Randomization(
     seed=1,
 )
 
+WRENCHES = ["panda_link1", "panda_link5", "panda_hand", "panda_leftfinger"]
+"""Links below joints that turn and slide, and links of fixed joints."""
+
 
 def motion(of, monkeypatch, natively, to_limits, ticks, envs=8, **options):
     """Return a rollout to random targets, of which some are at limits, with a reset of some robots
@@ -61,7 +64,8 @@ CASES = [
     ("panda", False, {}),
     ("panda", True, {}),
     ("panda", False, {"randomization": VARIED}),
-    ("panda", False, {"contacts": ["panda_hand"]}),
+    ("panda", False, {"contacts": ["panda_hand"], "wrenches": WRENCHES}),
+    ("panda", False, {"wrenches": WRENCHES, "randomization": VARIED}),
     ("panda", False, {"control": "drive"}),
     ("panda", True, {"control": "drive", "randomization": VARIED}),
     ("jaco2", False, {}),
@@ -87,6 +91,8 @@ def test_a_motion_is_that_of_mujoco(name, to_limits, options, tmp_path, monkeypa
         np.testing.assert_allclose(
             one.effort, other.effort, rtol=1e-7, atol=(tolerance or 1e-9) * largest
         )
+        if "wrenches" in options:
+            np.testing.assert_allclose(one.wrench, other.wrench, rtol=1e-5, atol=1e-5)
 
 
 def test_default_controls_are_passes(monkeypatch):

@@ -38,6 +38,14 @@ def load(folder, text=URDF):
     return Robot.load(path)
 
 
+def heavier(factor):
+    """Return the text of an arm whose forearm has a multiple of its mass and inertia."""
+    text = URDF
+    for name, value in {"mass value": "1", "ixx": "0.01", "iyy": "0.01", "izz": "0.002"}.items():
+        text = text.replace(f'{name}="{value}"', f'{name}="{factor * float(value)}"')
+    return text
+
+
 def motion(seconds=3.0, seed=0):
     """Return setpoints (ticks, 2) that begin at rest."""
     time, rng = np.arange(0, seconds, STEPS * DT)[:, None], np.random.default_rng(seed)

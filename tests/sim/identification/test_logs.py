@@ -154,13 +154,11 @@ def test_a_recording_says_what_it_knows(robot, tmp_path):
 
 
 NONE = 0 * motion(0.5)
+DRIVEN = dict.fromkeys(("strength", "command_delay"))
 REFUSED = {
     "guard changed": lambda robot: {"guard": robot.guard(rate=np.full(2, 0.1))},
     "randomization": lambda _: {"randomization": Randomization(payload=Uniform(0.1, 0.2))},
-    "under control 'drive'": lambda _: {
-        "control": "drive",
-        "actuators": dict.fromkeys(("strength", "command_delay")),
-    },
+    "under control 'drive'": lambda _: {"control": "drive", "actuators": DRIVEN},
     "setpoint rates": lambda _: {"commands": {"setpoint_rates": NONE}},
     "a feedforward": lambda _: {"commands": {"feedforwards": NONE}},
 }

@@ -31,17 +31,6 @@ def test_the_integral_of_the_pid_removes_the_error_of_gravity(panda):
     assert left < 0.1 * sag
 
 
-def test_efforts_are_applied_within_the_limits(panda):
-    wanted = np.zeros((2, 9))
-    wanted[1, 0] = 1000.0
-    with Runner(panda, 2, workers=0, control="effort", compensate="none", substeps=1) as runner:
-        obs = runner.step(wanted)
-    np.testing.assert_array_equal(obs.effort[0], 0)
-    assert obs.effort[1, 0] == 87.0
-    assert obs.saturated.sum() == 1
-    assert obs.saturated[1, 0]
-
-
 def test_the_limit_holds_for_the_effort_with_compensation_and_feedforward(panda):
     with Runner(
         panda, 1, workers=0, params=panda.params(kp=5e4, ki=0.0, kd=0.0), substeps=1

@@ -113,20 +113,6 @@ def test_a_fault_names_the_controller_whose_effort_is_nan(panda, how):
     assert snapshot.rows["containment/cause"][3] == 7  # files hold the numbers of causes
 
 
-class Diverges(Counter):
-    def __call__(self, state, setpoint, qpos, qvel, passive):
-        return state, 0 * passive + 1e38
-
-
-@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
-def test_a_finite_effort_that_ends_the_state_is_a_fault_of_the_state(panda):
-    with Runner(
-        panda, 1, control=Diverges(), workers=0, params=panda.params(effort_limit=None)
-    ) as runner:
-        runner.step(np.zeros(panda.dof))
-        assert [fault.cause for fault in runner.faults] == ["state"]
-
-
 def test_efforts_are_limited(panda):
     class Strong(Counter):
         def __call__(self, state, *_):

@@ -15,7 +15,7 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import ClosedError, InvalidArgumentError
-from batchpid.sim import FaultWarning, Recorder, RecordingError, Runner, read_recording
+from batchpid.sim import Recorder, RecordingError, Runner, read_recording
 from batchpid.sim.cli import main
 from batchpid.sim.recording import recorder as recorder_module
 from batchpid.sim.robot.robot_options import content
@@ -34,7 +34,7 @@ def table(ticks):
     return np.clip(ROBOT.settings.target + noise, ROBOT.lower, ROBOT.upper)
 
 
-def test_every_tick_is_recorded_with_robot_options_and_units(tmp_path):
+def test_every_tick_is_recorded_with_its_units(tmp_path):
     path = tmp_path / "deep" / "run.h5"
     with make() as runner:
         start = runner.step(ROBOT.start).qpos
@@ -43,16 +43,10 @@ def test_every_tick_is_recorded_with_robot_options_and_units(tmp_path):
         runner.step(ROBOT.start)
     recording = read_recording(path)
     assert_identical(recording, rollout)
-    info = recording.info
-    assert (info.complete, info.control, info.timestep) == (True, "pid", 1 / 2000)
-    assert recording.tick == rollout.tick
     assert recording.feedforward is None
-    assert (info.robot, info.joint_names) == ("panda", ROBOT.joint_names)
-    assert info.digest == content(ROBOT)
-    for ours, theirs in zip(info.params, rollout.info.params, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-    np.testing.assert_array_equal(info.start, start)
-    assert {"python", "numpy", "h5py", "sapien"} <= set(info.versions)
+    assert recording.info.digest == content(ROBOT)
+    np.testing.assert_array_equal(recording.info.start, start)
+    assert {"python", "numpy", "h5py", "sapien"} <= set(recording.info.versions)
     assert [path.name] == os.listdir(path.parent)
     with h5py.File(path) as file:  # as any reader of HDF5 sees it
         assert file.attrs["num_envs"] == N
@@ -193,18 +187,6 @@ def test_a_runner_takes_one_recorder_at_a_time_and_none_when_closed(tmp_path):
         Recorder(tmp_path / "c.h5", runner)
     assert sorted(os.listdir(tmp_path)) == ["a.h5", "b.h5"]
     assert [len(read_recording(tmp_path / name).time) for name in ("a.h5", "b.h5")] == [2, 1]
-
-
-def test_faults_are_recorded(tmp_path):
-    with make(on_invalid_input="contain") as runner, Recorder(tmp_path / "run.h5", runner):
-        setpoints = table(4)
-        setpoints[2, 1, 3] = np.nan
-        with pytest.warns(FaultWarning):
-            runner.rollout(setpoints)
-    recording = read_recording(tmp_path / "run.h5")
-    (fault,) = recording.info.faults
-    assert (fault.env, fault.joint, fault.cause) == (1, "panda_joint4", "setpoint")
-    assert recording.ok.tolist() == [[True] * 3] * 2 + [[True, False, True]] * 2
 
 
 def with_path():

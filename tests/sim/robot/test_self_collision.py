@@ -178,7 +178,7 @@ def test_contacts_are_of_all_pairs_but_the_disabled_and_the_neighbours(seed):
         spec = spec_of(loaded)
         ignored = {frozenset(pair) for pair in spec.ignored}
         contacts = Contacts(spec.rigid_tree, spec.simulated.shapes, ignored, False)
-        near = contacts.near(loaded.start)
+        near = contacts.near(loaded.start, 0.02)
         seen = {frozenset((first, second)) for first, second, _ in near}
     far = {pair for pair in map(frozenset, pairs) if len({body[name] for name in pair}) == 2}
     neighbours = {frozenset((a, b)) for a, b in pairs if {body[a], body[b]} == {"arm0", "arm4"}}
