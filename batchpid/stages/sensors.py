@@ -45,8 +45,5 @@ class Sensors(Stage):
 
     def step(self, state: ActuatorState, values: Values) -> Told:
         qpos, qvel, passive = values.measured
-        noise = values.noise
-        if values.model.noise is not None:
-            noise = values.model.noise(self.k, state, qpos)
-        state, qpos, qvel = model.advance_measurement(self.k, state, qpos, qvel, noise)
+        state, qpos, qvel = model.advance_measurement(self.k, state, qpos, qvel, values.noise)
         return state, values._replace(seen=Measured(qpos, qvel, passive), noise=None)

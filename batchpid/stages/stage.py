@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Pytree
-from batchpid.arrays.elementwise import namespace, replace_envs
+from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.trees import mapped
 from batchpid.native.array_program import Bound, TreeProgram
 from batchpid.stages.control import Control
@@ -116,17 +116,6 @@ def started(stages: Iterable[Any], values: Values) -> States:
         state, values = stage.init(values)
         states.append(state)
     return tuple(states)
-
-
-def placed(
-    stages: Iterable[Any],
-    states: States,
-    values: Values,
-    mask: Array,
-) -> States:
-    """Return the states with the envs of ``mask`` (M,) started."""
-    placed: States = replace_envs(states, started(stages, values), mask)
-    return placed
 
 
 def adopted(

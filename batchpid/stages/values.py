@@ -114,10 +114,6 @@ class Model(NamedTuple):
     """state of the friction model, qpos -> the state with its inertia there; None: by
     :attr:`joint_mass_matrix`.
     """
-    noise: Any = None
-    """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it
-    at each step.
-    """
     when: Callable[[Any, Callable[[], Any], Any], Any] = when
     """:func:`when`, or a conditional of JAX."""
     envs: Array = None
@@ -144,7 +140,7 @@ class Values(NamedTuple):
     read them.
     """
     noise: Pytree = None
-    """Noise of the sensors in this step, if it is drawn in advance."""
+    """Noise of the sensors in this step; None to draw it."""
     inertia: tuple[Array, Array] = (None, None)
     """Factors of the friction model, from the inertias that the joints show."""
     matrix: Array = None

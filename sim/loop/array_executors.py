@@ -7,13 +7,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache, partial
 from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Float64, Pytree, Rows
 from batchpid.arrays.elementwise import precision
-from batchpid.arrays.trees import filled, leaves, structure
+from batchpid.arrays.trees import filled, leaves, mapped, structure
+from batchpid.motors import measurement_noise
 from batchpid.sim.engine.native_model import NativeStep
 from batchpid.sim.loop.env_parts import controller_errors
 from batchpid.sim.loop.faults import is_near
@@ -25,6 +27,10 @@ COUPLING_STEPS = 4
 """Sim steps for which the constraint efforts of coupled joints keep their mass matrix within a
 tick.
 """
+
+
+NOISE_STEPS = 64
+"""Sim steps for which the noise of sensors is drawn at once."""
 
 
 class Executor:
@@ -62,6 +68,8 @@ class Executor:
             self._native_force = pack.steps_read_force(*self._parts)
         self._step: NativeStep
         self._bound: object = None
+        self._noise: Pytree = None
+        self._first = -NOISE_STEPS  # sim step of the noise's first row
 
     def state(self, name: str) -> Any:
         """Return the state of a stage by name; None if it does not apply."""
@@ -84,6 +92,23 @@ class Executor:
     def write_state(self, states: States) -> None:
         """Replace the states; they have the arrays of the states before."""
         self._states = states
+        self._first = -NOISE_STEPS  # they may have other keys of noise
+
+    def draw_noise(self) -> Any:
+        """Return the noise of positions and velocities in the next sim steps (steps, M, dof), as far
+        as it has been drawn: :func:`batchpid.motors.measurement_noise`; None without noise.
+        """
+        sensors = self.state("sensors")
+        if sensors is None or sensors.key is None:
+            return None
+        # All envs advance by the same number of steps.
+        step = int(sensors.step[0])
+        if not 0 <= step - self._first < NOISE_STEPS:
+            steps = sensors.step + np.arange(NOISE_STEPS, dtype=np.uint32)[:, None]
+            k, like = self.setup.stage("sensors").k, np.zeros_like(self.measured.qpos)
+            self._noise = measurement_noise(k, sensors.key, steps, like, np)
+            self._first = step
+        return mapped(itemgetter(slice(step - self._first, None)), self._noise)
 
     def measure(self) -> None:
         """Read the robots, after a change of their states between sim steps."""
@@ -148,6 +173,7 @@ class NumPyExecutor(Executor):
                 control.timestep,
                 step,
                 setup.model,
+                noise=mapped(itemgetter(0), self.draw_noise()),
             )
             with controller_errors(control.controller, index + 1):
                 self.outputs = outputs = self._stepped(values).outputs

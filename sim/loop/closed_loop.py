@@ -23,7 +23,7 @@ from batchpid.sim.loop.tree_plant import DYNAMICS, TreePlant
 from batchpid.sim.options.options import OPTIONS, RunnerOptions
 from batchpid.sim.robot.robot import Robot
 from batchpid.stages import Control, stages_of
-from batchpid.stages.stage import States, placed, started, stepped
+from batchpid.stages.stage import States, started, stepped
 from batchpid.stages.values import Command, Measured, Model, Outputs, Step, Values
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_quantities import bias, evaluated, mass_matrix
@@ -106,11 +106,7 @@ class ClosedLoop:
         default at rest at the robot's start pose, in NumPy's arrays. For a loop in JAX, give one
         of JAX.
         """
-        plant = self._placed(qpos, qvel)
-        xp = namespace(*self.plant.read(plant))
-        episode = xp.zeros(self.control.envs, int)
-        values = self.values(plant, Command(None), Step(0, 1), episode)
-        return LoopState(plant, started(stages_of(self.control), values), episode)
+        return self._started(qpos, qvel)
 
     def reset(
         self, state: LoopState, qpos: Array = None, qvel: Array = None, mask: Array = None
@@ -118,18 +114,29 @@ class ClosedLoop:
         """Return ``state`` with the envs of ``mask`` (envs,) bool restarted as by :meth:`init`; by
         default all. Raises InvalidArgumentError for another mask.
         """
-        fresh = self._placed(qpos, qvel)
         xp = namespace(*self.plant.read(state.plant))
         mask = xp.ones(self.control.envs, bool) if mask is None else xp.asarray(mask)
         if mask.dtype != bool or mask.shape != (self.control.envs,):
             problem = f"is {mask.dtype} {mask.shape}, not bool ({self.control.envs},)"
             raise InvalidArgumentError("mask", problem, remedy="give one bool per env")
-        episode = state.episode + mask
-        plant = replace_envs(state.plant, fresh, mask)
+        start = xp.asarray(self.start if qpos is None else qpos)
+        return replace_envs(state, self._started(start, qvel, state.episode + 1), mask)
+
+    def _started(self, qpos: Array, qvel: Array, episode: Array = None) -> LoopState:
+        """Return the state of envs that start, in their ``episode`` (envs,); by default the
+        first.
+        """
+        start = self.start if qpos is None else qpos
+        rest = np.zeros(1) if qvel is None else qvel
+        xp = namespace(start, rest)
+        control = self.control
+        shape = control.envs, control.coupling.leader.shape[0]
+        place, rate = (xp.broadcast_to(xp.asarray(rows, float), shape) for rows in (start, rest))
+        plant = self.plant.init(place, rate)
+        if episode is None:
+            episode = xp.zeros(control.envs, int)
         values = self.values(plant, Command(None), Step(0, 1), episode)
-        return LoopState(
-            plant, placed(stages_of(self.control), state.stages, values, mask), episode
-        )
+        return LoopState(plant, started(stages_of(control), values), episode)
 
     def step(
         self,
@@ -188,16 +195,7 @@ class ClosedLoop:
             carry, outputs = jax.lax.scan(sim_step, carry, xp.arange(substeps))
             outputs = jax.tree.map(itemgetter(-1), outputs)
         qpos, qvel = self.plant.read(carry[0])
-        seen = outputs.motor, outputs.saturated, outputs.guarded
-        return LoopState(*carry, episode), LoopObservation(qpos, qvel, *seen)
-
-    def _placed(self, qpos: Array, qvel: Array) -> Pytree:
-        start = self.start if qpos is None else qpos
-        rest = np.zeros(1) if qvel is None else qvel
-        xp = namespace(start, rest)
-        shape = self.control.envs, self.control.coupling.leader.shape[0]
-        place, rate = (xp.broadcast_to(xp.asarray(rows, float), shape) for rows in (start, rest))
-        return self.plant.init(place, rate)
+        return LoopState(*carry, episode), LoopObservation(qpos, qvel, **outputs.shown)
 
     def values(
         self,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64, Rows
-from batchpid.arrays.elementwise import clip
+from batchpid.arrays.elementwise import clip, replace_envs
 from batchpid.arrays.trees import flatten, leaves, structure, unflatten
 from batchpid.sim.loop.array_executors import NumPyExecutor
 from batchpid.sim.loop.arrays import Arrays, Snapshot
@@ -25,7 +25,7 @@ from batchpid.sim.loop.native_executor import NativeExecutor, make_executor, run
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
 from batchpid.sim.signals import untouched
-from batchpid.stages.stage import adopted, by_name, placed, started
+from batchpid.stages.stage import adopted, by_name, started
 
 
 class EnvGroup:
@@ -431,8 +431,8 @@ class EnvGroup:
         executor.measure()
         if setup.control.has_motors:
             self._episode[mask] += 1
-        states = placed(setup.stages, executor.read_state(), setup.values(self._episode), mask)
-        executor.write_state(states)
+        fresh = started(setup.stages, setup.values(self._episode))
+        executor.write_state(replace_envs(executor.read_state(), fresh, mask))
 
 
 def _are_equal(one: Any, other: Any) -> bool:

@@ -79,7 +79,7 @@ class Pushes:
 
     def __init__(self, options: RunnerOptions, size: int) -> None:
         self._options = options
-        names = COUNTS if options.has_pushes else ()
+        names = COUNTS if getattr(options.randomization, "push", None) else ()
         self.counts: dict[str, Int64] = {name: np.zeros(size, np.int64) for name in names}
         """Counts of each env (size,), by name of :data:`COUNTS`; empty without pushes."""
 

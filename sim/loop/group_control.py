@@ -1,13 +1,12 @@
 """Control of a group of envs: its stages, from options, params and robots; and the functions of the
 robots' model that they call.
 
-Mass matrices, passive force and noise of sensors are natively compiled where the engine's steps
+Mass matrices and passive force are natively compiled where the engine's steps
 are, for every executor alike, since NumPy's results differ in the last bits.
 """
 
 from __future__ import annotations
 
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +15,6 @@ import batchpid as bp
 from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.trees import leaves, mapped
-from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
 from batchpid.motors.friction import Friction
 from batchpid.native.extensions import MOST_SUMMED
 from batchpid.sim.description.merging import coupling_of
@@ -274,7 +272,6 @@ def model_functions(pack: EnginePack, control: Control) -> Model:
         mass_matrix=mass_matrix_of(pack, native),
         joint_mass_matrix=joint_mass_matrix,
         load=lambda: pack.passive_force(not falls, True),
-        noise=NoiseBlocks(),
         envs=np.arange(pack.first_env, pack.first_env + pack.size),
     )
     if control.gravity:
@@ -288,49 +285,3 @@ def model_functions(pack: EnginePack, control: Control) -> Model:
         refresh = NativeRefresh(pack.joint_model, pack.size, pack.armature, *inputs, REFRESH_STEPS)
         model = model._replace(refresh=refresh)
     return model
-
-
-BLOCK = 64
-"""Sim steps of a block."""
-
-
-class NoiseBlocks:
-    """:func:`batchpid.motors.measurement_noise` at the step of a state, from blocks of consecutive
-    steps.
-    """
-
-    def __init__(self) -> None:
-        self._key: Any = None
-        self._first = 0
-        self._block: tuple[Array, Array] = (None, None)
-
-    def forget(self) -> None:
-        """Draw the next noise anew, after a change of the arrays of a state."""
-        self._key = None
-
-    def __call__(
-        self, k: MotorCoefficients, state: ActuatorState, like: Float64
-    ) -> tuple[Array, Array]:
-        """Return the noise of positions and velocities; None for a sensor without noise."""
-        noise: tuple[Array, Array] = mapped(itemgetter(0), self.from_step(k, state, like))
-        return noise
-
-    def from_step(
-        self, k: MotorCoefficients, state: ActuatorState, like: Float64
-    ) -> tuple[Array, Array]:
-        """Return the noise of the step of a state and the next ones (steps, M, dof), as far as it
-        has been drawn.
-
-        A reset replaces the key. While the key is the same, all envs advance by the same number of
-        steps.
-        """
-        if state.key is None:
-            return None, None
-        step = int(state.step[0])
-        if state.key is not self._key or not 0 <= step - self._first < BLOCK:
-            steps = state.step + np.arange(BLOCK, dtype=np.uint32)[:, None]
-            self._block = measurement_noise(k, state.key, steps, np.zeros_like(like), np)
-            self._key = state.key
-            self._first = step
-        rest: tuple[Array, Array] = mapped(itemgetter(slice(step - self._first, None)), self._block)
-        return rest

@@ -17,7 +17,13 @@ from batchpid.arrays.array_types import Pytree, Rows
 from batchpid.arrays.trees import leaves, mapped
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import number, structure
-from batchpid.sim.loop.array_executors import COUPLING_STEPS, Executor, JAXExecutor, NumPyExecutor
+from batchpid.sim.loop.array_executors import (
+    COUPLING_STEPS,
+    NOISE_STEPS,
+    Executor,
+    JAXExecutor,
+    NumPyExecutor,
+)
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.loop.group_control import GroupControl, native_obstacle
 from batchpid.stages.stage import States, bind_stages, recalled, running
@@ -285,7 +291,7 @@ class NativeExecutor(Executor):
         for array, rows in zip(leaves(self._states), leaves(states), strict=True):
             if rows is not array:
                 array[...] = rows
-        self.setup.model.noise.forget()
+        self._first = -NOISE_STEPS
 
     def run(
         self,
@@ -318,7 +324,7 @@ class NativeExecutor(Executor):
                 seen=measured,
                 timestep=self.setup.control.timestep,
                 step=Step(0, 1, np.zeros(())),
-                noise=mapped(lambda block: block[0].copy(), self._noise()),
+                noise=mapped(lambda block: block[0].copy(), self.draw_noise()),
             )
             program = TickProgram(
                 self.setup,
@@ -378,7 +384,7 @@ class NativeExecutor(Executor):
         tick = self._program.tick
         # The address changes when the engine's robots are built again.
         tick.group = self.compiled().prepare()
-        noise = leaves(self._noise())
+        noise = leaves(self.draw_noise())
         tick.drawn = min(map(len, noise), default=-1)
         for place, block in enumerate(noise):
             tick.noise[place] = block.ctypes.data
@@ -393,15 +399,6 @@ class NativeExecutor(Executor):
         if sensors.step is not None:
             sensors.step[...] += tick.ran
         return bool(tick.status & number("Status", "NO_NOISE"))
-
-    def _noise(self) -> Any:
-        """Return the noise of positions and velocities in the next sim steps (steps, M, dof); None
-        without sensors.
-        """
-        sensors, setup = self.state("sensors"), self.setup
-        if sensors is None:
-            return None
-        return setup.model.noise.from_step(setup.stage("sensors").k, sensors, self.before)
 
 
 def run_ticks(

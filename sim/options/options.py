@@ -229,11 +229,6 @@ class RunnerOptions(RunnerKeywords):
             return True
         return added_friction(Friction(), actuators).coulomb is not None
 
-    @property
-    def has_pushes(self) -> bool:
-        """True if floating bases are pushed."""
-        return self.randomization is not None and self.randomization.push is not None
-
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
         """Return ``params``, as a read-only copy, if they fit the robot, the number of envs and the
         control.

@@ -56,9 +56,7 @@ def test_motions_are_those_of_a_runner_in_mujoco_without_contact(case):
         for _ in range(TICKS):
             state, seen = loop.step(state, target, substeps=SUBSTEPS)
             expected = runner.step(target)
-            # A Runner keeps the mass matrix of coupled joints for four sim steps.
-            near = 3e-5 if "coupled" in case else 1e-6
-            np.testing.assert_allclose(seen.qpos, expected.qpos, atol=near)
+            np.testing.assert_allclose(seen.qpos, expected.qpos, atol=1e-6)
     at_limits = (seen.qpos > robot.upper) | (seen.qpos < robot.lower)
     is_free = "osc" in case or "coupled" in case or not np.isfinite(robot.upper).all()
     assert at_limits.any() or is_free
