@@ -96,18 +96,17 @@ def features(observation, config):
     return np.concatenate(rows, axis=1)
 
 
-def potential(envs, observation, config):
-    """Return minus the mean over joints of |goal - setpoint| / range (envs,)."""
-    _, _, goal, setpoint = split(observation, config)
-    _, _, span, _ = split(envs.observation_space.high - envs.observation_space.low, config)
-    return -(np.abs(goal - setpoint) / span).mean(1)
-
-
 def shaping(envs, config):
-    """Return the shaping for two observations, the change of the potential: reward for progress."""
-    return lambda before, after: (
-        config.shaping * (potential(envs, after, config) - potential(envs, before, config))
-    )
+    """Return the reward for progress between two observations: the change of a potential, minus
+    the mean over joints of |goal - setpoint| / range.
+    """
+    _, _, span, _ = split(envs.observation_space.high - envs.observation_space.low, config)
+
+    def potential(observation):
+        _, _, goal, setpoint = split(observation, config)
+        return -(np.abs(goal - setpoint) / span).mean(1)
+
+    return lambda before, after: config.shaping * (potential(after) - potential(before))
 
 
 def evaluate(envs, act, config):

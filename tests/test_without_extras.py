@@ -82,8 +82,8 @@ def test_each_command_and_program_runs_or_names_its_extra(tmp_path):
     programs = [match["code"] for page in (README, INDEX) for match in blocks(page, "python")]
     for pattern, size in (SHORTER_CODE | {"workers=2": "workers=0"}).items():
         programs = [re.sub(pattern, size, program) for program in programs]
-    assert len(commands) > 10
-    assert len(programs) == 2
+    assert len(commands) >= 10
+    assert programs
     given = json.dumps([modules_of_extras(), commands, programs])
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM], input=given, cwd=tmp_path, capture_output=True, text=True

@@ -76,11 +76,12 @@ class RobotInFile:
     """Robot of a compiled file: names of its parts, by their numbers in the model.
 
     ``bodies`` has all bodies of the file, ``joints`` the hinges and slides of the robot, ``base``
-    is the body of the root, 0 for the world. ``moments`` are the moment arms of the outputs of
-    actuators on the degrees of freedom, at the reference pose. After :meth:`read` ``solid`` is the
-    row of each body that has shapes, by the body's number. ``link_names`` and ``joint_names`` are all names in
-    use. ``repairs`` are findings of what is simulated otherwise than the file says. ``lost`` has names
-    of contents, by kind, that only an engine simulates that reads the file itself.
+    is the body of the root, 0 for the world; ``link_names`` and ``joint_names`` are all names in
+    use. ``moments`` are the moment arms of the outputs of actuators on the degrees of freedom, at
+    the reference pose. ``repairs`` are findings of what is simulated otherwise than the file says.
+    ``lost`` has names of contents, by kind, that only an engine simulates that reads the file
+    itself. After :meth:`read` ``solid`` is the row of each body that has shapes, by the body's
+    number.
 
     Raises RobotError for a ball joint, and for several robots.
     """

@@ -171,17 +171,13 @@ def checked(robot: Robot, log: Log, resets: Sequence[int] = ()) -> list[Log]:
 
 
 def _check_finite(robot: Robot, log: Log) -> None:
-    tables = {
-        "time": log.time[:, None],
-        "command_time": log.command_time[:, None],
-        "qpos": log.qpos,
-        log.kind: log.command,
-    }
+    tables = {"time": log.time, "command_time": log.command_time, "qpos": log.qpos}
+    tables[log.kind] = log.command
     for quantity, table in tables.items():
-        for row, column in np.argwhere(~np.isfinite(table)):
-            if quantity in ("qpos", log.kind):
-                quantity += f":{robot.joint_names[log.joints[column]]}"
-            problem = f"{log.place(row)}, column {quantity!r} is empty or not finite"
+        for row, *columns in np.argwhere(~np.isfinite(table)).tolist():
+            joints = [robot.joint_names[log.joints[column]] for column in columns]
+            name = ":".join([quantity, *joints])
+            problem = f"{log.place(row)}, column {name!r} is empty or not finite"
             raise log.error(problem, "remove the row")
 
 

@@ -29,7 +29,7 @@ from batchpid.sim.robot.urdf_export import to_urdf
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ROBOT = "robot"
+WHOLE_ROBOT = "robot"
 """Place of unknowns of the whole robot."""
 KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
@@ -99,8 +99,8 @@ class Identification:
         logs, simulated from the logged state: of the robot as described and as identified.
         """
         described = self._described.errors(np.zeros(0), free_states=False)
-        found = self.fit.problem.errors(self.fit.point, free_states=False)
-        return described[0], found[0]
+        identified = self.fit.problem.errors(self.fit.point, free_states=False)
+        return described[0], identified[0]
 
     @property
     def held_out_error(self) -> tuple[float, float]:
@@ -168,7 +168,9 @@ class Identification:
     def _place(self, entry: Unknown) -> str:
         """Return the joint of an unknown, the link of a mass, or "robot"."""
         return (
-            self.joint_names[entry.place] if isinstance(entry.place, int) else entry.place or ROBOT
+            self.joint_names[entry.place]
+            if isinstance(entry.place, int)
+            else entry.place or WHOLE_ROBOT
         )
 
     def interval(
@@ -189,7 +191,7 @@ class Identification:
         if kind in self.fit.dropped and joint is None:
             return None
         try:
-            place = self.joint_names[joint] if isinstance(joint, int) else joint or ROBOT
+            place = self.joint_names[joint] if isinstance(joint, int) else joint or WHOLE_ROBOT
             estimate = self.estimates[place][kind]
         except (IndexError, KeyError):
             problem = f"is no unknown of {joint!r}"

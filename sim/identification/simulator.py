@@ -198,7 +198,7 @@ class LogPlant:
             further=further,
             **{name: self.spread(getattr(drive, name)) for name in OF_JOINTS},
         )
-        inertia = dt * np.zeros((envs, tree.dof)) + dt * control.friction.viscous
+        inertia = np.zeros((envs, tree.dof)) + dt * control.friction.viscous
         if actuators.armature is not None:
             inertia = inertia + actuators.armature
         limits = self.low, self.high, self._weight, 2 * dt, dt

@@ -212,10 +212,6 @@ def _exact(scene: MjSpec) -> Any:
             axis="axis",
             range="range",
             actuatorfrcrange="actfrcrange",
-        )
-        _write(
-            element,
-            joint,
             armature="armature",
             damping="damping",
             frictionloss="frictionloss",
