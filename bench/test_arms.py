@@ -45,11 +45,11 @@ class Floors(NamedTuple):
 
 
 FLOORS = {
-    "panda": Floors(8.7, 8.2, 6.0),
-    "six joints": Floors(9.3, 8.6, 6.6),
-    "six joints with shapes": Floors(10.0, 9.0, 7.0),
-    "coupled gripper": Floors(7.0, 6.3, 5.6),
-    "jaco2": Floors(7.8, 7.3, 6.8),
+    "panda": Floors(11.0, 10.0, 7.6),
+    "six joints": Floors(12.5, 11.0, 8.6),
+    "six joints with shapes": Floors(13.5, 12.2, 9.8),
+    "coupled gripper": Floors(9.5, 8.4, 7.6),
+    "jaco2": Floors(10.0, 9.2, 9.0),
 }
 
 

@@ -36,10 +36,10 @@ def leaves(tree: Pytree) -> list[Pytree]:
     """Return the leaves of a tree of tuples, mappings and dataclasses, in order."""
     if is_leaf(tree):
         return [tree]
-    if isinstance(tree, Mapping):
-        tree = tuple(tree.values())
     if isinstance(tree, tuple):
         return [leaf for part in tree for leaf in leaves(part)]
+    if isinstance(tree, dict):
+        return leaves(tuple(tree.values()))
     if is_dataclass(tree):
         return leaves(tuple(vars(tree).values()))
     return []
@@ -49,10 +49,10 @@ def mapped(function: Callable[[Pytree], Pytree], tree: Pytree) -> Pytree:
     """Return a tree of tuples, mappings and dataclasses with ``function`` applied to its leaves."""
     if is_leaf(tree):
         return function(tree)
-    if isinstance(tree, Mapping):
-        return {name: mapped(function, part) for name, part in tree.items()}
     if isinstance(tree, tuple) and tree:
         return rebuilt_as(tree, [mapped(function, part) for part in tree])
+    if isinstance(tree, dict):
+        return {name: mapped(function, part) for name, part in tree.items()}
     if is_dataclass(tree):
         kind: Callable[..., Pytree] = type(tree)
         return kind(*[mapped(function, part) for part in vars(tree).values()])

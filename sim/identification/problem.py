@@ -62,11 +62,11 @@ class Problem:
 
     @property
     def half_row(self) -> float:
-        """Time by which efforts seem late if the robot held them and the log is interpolated [s]:
-        half of the time between rows. A delay of setpoints is an unknown of its own.
+        """Time by which commanded efforts seem late if the robot held them and the log is interpolated
+        [s]: half of the time between rows. A delay of setpoints is an unknown of its own.
         """
         log, _, _, drive = self.data[0]
-        if log.held or drive.mode == "pid":
+        if log.held or log.measured or drive.mode == "pid":
             return 0.0
         return max(float(np.median(np.diff(log.command_time))) - drive.timestep, 0.0) / 2
 

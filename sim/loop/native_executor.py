@@ -384,7 +384,8 @@ class NativeExecutor(Executor):
         tick = self._program.tick
         # The address changes when the engine's robots are built again.
         tick.group = self.compiled().prepare()
-        noise = leaves(self.draw_noise())
+        drawn = self.draw_noise()
+        noise = [] if drawn is None else leaves(drawn)
         tick.drawn = min(map(len, noise), default=-1)
         for place, block in enumerate(noise):
             tick.noise[place] = block.ctypes.data

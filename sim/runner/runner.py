@@ -780,11 +780,11 @@ class Runner(SingleOwner):
         """Return the command of one tick, or of ``ticks``: :func:`read_command`; and the chunk of
         each, with the latency of each env.
         """
-        setpoint, *rates, _ = inputs
-        chunks = list[tuple[Float64, Float64]]()
+        chunks: list[tuple[Float64, Float64]] = []
+        setpoint = next(iter(inputs))
         if self.options.plan is None:
             refuse_latency(latency)
-        elif all(inputs[name] is None for name in (setpoint, *rates)):
+        elif not any(value is not None for value in list(inputs.values())[:3]):
             inputs[setpoint] = self._goal
         else:
             entries, ages = read_chunks(self.options, inputs, latency, ticks)

@@ -311,11 +311,11 @@ WALK = DOG.start + 0.15 * np.sin(np.arange(24))[:, None, None] * np.ones((1, 3, 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
 def test_a_replay_from_resets_of_some_envs_in_contact(engine, monkeypatch):
-    monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 60)
+    monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 24)
     masks = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 1], [0, 0, 0]], bool)
     with (
-        Runner(DOG, 3, workers=2, engine=engine) as runner,
-        Runner(DOG, 3, workers=0, engine=engine) as model,
+        Runner(DOG, 3, workers=2, engine=engine, substeps=8) as runner,
+        Runner(DOG, 3, workers=0, engine=engine, substeps=8) as model,
     ):
         for number, mask in enumerate(masks):
             send(runner.pids[number % 2], signal.SIGKILL)
