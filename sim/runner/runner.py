@@ -477,8 +477,10 @@ class Runner(SingleOwner):
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
+        # Taken before the check, since a signal handler may close the runner at any time.
+        present: Any = getattr(self._pool, "present", None)
         self._ready()
-        return self._with_tool(self._pool.present.observation.map(COPY))
+        return self._with_tool(present.observation.map(COPY))
 
     def _with_tool(self, seen: Observation) -> Observation:
         """Return what the loop observed with the pose of the tool, which follows from the joints."""
