@@ -49,7 +49,9 @@ has more friction at rest, but a few percent may be an error of the model that l
 """
 
 Solver = Callable[..., Fit]
-""":func:`solve` with its number of evaluations, of a problem, from a point, to a tolerance."""
+""":func:`batchpid.sim.identification.fit.solve` with its number of evaluations and its progress: of a
+problem, from a point, to a tolerance.
+"""
 
 
 def fit(starts: Sequence[Problem], solver: Solver) -> Fit:
