@@ -19,9 +19,14 @@ from batchpid.checks import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.sim.identification.fit import INTERVAL, Fit
-from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.simulator import changed_params
-from batchpid.sim.identification.unknowns import UNKNOWN_KINDS, Unknown, Unknowns, least_value
+from batchpid.sim.identification.unknowns import (
+    UNKNOWN_KINDS,
+    Problem,
+    Unknown,
+    Unknowns,
+    least_value,
+)
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import load_robot_actuators
 from batchpid.sim.robot.urdf_export import to_urdf
