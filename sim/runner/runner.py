@@ -353,7 +353,7 @@ class Runner(SingleOwner):
             self._ready()
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         self._execute(self._tick(command, latency, substeps))
-        return self._pool.present.observation.copied(self._derived)
+        return self._observed()
 
     def send(
         self,
@@ -410,7 +410,7 @@ class Runner(SingleOwner):
         if self._is_running:
             self._execute(self._sent)
         self._sent = None
-        return self._pool.present.observation.copied(self._derived)
+        return self._observed()
 
     def rollout(
         self,
@@ -488,7 +488,7 @@ class Runner(SingleOwner):
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
         self._ready()
-        return self._pool.present.observation.copied(self._derived)
+        return self._observed()
 
     def poses(self) -> NDArray[np.float32]:
         """Return the poses of the entities that ``build`` returned (envs, entities, 7): x, y, z
@@ -899,6 +899,14 @@ class Runner(SingleOwner):
                 arrays.observation.copied(self._derived),
                 None if number else before.changes,
             )
+
+    def _observed(self) -> Observation:
+        """Return the present observation, as fresh arrays."""
+        try:
+            return self._pool.present.observation.copied(self._derived)
+        except AttributeError:  # a signal handler closed the runner after the tick
+            self._check_open()
+            raise
 
     def _fail(self, error: BaseException) -> None:
         """End the runner, which cannot complete a command."""
