@@ -144,8 +144,8 @@ def solve(
 ) -> Fit:
     """Return the fit from a ``point``.
 
-    The size of the residuals that are left may be far smaller than at the point, which would give
-    the prior too much weight: it is taken anew until it stays.
+    Residuals are weighted by their size. It may become far smaller in the fit, and the prior would
+    have too much weight: the weights are then renewed, until the size settles.
     """
     low, high = problem.unknowns.bounds
     point = np.clip(point, low, high)

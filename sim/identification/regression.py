@@ -111,8 +111,8 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
 
 
 def regress(data: Sequence[LogData]) -> Guess:
-    """Return the motors of logs at the delays of the least cost; setpoints that were logged late are
-    the last explanation.
+    """Return the motors of logs at the delays of the least cost. Setpoints count as logged late, at
+    a negative delay, only if no other delay explains the logs as well.
     """
     every = 1 + sum(len(part.motion.qpos) for part in data) // MOST_REGRESSION_ROWS
     cutoff = min(_cutoff(part.log) for part in data)
