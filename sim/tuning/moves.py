@@ -104,8 +104,8 @@ def random_moves(
     and 5 % beyond it.
 
     Starts are uniform over :meth:`Robot.sample`, 2 % off the limits; targets within 2 rad or m, but
-    at most the whole range, of them, by the :data:`MOVE_KINDS` in turn. The effort limits
-    allow each move within LONGEST_MOVE, and hold its ends. If few poses are free of contact, as with many
+    at most the whole range, of them, by the :data:`MOVE_KINDS` in turn. The effort limits allow
+    each move within LONGEST_MOVE, and hold its ends. If few poses are free of contact, as with many
     fingers or legs, or if the robot is weak, moves lie nearer to its start pose, or to the pose
     that it holds most easily: after every 50 rejected draws, the range of starts and steps is
     halved.
@@ -113,8 +113,8 @@ def random_moves(
     Raises
     ------
     InvalidArgumentError
-        ``count`` or ``seed`` is out of range, or there are no such moves: the robot
-        touches itself, or is too weak, in nearly every pose.
+        ``count`` or ``seed`` is out of range, or there are no such moves: the robot touches itself,
+        or is too weak, in nearly every pose.
     """
     count = integer("count", count, 0, 100_000)
     rng = np.random.default_rng(integer("seed", seed, 0, 2**63 - 1))
