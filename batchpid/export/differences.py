@@ -22,7 +22,7 @@ from batchpid.motors.actuators import ACTUATOR_FIELDS, Actuators
 
 
 class Difference(NamedTuple):
-    """What targets do at the joints at which an option is on, "" where it is as here."""
+    """Effect of an option in the targets, at the joints at which it is on; "" for the law's."""
 
     option: str
     ros2_control: str
@@ -36,7 +36,7 @@ WHOLE = "P acts on the whole setpoint (b = 1), so steps overshoot more"
 NO_FILTER = "no filter"
 MEASURED = "the derivative is the measured velocity, not a difference"
 WRITTEN = {"armature", "viscous", "coulomb", "effort_limit"}
-"""Effects of motors in an MJCF: those of joints."""
+"""Effects of motors that an MJCF file has, as properties of its joints."""
 DIFFERENCES = (
     Difference("effort_rate_limit", NO_RATE, NO_RATE),
     Difference("setpoint_weight", WHOLE, WHOLE),

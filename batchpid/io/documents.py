@@ -61,7 +61,7 @@ class RecordFile(Generic[R]):
     def dumps(
         self,
         record: R,
-        joint_names: Sequence[str] = (),
+        joint_names: Sequence[str],
         about: Mapping[str, object] | None = None,
         format: str = "yaml",
     ) -> str:
@@ -70,7 +70,7 @@ class RecordFile(Generic[R]):
         Parameters
         ----------
         joint_names
-            One name per joint; has to be given.
+            One name per joint.
         about
             Kept with the record, e.g. where it comes from: plain numbers, strings, lists,
             mappings.
@@ -107,7 +107,7 @@ class RecordFile(Generic[R]):
         self,
         path: str | os.PathLike[str],
         record: R,
-        joint_names: Sequence[str] = (),
+        joint_names: Sequence[str],
         about: Mapping[str, object] | None = None,
     ) -> None:
         """Write a record to ``path`` (.yaml, .yml or .json), as :meth:`dumps`.

@@ -170,7 +170,7 @@ def make_osc_params(
         Bools: the axes whose motion is controlled; the posture moves the others. None: all.
     force_axes
         Bools: axes, not among ``axes``, that the wrench controls, and on which the posture does not
-            act.
+        act.
     posture_stiffness, posture_damping_ratio
         Gains of the joints towards their posture: within the null space of the task for the joints
         of the chain to the tool, fully for others, such as fingers [1/s^2]. Followers have none.

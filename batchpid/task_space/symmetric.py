@@ -26,7 +26,7 @@ def whitened(matrix: Array, right: Array) -> Array:
     """
     xp = namespace(matrix, right)
     size = matrix.shape[-1]
-    # Gauss's elimination of A = L D L^T beside B: each row that leaves is one of sqrt(D) L^T.
+    # Gaussian elimination of the rows [A, B]: A becomes sqrt(D) L^T of A = L D L^T, row by row.
     rows = xp.concatenate([matrix, right], axis=-1)
     result = []
     with quiet():

@@ -143,7 +143,7 @@ def export(
     ] = 1 / 1000,
     limits: Annotated[
         bool,
-        flag("Limit setpoints to the robot's joint limits and speeds before they reach the law."),
+        flag("In C, limit setpoints to the robot's limits and speeds before they reach the law."),
     ] = False,
     prefix: Annotated[
         str,
@@ -161,8 +161,8 @@ def export(
 
     Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to
     batchpid's. "ros2_control" is the YAML of a controller. "mjcf" is the robot for MuJoCo, with
-    motors, or with servos of the --gains; "urdf" the robot with its repairs. Differences between the file and
-    batchpid's law or the robot's file are printed, one line each.
+    motors, or with servos of the --gains; "urdf" the robot with its repairs. Differences between the
+    file and batchpid's law or the robot's file are printed, one line each.
     """
     # A flag without effect is refused by name.
     chosen = {

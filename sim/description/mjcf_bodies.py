@@ -79,9 +79,9 @@ class RobotInFile:
     is the body of the root, 0 for the world; ``link_names`` and ``joint_names`` are all names in
     use. ``moments`` are the moment arms of the outputs of actuators on the degrees of freedom, at
     the reference pose. ``repairs`` are findings of what is simulated otherwise than the file says.
-    ``lost`` has names of contents, by kind, that only an engine simulates that reads the file
-    itself. After :meth:`read` ``solid`` is the row of each body that has shapes, by the body's
-    number.
+    ``lost`` has the names of contents, by kind, that are simulated only by an engine that reads the
+    file itself. After :meth:`read` ``solid`` is the name of the row of each body that has shapes, by
+    the body's number.
 
     Raises RobotError for a ball joint, and for several robots.
     """

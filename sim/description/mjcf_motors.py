@@ -6,7 +6,8 @@ fixed tendon) applies the effort g F; a follower q' = m q adds m g' to the arm o
 servo F = k u - kp g q - kv g q' has the gains g^2 kp and g^2 kv of a PID whose setpoint is its
 target in units of the joint. (MuJoCo's documentation, "Computation", actuation model.)
 
-Motors and servos of one joint are read. A finding names every other actuator.
+Motors and position servos of one joint are read. A finding names every other actuator; the damping
+of a velocity servo is read as well.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ def _moments(robot: RobotInFile) -> Float64:
 
 
 def _is_plain(model: MjModel, actuator: int) -> bool:
-    """Return whether an actuator is a motor or a servo without further effects."""
+    """Return whether an actuator is a motor or a position servo without further effects."""
     effects = ("delay", "damping", "dampingpoly")
     if model.actuator_plugin[actuator] >= 0:
         return False

@@ -86,8 +86,8 @@ def is_mjcf(root: etree._Element) -> bool:
 
 
 def with_srdf(source: Source) -> Source:
-    """Return ``source`` with the pairs in the .srdf beside its file, if there is one, for any
-    reason; a pair without reason gets "User".
+    """Return ``source`` with the pairs in the .srdf beside its file, if there is one. Any reason of
+    a pair counts; a pair without a reason gets "User".
 
     Pairs that name a link twice or an unknown link are left out, as in MoveIt, with a finding.
     Raises RobotError for what :func:`batchpid.sim.description.xml.parse_xml` refuses.

@@ -1,12 +1,13 @@
 """Record of a robot: bodies with their joints, and shapes, as rows of arrays and names.
 
-A :class:`Tables` is made once, by the reader of a URDF (:mod:`batchpid.sim.description.urdf`) or of an
-MJCF file (:mod:`batchpid.sim.description.mjcf`). Everything else reads it: engines, rigid
-trees, distances, exports and pictures.
+A :class:`Tables` is made once, by the reader of a URDF (:mod:`batchpid.sim.description.urdf`) or of
+an MJCF file (:mod:`batchpid.sim.description.mjcf`). Everything else reads it: engines, rigid trees,
+distances, exports and pictures.
 
-:func:`batchpid.sim.description.merging.merge_links` makes the tables that engines simulate, with one body
-for all links that fixed joints hold together. :attr:`batchpid.sim.engine.scene_spec.SceneSpec.tables`
-has a row for each link of the file, ``SceneSpec.simulated`` the merged rows.
+:func:`batchpid.sim.description.merging.merge_links` makes the tables that engines simulate, with
+one body for all links that fixed joints hold together. ``SceneSpec.tables``
+(:class:`batchpid.sim.engine.scene_spec.SceneSpec`) has a row for each link of the file,
+``SceneSpec.simulated`` the merged rows.
 
 Limits, damping and friction are those of the file. The degrees of freedom of a robot,
 ``SceneSpec.joints``, are the same joints with limits, friction and damping of followers moved to
@@ -232,8 +233,8 @@ def with_mass(
     wxyz: Float64,
     findings: list[Finding],
 ) -> Body:
-    """Return ``body`` with a mass [kg], and an inertia that a body can have: another than
-    ``inertia`` is a finding.
+    """Return ``body`` with a mass [kg] and an inertia that a body can have. If that is another one
+    than ``inertia``, a finding is added.
     """
     inertia, repair = possible_inertia(mass, inertia)
     if repair is not None:
@@ -311,9 +312,9 @@ class MjcfFile:
     (:func:`batchpid.sim.description.mjcf.compile_scene`), and ``content`` is the digest of the
     model. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
     other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
-    links. ``lost`` is what an engine lacks that does not simulate the file, in words.
-    ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of
-    the world can collide, unless the root is fixed to the origin in place of its free joint.
+    links. ``lost`` describes the content that is missing in an engine which does not simulate the
+    file. ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of the
+    world can collide, unless the root is fixed to the origin in place of its free joint.
     ``friction`` is the coefficient of its ground, the first of these planes.
     """
 

@@ -12,13 +12,19 @@ differences by single unknowns are off by some percent, which looks like informa
 that the data do not show. Hence the changes of an evaluation are the axes of the present covariance,
 each about a standard deviation long.
 
-Confidence intervals of a fit, and the unknowns that the logs do not determine.
+A fit may end in a local minimum, for example with a payload at the wrong link, or with the law's
+limit far from the error that saturates it. A short fit from each start shows the better one.
+
+Unknowns besides those of the motors have to lower the error at held-out rows, with free initial
+states of windows. A delay or a lag of setpoints is left out unless its absence raises that error.
+Where residuals are correlated, friction at rest, masses, offsets and load friction are added, the
+most helpful first, as long as the error falls. One evaluation with all of them, and the linear step
+of each, give the order of the trials.
 
 With the residuals r and their derivatives J in units of the prior's deviations, the information of
 the data is ``J^T J / s^2`` with the mean square s^2 of the residuals. J comes from differences along
-the axes of the covariance in passes until their lengths
-stay, so that a direction without effect carries no information. The prior has a quarter of its
-weight: ``H = J^T J / s^2 + 1 / 4``.
+the axes of the covariance in passes until their lengths stay, so that a direction without effect
+carries no information. The prior has a quarter of its weight: ``H = J^T J / s^2 + 1 / 4``.
 
 The variance is the larger of H^-1 and K times that of the scores of PARTS stretches, each with the
 sum g of its scores ``J^T r / s^2``::
@@ -35,13 +41,15 @@ at least the correlation rho of neighbouring residuals.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.identification.problem import Problem, size_of
 from batchpid.sim.identification.regression import bounded_solution
+from batchpid.sim.identification.unknowns import SENDER, Problem, kinds_of, size_of
 
 OUTLIER = 2.0
 """Ratio C of a residual to its size above which its weight in the loss decreases."""
@@ -85,16 +93,21 @@ SHOWN = 0.7
 """Standard deviation by the data, over the prior's, from which an unknown is not shown."""
 ALIKE_CORRELATION = 0.8
 """Correlation from which one unknown cannot be told from another."""
-
-
-class Iterate(NamedTuple):
-    """A point with residuals and their changes."""
-
-    point: Float64
-    changes: Float64
-    """Changes of the point (n, unknowns)."""
-    table: Float64
-    """Residuals and their changes (rows, joints, 1 + n)."""
+TRIAL = 5
+"""Evaluations of a short fit."""
+KEPT = 0.95
+"""Share of the held-out error that an unknown has to leave for it to be kept."""
+COLORED = 0.2
+"""Correlation of the residuals from which further effects are tried."""
+EFFECTS = {
+    "stribeck": KEPT,
+    "mass": 0.8,
+    "offset": 0.8,
+    "load_friction": 0.8,
+}
+"""Effects that are tried, and the share of the held-out error that each has to leave: every motor
+has more friction at rest, but a few percent may be an error of the model that looks like a mass.
+"""
 
 
 class Fit(NamedTuple):
@@ -131,38 +144,38 @@ def solve(
 ) -> Fit:
     """Return the fit from a ``point``.
 
-    The size of the residuals that are left may be far smaller than at the point, which would give
-    the prior too much weight: it is taken anew until it stays.
+    Residuals are weighted by their size. It may become far smaller in the fit, and the prior would
+    have too much weight: the weights are then renewed, until the size settles.
     """
     low, high = problem.unknowns.bounds
     point = np.clip(point, low, high)
-    place = iterate(problem, point, FIRST_CHANGE * np.eye(len(point)))
-    weight = size_of(place.table)
-    count = place.table[..., 0].size
+    table = problem.fitted(point, FIRST_CHANGE * np.eye(len(point)))
+    weight = size_of(table)
+    count = table[..., 0].size
     damping = DAMPING
     growth = GROWTH
     rounds = 1
     settled = False
     for _ in range(evaluations - 1):
         progress()
-        before = cost(problem, place, weight)
-        triangle = triangle_of(problem, place, weight)
-        step, expected = bounded_step(triangle, damping, low - place.point, high - place.point)
-        further = place.point + step
-        trial = Iterate(further, place.changes[:0], problem.fitted(further))
-        gain = before - cost(problem, trial, weight)
+        before = cost(problem, point, table, weight)
+        triangle = triangle_of(problem, point, table, weight)
+        step, expected = bounded_step(triangle, damping, low - point, high - point)
+        further = point + step
+        gain = before - cost(problem, further, problem.fitted(further), weight)
         if gain > 0:
             square = max(float(triangle[:, 0] @ triangle[:, 0]) / count, 1e-6)
             hessian = triangle[:, 1:].T @ triangle[:, 1:] / square
-            axes, _ = axes_of(hessian, np.maximum(abs(further), 1))
-            place = iterate(problem, further, inward(further, axes, low, high))
+            point = further
+            axes, _ = axes_of(hessian, np.maximum(abs(point), 1))
+            table = problem.fitted(point, inward(point, axes, low, high))
             damping = max(damping * (0.1 if gain > 0.5 * expected else 0.5), 1e-9)
             growth = GROWTH
         else:
             damping *= growth
             growth *= GROWTH
         settled = expected < tolerance * before or damping > MOST_DAMPING
-        size = size_of(place.table)
+        size = size_of(table)
         shrunk = rounds < ROUNDS and bool(np.median(size / weight) < SETTLED)
         if shrunk and (settled or gain > 0):
             weight = size
@@ -171,22 +184,15 @@ def solve(
             settled = False
         elif settled:
             break
-    return Fit(problem, place.point, weight, settled)
+    return Fit(problem, point, weight, settled)
 
 
-def iterate(problem: Problem, point: Float64, changes: Float64) -> Iterate:
-    """Return the evaluation of a point and of ``changes`` (n, unknowns) of it."""
-    return Iterate(point, changes, problem.fitted(point, changes))
-
-
-def linearised(place: Iterate, size: Float64) -> Float64:
-    """Return residuals over their ``size`` and derivatives by the unknowns (rows, 1 + unknowns),
-    with the weights of the loss.
+def weighted(table: Float64, size: Float64) -> Float64:
+    """Return residuals and derivatives (rows, joints, 1 + unknowns) over the residuals' ``size``,
+    with the weights of the loss: (rows, 1 + unknowns).
     """
-    table = (place.table / size[:, None]).reshape(-1, place.table.shape[2])
-    table *= (1 + (table[:, :1] / OUTLIER) ** 2) ** -0.25
-    slopes = table[:, 1:] @ np.linalg.pinv(place.changes, rcond=1e-12).T
-    return np.column_stack([table[:, 0], slopes])
+    rows = (table / size[:, None]).reshape(-1, table.shape[2])
+    return np.asarray(rows * (1 + (rows[:, :1] / OUTLIER) ** 2) ** -0.25, float)
 
 
 def axes_of(hessian: Float64, scale: Float64) -> tuple[Float64, Float64]:
@@ -202,19 +208,29 @@ def axes_of(hessian: Float64, scale: Float64) -> tuple[Float64, Float64]:
     return axes * np.clip(largest, LEAST_CHANGE, MOST_CHANGE) / largest, spans
 
 
-def cost(problem: Problem, place: Iterate, size: Float64) -> float:
-    """Return half the loss of all residuals, the prior's distances included."""
-    residual = place.table[..., 0] / size
+def cost(
+    problem: Problem,
+    point: Float64,
+    table: Float64,
+    size: Float64,
+) -> float:
+    """Return half the loss of all residuals at a point, the prior's distances included."""
+    residual = table[..., 0] / size
     loss = 2 * OUTLIER**2 * (np.sqrt(1 + (residual / OUTLIER) ** 2) - 1).sum()
     mean, spread = problem.unknowns.prior
-    return 0.5 * float(loss + (((place.point - mean) / spread) ** 2).sum())
+    return 0.5 * float(loss + (((point - mean) / spread) ** 2).sum())
 
 
-def triangle_of(problem: Problem, place: Iterate, size: Float64) -> Any:
-    """Return the triangle of residuals and derivatives, the prior's rows included."""
+def triangle_of(
+    problem: Problem,
+    point: Float64,
+    table: Float64,
+    size: Float64,
+) -> Any:
+    """Return the triangle of residuals and derivatives at a point, the prior's rows included."""
     mean, spread = problem.unknowns.prior
-    prior = np.column_stack([(place.point - mean) / spread, np.diag(1 / spread)])
-    return np.linalg.qr(np.vstack([linearised(place, size), prior]), mode="r")
+    prior = np.column_stack([(point - mean) / spread, np.diag(1 / spread)])
+    return np.linalg.qr(np.vstack([weighted(table, size), prior]), mode="r")
 
 
 def bounded_step(
@@ -297,8 +313,7 @@ def _information(
     spans = np.ones(len(point))
     for _ in range(PASSES):
         changes = np.clip(np.vstack([point + axes, point - axes]), low, high) - point
-        place: Iterate = iterate(problem, point, changes)
-        table = linearised(place, size)
+        table = weighted(problem.fitted(point, changes), size)
         residual, matrix = table[:, 0], table[:, 1:] * prior
         data = matrix.T @ matrix / _mean_square(residual, len(point))
         hessian = data + PRIOR_WEIGHT * np.eye(len(point))
@@ -317,3 +332,117 @@ def inverse(matrix: Float64) -> Float64:
 
 def _mean_square(residual: Float64, unknowns: int) -> float:
     return float(residual @ residual) / max(len(residual) - unknowns, 1)
+
+
+def fit(starts: Sequence[Problem], evaluations: int, progress: Callable[[], object]) -> Fit:
+    """Fit from the best of ``starts``, with at most so many evaluations of each problem."""
+    solver = partial(solve, evaluations=evaluations, progress=progress)
+    problem, point = _best_start(starts, solver)
+    coarse = problem.coarse()
+    if coarse is not problem:
+        point = solver(coarse, point, tolerance=ROUGH_TOLERANCE).point
+    result = with_certainty(solver(problem, point))
+    # The effects that lower the held-out error, the most helpful first.
+    while result.colored > COLORED:
+        trial = _with_effect(result, solver)
+        if trial is result:
+            break
+        result = trial
+    return _without_sender(result, solver)
+
+
+def _best_start(starts: Sequence[Problem], solver: partial[Fit]) -> tuple[Problem, Float64]:
+    """Return the problem and the point of the start with the least error after a short fit."""
+    point = starts[0].unknowns.start
+    if len(starts) == 1:
+        return starts[0], point
+    least = np.inf
+    for start in starts:
+        coarse = start.coarse()
+        end = solver(
+            coarse,
+            start.unknowns.start,
+            evaluations=TRIAL,
+            tolerance=ROUGH_TOLERANCE,
+        ).point
+        error = float(np.linalg.norm(size_of(coarse.fitted(end))))
+        if error < least:
+            problem = start
+            point = end
+            least = error
+    return problem, point
+
+
+def _without_sender(result: Fit, solver: partial[Fit]) -> Fit:
+    """Return a fit without the delay and the lag of setpoints, or one of them, if the held-out
+    error is about the same.
+
+    Intervals stay as wide as with them: the motor's delay may be theirs in part.
+    """
+    error = _left(result)
+    for kinds in (SENDER, SENDER[1:], SENDER[:1]):
+        unknowns = result.problem.unknowns
+        is_kept = np.array([entry.kind not in kinds for entry in unknowns.entries])
+        if is_kept.all():
+            continue
+        problem = replace(result.problem, unknowns=unknowns.only(is_kept))
+        smaller = solver(problem, result.point[is_kept])
+        if _left(smaller._replace(size=result.size)) * KEPT <= error:
+            return smaller._replace(
+                deviation=result.deviation[is_kept],
+                root=result.root[is_kept],
+                shown=result.shown[is_kept],
+                alike=result.alike[np.ix_(is_kept, is_kept)],
+                dropped=kinds,
+                effects=result.effects,
+            )
+    return result
+
+
+def _with_effect(result: Fit, solver: partial[Fit]) -> Fit:
+    """Return a fit with the effect whose linear step leaves the least held-out error, or the fit
+    itself.
+    """
+    problem = result.problem
+    unknowns = problem.unknowns
+    present = [entry.kind for entry in unknowns.entries]
+    effects = [effect for effect in EFFECTS if effect not in present]
+    if not effects:
+        return result
+    # All effects at once, at the values where they are none.
+    zero = np.zeros(len(unknowns.joints))
+    kinds = [kind for effect in effects for kind in kinds_of(effect)]
+    wider = unknowns.adding(kinds, {"load_friction": zero, "static": zero})
+    wide = replace(problem.coarse(judged=True), unknowns=wider)
+    count = len(present)
+    point = np.append(result.point, wider.start[count:])
+    changes = inward(point, FIRST_CHANGE * np.eye(len(point)), *wider.bounds)
+    triangle = triangle_of(wide, point, wide.fitted(point, changes), result.size)
+    low, high = wider.bounds - point
+    names = np.array([entry.kind for entry in wider.entries])
+    steps = np.zeros((len(effects), len(point)))
+    for step, effect in zip(steps, effects, strict=True):
+        is_free = np.isin(names, [*present, *kinds_of(effect)])
+        columns = triangle[:, np.append(True, is_free)]
+        step[is_free], _ = bounded_step(columns, DAMPING, low[is_free], high[is_free])
+    before, *after = np.linalg.norm(wide.errors(point, steps) / result.size, axis=1).tolist()
+    best = int(np.argmin(after))
+    # A linear step is no fit: half of the decrease will do.
+    if after[best] > 0.5 * (1 + EFFECTS[effects[best]]) * before:
+        return result
+    is_used = np.isin(names, [*present, *kinds_of(effects[best])])
+    trial = replace(wide, unknowns=wider.only(is_used))
+    start = (point + steps[best])[is_used]
+    further = solver(trial, start, tolerance=ROUGH_TOLERANCE)
+    share = _left(further._replace(size=result.size)) / before
+    if share > EFFECTS[effects[best]]:
+        return result
+    trial = replace(trial, windows=problem.windows)
+    further = solver(trial, further.point)
+    added = {**result.effects, effects[best]: share}
+    return with_certainty(further._replace(effects=added))
+
+
+def _left(fit: Fit) -> float:
+    """Return the held-out error over the size of the residuals, with free initial states."""
+    return float(np.linalg.norm(fit.problem.errors(fit.point)[0] / fit.size))

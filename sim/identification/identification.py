@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from multiprocessing import get_context
 from typing import Any, get_args
@@ -19,27 +18,24 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks import choice, flag, instance, integer, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.identification.fit import solve
+from batchpid.sim.identification.fit import fit
 from batchpid.sim.identification.log import CommandKind, Log, checked
 from batchpid.sim.identification.logs import Reading, read_logs
-from batchpid.sim.identification.problem import Problem, windows_of
 from batchpid.sim.identification.regression import (
     Guess,
-    LogData,
-    Motion,
     better_reading,
     cost_of,
     regress,
     smooth,
 )
 from batchpid.sim.identification.result import Identification
-from batchpid.sim.identification.simulator import Exact, LogPlant
-from batchpid.sim.identification.trials import fit
+from batchpid.sim.identification.simulator import Exact, LogData, LogPlant, Motion, windows_of
 from batchpid.sim.identification.unknowns import (
     BASIC,
     EXTRAS,
     SENDER,
     UNKNOWN_KINDS,
+    Problem,
     Unknowns,
     kinds_of,
 )
@@ -157,7 +153,7 @@ def identify(
                 share,
             )
             starts.append(Problem(data, windows, unknowns, run))
-        solution = fit(starts, partial(solve, evaluations=evaluations, progress=progress))
+        solution = fit(starts, evaluations, progress)
     # Worker processes end with the fit.
     return Identification(solution._replace(problem=replace(solution.problem, run=map)), still)
 

@@ -334,7 +334,7 @@ def _silences(
 
 
 def _samples(path: Path, reading: Reading) -> dict[str, Float64]:
-    """Return stamps [s], since the first one, and values of the columns of a bag: (2, samples)."""
+    """Return the columns of a bag, each (2, samples): stamps [s] since the first one, and values."""
     topics = {reading.topic: ("qpos:", "measured_effort:")}
     if reading.command_topic:
         topics[reading.command_topic] = ("setpoint:", "effort:")

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,9 +26,8 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import wrap
 from batchpid.motors.friction import compensation
 from batchpid.sim.identification.log import Log, interpolated
-from batchpid.sim.identification.simulator import LogPlant
+from batchpid.sim.identification.simulator import LogData, Motion
 from batchpid.sim.robot.robot import Robot
-from batchpid.stages import Control
 from batchpid.task_space.tree_quantities import inverse_dynamics
 
 VALUES = "armature", "damping", "friction", "strength", "bias", "cost"
@@ -69,26 +68,6 @@ LEAST_SHARE = 0.05
 """Share of a joint's effort that moves the links, below which its strength is not identifiable: the
 motor's inertia and friction take the rest, which determines their ratios to the strength only.
 """
-
-
-class Motion(NamedTuple):
-    """Smoothed motion of a log on the grid of the sim steps, from its first row on; arrays (steps,
-    joints).
-    """
-
-    qpos: Float64
-    qvel: Float64
-    qacc: Float64
-    command: Float64
-
-
-class LogData(NamedTuple):
-    """A log, its smoothed motion, and the plant and control that made it."""
-
-    log: Log
-    motion: Motion
-    plant: LogPlant
-    drive: Control
 
 
 Guess = dict[str, Float64]
@@ -132,8 +111,8 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
 
 
 def regress(data: Sequence[LogData]) -> Guess:
-    """Return the motors of logs at the delays of the least cost; setpoints that were logged late are
-    the last explanation.
+    """Return the motors of logs at the delays of the least cost. Setpoints count as logged late, at
+    a negative delay, only if no other delay explains the logs as well.
     """
     every = 1 + sum(len(part.motion.qpos) for part in data) // MOST_REGRESSION_ROWS
     cutoff = min(_cutoff(part.log) for part in data)

@@ -19,9 +19,14 @@ from batchpid.checks import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.sim.identification.fit import INTERVAL, Fit
-from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.simulator import changed_params
-from batchpid.sim.identification.unknowns import UNKNOWN_KINDS, Unknown, Unknowns, least_value
+from batchpid.sim.identification.unknowns import (
+    UNKNOWN_KINDS,
+    Problem,
+    Unknown,
+    Unknowns,
+    least_value,
+)
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import load_robot_actuators
 from batchpid.sim.robot.urdf_export import to_urdf
@@ -40,7 +45,7 @@ EXPLAINS = 0.5
 
 
 class Estimate(NamedTuple):
-    """Value of an unknown, with the description's."""
+    """Value of an unknown; friction and damping include the description's."""
 
     value: float
     low: float
@@ -52,7 +57,7 @@ class Estimate(NamedTuple):
     """Unknowns that it cannot be told from if it is not shown, or that it is at its bound."""
 
     def cell(self, is_positive: bool) -> str:
-        """Return it with its interval, or its bound where the interval is wider than itself."""
+        """Return the value with its interval, or its upper end where the interval is wider."""
         half = self.high - self.value
         if not self.is_shown:
             text = "not shown by these logs"

@@ -1,6 +1,7 @@
 """Simulation of many candidates along stretches of logs: a Runner's stages in closed loop with the
 rigid tree of the logged joints (:mod:`batchpid.sim.loop.loop_run`).
 
+A log of efforts is simulated in windows, a log of setpoints as a whole.
 Unlogged joints rest at the robot's start pose, followers move with their leaders.
 """
 
@@ -20,6 +21,7 @@ from batchpid.motors.coupling import Coupling, Follower
 from batchpid.motors.friction import Friction
 from batchpid.motors.guard import Guard
 from batchpid.sim.engine.scene_spec import added_friction
+from batchpid.sim.identification.log import Log
 from batchpid.sim.loop.closed_loop import ClosedLoop
 from batchpid.sim.loop.loop_run import LoopRun
 from batchpid.sim.loop.tree_plant import TreePlant
@@ -33,8 +35,20 @@ DIVERGED = 1e4
 """Position beyond which a simulation has diverged [rad or m]."""
 TABLE_ROWS = 2**16
 """Robots times sim steps of a table of commands, which stays in the cache."""
-
-
+WINDOW = 0.3
+"""Length of a window of a log of efforts [s]."""
+PAST = 0.1
+"""Time before a window whose commands may still act in it [s]."""
+SETTLE = 0.3
+"""Time after the start of a log under the PID law in which the initial state is forgotten [s]: it
+is not fitted.
+"""
+HELD_OUT = 0.25
+"""Share of each log, at its end, that is held out."""
+MOST_WINDOWS = 500
+"""Largest number of windows; if there are more, evenly spaced ones are used."""
+MOST_ROWS = 40_000
+"""Largest number of rows of all logs; if there are more, evenly spaced ones are used."""
 OF_JOINTS = ("powered", "modelled", "band", "turns")
 """Constants (joints,) of a control."""
 
@@ -223,6 +237,26 @@ class LogPlant:
         return tree.varied(added) if added else tree.bodies
 
 
+class Motion(NamedTuple):
+    """Smoothed motion of a log on the grid of the sim steps, from its first row on; arrays (steps,
+    joints).
+    """
+
+    qpos: Float64
+    qvel: Float64
+    qacc: Float64
+    command: Float64
+
+
+class LogData(NamedTuple):
+    """A log, its smoothed motion, and the plant and control that made it."""
+
+    log: Log
+    motion: Motion
+    plant: LogPlant
+    drive: Control
+
+
 def changed_params(params: bp.PIDParams, law: Mapping[str, Float64]) -> bp.PIDParams:
     """Return the params of n candidates."""
     gain = law.get("gain", 1.0)
@@ -301,3 +335,75 @@ def simulate(
     positions[~(np.abs(positions) < DIVERGED)] = np.inf
     parts = np.split(positions, np.cumsum(sizes)[:-1])
     return [np.ascontiguousarray(part.swapaxes(0, 1)) for part in parts]
+
+
+def windows_of(data: Sequence[LogData]) -> list[Stretch]:
+    """Return the windows of logs, one for each log of setpoints. A window begins where the held-out
+    part begins.
+    """
+    windows = list[Stretch]()
+    every = 1 + sum(len(part.log.time) for part in data) // MOST_ROWS
+    for number, part in enumerate(data):
+        dt = part.drive.timestep
+        total = len(part.motion.qpos) - 1
+        share = {None: 1 - HELD_OUT, False: 1.0, True: 0.0}[part.log.held_out]
+        split = round(share * total)
+        length = total
+        starts = [0]
+        if part.drive.mode == "effort":
+            # Windows of the fitted part, then of the held-out part; the filter begins at the edge.
+            edge = round(0.05 / dt)
+            first = max(split + 1, edge)
+            length = min(round(WINDOW / dt), max(total - first, split - edge))
+            starts = [*range(edge, split - length + 1, length)]
+            starts += range(first, total - length + 1, length)
+        for start in starts:
+            windows.append(
+                _window(
+                    number,
+                    part,
+                    start,
+                    start + length,
+                    split,
+                    every,
+                )
+            )
+    return windows[:: 1 + len(windows) // MOST_WINDOWS]
+
+
+def _window(
+    number: int,
+    data: LogData,
+    first: int,
+    last: int,
+    split: int,
+    every: int,
+) -> Stretch:
+    """Return the window between two sim steps of a log's grid, of one row of ``every``; rows are
+    held out from the step ``split`` on.
+    """
+    log, motion, _, drive = data
+    dt = drive.timestep
+    settle = 0.0
+    if drive.mode == "pid":
+        settle = min(SETTLE, 0.2 * log.seconds) / dt
+    place = (log.time - log.time[0]) / dt
+    rows = np.flatnonzero((place > first + settle + 1e-6) & (place <= last + 1e-6))[::every]
+    place = place[rows]
+    # Rows lie before the ends of their sim steps.
+    step = np.maximum(np.ceil(place - 1e-6).astype(int), first + 1)
+    before = np.maximum(step - place, 0.0) * dt
+    past = round(PAST / dt)
+    command = motion.command[np.maximum(np.arange(first - past, last), 0)]
+    return Stretch(
+        motion.qpos[first],
+        motion.qvel[first],
+        command,
+        past,
+        step - first - 1,
+        before,
+        number,
+        log.qpos[rows],
+        log.time[rows],
+        place <= split + 1e-6,
+    )

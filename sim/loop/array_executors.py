@@ -77,8 +77,8 @@ class Executor:
         return None if place is None else self._states[place]
 
     def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
-        """Change the state of the stage ``name``, between sim steps, to ``function(stage, state)``,
-        which has the same arrays or others in their place.
+        """Replace the state of the stage ``name``, between sim steps, by ``function(stage, state)``,
+        a state with arrays of the same shapes.
         """
         states = list(self._states)
         place = self._places[name]
@@ -90,7 +90,7 @@ class Executor:
         return self._states
 
     def write_state(self, states: States) -> None:
-        """Replace the states; they have the arrays of the states before."""
+        """Replace the states by others with arrays of the same shapes."""
         self._states = states
         self._first = -NOISE_STEPS  # they may have other keys of noise
 

@@ -104,7 +104,7 @@ class Snapshot:
 
     about: Document
     """Options that a runner must share to restore it:
-    :meth:`batchpid.sim.RunnerOptions.describe`.
+    :attr:`batchpid.sim.RunnerOptions.described`.
     """
     steps: int
     """Sim steps up to this moment."""

@@ -113,8 +113,8 @@ class EnvGroup:
         return params, actuators
 
     def _make_control(self, goes_on: bool = True) -> None:
-        """Make the control of the present robots, params and actuators, with its executor. It goes
-        on from the states so far, or starts.
+        """Make the control of the present robots, params and actuators, with its executor. If it
+        ``goes_on``, the states of the stages carry over; otherwise the stages start.
         """
         setup = GroupControl.of(self._options, self.pack, *self._acting(), self._controller)
         stages, control = setup.stages, setup.control
@@ -152,8 +152,8 @@ class EnvGroup:
         self._executor.change("plan", lambda stage, state: stage.add(state, chunk, latency))
 
     def _write_joints(self, rows: list[int] | None = None) -> None:
-        """Put friction and armature behind the gear, which belong to the engine's joints, into
-        effect, for the robots ``rows`` or all.
+        """Write the motors' armature, and their friction behind the gear, to the engine's joints, of
+        the robots ``rows`` or all.
         """
         _, actuators = self._acting()
         self.pack.write_joints(actuators, rows)
@@ -321,7 +321,7 @@ class EnvGroup:
 
     def _parts(self) -> Document:
         """Return the arrays outside engine and control that a snapshot holds: results of the last
-        tick, episodes of the motors' noise, those of faults and pushes, and the digests of the
+        tick, episodes of the motors' noise, the state of faults and pushes, and the digests of the
         user's content.
         """
         return self._shown | {

@@ -1,8 +1,8 @@
 """Control of a group of envs: its stages, from options, params and robots; and the functions of the
 robots' model that they call.
 
-Mass matrices and passive force are natively compiled where the engine's steps
-are, for every executor alike, since NumPy's results differ in the last bits.
+Mass matrices and passive force are native where the engine's steps are, under every executor, since
+NumPy's results differ in the last bits.
 """
 
 from __future__ import annotations
@@ -165,8 +165,8 @@ def empty_control(
     params: bp.PIDParams,
     actuators: bp.Actuators | None,
 ) -> tuple[tuple[Any, ...], States, Values]:
-    """Return the stages of all envs of a runner, without its robots; their states; and values that
-    a stage may read, 0.
+    """Return the stages of all envs of a runner, their states, and the values that a stage may read,
+    all 0. No robots are made.
 
     ``params`` and ``actuators`` include the draws of the randomization.
     """

@@ -158,7 +158,7 @@ class Loop:
         the first failure does not depend on grouping.
 
         ``given`` says which arrays of the commands are given
-        (:attr:`batchpid.sim.loop.arrays.Command.given`); the others are set to 0.
+        (:attr:`batchpid.stages.values.Command.given`); the others are set to 0.
         """
         began = time.perf_counter()
         if given != self._given:

@@ -428,7 +428,7 @@ def make_executor(
     shown: Mapping[str, Rows],
     faults: FaultArrays,
 ) -> NumPyExecutor | NativeExecutor:
-    """Return the executor of a control, from ``states`` on."""
+    """Return the executor of a control, which begins with ``states``."""
     # Native wherever the engine has native steps, under backend "numpy" too: the bits are the same.
     if setup.options.backend == "jax":
         return JAXExecutor(setup, states)

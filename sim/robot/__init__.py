@@ -1,1 +1,1 @@
-"""Robots: :class:`batchpid.sim.Robot`, what it is asked for, and its export to other programs."""
+"""Robots: :class:`batchpid.sim.Robot`, its model, the options of its runs, and its exports."""

@@ -212,8 +212,8 @@ def scene_of(
     physics: object,
     **options: Any,
 ) -> SceneSpec:
-    """Return the description of scenes of ``robot`` for an engine; ``options`` are further
-    fields.
+    """Return the description of scenes of ``robot`` for an engine; ``options`` are further fields of
+    it.
     """
     return SceneSpec(
         robot.tables,
@@ -228,8 +228,8 @@ def scene_of(
 
 
 def engine_findings(robot: Robot, name: str | None, timestep: float) -> Iterator[Finding]:
-    """Yield what of ``robot`` an engine, if any, cannot run, or runs otherwise than the file
-    says.
+    """Yield findings of the content of ``robot`` that the engine ``name`` cannot run, or runs
+    otherwise than the file says; none without a name.
     """
     if name is None:
         return

@@ -136,9 +136,8 @@ class Replay:
 class WorkerPool(SingleOwner):
     """Workers of a runner: processes, or with ``options.workers`` 0 the loop in this process.
 
-    The workers start with :meth:`open`. With ``options.cluster`` the
-    workers are nodes. Each node has a pool for its ``envs`` (default: all) and with requests of
-    ``ticks`` at most.
+    The workers start with :meth:`open`. With ``options.cluster`` they are nodes, each of which has
+    a pool for some ``envs`` (default: all), whose requests have ``ticks`` at most.
     """
 
     def __init__(

@@ -111,10 +111,10 @@ def wrench_tables(
     origins = np.einsum("lij,li->lj", turns, data.site_xpos[sites] - places)
     carried = [
         [
-            _inertia(own, bodies, turn, place)
+            _inertia(variant, bodies, turn, place)
             for bodies, turn, place in zip(inside, turns, places, strict=True)
         ]
-        for own in models
+        for variant in models
     ]
     return {
         "carriers": carriers,
