@@ -69,23 +69,14 @@ def test_a_log_is_simulated_as_by_the_runner(tmp_path, monkeypatch, kind, compen
     np.testing.assert_allclose(table - offset, rollout.qpos[:, 0], atol=1e-4)
 
 
-def test_delays_of_setpoints_are_those_of_late_rows(tmp_path):
+def test_late_setpoints_and_masses_are_those_of_late_rows_and_another_description(tmp_path):
     robot, setpoints, drive = load(tmp_path), motion(0.5), control(gains())
     late = np.vstack([setpoints[:1]] * 4 + [setpoints[:-4]])
-    expected = simulated(robot, late, drive, candidates(**TRUTH), setpoints[0])
-    delayed = candidates(delay=4 * STEPS * DT, **TRUTH)
-    table = simulated(robot, setpoints, drive, delayed, setpoints[0])
-    np.testing.assert_allclose(table, expected, atol=1e-9)
-
-
-def test_masses_are_those_of_another_description(tmp_path):
-    robot, setpoints, drive = load(tmp_path), motion(0.5), control(gains())
-    changed = candidates(mass={"fore": np.array([1.5])}, **TRUTH)
+    heavy = load(tmp_path, heavier(1.5))
+    expected = simulated(heavy, late, drive, candidates(**TRUTH), setpoints[0])
+    changed = candidates(delay=4 * STEPS * DT, mass={"fore": np.array([1.5])}, **TRUTH)
     table = simulated(robot, setpoints, drive, changed, setpoints[0])
-    other = simulated(
-        load(tmp_path, heavier(1.5)), setpoints, drive, candidates(**TRUTH), setpoints[0]
-    )
-    np.testing.assert_allclose(table, other, atol=1e-9)
+    np.testing.assert_allclose(table, expected, atol=1e-9)
 
 
 def test_followers_move_with_their_leader(tmp_path):
