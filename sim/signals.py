@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from operator import itemgetter
-from typing import Annotated, Any, NamedTuple, get_type_hints
+from typing import Annotated, NamedTuple, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -228,15 +228,6 @@ class Observation(NamedTuple):
         """Return an observation with ``function`` applied to each array that there is."""
         return Observation._make([None if rows is None else function(rows) for rows in self])
 
-    def copied(self, derived: Mapping[str, Callable[[Observation], Rows]]) -> Observation:
-        """Return a copy with arrays of its own, and with ``derived`` quantities, by name."""
-        rows = list[Any]()
-        for values in self:
-            rows.append(None if values is None else values.copy())
-        for name, derive in derived.items():
-            rows[_INDICES[name]] = derive(self)
-        return Observation(*rows)
-
     @staticmethod
     def join(parts: Sequence[Observation]) -> Observation:
         """Return the observations as one, along the first axis."""
@@ -250,7 +241,6 @@ class Observation(NamedTuple):
         return f"Observation({envs} envs, {dof} joints, {failed_envs(self.ok)})"
 
 
-_INDICES = {name: index for index, name in enumerate(Observation._fields)}
 _HINTS = get_type_hints(Observation, include_extras=True)
 QUANTITIES: dict[str, Quantity] = {name: hint.__metadata__[0] for name, hint in _HINTS.items()}
 """Quantity of each field of :class:`Observation`."""

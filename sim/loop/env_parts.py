@@ -117,9 +117,9 @@ class Pushes:
     def _draw(self, name: str, rows: NDArray[np.intp], episodes: Int64) -> Float64:
         randomization = self._options.randomization
         assert randomization is not None
-        return randomization.next_push(
-            name, self._options.robot, episodes[rows], self.counts["number"][rows]
-        )
+        number = self.counts["number"][rows]
+        drawn = randomization.draw_field(name, self._options.robot, episodes[rows], number)
+        return np.nan_to_num(drawn)
 
 
 class OwnController:

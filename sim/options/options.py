@@ -7,7 +7,6 @@ depend on options of another group, or on the number of envs.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Annotated, Any, get_type_hints
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Kind, PerMassMatrix, Rows
+from batchpid.arrays.array_types import Document, Kind, PerMassMatrix
 from batchpid.arrays.field_tables import Field, declared, plain
 from batchpid.arrays.records import frozen
 from batchpid.arrays.trees import digest
@@ -51,7 +50,6 @@ from batchpid.sim.robot.robot_options import (
 )
 from batchpid.sim.signals import (
     CommandSpec,
-    Observation,
     Quantity,
     joint_command,
     observed,
@@ -213,15 +211,6 @@ class RunnerOptions(RunnerKeywords):
         if is_coupled:
             return self.robot.coupling
         return None
-
-    @cached_property
-    def derived(self) -> dict[str, Callable[[Observation], Rows]]:
-        """Functions from what the loop observed to further quantities, by name."""
-        # The loop observes joints; the pose of the tool follows from them.
-        if not isinstance(self.control, OperationalSpace):
-            return {}
-        tool_pose = self.control.tool_pose
-        return {"tool_pose": lambda seen: tool_pose(seen.qpos)}
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""

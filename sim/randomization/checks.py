@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -65,17 +65,15 @@ def _outermost(
     field: Field,
     columns: Sequence[str],
     nominal: Rows,
-) -> tuple[Rows, Rows]:
-    """Return ``nominal`` (rows, elements, ...) with the least, and with the largest draws of a
+) -> Iterator[Rows]:
+    """Yield ``nominal`` (rows, elements, ...) with the least, and with the largest draws of a
     field: all operations are monotonic.
     """
-    least = np.array(nominal)
-    largest = np.array(nominal)
-    for _, chosen, distribution in parts(name, field, columns):
-        low, high = distribution.support
-        least[:, chosen] = distribution.apply(least[:, chosen], low)
-        largest[:, chosen] = distribution.apply(largest[:, chosen], high)
-    return least, largest
+    for end in (0, 1):
+        rows = np.array(nominal)
+        for _, chosen, distribution in parts(name, field, columns):
+            rows[:, chosen] = distribution.apply(rows[:, chosen], distribution.support[end])
+        yield rows
 
 
 def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robot) -> None:

@@ -156,10 +156,10 @@ class Randomization:
         draws = {}
         for name in self.distributions:
             if name not in EVENTS:
-                draws[name] = self._draw(name, robot, episodes)
+                draws[name] = self.draw_field(name, robot, episodes)
         return Draws(episodes, draws)
 
-    def _draw(
+    def draw_field(
         self,
         name: str,
         robot: Robot,
@@ -168,6 +168,9 @@ class Randomization:
     ) -> Float64:
         """Return draws of a field (envs, elements), NaN where nothing is drawn; see
         :func:`generators`.
+
+        For an event ``number`` (envs,) is that of the push before it in the episode, 0 for the
+        reset.
         """
         columns = elements(name, robot)
         rows = np.full((len(episodes), len(columns)), np.nan)
@@ -182,27 +185,6 @@ class Randomization:
                 row[chosen] = distribution.sample(generator, size)
         return rows
 
-    def next_push(
-        self,
-        name: str,
-        robot: Robot,
-        episodes: Episodes,
-        number: Episodes,
-    ) -> Float64:
-        """Return one field of the push after push ``number`` (n,) of these episodes (n, 2); number
-        0 is the reset.
-
-        Its ``name`` is "push_interval", the time between the two (n, 1) [s], or "push", the added
-        twist (n, 6).
-        """
-        return np.nan_to_num(self._draw(name, robot, episodes, number))
-
-    def first(self, robot: Robot, num_envs: int, first_env: int = 0) -> Draws:
-        """Return the draws for the first episode of each env, of the stream of its number, from
-        ``first_env`` on.
-        """
-        return self.draw(robot, _first_episodes(first_env + np.arange(num_envs)))
-
     def redraw(
         self,
         robot: Robot,
@@ -214,7 +196,7 @@ class Randomization:
         """Return ``draws`` with new ones for the envs of ``mask`` (envs,), which begin an episode.
 
         It is the next of each env's stream, or the first of the stream ``seed`` + k for env number
-        k, from ``first_env`` on, or of ``seed`` (envs,).
+        k, from ``first_env`` on, or of ``seed`` (envs,). The first draws, of all envs, have a seed.
 
         Raises
         ------
@@ -230,7 +212,9 @@ class Randomization:
             if streams.shape != mask.shape or streams.min() < 0:
                 problem = f"must be a whole number >= 0, or {len(mask)} of them, one for each env"
                 raise InvalidArgumentError("seed", problem, value=seed, remedy="pass an int")
-            episodes = _first_episodes(streams)
+            episodes = np.stack([streams, np.zeros_like(streams)], 1)
+        if mask.all():
+            return self.draw(robot, episodes)
         return draws.replaced(mask, self.draw(robot, episodes[mask]))
 
     def apply(
@@ -318,11 +302,6 @@ class Randomization:
                 group = mapping(name, value).items()
                 values[name] = {key: read_field(f"{name}.{key}", part) for key, part in group}
         return cls(**values)
-
-
-def _first_episodes(streams: Rows) -> Episodes:
-    """Return the first episodes (envs, 2) of ``streams`` (envs,)."""
-    return np.stack([streams, np.zeros_like(streams)], 1)
 
 
 def _copied(value: Any, plain: bool = False) -> Any:

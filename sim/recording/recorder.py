@@ -148,8 +148,16 @@ class Recorder(SingleOwner):
                 self.prepare()
         finally:
             if self._info is not None and self._error is None:
-                complete = complete and not self._runner._sent
-                self._finish(replace(self._info, complete=complete))
+                self._write()
+                if self._file:  # not closed yet
+                    info = replace(
+                        self._info,
+                        complete=complete and not self._runner._sent,
+                        faults=self._runner.faults,
+                        rates=self._rates,
+                    )
+                    self._file.attrs.update(files.attributes(info))
+                    self._close_file()
             self._runner.recorder = None
             self._is_closed = True
 
@@ -158,14 +166,6 @@ class Recorder(SingleOwner):
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close(complete=kind is None)
-
-    def _finish(self, info: RunInfo) -> None:
-        """Write the remaining rows and the events of the run, and close the file."""
-        self._write()
-        if self._file:  # not closed yet
-            info = replace(info, faults=self._runner.faults, rates=self._rates)
-            self._file.attrs.update(files.attributes(info))
-            self._close_file()
 
     def _close_file(self) -> None:
         if self._file:

@@ -25,11 +25,11 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document
-from batchpid.checks import file_path, instance, integer
+from batchpid.checks import file_path, instance
 from batchpid.errors import BatchPIDError, InvalidArgumentError, RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.loop.faults import Fault
-from batchpid.sim.rollout import OPTIONAL, Rollout, RunInfo, merged_changes
+from batchpid.sim.rollout import OPTIONAL, Rollout, RunInfo
 from batchpid.sim.signals import CommandSpec, Observation
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def write_recording(
     return path
 
 
-def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
+def read_recording(path: str | os.PathLike[str]) -> Rollout:
     """Read a recording: complete, cut short by a kill, or one that is still being written.
 
     ``info.complete`` of the result says whether the run came to its end. Nothing in the file is
@@ -98,8 +98,6 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
     ----------
     path
         An HDF5 file of any name.
-    every
-        Keep every n-th tick.
 
     Raises
     ------
@@ -109,7 +107,6 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
     import h5py
 
     path = file_path("path", path)
-    every = integer("every", every, 1, 10**9)
     try:
         if not path.is_file():
             raise FileNotFoundError("there is no such file")
@@ -123,15 +120,10 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
             time = file["time"][:]
             # The rows of a run that still goes on, or was killed, end at the first without a time.
             count = int(np.append(np.isfinite(time), False).argmin())
-            rows = slice(0, count, every)
-            arrays = {"time": time[rows]}
+            arrays = {"time": time[:count]}
             for name, quantity in info.recorded.items():
-                if name == "changes":
-                    ticks = np.arange(count)[::every]
-                    array = merged_changes(file[name][:count], ticks)
-                else:
-                    array = file[name][rows]
-                shape = (len(arrays["time"]), *info.row_shape(name, num_envs))
+                array = file[name][:count]
+                shape = (count, *info.row_shape(name, num_envs))
                 if array.shape != shape:
                     raise ValueError(f"its {name} has shape {array.shape}, not {shape}")
                 arrays[name] = array.astype(quantity.dtype, casting="same_kind", copy=False)
@@ -146,7 +138,7 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
     return Rollout(
         **inputs,
         observation=Observation(**arrays),
-        tick=tick * every,
+        tick=tick,
         info=info,
     )
 

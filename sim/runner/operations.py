@@ -74,17 +74,13 @@ class RunnerState(NamedTuple):
 
     @classmethod
     def first(cls, options: RunnerOptions) -> RunnerState:
-        """Return the state before the first reset, which places all envs."""
-        robot = options.robot
+        """Return the state before the first reset, which draws for all envs and places them."""
         count = options.num_envs
-        draws = NOTHING
-        if options.randomization is not None:
-            draws = options.randomization.first(robot, count, options.first_env)
         motion = None
         if options.sets_positions:
-            motion = (np.tile(robot.start, (count, 1)), None)
+            motion = (np.tile(options.robot.start, (count, 1)), None)
         steps = np.full(count, NO_STEP)
-        return cls(options.params, options.actuators, draws, (), steps, motion)
+        return cls(options.params, options.actuators, NOTHING, (), steps, motion)
 
 
 # -- requests

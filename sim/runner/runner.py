@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from operator import itemgetter
+from operator import itemgetter, methodcaller
 from time import strftime
 from typing import TYPE_CHECKING, Any, Literal, Never
 
@@ -77,11 +77,15 @@ if TYPE_CHECKING:
 
 CHECKPOINT_STEPS = 8000
 """Least number of sim steps between checkpoints, from the last of which a lost worker is replayed."""
+COPY = methodcaller("copy")
+"""Copy of an array; a tick makes several."""
 
 
 class Runner(SingleOwner):
     """N robots in N headless scenes of a physics engine, under explicit PID, drive or effort
     control.
+
+    docs/runner.md has the ranges of the options, :class:`batchpid.sim.RunnerOptions` their texts.
 
     Parameters
     ----------
@@ -108,8 +112,6 @@ class Runner(SingleOwner):
     on_fault, on_invalid_input, speed_limit
         Failed envs "hold" or "reset"; inputs that are not finite "raise", or are contained by
         failures ("contain"); joint speed at which an env fails.
-
-    docs/runner.md has their ranges, :class:`batchpid.sim.RunnerOptions` their texts.
 
     Raises
     ------
@@ -194,7 +196,6 @@ class Runner(SingleOwner):
         self.recorder: Recorder | None = None
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call = OneCall()
-        self._derived = checked.derived
         self._state = RunnerState.first(checked)
         self._sent: Request | None = None  # by send(), until recv()
         self._is_running = False  # whether the workers run it
@@ -214,25 +215,14 @@ class Runner(SingleOwner):
 
     def _open(self) -> None:
         """Start the workers, and reset all envs."""
-        options = self.options
-        seed = None if options.randomization is None else 0
-        base = {"base_pose": None, "base_twist": None}
-        start = reset_request(
-            options,
-            self._state,
-            (None, None),
-            None,
-            seed,
-            base,
-        )
         self._call.begin()
         try:
             self._call.waits = True
-            self._pool = WorkerPool(options)
+            self._pool = WorkerPool(self.options)
             self._pool.open()
         finally:
             self._call.end()
-        self._execute(start)
+        self.reset(seed=None if self.options.randomization is None else 0)
         self._check_stability()
         if isinstance(self.control, OperationalSpace):
             self.control.check_stability()
@@ -353,7 +343,7 @@ class Runner(SingleOwner):
             self._ready()
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         self._execute(self._tick(command, latency, substeps))
-        return self._observed()
+        return self.observe()
 
     def send(
         self,
@@ -410,7 +400,7 @@ class Runner(SingleOwner):
         if self._is_running:
             self._execute(self._sent)
         self._sent = None
-        return self._observed()
+        return self.observe()
 
     def rollout(
         self,
@@ -471,7 +461,7 @@ class Runner(SingleOwner):
                 for name in options.observed:
                     getattr(seen, name)[part] = getattr(observed, name)
         next(shown, None)  # the end
-        seen = seen._replace(**{name: derive(seen) for name, derive in self._derived.items()})
+        seen = self._with_tool(seen)
         rated = command.setpoint_rate is not None
         info = replace(info, rates=rated, faults=self._state.faults)
         times = steps * options.timestep
@@ -487,8 +477,16 @@ class Runner(SingleOwner):
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
+        # Taken before the check, since a signal handler may close the runner at any time.
+        present: Any = getattr(self._pool, "present", None)
         self._ready()
-        return self._observed()
+        return self._with_tool(present.observation.map(COPY))
+
+    def _with_tool(self, seen: Observation) -> Observation:
+        """Return what the loop observed with the pose of the tool, which follows from the joints."""
+        if isinstance(self.control, OperationalSpace):
+            return seen._replace(tool_pose=self.control.tool_pose(seen.qpos))
+        return seen
 
     def poses(self) -> NDArray[np.float32]:
         """Return the poses of the entities that ``build`` returned (envs, entities, 7): x, y, z
@@ -500,7 +498,7 @@ class Runner(SingleOwner):
             ``build`` returned more entities for one env than for another, or in SAPIEN is not given.
         """
         self._ready()
-        rows = self._read(Request("poses", changes_loop=False))
+        rows = self._execute(Request("poses", changes_loop=False)).result
         if len({len(poses) for poses in rows}) != 1:
             problem = "was not given, or returned more entities for one env than for another"
             remedy = "let build(scene, env) return as many entities for every env"
@@ -524,7 +522,7 @@ class Runner(SingleOwner):
             remedy = "use robot.kinematic_tree() for links"
             raise InvalidArgumentError("names", problem, remedy=remedy)
         chosen = tuple([choice("names", name, self.options.mjcf.bodies) for name in names])
-        return np.stack(self._read(Request("poses", (chosen,), changes_loop=False)))
+        return np.stack(self._execute(Request("poses", (chosen,), changes_loop=False)).result)
 
     @property
     def params(self) -> bp.PIDParams:
@@ -617,7 +615,7 @@ class Runner(SingleOwner):
     @cached_property
     def _present(self) -> Snapshot:
         """Snapshot of a moment, whose names and shapes those to restore are compared with."""
-        return snapshot_of(self.options, self._state, self._read(READ))
+        return snapshot_of(self.options, self._state, self._execute(READ).result)
 
     @cached_property
     def _versions(self) -> dict[str, str]:
@@ -807,10 +805,6 @@ class Runner(SingleOwner):
         if np.isfinite(latency).any():
             self._execute(Request("add_chunk", (chunk, latency)))
 
-    def _read(self, request: Request) -> Any:
-        """Return the result of a request that reads from the loops of all envs."""
-        return self._execute(request).result
-
     def _execute(self, request: Request) -> Outcome:
         """Execute a request, or complete the one that was sent; then issue warnings.
 
@@ -878,7 +872,7 @@ class Runner(SingleOwner):
         is_wanted = not self._keeps_bits and self.options.build is None
         if is_wanted and not self._pool.replay.waits:
             state = self._state
-            snapshot = snapshot_of(self.options, state, self._read(READ))
+            snapshot = snapshot_of(self.options, state, self._execute(READ).result)
             restore = restore_request(snapshot.copy(), state.draws)
             self._pool.replay.start_at_resets(restore, self.num_envs)
             self._state = state._replace(steps_since_checkpoint=0)
@@ -896,17 +890,9 @@ class Runner(SingleOwner):
             recorder.append(
                 time,
                 run.command.map(itemgetter(number)),
-                arrays.observation.copied(self._derived),
+                self._with_tool(arrays.observation.map(COPY)),
                 None if number else before.changes,
             )
-
-    def _observed(self) -> Observation:
-        """Return the present observation, as fresh arrays."""
-        try:
-            return self._pool.present.observation.copied(self._derived)
-        except AttributeError:  # a signal handler closed the runner after the tick
-            self._check_open()
-            raise
 
     def _fail(self, error: BaseException) -> None:
         """End the runner, which cannot complete a command."""
@@ -920,7 +906,7 @@ class Runner(SingleOwner):
         begins.
         """
         state = self._state
-        snapshot = snapshot_of(self.options, state, self._read(SNAPSHOT))
+        snapshot = snapshot_of(self.options, state, self._execute(SNAPSHOT).result)
         self._pool.replay.start_from(restore_request(snapshot.copy(), state.draws))
         return snapshot
 

@@ -13,7 +13,7 @@ from batchpid import make_actuators
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Choice, LogUniform, Normal, Randomization, Robot, Uniform
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
-from batchpid.sim.randomization.distributions import elements
+from batchpid.sim.randomization.distributions import NOTHING, elements
 
 PANDA = load_bundled("panda")
 FIELDS = {
@@ -108,7 +108,7 @@ def test_what_is_drawn_once_for_each_env_does_not_depend_on_the_episode():
 
 def test_draws_are_applied_by_their_operation():
     randomization = Randomization(**FIELDS)
-    draws = randomization.first(PANDA, 3)
+    draws = randomization.redraw(PANDA, NOTHING, np.ones(3, bool), 0)
     params = PANDA.params()
     varied = randomization.randomized("params", params, draws, PANDA)
     np.testing.assert_array_equal(varied.kp, params.kp * draws.values["params.kp"])
@@ -153,7 +153,8 @@ def test_static_friction_may_be_drawn_below_coulombs():
     check_robot(drawn_static, PANDA)
     worn = make_actuators(PANDA.dof, coulomb=1.0)
     prepared = prepared_actuators(drawn_static, worn, PANDA)
-    rows = drawn_static.randomized("actuators", prepared, drawn_static.first(PANDA, 50), PANDA)
+    draws = drawn_static.redraw(PANDA, NOTHING, np.ones(50, bool), 0)
+    rows = drawn_static.randomized("actuators", prepared, draws, PANDA)
     assert rows.static.min() < 1.0 < rows.static.max()
     assert rows.coulomb.tolist() == worn.coulomb.tolist()
 
