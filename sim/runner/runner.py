@@ -85,6 +85,8 @@ class Runner(SingleOwner):
     """N robots in N headless scenes of a physics engine, under explicit PID, drive or effort
     control.
 
+    docs/runner.md has the ranges of the options, :class:`batchpid.sim.RunnerOptions` their texts.
+
     Parameters
     ----------
     robot, num_envs
@@ -110,8 +112,6 @@ class Runner(SingleOwner):
     on_fault, on_invalid_input, speed_limit
         Failed envs "hold" or "reset"; inputs that are not finite "raise", or are contained by
         failures ("contain"); joint speed at which an env fails.
-
-    docs/runner.md has their ranges, :class:`batchpid.sim.RunnerOptions` their texts.
 
     Raises
     ------
