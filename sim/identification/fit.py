@@ -324,7 +324,7 @@ def _information(
 
 
 def fit(starts: Sequence[Problem], evaluations: int, progress: Callable[[], object]) -> Fit:
-    """Fit from the best of ``starts``, with at most so many evaluations of each problem."""
+    """Fit from the best of ``starts``, with at most ``evaluations`` of each problem."""
     solver = partial(solve, evaluations=evaluations, progress=progress)
     problem, point = _best_start(starts, solver)
     coarse = problem.coarse()
