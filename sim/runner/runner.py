@@ -343,7 +343,7 @@ class Runner(SingleOwner):
             self._ready()
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         self._execute(self._tick(command, latency, substeps))
-        return self.observe()
+        return self._observed()
 
     def send(
         self,
@@ -400,7 +400,7 @@ class Runner(SingleOwner):
         if self._is_running:
             self._execute(self._sent)
         self._sent = None
-        return self.observe()
+        return self._observed()
 
     def rollout(
         self,
@@ -477,9 +477,15 @@ class Runner(SingleOwner):
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
-        # Taken before the check, since a signal handler may close the runner at any time.
-        present: Any = getattr(self._pool, "present", None)
         self._ready()
+        return self._observed()
+
+    def _observed(self) -> Observation:
+        """Return the present observation, as fresh arrays."""
+        # A signal handler may have closed the runner after the tick.
+        present: Any = getattr(self._pool, "present", None)
+        if present is None:
+            self._check_open()
         return self._with_tool(present.observation.map(COPY))
 
     def _with_tool(self, seen: Observation) -> Observation:
