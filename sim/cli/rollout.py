@@ -350,20 +350,19 @@ class RunReport:
             error = np.abs(pose_error(rollout.setpoint[..., :7], rollout.tool_pose.astype(float)))
             figures = {"first_error": error[0], "final_error": error[ends].max(0)}
             return list(AXIS_UNITS), list(AXIS_UNITS.values()), figures
-        has_effort = rollout.info.control != "drive"
         # A setpoint that moves is followed; one that is held is a step, with a settling time.
         if not self.is_held:
             figures = {
                 "following_error": following_error(robot, rollout),
                 "final_error": following_error(robot, rollout.for_ticks(ends)),
             }
-            if has_effort:
+            if rollout.info.control != "drive":
                 figures["saturation_share"] = rollout.saturated.mean(0)
             return robot.joint_names, robot.units, figures
         start = robot.start
         if rollout.info.start is not None:
             start = rollout.info.start.astype(float)
-        metrics = step_response_metrics(robot, rollout, start, with_effort=has_effort)
+        metrics = step_response_metrics(robot, rollout, start)
         overshoot = overshoot_of_settled(metrics.overshoot, metrics.settling_time)
         return robot.joint_names, robot.units, metrics._asdict() | {"overshoot": overshoot}
 

@@ -39,6 +39,13 @@ def absolute_band(robot: Robot) -> Float64:
     return np.array([1e-4 if joint.type == "prismatic" else 1e-3 for joint in robot.joints])
 
 
+def joint_difference(robot: Robot, difference: Rows) -> Rows:
+    """Return a difference of positions (..., dof) [rad or m], of continuous joints the short way
+    round.
+    """
+    return wrap(difference, np.where(robot.continuous, 1 / TURN, 0.0), np)
+
+
 def settled_envs(rollout: Rollout, robot: Robot) -> Bool:
     """Return the envs of a ``rollout`` of ``robot`` that have not failed and whose joints all
     settle (envs,).
@@ -131,9 +138,7 @@ class _Run:
         """Joint positions at the last setpoints, of a pose those nearest to the end; the end where
         they are unknown.
         """
-        error = self.goal - self.qpos
-        turns = np.rint(error / TURN) * robot.continuous
-        self.error = error - TURN * turns
+        self.error = joint_difference(robot, self.goal - self.qpos)
         """Last setpoint minus each position (ticks, envs, dof) [rad or m]."""
         self.band = np.maximum(SETTLING_SHARE * np.abs(self.error[0]), absolute_band(robot))
         """Half width of the settling band [rad or m]."""
@@ -152,9 +157,8 @@ class _Run:
         setpoint = self.rollout.setpoint
         if setpoint.shape != self.qpos.shape or self.info.control == "effort":
             return lag
-        period = np.where(self.robot.continuous, 1 / TURN, 0.0)
-        change = wrap(np.diff(setpoint, axis=0), period, np) / self.rollout.tick
-        error = wrap(setpoint - self.qpos, period, np)[1:]
+        change = joint_difference(self.robot, np.diff(setpoint, axis=0)) / self.rollout.tick
+        error = joint_difference(self.robot, setpoint - self.qpos)[1:]
         moves = change[self.tail].any(0)
         np.divide(np.abs(error).sum(0), np.abs(change).sum(0), out=lag, where=moves)
         return lag

@@ -10,7 +10,6 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
@@ -101,20 +100,6 @@ class _Plan:
     params: bp.PIDParams | None
     timestep: float
 
-    @cached_property
-    def chain(self) -> float:
-        """Length [m] of the longest chain of joints, slides extended."""
-        robot = self.robot
-        length: dict[str, float] = defaultdict(float)
-        for joint, link in zip(
-            robot.tables.joints, robot.tables.bodies[1:], strict=True
-        ):  # parents first
-            ends = (joint.lower, joint.upper) if joint.type == "prismatic" else ()
-            travel = max((abs(end) for end in ends if np.isfinite(end)), default=0.0)
-            offset = float(np.linalg.norm(link.position)) + travel
-            length[joint.child_link] = length[joint.parent_link] + offset
-        return max(length.values(), default=0.0)
-
 
 def touching_links(
     robot: Robot,
@@ -134,16 +119,24 @@ def touching_links(
 def _odd_sizes(plan: _Plan) -> Iterator[Finding]:
     """Yield links whose shapes are larger than the robot, or the robot if all are tiny."""
     tables = plan.robot.tables
+    # Length [m] of the longest chain of joints, slides extended; parents come first.
+    length: dict[str, float] = defaultdict(float)
+    for joint, link in zip(tables.joints, tables.bodies[1:], strict=True):
+        ends = (joint.lower, joint.upper) if joint.type == "prismatic" else ()
+        travel = max((abs(end) for end in ends if np.isfinite(end)), default=0.0)
+        offset = float(np.linalg.norm(link.position)) + travel
+        length[joint.child_link] = length[joint.parent_link] + offset
+    chain = max(length.values(), default=0.0)
     sizes: dict[str, float] = defaultdict(float)
     for shape in tables.shapes:
         sizes[shape.owner] = max(sizes[shape.owner], extent(shape))
-    of_chain = f"the robot's chain of joints is {plan.chain:.3g} m long"
+    of_chain = f"the robot's chain of joints is {chain:.3g} m long"
     for name, size in sizes.items():
-        if size > LARGEST_SHAPES * max(plan.chain, SHORTEST_CHAIN):
+        if size > LARGEST_SHAPES * max(chain, SHORTEST_CHAIN):
             yield Finding.of("units", link=name, detail=f"shapes of {size:.3g} m; {of_chain}")
     # A single small link is common, such as a sensor.
     largest = max(sizes.values(), default=math.inf)
-    if largest < SMALLEST_SHAPES * plan.chain:
+    if largest < SMALLEST_SHAPES * chain:
         yield Finding.of("units", detail=f"shapes of at most {largest:.2g} m; {of_chain}")
 
 

@@ -87,7 +87,7 @@ def excite(
     rng = np.random.default_rng(integer("seed", seed, 0, 2**31 - 1))
     time = np.arange(1, round(duration * rate) + 1) / rate
     phase = rng.uniform(0, 2 * np.pi, robot.dof)
-    easy, movable = easy_pose(robot, robot.dynamics(), robot.sample(200, seed=0))
+    easy, movable = easy_pose(robot)
     movable = movable if movable.any() else ~movable
     best = None
     most = 0.0

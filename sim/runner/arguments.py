@@ -176,7 +176,7 @@ def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
     """Return the number of ticks of a rollout, from the shape of its setpoints."""
     rows = read_array("setpoints", setpoints)
     num_envs = options.num_envs
-    size = len(options.command_columns[0][1])
+    size = options.command.size
     axes = (2, 3) if options.plan is None else (2, 3, 4)
     if rows.ndim not in axes or len(rows) == 0:
         raise InvalidArgumentError(

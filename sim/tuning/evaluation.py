@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Float64, Progress, Rows
-from batchpid.arrays.elementwise import TURN
 from batchpid.checks import file_path, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
@@ -29,6 +28,7 @@ from batchpid.motors import DRIVEN
 from batchpid.sim.diagnosis.causes import (
     absolute_band,
     cause_lines,
+    joint_difference,
     median_and_worst,
     overshoot_of_settled,
     table,
@@ -43,11 +43,10 @@ from batchpid.sim.runner.runner import Runner
 from batchpid.sim.tuning.gain_sets import GainSet, default_sets, gain_set
 from batchpid.sim.tuning.moves import (
     Moves,
-    random_moves,
+    seeded_moves,
     shortest_durations,
     smooth_durations,
     smooth_variation,
-    tutorial_move,
 )
 from batchpid.trajectories import minimum_jerk
 
@@ -93,37 +92,34 @@ class Evaluation(NamedTuple):
     """
     settling_limit: Float64
     """Settling time asked for (moves,) [s]."""
-    following_error: Float64 | None = None
-    """Largest error on the same moves as smooth motions [rad or m]: :func:`following_error`; None
-    if not asked for.
-    """
+    following_error: Float64
+    """Largest error on the same moves as smooth motions [rad or m]: :func:`following_error`."""
 
 
 def step_response_metrics(
     robot: Robot,
     rollout: Rollout,
     start: Rows,
-    *,
-    with_effort: bool = True,
 ) -> StepMetrics:
     """Return the metrics of a rollout from rest at ``start`` (envs, dof); inf for envs that
     diverged.
 
-    Followers have the metrics of their leaders. Without ``with_effort`` the metrics of efforts are
-    undefined (NaN), as under control "drive".
+    Followers have the metrics of their leaders. Under control "drive" the metrics of efforts are
+    undefined (NaN).
     """
     command = rollout.info.own_command
     if command is not None:
         problem = f"has setpoints of {', '.join(command.names)}, not of joints"
         remedy = "pass a run with joint setpoints"
         raise InvalidArgumentError("rollout", problem, remedy=remedy)
+    has_effort = rollout.info.control != "drive"
     metrics = step_metrics(
         rollout.tick,
         rollout.setpoint,
         np.where(rollout.ok[..., None], rollout.qpos, np.nan),
         start=start,
-        effort=rollout.effort if with_effort else None,
-        saturated=rollout.saturated if with_effort else None,
+        effort=rollout.effort if has_effort else None,
+        saturated=rollout.saturated if has_effort else None,
         absolute_band=absolute_band(robot),
         continuous=robot.continuous,
     )
@@ -137,9 +133,7 @@ def following_error(robot: Robot, rollout: Rollout) -> Float64:
     A setpoint and its rate hold at the end of their tick, so the error of an ideal loop is 0.
     Followers have the error of their leaders. The errors of continuous joints are modulo 2 pi.
     """
-    error = rollout.qpos - rollout.setpoint
-    nearest = error - TURN * np.rint(error / TURN)
-    size = np.abs(np.where(robot.continuous, nearest, error))
+    size = np.abs(joint_difference(robot, rollout.qpos - rollout.setpoint))
     largest = np.where(rollout.ok[..., None], size, np.inf).max(0)
     errors: Float64 = robot.coupling.of_leaders(largest)
     return errors
@@ -240,8 +234,7 @@ def run_moves(
         setpoints = np.where(is_smooth, motion.position[rows], setpoints)
         rates = np.where(is_smooth, motion.velocity[rows], 0.0)
     rollout = runner.rollout(setpoints, setpoint_rates=rates)
-    with_effort = runner.control != "drive"
-    return rollout, step_response_metrics(runner.robot, rollout, start, with_effort=with_effort)
+    return rollout, step_response_metrics(runner.robot, rollout, start)
 
 
 def evaluate_gains(
@@ -251,24 +244,20 @@ def evaluate_gains(
     *,
     name: str = "gains",
     seconds: float = 2.0,
-    follow: bool = False,
     **runner_options: Any,
 ) -> Evaluation:
     """Run ``moves`` from rest for ``seconds`` under ``params``, all at once, and return the metrics
     of every joint.
 
     ``params`` have one row for all moves, or one row per move; ``runner_options`` go to
-    :class:`batchpid.sim.Runner`. With ``follow`` the moves are made once more, as smooth motions of
+    :class:`batchpid.sim.Runner`. The moves are made once more, as smooth motions of
     :func:`smooth_durations`, of which the first ``seconds`` are run, with setpoint rates.
     """
     options = {"substeps": EVALUATION_SUBSTEPS, **runner_options}
     with Runner(robot, len(moves.start), params=params, **options) as runner:
         rollout, metrics = run_moves(runner, moves, seconds)
-        followed = None
         # The same moves as smooth motions, in the same scenes.
-        if follow:
-            motion, _ = run_moves(runner, moves, seconds, durations=smooth_durations(robot, moves))
-            followed = following_error(robot, motion)
+        motion, _ = run_moves(runner, moves, seconds, durations=smooth_durations(robot, moves))
     # The smooth motion to compare with takes as long as the slowest arm joint took to settle.
     settling = metrics.settling_time
     settled = np.where(np.isfinite(settling) & arm_joints(robot), settling, 0.0).max(1)
@@ -282,7 +271,7 @@ def evaluate_gains(
         metrics=metrics,
         chatter=metrics.effort_variation / smooth_variation(robot, moves, durations),
         settling_limit=settling_limits(robot, moves),
-        following_error=followed,
+        following_error=following_error(robot, motion),
     )
 
 
@@ -337,7 +326,6 @@ class Comparison:
         """Return the row of an evaluation in the table."""
         arm = arm_joints(self.robot)
         metrics = evaluation.metrics
-        error = evaluation.following_error
         settling = metrics.settling_time[:, arm]
         settled = np.isfinite(settling).all(1).sum()
         # A joint without a move has no settling time, and is in time.
@@ -346,7 +334,7 @@ class Comparison:
         return [
             evaluation.name,
             median_and_worst(settling, "{:.2f} s"),
-            "-" if error is None else median_and_worst(error[:, arm].max(1), "{:.2g}"),
+            median_and_worst(evaluation.following_error[:, arm].max(1), "{:.2g}"),
             median_and_worst(overshoot_of_settled(metrics.overshoot[:, arm], settling), "{:.1%}"),
             median_and_worst(metrics.steady_state_error[:, arm], "{:.1e}"),
             median_and_worst(evaluation.chatter[:, arm], "{:.1f}"),
@@ -418,7 +406,7 @@ def compare(
     named = gains or default_sets(robot)
     sets = [gain_set(robot, entry) if isinstance(entry, str) else entry for entry in named]
     # The search of the same seed has other moves and other draws.
-    unseen = tutorial_move(robot) + random_moves(robot, moves, seed + 1)
+    unseen = seeded_moves(robot, moves, seed + 1)
     draws = reseeded(randomization, seed + 1)
     # Drives know friction and inertia, and no other actuators.
     drawn_drives = draws
@@ -434,7 +422,6 @@ def compare(
             unseen,
             name=chosen.name if len(titles) == 1 else f"{chosen.name}, {titles[name]}",
             seconds=seconds,
-            follow=True,
             control=chosen.control,
             randomization=drawn_drives if chosen.control == "drive" else draws,
             engine=name,

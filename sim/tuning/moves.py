@@ -26,16 +26,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.checks import integer, number
+from batchpid.checks import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.trajectories import minimum_jerk
 
 MOVE_KINDS = ("large", "small", "one joint", "all alike")
-"""Kinds of random moves, in turn: up to ``size``; up to a tenth of it; of one joint; of all joints
+"""Kinds of random moves, in turn: up to :data:`LARGEST_STEP`; up to a tenth of it; of one joint; of all joints
 by one fraction.
 """
+LARGEST_STEP = 2.0
+"""Largest step of a joint in a random move [rad or m]."""
 MAX_OVERSHOOT = 0.05
 """Overshoot that a good move may have, as a fraction of it."""
 LONGEST_MOVE = 1.0
@@ -74,11 +75,6 @@ class Moves(NamedTuple):
     target: Float64
     names: tuple[str, ...]
 
-    def __add__(self, other: Moves) -> Moves:  # type: ignore[override]
-        start = np.concatenate([self.start, other.start])
-        target = np.concatenate([self.target, other.target])
-        return Moves(start, target, self.names + other.names)
-
     def take(self, rows: Iterable[int]) -> Moves:
         """Return the moves ``rows``."""
         rows = list(rows)
@@ -89,48 +85,45 @@ class Moves(NamedTuple):
         )
 
 
-def tutorial_move(robot: Robot) -> Moves:
-    """Return the move of a bundled robot's settings; none for other robots."""
-    if robot.settings is None:
-        none = np.empty((0, robot.dof))
-        return Moves(none, none, ())
-    return Moves(robot.settings.start[None], robot.settings.target[None], ("tutorial",))
+def seeded_moves(robot: Robot, count: int, seed: int) -> Moves:
+    """Return ``count`` :func:`random_moves`, of a bundled robot after the move of its settings."""
+    start, target, names = moves = random_moves(robot, count, seed)
+    settings = robot.settings
+    if settings is None:
+        return moves
+    ends = np.vstack([settings.start, start]), np.vstack([settings.target, target])
+    return Moves(*ends, ("tutorial", *names))
 
 
 def random_moves(
     robot: Robot,
     count: int,
     seed: int = 0,
-    size: float = 2.0,
-    ground: bool | None = None,
 ) -> Moves:
     """Return ``count`` seeded moves within the joint limits, free of contact on the straight line
     and 5 % beyond it.
 
-    Starts are uniform over :meth:`Robot.sample`, 2 % off the limits; targets within ``size`` [rad,
-    or m but at most the whole range] of them, by the :data:`MOVE_KINDS` in turn. The effort limits
-    allow each move within LONGEST_MOVE, and hold its ends. If few poses are free of contact, as with many
+    Starts are uniform over :meth:`Robot.sample`, 2 % off the limits; targets within 2 rad or m, but
+    at most the whole range, of them, by the :data:`MOVE_KINDS` in turn. The effort limits allow
+    each move within LONGEST_MOVE, and hold its ends. If few poses are free of contact, as with many
     fingers or legs, or if the robot is weak, moves lie nearer to its start pose, or to the pose
     that it holds most easily: after every 50 rejected draws, the range of starts and steps is
-    halved. ``ground`` says whether there is one at height 0, by default as
-    :attr:`Robot.has_ground`.
+    halved.
 
     Raises
     ------
     InvalidArgumentError
-        ``count``, ``seed`` or ``size`` is out of range, or there are no such moves: the robot
-        touches itself, or is too weak, in nearly every pose.
+        ``count`` or ``seed`` is out of range, or there are no such moves: the robot touches itself,
+        or is too weak, in nearly every pose.
     """
     count = integer("count", count, 0, 100_000)
-    size = number("size", size, 1e-3, 10.0, "rad or m")
     rng = np.random.default_rng(integer("seed", seed, 0, 2**63 - 1))
-    dynamics = robot.dynamics(ground)
-    poses = robot.sample(1000, seed=0)
-    reach = np.ptp(poses, axis=0)
+    dynamics = robot.dynamics()
+    reach = np.ptp(robot.sample(1000, seed=0), axis=0)
     low = robot.lower + EDGE_SHARE * reach
     high = robot.upper - EDGE_SHARE * reach
     line = np.linspace(0, 1 + MAX_OVERSHOOT, LINE)[:, None]
-    center, movable = easy_pose(robot, dynamics, poses[:200])
+    center, movable = easy_pose(robot)
     clearance = TOUCH_DISTANCE
     # Around a pose in contact, only deeper contact can be avoided.
     if dynamics.in_contact(center[None], TOUCH_DISTANCE)[0]:
@@ -162,7 +155,7 @@ def random_moves(
         elif kind == "one joint":
             step[np.arange(robot.dof) != joint] = 0.0
             kind = f"{robot.joint_names[joint]} alone"
-        step *= movable * share * np.minimum(size, reach)
+        step *= movable * share * np.minimum(LARGEST_STEP, reach)
         target = np.clip(start + step, low, high)
         move = Moves(
             robot.coupling.positions(start[None]), robot.coupling.positions(target[None]), (kind,)
@@ -179,18 +172,16 @@ def random_moves(
         f"{robot.name!r} touches itself or the ground, or is too weak, in nearly every draw of a"
         f" move: {len(moves)} of {count} moves were found"
     )
-    remedy = "pass moves or gains, or correct the contacts and limits that batchpid inspect lists"
+    remedy = "correct the contacts and limits that batchpid inspect lists"
     raise InvalidArgumentError("robot", problem, remedy=remedy)
 
 
-def easy_pose(
-    robot: Robot, dynamics: RobotModel, poses: Float64
-) -> tuple[Float64, NDArray[np.bool_]]:
+def easy_pose(robot: Robot) -> tuple[Float64, NDArray[np.bool_]]:
     """Return the pose about which moves lie if they are hard to find, and the joints that can move
     (dof,).
 
     It is the start pose if its links are well apart and the effort limits hold it easily. Otherwise
-    it is the pose of the least effort whose links are well apart, among ``poses`` and others
+    it is the pose of the least effort whose links are well apart, among seeded poses and others
     between these and the start pose; if none of the first :data:`TRIED_POSES` is, the start pose.
     """
 
@@ -198,6 +189,8 @@ def easy_pose(
         still = np.zeros_like(qpos)
         return np.abs(motion_effort(robot, qpos, still, still)) / robot.design_effort_limit
 
+    dynamics = robot.dynamics()
+    poses = robot.sample(200, seed=0)
     # A joint that cannot hold itself nearly anywhere does not move.
     weak = shares(poses) + robot.friction / robot.design_effort_limit >= 1
     movable = weak.mean(0) <= STUCK

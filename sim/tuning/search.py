@@ -37,7 +37,7 @@ from batchpid.sim.robot.robot_options import describe
 from batchpid.sim.tuning.candidates import FACTORS, GainCandidates
 from batchpid.sim.tuning.evaluation import EVALUATION_SUBSTEPS, Comparison, compare, reseeded
 from batchpid.sim.tuning.gain_sets import GainSet, gain_table
-from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
+from batchpid.sim.tuning.moves import Moves, random_moves, seeded_moves
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,8 +46,10 @@ INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
 HEADROOM = 0.9
 """Share of the effort limits that candidates may use."""
+POPULATION = 8
+"""Candidates of a population, evaluated at once."""
 SEARCH_MOVES = 12
-"""Number of random moves of the search."""
+"""Number of random moves of the search, besides the tutorial's."""
 FINAL_MOVES = 24
 """Number of moves of the final round."""
 FINALISTS = 3
@@ -112,11 +114,9 @@ def tune(
     robot: Robot,
     *,
     generations: int = 10,
-    population: int = 8,
     seed: int = 0,
     seconds: float = 1.5,
     gain_units: Literal["mass_matrix", "effort"] = "mass_matrix",
-    moves: Moves | None = None,
     randomization: Randomization | None = None,
     motors: bp.Actuators | None = None,
     engine: EngineName = DEFAULT_ENGINE,
@@ -133,19 +133,13 @@ def tune(
     Parameters
     ----------
     generations
-        Number of populations that the search evaluates.
-    population
-        Candidates of a population, evaluated at once.
+        Number of populations, of POPULATION candidates each, that the search evaluates.
     seed
         Seed of the search, of its moves and of the draws.
     seconds
         Simulated time of each move of the search [s].
     gain_units
         Gains per mass matrix (all joints respond equally fast), or as efforts (for any controller).
-    moves
-        Default: the tutorial's move and SEARCH_MOVES random ones, and FINAL_MOVES others in the
-        final round. Given moves replace them, with contacts, since they may touch something. There
-        is then no final round.
     randomization
         Draw the robot of each move, the same for all candidates: a YAML file
         (docs/randomization.md), e.g. `payload: {uniform: [0, 0.5]}`.
@@ -176,7 +170,6 @@ def tune(
         raise MissingDependencyError("cmaes", "tuning", "tune")
     seed = integer("seed", seed, 0, 2**31 - 1)
     generations = integer("generations", generations, 1, 100_000)
-    population = integer("population", population, 4, 1000)
     seconds = number("seconds", seconds, 0.05, 600.0, "seconds")
     for name in {"params", "discretization"} & runner_options.keys():
         problem = "is chosen by the search, which is for explicit gains"
@@ -185,19 +178,16 @@ def tune(
     if motors is not None and runner_options.get("actuators") is not None:
         remedy = "leave it out: the control knows the actuators of the robot"
         raise InvalidArgumentError("actuators", "cannot be combined with motors", remedy=remedy)
-    build = runner_options.get("build")
     # Options of all rollouts; the search adds fast ones where moves are free of contact.
     scene: Document = {"engine": engine, "workers": workers, **runner_options}
     options: Document = {"substeps": EVALUATION_SUBSTEPS, **scene}
 
     differs = randomization is not None or robot.actuators is not None or motors is not None
-    unseen = None
+    moves = seeded_moves(robot, SEARCH_MOVES, seed)
+    unseen = random_moves(robot, FINAL_MOVES, seed + FINAL_SEED)
     fast = Document()
-    if moves is None:
-        unseen = random_moves(robot, FINAL_MOVES, seed + FINAL_SEED)
-        moves = tutorial_move(robot) + random_moves(robot, SEARCH_MOVES, seed)
-        if robot.fixed_base and build is None:
-            fast = SEARCH_SCENE
+    if robot.fixed_base and runner_options.get("build") is None:
+        fast = SEARCH_SCENE
 
     def candidates(moves: Moves, headroom: float) -> GainCandidates:
         return GainCandidates(
@@ -215,16 +205,15 @@ def tune(
     first = np.zeros((1, len(FACTORS)))
     start = searched.params(first)
     if differs:
-        first = np.vstack([first, searched.designs()])[:population]
+        first = np.vstack([first, searched.designs()])[:POPULATION]
     options["params"] = start
     options["randomization"] = reseeded(randomization, seed)
-    with searched.runner(population, options | fast) as runner:
+    with searched.runner(POPULATION, options | fast) as runner:
         evaluate = partial(searched.costs, runner)
         points, history = _evolve(
             evaluate,
             first,
             generations,
-            population,
             seed,
             progress,
         )
@@ -235,7 +224,7 @@ def tune(
     finalists = np.append(ranking[costs[ranking] < costs[0]], 0)
     stage = "search"
     final_costs = costs[finalists]
-    if unseen is not None and len(finalists) > 1:
+    if len(finalists) > 1:
         stage = "final round"
         final = candidates(unseen, 1.0)
         options["randomization"] = reseeded(randomization, seed + FINAL_SEED)
@@ -247,7 +236,7 @@ def tune(
         **describe(robot),
         "seed": seed,
         "generations": len(history),
-        "population": population,
+        "population": POPULATION,
         "seconds": seconds,
         "gain_units": gain_units,
         "moves": list(moves.names),
@@ -273,7 +262,6 @@ def _evolve(
     evaluate: Callable[[Float64], Float64],
     first: Float64,
     generations: int,
-    population: int,
     seed: int,
     progress: Progress[int] | None,
 ) -> tuple[Float64, tuple[tuple[float, ...], ...]]:
@@ -288,14 +276,14 @@ def _evolve(
         CMA,
         sigma=INITIAL_SPREAD,
         seed=seed,
-        population_size=population,
+        population_size=POPULATION,
     )
     optimizer = make(mean=first[0])
     points = []
     history = []
     numbers = range(generations)
     for generation in numbers if progress is None else progress(numbers):
-        samples = np.array([optimizer.ask() for _ in range(population)])
+        samples = np.array([optimizer.ask() for _ in range(POPULATION)])
         if generation == 0:
             samples[: len(first)] = first
         costs = evaluate(samples)

@@ -7,7 +7,7 @@ from tiny_urdf import one_joint, write
 import batchpid as bp
 from batchpid.io import documents
 from batchpid.sim import Robot
-from batchpid.sim.tuning.moves import random_moves
+from batchpid.sim.tuning.moves import seeded_moves
 
 pytest.importorskip("cmaes")
 
@@ -18,8 +18,8 @@ def few_moves(monkeypatch):
     monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
     monkeypatch.setattr("batchpid.sim.tuning.search.SEARCH_MOVES", 1)
     monkeypatch.setattr(
-        "batchpid.sim.tuning.evaluation.random_moves",
-        lambda robot, moves, seed: random_moves(robot, min(moves, 1), seed),
+        "batchpid.sim.tuning.evaluation.seeded_moves",
+        lambda robot, moves, seed: seeded_moves(robot, min(moves, 1), seed),
     )
 
 

@@ -127,4 +127,4 @@ def test_candidates_of_a_search_do_not_warn(arm):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", StabilityWarning)
-        tune(arm, generations=1, population=6, seconds=0.1, workers=0)
+        tune(arm, generations=1, seconds=0.1, workers=0)

@@ -49,7 +49,8 @@ def test_designed_gains_settle_within_two_seconds(name, units):
     if (name, units) in MISSES:
         pytest.xfail(MISSES[name, units])
     robot = load_published(name)
-    moves = random_moves(robot, 4, size=1.0, ground=False)
+    moves = random_moves(robot, 4)
+    moves = moves._replace(target=(moves.start + moves.target) / 2)
     evaluation = evaluate_gains(
         robot,
         bp.design_gains(robot, gain_units=units, measurement_rate="measured"),

@@ -14,7 +14,7 @@ from batchpid.sim.tuning.evaluation import (
     run_moves,
     step_response_metrics,
 )
-from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
+from batchpid.sim.tuning.moves import Moves, random_moves, seeded_moves
 
 
 def hold(pose, name="hold"):
@@ -42,7 +42,7 @@ def test_arm_joints_leave_out_fingers(panda, jaco2):
 
 
 def following_and_settling(robot, params, moves, **options):
-    found = evaluate_gains(robot, params, moves, workers=0, seconds=1.2, follow=True, **options)
+    found = evaluate_gains(robot, params, moves, workers=0, seconds=1.2, **options)
     arm = arm_joints(robot)
     return found.following_error[:, arm].max(1), found.metrics.settling_time[:, arm].max()
 
@@ -72,8 +72,7 @@ def test_a_step_is_the_same_beside_a_smooth_motion(panda):
 @pytest.mark.parametrize("name", ["jaco2", "panda"])
 def test_shipped_gains_meet_the_demands_on_moves_that_the_search_did_not_see(name, request):
     robot = request.getfixturevalue(name)
-    moves = tutorial_move(robot) + random_moves(robot, 8, seed=11)
-    evaluation = evaluate_gains(robot, robot.tuned(), moves, workers=0)
+    evaluation = evaluate_gains(robot, robot.tuned(), seeded_moves(robot, 8, 11), workers=0)
     assert evaluation.rollout.ok.all()
     arm = arm_joints(robot)
     metrics = evaluation.metrics

@@ -10,7 +10,6 @@ from batchpid.sim.tuning.moves import (
     smooth_durations,
     smooth_effort,
     smooth_variation,
-    tutorial_move,
 )
 from batchpid.trajectories import minimum_jerk
 
@@ -73,10 +72,10 @@ def test_smooth_motions_take_half_of_the_velocity_limits_and_leave_a_reserve_of_
 
 
 def test_smooth_effort_is_gravity_at_the_end(panda):
-    move = tutorial_move(panda)
-    efforts = smooth_effort(panda, move.start[0], move.target[0], 1.0)
-    still = np.zeros_like(move.target)
-    gravity = panda.dynamics().inverse_dynamics(move.target, still, still)[0]
+    target = panda.target[None]
+    efforts = smooth_effort(panda, panda.start, target[0], 1.0)
+    still = np.zeros_like(target)
+    gravity = panda.dynamics().inverse_dynamics(target, still, still)[0]
     np.testing.assert_allclose(efforts[-1], gravity, atol=1e-9)
 
 

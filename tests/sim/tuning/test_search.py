@@ -12,18 +12,21 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Randomization, Uniform
 from batchpid.sim.tuning import tune
 from batchpid.sim.tuning.evaluation import arm_joints, evaluate_gains
-from batchpid.sim.tuning.moves import random_moves, tutorial_move
+from batchpid.sim.tuning.moves import seeded_moves
 
 pytest.importorskip("cmaes")
 
-SMALL = {"generations": 2, "population": 4, "seconds": 0.1, "engine": "mujoco"}
+SMALL = {"generations": 2, "seconds": 0.1, "engine": "mujoco"}
+
+
+SIZES = "batchpid.sim.tuning.search."
 
 
 @pytest.fixture
 def few_moves(monkeypatch):
-    """Search on two moves, with a final on one other."""
-    monkeypatch.setattr("batchpid.sim.tuning.search.SEARCH_MOVES", 2)
-    monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
+    """Search four candidates at once on two moves, with a final on one other."""
+    for name, size in {"POPULATION": 4, "SEARCH_MOVES": 2, "FINAL_MOVES": 1}.items():
+        monkeypatch.setattr(SIZES + name, size)
 
 
 def test_gains_and_implicit_laws_are_refused(panda):
@@ -56,42 +59,33 @@ def test_same_seed_gives_bit_identical_gains_for_any_number_of_workers(few_moves
 
 @pytest.mark.parametrize("engine", ["mujoco", pytest.param("sapien", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["arm", "panda", "jaco2"])
-def test_a_short_search_is_near_the_best_of_many_candidates(name, engine):
+def test_a_short_search_is_near_the_best_of_many_candidates(name, engine, few_moves, monkeypatch):
     robot = ARM if name == "arm" else load_bundled(name)
-    options = SMALL | {
-        "seconds": 0.3,
-        "engine": engine,
-        "moves": random_moves(robot, 2, 0),
-        "workers": 0,
-    }
+    options = SMALL | {"seconds": 0.3, "engine": engine, "workers": 0}
     short = tune(robot, **options)
-    wide = tune(robot, **options | {"generations": 1, "population": 48, "seed": 1})
+    monkeypatch.setattr(SIZES + "POPULATION", 48)
+    wide = tune(robot, **options | {"generations": 1})
     assert short.cost <= short.start_cost
     assert short.cost <= 1.1 * min(wide.history[0])
 
 
-def test_search_starts_from_the_designed_gains():
-    found = tune(ARM, moves=random_moves(ARM, 1, 0), workers=0, **SMALL)
+def test_search_starts_from_the_designed_gains(few_moves):
+    found = tune(ARM, workers=0, **SMALL)
     for name in ("kp", "ki", "kd"):
         np.testing.assert_array_equal(
             getattr(found.start_params, name), getattr(ARM.designed(), name)
         )
 
 
-def test_gains_in_efforts_can_be_searched_too():
-    found = tune(ARM, moves=random_moves(ARM, 1, 0), gain_units="effort", workers=0, **SMALL)
+def test_gains_in_efforts_can_be_searched_too(few_moves):
+    found = tune(ARM, gain_units="effort", workers=0, **SMALL)
     ratio = found.params.kp / found.start_params.kp
     assert found.cost == found.start_cost or (ratio != 1).all()
 
 
-def test_moves_are_made_with_different_motors_of_which_the_worst_counts():
+def test_moves_are_made_with_different_motors_of_which_the_worst_counts(few_moves):
     motors = make_actuators(ARM.dof, command_delay=np.array([[1e-3], [4e-2]]).repeat(ARM.dof, 1))
-    options = SMALL | {
-        "moves": random_moves(ARM, 2, 0),
-        "workers": 0,
-        "generations": 1,
-        "seconds": 0.3,
-    }
+    options = SMALL | {"workers": 0, "generations": 1, "seconds": 0.3}
     late, mixed, early = (
         tune(ARM, motors=motors.for_envs(rows), **options) for rows in ([1, 1], [0, 1], [0, 0])
     )
@@ -107,7 +101,7 @@ def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(
     robot = dataclasses.replace(robot, actuators=motors)
     payload = Randomization(payload=Uniform(0, 0.5))
     found = tune(robot, generations=1, randomization=payload)
-    moves = tutorial_move(robot) + random_moves(robot, 20, 1)
+    moves = seeded_moves(robot, 20, 1)
     judged = evaluate_gains(
         robot, found.params, moves, randomization=dataclasses.replace(payload, seed=1)
     )
@@ -119,10 +113,9 @@ def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(
 @pytest.mark.slow
 def test_gains_of_the_search_settle_sooner_than_designed_ones_and_follow_closely(panda):
     found = tune(panda)
-    moves = tutorial_move(panda) + random_moves(panda, 20, 1)
+    moves = seeded_moves(panda, 20, 1)
     designed, tuned = (
-        evaluate_gains(panda, each, moves, follow=True)
-        for each in (found.start_params, found.params)
+        evaluate_gains(panda, each, moves) for each in (found.start_params, found.params)
     )
     arm = arm_joints(panda)
     assert tuned.following_error[:, arm].max() < 1e-3
