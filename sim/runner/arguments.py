@@ -67,8 +67,8 @@ def read_command(
             kind=kind,
         ).copy()
         rows.append(entries[None] if ticks is None else entries)
-    coupling = options.command_coupling
-    if coupling is not None:
+    if options.sets_positions:
+        coupling = options.robot.coupling
         rows[0] = coupling.positions(rows[0])
         rows[1:3] = [None if table is None else coupling.rates(table) for table in rows[1:3]]
     command = Command(*rows)
