@@ -266,11 +266,9 @@ def with_certainty(fit: Fit) -> Fit:
     problem, point, size, *_ = fit
     unknowns = problem.unknowns
     prior = unknowns.spread(point)
-    residual, matrix, covariance = _information(problem, point, size)
-    square = _mean_square(residual, len(point))
-    data = matrix.T @ matrix / square
+    residual, score, data = _information(problem, point, size)
+    covariance = np.linalg.inv(data + PRIOR_WEIGHT * np.eye(len(point)))
     # Stretches have independent noise.
-    score = matrix * residual[:, None] / square
     sums = np.array([part.sum(0) for part in np.array_split(score, PARTS)])
     spread = covariance @ (sums.T @ sums) @ covariance * PARTS / (PARTS - 1)
     rows = residual.reshape(-1, len(size))
@@ -288,7 +286,7 @@ def with_certainty(fit: Fit) -> Fit:
     spans, axes = np.linalg.eigh(covariance)
     lengths = np.minimum(deviation, scale) / np.sqrt(variance)
     root = lengths[:, None] * axes * np.sqrt(np.maximum(spans, 0.0))
-    alone = inverse(data + FAINT_WEIGHT * np.eye(len(point)))
+    alone = np.linalg.inv(data + FAINT_WEIGHT * np.eye(len(point)))
     faint = np.sqrt(np.diagonal(alone))
     alike = np.abs(alone) > ALIKE_CORRELATION * np.outer(faint, faint)
     return fit._replace(
@@ -303,8 +301,8 @@ def with_certainty(fit: Fit) -> Fit:
 def _information(
     problem: Problem, point: Float64, size: Float64
 ) -> tuple[Float64, Float64, Float64]:
-    """Return residuals (rows,), derivatives (rows, unknowns) in units of the prior, and the inverse
-    of the information with the prior's.
+    """Return residuals (rows,), their scores (rows, unknowns) and the information of the data
+    (unknowns, unknowns), in units of the prior.
     """
     low, high = problem.unknowns.bounds
     prior = problem.unknowns.spread(point)
@@ -315,27 +313,18 @@ def _information(
         changes = np.clip(np.vstack([point + axes, point - axes]), low, high) - point
         table = weighted(problem.fitted(point, changes), size)
         residual, matrix = table[:, 0], table[:, 1:] * prior
-        data = matrix.T @ matrix / _mean_square(residual, len(point))
-        hessian = data + PRIOR_WEIGHT * np.eye(len(point))
+        square = float(residual @ residual) / max(len(residual) - len(point), 1)
+        data = matrix.T @ matrix / square
         before = spans
-        axes, spans = axes_of(hessian, scale / prior)
+        axes, spans = axes_of(data + PRIOR_WEIGHT * np.eye(len(point)), scale / prior)
         axes = axes * prior
         if (np.abs(np.log(spans / before)) < SAME_LENGTH).all():
             break
-    return residual, matrix, inverse(hessian)
-
-
-def inverse(matrix: Float64) -> Float64:
-    """Return the inverse of a matrix (n, n)."""
-    return np.asarray(np.linalg.inv(matrix), float)
-
-
-def _mean_square(residual: Float64, unknowns: int) -> float:
-    return float(residual @ residual) / max(len(residual) - unknowns, 1)
+    return residual, matrix * residual[:, None] / square, data
 
 
 def fit(starts: Sequence[Problem], evaluations: int, progress: Callable[[], object]) -> Fit:
-    """Fit from the best of ``starts``, with at most so many evaluations of each problem."""
+    """Fit from the best of ``starts``, with at most ``evaluations`` of each problem."""
     solver = partial(solve, evaluations=evaluations, progress=progress)
     problem, point = _best_start(starts, solver)
     coarse = problem.coarse()

@@ -108,7 +108,7 @@ def identify(
     reading
         Units and names in the files.
     evaluations
-        Largest number of evaluations of each fit: of all unknowns, and of those that are shown.
+        Largest number of evaluations of each fit: of all unknowns, and of more or fewer of them.
     workers
         Number of processes, 0 for this one.
     progress
@@ -137,7 +137,7 @@ def identify(
         timestep,
     )
     law_unknown = bool({"kd", "gain"}.intersection(kinds))
-    progress = progress or _idle
+    progress = progress or (lambda: None)
     data, guess = _regress(robot, data, law_unknown, progress)
     windows = windows_of(data)
     with ExitStack() as stack:
@@ -156,10 +156,6 @@ def identify(
         solution = fit(starts, evaluations, progress)
     # Worker processes end with the fit.
     return Identification(solution._replace(problem=replace(solution.problem, run=map)), still)
-
-
-def _idle() -> None:
-    """Report no progress."""
 
 
 def _payload_links(robot: Robot, name: str | None) -> list[str | None]:

@@ -1,8 +1,8 @@
 """Simulation of many candidates along stretches of logs: a Runner's stages in closed loop with the
 rigid tree of the logged joints (:mod:`batchpid.sim.loop.loop_run`).
 
-A log of efforts is simulated in windows, a log of setpoints as a whole.
-Unlogged joints rest at the robot's start pose, followers move with their leaders.
+A log of efforts is simulated in windows, a log of setpoints as a whole. Unlogged joints rest at the
+robot's start pose, followers move with their leaders.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 against measured positions of all windows of logs.
 
 A point has the values over their typical sizes. Bounds hold for the sum with the robot's
-description: what adds to its friction and damping may be negative.
+description: an addition to its friction or damping may be negative.
 
 The effect of a window's free initial state is projected out of residuals and derivatives (H. G.
 Bock, "Recent advances in parameter identification techniques for ODE", 1983). All candidates of an
@@ -429,8 +429,8 @@ def size_of(table: Float64) -> Float64:
 
 
 def _projected(table: Float64, count: int) -> Float64:
-    """Return the first ``count`` columns of a table (rows, joints, columns) without what the others
-    explain.
+    """Return the first ``count`` columns of a table (rows, joints, columns), less their projection
+    on the others.
     """
     columns = table.reshape(-1, table.shape[2])
     basis = columns[:, count:]

@@ -23,7 +23,6 @@ from batchpid.checks import AxisKind, instance
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.state import check_drive
-from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.description.tables import MjcfFile
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction
@@ -203,14 +202,6 @@ class RunnerOptions(RunnerKeywords):
         """Last axis of each array of a command: the kind of its columns, and their names."""
         kind: AxisKind = "joint" if self.own_command is None else "entry"
         return (*[(kind, self.command.names)] * 3, ("joint", self.robot.joint_names))
-
-    @cached_property
-    def command_coupling(self) -> Coupling | None:
-        """Coupling of the joints that setpoints are for; None where there is none."""
-        is_coupled = self.sets_positions and not self.robot.independent.all()
-        if is_coupled:
-            return self.robot.coupling
-        return None
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""

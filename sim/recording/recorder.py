@@ -88,7 +88,6 @@ class Recorder(SingleOwner):
         self._last_write = time.monotonic()
         self._rates = False  # whether a recorded tick had rates
         self._error: Exception | None = None
-        self._is_closed = False
         runner.recorder = self
 
     def prepare(self) -> None:
@@ -141,7 +140,7 @@ class Recorder(SingleOwner):
         RecordingError
             The file cannot be written.
         """
-        if self._is_closed:
+        if self._runner.recorder is not self:
             return
         try:
             if complete:
@@ -159,7 +158,6 @@ class Recorder(SingleOwner):
                     self._file.attrs.update(files.attributes(info))
                     self._close_file()
             self._runner.recorder = None
-            self._is_closed = True
 
     def __enter__(self) -> Recorder:
         return self

@@ -67,8 +67,8 @@ def read_command(
             kind=kind,
         ).copy()
         rows.append(entries[None] if ticks is None else entries)
-    coupling = options.command_coupling
-    if coupling is not None:
+    if options.sets_positions:
+        coupling = options.robot.coupling
         rows[0] = coupling.positions(rows[0])
         rows[1:3] = [None if table is None else coupling.rates(table) for table in rows[1:3]]
     command = Command(*rows)
@@ -176,7 +176,7 @@ def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
     """Return the number of ticks of a rollout, from the shape of its setpoints."""
     rows = read_array("setpoints", setpoints)
     num_envs = options.num_envs
-    size = len(options.command_columns[0][1])
+    size = options.command.size
     axes = (2, 3) if options.plan is None else (2, 3, 4)
     if rows.ndim not in axes or len(rows) == 0:
         raise InvalidArgumentError(

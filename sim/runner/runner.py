@@ -370,7 +370,7 @@ class Runner(SingleOwner):
         self._ready()
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         run = self._tick(command, latency, substeps)
-        self._prepare_ticks()
+        self._prepare(run)
         self._call.begin()
         try:
             self._call.waits = True
@@ -615,7 +615,7 @@ class Runner(SingleOwner):
     @cached_property
     def _present(self) -> Snapshot:
         """Snapshot of a moment, whose names and shapes those to restore are compared with."""
-        return snapshot_of(self.options, self._state, self._execute(READ).result)
+        return self._read(READ)
 
     @cached_property
     def _versions(self) -> dict[str, str]:
@@ -815,11 +815,8 @@ class Runner(SingleOwner):
         pool = self._pool
         is_sent = self._is_running
         is_run = request.method == "run"
-        is_due = self.recorder is not None or self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
-        if is_due and is_run and not is_sent:
-            self._prepare_ticks()
-        elif is_due and request.method == "reset":
-            self._prepare_reset()
+        if not is_sent:
+            self._prepare(request)
         # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
@@ -854,28 +851,25 @@ class Runner(SingleOwner):
             warn(text, FaultWarning)
         return outcome
 
-    def _prepare_ticks(self) -> None:
-        """Take a checkpoint if one is due, and let the recorder keep the state before its first
-        tick.
-        """
-        if self._keeps_bits and self._state.steps_since_checkpoint >= CHECKPOINT_STEPS:
-            self._take_snapshot()
-        if self.recorder is not None:
-            self.recorder.prepare()
+    def _prepare(self, request: Request) -> None:
+        """Take a checkpoint if one is due, before ticks or a reset, and let the recorder keep the
+        state before its first tick.
 
-    def _prepare_reset(self) -> None:
-        """Take a checkpoint before a reset, if one is due that the loops must not notice.
-
-        It holds all that there is of an env after its next reset. With ``build`` that is not so:
-        the user's content is not rebuilt.
+        Before a reset it is one that the loops do not notice. It holds all that there is of an env
+        after its next reset. With ``build`` that is not so: the user's content is not rebuilt.
         """
-        is_wanted = not self._keeps_bits and self.options.build is None
-        if is_wanted and not self._pool.replay.waits:
-            state = self._state
-            snapshot = snapshot_of(self.options, state, self._execute(READ).result)
-            restore = restore_request(snapshot.copy(), state.draws)
-            self._pool.replay.start_at_resets(restore, self.num_envs)
-            self._state = state._replace(steps_since_checkpoint=0)
+        is_due = self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
+        if request.method == "run":
+            if is_due and self._keeps_bits:
+                self._take_snapshot()
+            if self.recorder is not None:
+                self.recorder.prepare()
+        elif is_due and request.method == "reset":
+            keeps_rest = self._keeps_bits or self.options.build is not None
+            if not (keeps_rest or self._pool.replay.waits):
+                restore = restore_request(self._read(READ).copy(), self._state.draws)
+                self._pool.replay.start_at_resets(restore, self.num_envs)
+                self._state = self._state._replace(steps_since_checkpoint=0)
 
     @cached_property
     def _keeps_bits(self) -> bool:
@@ -905,10 +899,13 @@ class Runner(SingleOwner):
         """Return a snapshot, from which the runner goes on, and a replacement of a lost worker
         begins.
         """
-        state = self._state
-        snapshot = snapshot_of(self.options, state, self._execute(SNAPSHOT).result)
-        self._pool.replay.start_from(restore_request(snapshot.copy(), state.draws))
+        snapshot = self._read(SNAPSHOT)
+        self._pool.replay.start_from(restore_request(snapshot.copy(), self._state.draws))
         return snapshot
+
+    def _read(self, request: Request) -> Snapshot:
+        """Return the snapshot that a request reads."""
+        return snapshot_of(self.options, self._state, self._execute(request).result)
 
     def _max_ticks(self) -> int:
         """Return the number of ticks that one request may have: none beyond the next checkpoint."""
