@@ -25,7 +25,7 @@ from batchpid.motors.actuators import ACTUATOR_FIELDS
 from batchpid.sim.findings import OF_FILES, OF_ROBOTS, FindingKind
 from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.options.options import OPTION_GROUPS, OPTIONS, RunnerKeywords
-from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
+from batchpid.sim.randomization.randomization import RANDOMIZED_FIELDS, Randomization
 
 DOCS = Path(__file__).parent
 
@@ -169,7 +169,7 @@ def tables() -> dict[tuple[str, str], str]:
         ("law.md", "params"): table(numpydoc(bp.make_params), LAW_FIELDS, without),
         ("actuators.md", "actuators"): table(numpydoc(bp.make_actuators), ACTUATOR_FIELDS, without),
         ("randomization.md", "randomization"): table(
-            attributes(Randomization), PHYSICAL | START | EVENTS, ("seed", "per"), off=False
+            attributes(Randomization), RANDOMIZED_FIELDS, ("seed", "per"), off=False
         ),
         ("runner.md", "options"): options(),
         ("runner.md", "advanced"): advanced(),

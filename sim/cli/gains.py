@@ -161,8 +161,8 @@ def export(
 
     Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to
     batchpid's. "ros2_control" is the YAML of a controller. "mjcf" is the robot for MuJoCo, with
-    motors, or with servos of the --gains; "urdf" the robot with its repairs. Differences between the
-    file and batchpid's law or the robot's file are printed, one line each.
+    motors, or with servos where --gains is given; "urdf" the robot with its repairs. Differences
+    between the file and batchpid's law or the robot's file are printed, one line each.
     """
     # A flag without effect is refused by name.
     chosen = {

@@ -136,7 +136,7 @@ def _drop_unused(root: etree._Element, findings: list[Finding]) -> None:
                 unknown[f"<{name.localname}>"] += 1
             parent.remove(child)
     for element in root.iter(*_ATTRIBUTES):
-        for key in {*element.attrib} - _ATTRIBUTES[element.tag]:
+        for key in sorted({*element.attrib} - _ATTRIBUTES[element.tag]):
             unknown[f"{key} of <{element.tag}>"] += 1
     for transmission in root.findall("transmission"):
         root.remove(transmission)

@@ -124,9 +124,10 @@ class StabilityWarning(UserWarning):
     :mod:`batchpid.sim.diagnosis.loop_stability`.
 
     The bound holds at the start pose, and counts delays, lag, strength, armature and viscous
-    friction of the actuators. It does not count noise and effort limits: beyond the bound, a joint
-    with limits oscillates instead of diverging. There is no warning with ``dissipation="sapien"``,
-    which adds friction that the formula lacks.
+    friction of the actuators. It does not count noise, gravity that is compensated late, and
+    limits: beyond the bound, a joint with an effort limit oscillates instead of diverging, and one
+    that leans on its position limit is held there. There is no warning with
+    ``dissipation="sapien"``, which adds friction that the formula lacks.
     """
 
 

@@ -77,7 +77,9 @@ def test_the_bound_of_late_motors_predicts_the_first_unstable_gain(units, late, 
     robot = load_bundled(name)
     motors = bp.make_actuators(robot.dof, **LATE[late])
     known = replace(robot, actuators=bp.make_actuators(robot.dof, armature=0.03))
-    pose = robot.start
+    # A joint at its limit would be held by it: panda's start is 0.2 mrad away from one.
+    inside = np.minimum(0.05, (robot.upper - robot.lower) / 4)
+    pose = np.clip(robot.start, robot.lower + inside, robot.upper - inside)
     unit = np.diagonal(robot.mass_matrix(pose)[0]) if units == "effort" else np.ones(robot.dof)
     gains = {
         "kp": 900 * unit,
@@ -87,18 +89,19 @@ def test_the_bound_of_late_motors_predicts_the_first_unstable_gain(units, late, 
         "gain_units": units,
     }
     params = known.params(**gains, effort_limit=None)
-    ratio = stability_report(known, params, pose, DT, actuators=motors)[0]
+    ratio, shares = stability_report(known, params, pose, DT, actuators=motors)[:2]
     assert ratio > 1.2 * stability_report(known, params, pose, DT, actuators=motors.joint_side())[0]
+    # Slow motions of other joints say nothing of the mode at the bound.
+    joint = int(np.argmax(shares))
     grows = {}
     for share in (0.95, 1.05):
         scaled = params.replace(kp=params.kp * share / ratio, kd=params.kd * share / ratio)
         options = {"workers": 0, "substeps": 1, "ground": False, "collisions": False}
         with Runner(known, 1, params=scaled, actuators=motors, **options) as runner:
             runner.reset(pose)
-            goal = pose + 1e-4 * np.random.default_rng(1).normal(size=pose.shape)
-            speed = np.abs(
-                runner.rollout(np.broadcast_to(goal, (1600, 1, robot.dof))).qvel[:, 0]
-            ).max(1)
+            goal = pose + 1e-3 * np.random.default_rng(1).normal(size=pose.shape)
+            rollout = runner.rollout(np.broadcast_to(goal, (1600, 1, robot.dof)))
+        speed = np.abs(rollout.qvel[:, 0, joint])
         grows[share] = np.nanmax(speed[1200:]) / speed[400:800].max()
     assert grows[0.95] < 1
     assert grows[1.05] > 1
