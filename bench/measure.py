@@ -160,9 +160,8 @@ def measure_phases(workload: Workload) -> dict[str, float]:
         loop = Loop(options, slice(0, share), shared.arrays)
     for group in loop.groups:
         group._executor._is_native = False
-    start = np.tile(workload.start, (share, 1))
-    rest = np.zeros((share, robot.dof))
-    loop.execute("reset", (np.ones(share, bool), start, rest, NOTHING, None))
+    places = np.tile(workload.start, (share, 1)), np.zeros((share, robot.dof))
+    loop.execute("reset", (np.ones(share, bool), *places, NOTHING, None))
     loop.arrays.command.setpoint[...] = workload.target
     spent = dict.fromkeys(("read", "control", "passive", "write", "step", "waiting"), 0.0)
     for group in loop.groups:

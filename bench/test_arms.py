@@ -45,7 +45,7 @@ class Floors(NamedTuple):
 
 
 FLOORS = {
-    "panda": Floors(11.0, 10.0, 7.6),
+    "panda": Floors(11.0, 10.0, 7.2),
     "six joints": Floors(12.5, 11.0, 8.6),
     "six joints with shapes": Floors(13.5, 12.2, 9.8),
     "coupled gripper": Floors(9.5, 8.4, 7.6),
