@@ -126,7 +126,8 @@ class MissingDependencyError(BatchPIDError, ImportError):
             f"{purpose} needs the package {package!r}; install it with: pip install {source}"
         )
 
-    __reduce__ = _reduced
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.package, self.purpose, self.extra)
 
 
 class WorkerError(BatchPIDError, RuntimeError):

@@ -161,9 +161,8 @@ def test_closed_loop(benchmark, report, compare, most, engine, num_envs):
 
     rows = benchmark.pedantic(measure, rounds=1)
     report([row[0] for row in rows])
-    least = (
-        None if num_envs == 1 else 0.86
-    )  # 0.9 of the measured median, 0.96: room for a machine that is not idle
+    # 0.9 of the measured median; joint PID of arms in free motion is a compiled pass in MuJoCo
+    least = None if num_envs == 1 else {"sapien": 0.86, "mujoco": 0.42}[engine]
     for column, gains in ((1, "tuned"), (2, "tutorial")):
         ratio = statistics.median(row[column] / row[0] for row in rows)
         compare(

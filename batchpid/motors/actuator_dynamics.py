@@ -34,7 +34,7 @@ native code; coefficients may use any.
 An effect on the joint's side (friction, armature) is in ``JOINT_SIDE`` and, if it acts on drives,
 ``DRIVEN`` of :mod:`batchpid.motors`; ``added_friction`` of batchpid/sim/engine/scene_spec.py or
 ``EnginePack._add_joints`` adds it to the joint. Joint-side effects and ``bias`` leave followers out,
-in ``fit_actuators`` (batchpid/sim/robot/robot_options.py) and ``OF_JOINTS``
+in ``fit_actuators`` (batchpid/sim/robot/robot_options.py) and ``LEADER_FIELDS``
 (batchpid/sim/randomization/randomization.py).
 """
 

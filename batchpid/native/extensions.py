@@ -210,7 +210,7 @@ TASK_SPACE = Extension(
 def codes() -> str:
     """Return codes.h: the numbers of operations and arrays for C++."""
     enumerations = {
-        "Code : std::int32_t": (*OPERATIONS, "number_of_codes"),
+        "Code : std::int32_t": OPERATIONS,
         "Kinematics": (*(f"kinematics_{name}" for name in KINEMATICS), "kinematics"),
         "Law": (*(f"law_{name}" for name in LAW), "law"),
     }

@@ -90,7 +90,7 @@ class Inertia(Stage):
         parts = zip(
             (*self.friction, self.armature), (*before.friction, before.armature), strict=True
         )
-        # An env does not depend on others that have been drawn anew.
+        # Draws of other envs must not change this env.
         changed = sum(
             np.not_equal(0.0 if new is None else new, 0.0 if old is None else old)
             for new, old in parts

@@ -119,8 +119,8 @@ def inverse_kinematics(
     tool = Tool(tree, link, point)
     tolerance = np.array([position, rotation])
     low, high = np.asarray(tree.lower), np.asarray(tree.upper)
-    # The draws are shares of the range, or of a turn without limits; the same for every env,
-    # whatever the others do.
+    # The draws are shares of the range, or of a turn without limits; the same for every env, so
+    # that no env depends on the number of envs.
     shares = np.random.default_rng(seed).uniform(size=(starts - 1, 1, tree.dof))
     with quiet():
         best = _search(tool, tolerance, iterations, goal, rows)

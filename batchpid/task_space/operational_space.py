@@ -17,7 +17,7 @@ the gains kp, kd, ki of the task and kp_n, kd_n of the posture::
     null  = M_cc a_n - J^T (L_s J a_s - L_n J a_d)              = N^T M_cc a_n, with J M_cc^-1 N^T = 0
     u_c   = h + M_co a_o + s1 task + s2 null + feedforward      a_o = a_n of the other joints
     u_o   = h + M_oo a_o + M_oc M_cc^-1 (s1 task + s2 null) + feedforward
-    I    <- I + ki dt e, within its limit, unless s1 < 1, u is clipped or L is bounded, and a e > 0
+    I    <- I + ki dt e, within its limit, unless s1 < 1 or s2 < 1, u is clipped or L is bounded, and a e > 0
 
 These are the gains of the explicit law; :mod:`batchpid.task_space.osc_state` has the
 implicit one. Springs of stiffness kp_l push joints of the chain away from their limits; x is the
@@ -226,7 +226,7 @@ def _advance(
         j = in_axes(turn, j)
         vectors = [None if x is None else in_axes(turn, x[..., None])[..., 0] for x in vectors]
     error, tool_twist, rate, twist, acceleration = vectors
-    # Position and rotation have limits of their own: a far target does not drown a turn.
+    # Position and rotation have separate limits: a far target leaves the turn as it is.
     position = _shortened(error[..., :3], k.position_error_limit, xp)
     rotation = _shortened(error[..., 3:], k.rotation_error_limit, xp)
     near = xp.concatenate([position, rotation], axis=-1)
@@ -254,7 +254,7 @@ def _advance(
     base = d.bias + product(m, (1 - chain) * a_n)
     base = base if inputs.feedforward is None else base + inputs.feedforward
 
-    # The task takes the room within the limits first, and the posture what is left of it.
+    # Within the effort limits the task comes first, the posture second.
     low = -math.inf if k.effort_min is None else k.effort_min
     high = math.inf if k.effort_max is None else k.effort_max
     able = (base >= low) & (base <= high)

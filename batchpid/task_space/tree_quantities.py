@@ -256,7 +256,7 @@ def link_poses(
     """Return the poses (..., links, 7) of ``links``, by default all, at ``qpos`` (..., dof) [rad or
     m].
 
-    With a ``point`` (3,) in the frame of the links [m], the positions of this point.
+    With a ``point`` (3,) in the frame of the links [m], the positions in them are those of the point.
     """
     prepared(tree, qpos=qpos)
     names = tree.links if links is None else links

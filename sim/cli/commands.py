@@ -94,7 +94,7 @@ COMMANDS = {
     ),
     "export": CommandFunction(
         export,
-        {"out": Output("File", (".h", ".yaml", ".xml", ".urdf"), "out/{robot}-{to}")},
+        {"out": Output("File", (".h", ".yaml", ".xml", ".urdf"), "out/{robot}-{to}{ending}")},
         ("actuators",),
     ),
     "inspect": CommandFunction(inspect_robot, loading=("base",)),
@@ -143,13 +143,14 @@ def _output_paths(command: CommandFunction, values: Document) -> dict[str, Path]
     inputs = [path for path in inputs if path.is_file()]
     # Defaults are named after the robot, or stand beside the recording.
     words = values | {"robot": Path(values.get("robot") or DEFAULT_ROBOT).stem}
+    words["ending"] = ENDINGS.get(values.get("to", ""), "")
     if "recording" in values:
         words["recording"] = values["recording"].parent / values["recording"].stem
     paths: dict[str, Path] = {}
     for name, output in command.outputs.items():
         path = values[name]
         if path is None and output.default:
-            path = Path(output.default.format_map(words) + ENDINGS.get(values.get("to", ""), ""))
+            path = Path(output.default.format_map(words))
         if path is not None:
             file_path(name, path, output.suffixes)
             check_output(name, path, inputs, values["force"])

@@ -177,7 +177,6 @@ def _moving_order(joints: Sequence[Joint], merged: Collection[str]) -> list[str]
             body[joint.child_link] = parent
         else:
             body[joint.child_link] = joint.child_link
-        if joint.name not in merged:
             below[parent].append(joint)
     ordered = below[joints[0].parent_link].copy()
     for joint in ordered:

@@ -288,9 +288,8 @@ class Settings:
     """Tutorial's poses and gains of a bundled robot, in joint order.
 
     ``start``, ``target``: (dof,) [rad or m]; ``kp``, ``ki``, ``kd``: (dof,) of the PID;
-        ``drive_stiffness`` and
-    ``drive_damping`` of PhysX's internal drive; ``rate_hz``: control and simulation rate;
-    ``notes``: differences from the tutorial, in words.
+    ``drive_stiffness`` and ``drive_damping`` of PhysX's internal drive; ``rate_hz``: control and
+    simulation rate; ``notes``: differences from the tutorial, in words.
     """
 
     start: Float64

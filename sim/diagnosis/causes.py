@@ -43,7 +43,7 @@ def joint_difference(robot: Robot, difference: Rows) -> Rows:
     """Return a difference of positions (..., dof) [rad or m], of continuous joints the short way
     round.
     """
-    return wrap(difference, np.where(robot.continuous, 1 / TURN, 0.0), np)
+    return wrap(difference, robot.continuous / TURN, np)
 
 
 def settled_envs(rollout: Rollout, robot: Robot) -> Bool:

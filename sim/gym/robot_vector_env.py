@@ -154,7 +154,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         # Spaces come first: an invalid one is an error before any process starts.
         self.single_observation_space, self.single_action_space = self.spaces()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._action_shape = (self.num_envs, *(self.single_action_space.shape or ()))
+        action_shape = (self.num_envs, *(self.single_action_space.shape or ()))
         if chunk is not None:
             self._rows = integer("chunk", chunk, 1, 499)
             self._ticks = integer("execute", chunk if execute is None else execute, 1, chunk)
@@ -171,7 +171,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             box = self.single_action_space
             low, high = (np.tile(end, (self._rows, 1)) for end in (box.low, box.high))
             self.single_action_space = spaces.Box(low, high, dtype=box.dtype.type)
-        elif execute is not None or latency != (0.0, 0.0):
+        elif execute is not None or np.any(latency):
             name = "latency" if execute is None else "execute"
             raise InvalidArgumentError(name, "has no effect without chunks", remedy="give chunk=")
         low, high = array("latency", latency, (1, 2), ("least", "largest"), kind="entry")[0]
@@ -191,7 +191,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._generators = np.random.default_rng().spawn(self.num_envs)
         self._starts = np.tile(self.robot.start, (self.num_envs, 1))
         self.setpoint = np.zeros((self.num_envs, self.runner.command.size))
-        self.action = np.zeros(self._action_shape)
+        self.action = np.zeros(action_shape)
         self._action_names: Sequence[str] = [str(column) for column in range(self.action.shape[1])]
         self._observation = np.zeros(self.observation_space.shape or (), np.float32)
         self._success = np.zeros(self.num_envs, bool)

@@ -160,7 +160,7 @@ def identify(
 
 def _payload_links(robot: Robot, name: str | None) -> list[str | None]:
     """Return the links where a payload may be: the one with a ``name``, or the last link with a
-    mass that is fixed behind the tool, and the tool.
+    mass on the body of the tool, and the tool.
     """
     tree = link_tree(robot)
     if name is not None:

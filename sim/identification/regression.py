@@ -164,11 +164,11 @@ def _table(
     efforts = _commanded(part)
     if part.drive.gravity:
         speed = float(part.drive.coriolis)
-        compensation = _force(part, motion.qpos, speed * motion.qvel, 0 * motion.qacc)
+        compensated = _force(part, motion.qpos, speed * motion.qvel, 0 * motion.qacc)
         if part.drive.further:
-            links -= compensation[rows]
+            links -= compensated[rows]
         else:
-            efforts = efforts + compensation
+            efforts = efforts + compensated
     if part.drive.mode == "effort":
         efforts = lowpass(efforts[0], cutoff, dt)[None]
     time = dt * np.arange(len(motion.qpos))

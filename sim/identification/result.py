@@ -259,8 +259,8 @@ class Identification:
         return to_urdf(self.unknowns.robot, mass_factors=factors).text
 
     def gains(self) -> bp.PIDParams | None:
-        """Return the params of the identified law, of the logged joints; None without unknowns of
-        the law.
+        """Return the params of the identified law, of the logged joints; None unless "gain", "kd" or
+        "saturation" was an unknown.
         """
         law = self.unknowns.tables(self.values[None], "law")
         if law.keys() <= {"slew"}:

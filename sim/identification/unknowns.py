@@ -27,7 +27,7 @@ from batchpid.sim.identification.simulator import Candidates, LogData, Stretch, 
 from batchpid.sim.robot.robot import Robot
 
 FEWER, LEAST_WINDOWS = 4, 12
-"""Share of the windows, and their least number, for the first steps of a fit."""
+"""Stride of the windows in the first steps of a fit, and the least number that it must leave."""
 BEGINNING = 4.0
 """Length of a log of setpoints for the first steps of a fit [s]."""
 ENVS = 1024

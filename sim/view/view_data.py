@@ -1,4 +1,4 @@
-"""Data of a page: robots that run while they are shown, or a recorded run."""
+"""Data of a page: robots that run while they are shown, or a recorded run; and its controls."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Scene of an MJCF file for MuJoCo: the file itself, in place of a robot built from a URDF.
 
-Actuators, sensors, keyframes, and the gravity compensation of the robot's bodies are removed.
+Actuators, sensors, keyframes, cameras, lights, tuples, and the gravity compensation of the robot's
+bodies are removed.
 Friction, damping and armature of the robot's joints are set later. The runner sets time step,
 integrator, solver and gravity. All other elements are unchanged, friction and impedance of contacts
 and limits included.

@@ -16,10 +16,10 @@ MuJoCo computes the damping of the file.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from itertools import combinations, count, product
+from itertools import combinations, product
 from typing import Any
 
 import mujoco
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
-from batchpid.sim.description.tables import CONTACT_FRICTION, Joint, MjcfFile
+from batchpid.sim.description.tables import CONTACT_FRICTION, Joint, MjcfFile, unique
 from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.mujoco_sensors import add_link_sensors
 from batchpid.sim.engine.scene_spec import MujocoSolver, SceneSpec
@@ -198,16 +198,6 @@ def _refusal(error: ValueError) -> RobotError:
     )
 
 
-def _unused(name: str, taken: Collection[str]) -> str:
-    """Return ``name``, or that with the first number after it that makes a name outside
-    ``taken``.
-    """
-    numbered = (f"{name}_{number}" for number in count(2))
-    if name not in taken:
-        return name
-    return next(candidate for candidate in numbered if candidate not in taken)
-
-
 def principal_inertia(inertia: SpatialInertia) -> tuple[Float64, Float64]:
     """Return principal moments (3,) [kg m^2] and the rotation of the principal axes (4,), in the
     axes of the body.
@@ -252,7 +242,7 @@ def _add_links(scene: MjSpec, spec: SceneSpec) -> dict[str, str]:
     rows = spec.simulated.bodies
     names = {row.name: row.name for row in rows}
     if "world" in names:
-        names["world"] = _unused("world_link", names)
+        names["world"] = unique("world_link", {*names})
     for row in rows:
         parent = scene.worldbody
         if row.joint is not None:
@@ -310,8 +300,7 @@ def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
     taken = {"world", *names.values()}
     for link in split:
         for owner in owners[link]:
-            bodies[owner] = _unused(f"{owner} (shapes)", taken)
-            taken.add(bodies[owner])
+            bodies[owner] = unique(f"{owner} (shapes)", taken)
             scene.body(names[link]).add_body(name=bodies[owner])
     pairs_of_bodies = {
         frozenset(bodies[owner] for owner in pair) for pair in ignored if pair <= set(bodies)

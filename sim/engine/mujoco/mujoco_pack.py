@@ -311,11 +311,7 @@ class MujocoPack(EnginePack):
         bases = np.tile(BASE_AT_REST, (len(rows), 1)) if base is None else base.copy()
         at, moves = self._robot.base or (0, 0)
         # MuJoCo's angular velocities are in the body's axes.
-        bases[:, 10:] = np.einsum(
-            "eji,ej->ei",
-            matrix_of(bases[:, 3:7]),
-            bases[:, 10:],
-        )
+        bases[:, 10:] = unrotate(matrix_of(bases[:, 3:7]), bases[:, 10:])
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
             data = everyone[row]
             # Everything else of the scene returns to its start, but drives keep their targets.

@@ -117,9 +117,7 @@ FUNCTIONS = {
     "set_log_handler": "mju_setLogHandler",
     "kinematics": "mj_kinematics",
 }
-"""Functions of MuJoCo's library, by field of the structures in
-:mod:`batchpid.sim.engine.native`.
-"""
+"""Functions of MuJoCo's library, by field of Mujoco in mujoco_step.h, or Clearance in clearance.h."""
 CLOCK = "mjcb_time"
 """Variable of the library that holds its clock."""
 ROW_FIELDS = (
@@ -131,7 +129,7 @@ ROW_FIELDS = (
     ("ctrl", "ctrl"),
     ("sensors", "sensordata"),
 )
-"""Fields of the structure, and arrays of ``mujoco.MjData``."""
+"""Fields of Mujoco in mujoco_step.h, and the arrays of ``mujoco.MjData`` that they point to."""
 
 
 def mujoco_library() -> Path:

@@ -33,7 +33,6 @@ Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
 
 
 _STATE = (
-    "pose",
     "entity_pose",
     "linear_velocity",
     "angular_velocity",
