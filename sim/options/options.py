@@ -91,10 +91,12 @@ def with_arguments_of(
 
     def decorated(method: Callable[..., None]) -> Callable[Concatenate[Any, P], None]:
         kinds = get_type_hints(record)
-        parameters = [inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)]
-        for parameter in inspect.signature(record).parameters.values():
-            parameters.append(parameter.replace(annotation=kinds[parameter.name]))
-        vars(method)["__signature__"] = inspect.Signature(parameters)
+        this = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        parameters = [
+            parameter.replace(annotation=kinds[parameter.name])
+            for parameter in inspect.signature(record).parameters.values()
+        ]
+        vars(method)["__signature__"] = inspect.Signature([this, *parameters])
         return method
 
     return decorated
