@@ -23,9 +23,8 @@ from batchpid.checks import AxisKind, instance
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.state import check_drive
-from batchpid.motors.friction import Friction
 from batchpid.sim.description.tables import MjcfFile
-from batchpid.sim.engine.scene_spec import SceneSpec, added_friction
+from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.options.groups import (
     Controller,
     ControlMode,
@@ -202,12 +201,6 @@ class RunnerOptions(RunnerKeywords):
         """Last axis of each array of a command: the kind of its columns, and their names."""
         kind: AxisKind = "joint" if self.own_command is None else "entry"
         return (*[(kind, self.command.names)] * 3, ("joint", self.robot.joint_names))
-
-    def has_stiction(self, actuators: bp.Actuators | None) -> bool:
-        """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
-        if self.robot.friction.any() or getattr(self.randomization, "friction", None) is not None:
-            return True
-        return added_friction(Friction(), actuators).coulomb is not None
 
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
         """Return ``params``, as a read-only copy, if they fit the robot, the number of envs and the

@@ -26,7 +26,6 @@ from batchpid.sim import (
     Recorder,
     Robot,
     Runner,
-    Snapshot,
     Uniform,
     read_recording,
 )
@@ -102,7 +101,6 @@ ENTRIES = {
     "Robot.params": (ARM.params, {"kp": 1.0}),
     "Robot.designed": (ARM.designed, {}),
     "Robot.check": (ARM.check, {}),
-    "Snapshot.load": (Snapshot.load, {"path": "none.npz"}),
     "read_recording": (read_recording, {"path": "none.h5"}),
 }
 """Public functions with good values of the arguments that they need."""
