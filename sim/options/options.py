@@ -11,9 +11,6 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Annotated, Any, get_type_hints
 
-import numpy as np
-from numpy.typing import NDArray
-
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Kind, PerMassMatrix
 from batchpid.arrays.field_tables import Field, declared, plain
@@ -31,7 +28,6 @@ from batchpid.sim.options.groups import (
     ControlOptions,
     Option,
     Place,
-    Ray,
     SceneOptions,
     WorkerOptions,
     option,
@@ -105,9 +101,7 @@ class RunnerOptions(RunnerKeywords):
     ground: bool
     contacts: tuple[str, ...] | None
     wrenches: tuple[str, ...] | None
-    speed_limit: NDArray[np.float64] | None
     guard: bp.Guard | None
-    cluster: Ray | None
     actuators: bp.Actuators | None
 
     def __post_init__(self) -> None:

@@ -40,7 +40,6 @@ from batchpid.sim.options.groups import (
     FaultAction,
     InvalidInputAction,
     PhysicsPreset,
-    Ray,
 )
 from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import Randomization
@@ -109,9 +108,9 @@ class Runner(SingleOwner):
     workers, first_env, timeout, cluster, backend
         Processes that step the scenes, default one per core, 0 for this process; number of the
         first env; time after which a worker counts as stuck [s]; machines; "numpy" or "jax".
-    on_fault, on_invalid_input, speed_limit
+    on_fault, on_invalid_input
         Failed envs "hold" or "reset"; inputs that are not finite "raise", or are contained by
-        failures ("contain"); joint speed at which an env fails.
+        failures ("contain").
 
     Raises
     ------
@@ -148,11 +147,10 @@ class Runner(SingleOwner):
         wrenches: Sequence[str] | None = None,
         build: Callable[[Any, int], Any] | None = None,
         backend: Backend = "numpy",
-        speed_limit: ArrayLike | None = None,
         on_invalid_input: InvalidInputAction = "raise",
         first_env: int = 0,
         timeout: float = 60.0,
-        cluster: Literal["ray"] | Ray | None = None,
+        cluster: Literal["ray"] | None = None,
         **unknown: Never,
     ) -> None:
         check_keywords("Runner", unknown, OPTIONS)
@@ -181,7 +179,6 @@ class Runner(SingleOwner):
             wrenches=wrenches,
             build=build,
             backend=backend,
-            speed_limit=speed_limit,
             on_invalid_input=on_invalid_input,
             first_env=first_env,
             timeout=timeout,

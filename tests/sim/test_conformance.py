@@ -223,7 +223,7 @@ FEATURES = {
     "a joint without a motor": Feature({"free_joints": ["elbow"]}),
     "no compensation": Feature({"compensate": "none", "physics": "fast"}),
     "no collisions": Feature({"collisions": False, "ground": False}),
-    "a reset at a fault": Feature({"on_fault": "reset", "speed_limit": 2.0}),
+    "a reset at a fault": Feature({"on_fault": "reset"}),
     "contact sensors": Feature({"contacts": ["hand"], "wrenches": ["arm"]}),
     "user content": Feature({"build": functools.partial(box, 0.05)}, engines=SAPIEN),
     "objects of a scene": Feature({"robot": "scene"}, engines=MUJOCO, alike=False),
