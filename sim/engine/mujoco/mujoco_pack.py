@@ -173,7 +173,7 @@ class MujocoPack(EnginePack):
         """Do one sim step of every robot, with constraint efforts on coupled joints."""
         if self.steps_natively:
             if self._own_step is None:
-                self._own_step = self.compiled_step(False, False, None)
+                self._own_step = self.compiled_step(False, False)
             self._own_step.may_have_failed(self._own_step(self.qf, *np.empty((3, *self.qf.shape))))
             return
         effort = self.qf
