@@ -7,9 +7,11 @@ depend on options of another group, or on the number of envs.
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Concatenate, ParamSpec, get_type_hints
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Kind, PerMassMatrix
@@ -51,6 +53,7 @@ from batchpid.sim.signals import (
 )
 from batchpid.sim.tool_space import OperationalSpace
 
+P = ParamSpec("P")
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
 OPTION_GROUPS = (SceneOptions, ControlOptions, WorkerOptions)
@@ -61,7 +64,7 @@ OPTION_GROUPS = (SceneOptions, ControlOptions, WorkerOptions)
     eq=False,
     kw_only=True,
 )
-class RunnerKeywords(SceneOptions, ControlOptions, WorkerOptions):
+class RunnerKeywords(WorkerOptions, SceneOptions, ControlOptions):
     """Arguments of a :class:`batchpid.sim.Runner`, as they are passed; all but the first two may be
     left out.
 
@@ -74,6 +77,24 @@ class RunnerKeywords(SceneOptions, ControlOptions, WorkerOptions):
         kw_only=False
     )
     """Number of robots, one in each scene."""
+
+
+def with_arguments_of(
+    record: Callable[P, object],
+) -> Callable[[Callable[..., None]], Callable[Concatenate[Any, P], None]]:
+    """Return a decorator that gives a method the arguments of ``record``, for editors and help."""
+
+    def decorated(method: Callable[..., None]) -> Callable[Concatenate[Any, P], None]:
+        kinds = get_type_hints(record)
+        this = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        parameters = [
+            parameter.replace(annotation=kinds[parameter.name])
+            for parameter in inspect.signature(record).parameters.values()
+        ]
+        vars(method)["__signature__"] = inspect.Signature([this, *parameters])
+        return method
+
+    return decorated
 
 
 OPTIONS = declared(RunnerKeywords, Option)

@@ -114,7 +114,13 @@ class LiveSimulation:
 
     def history(self) -> Rollout:
         """Return the frames of the last :data:`HISTORY_SECONDS`, the present one included."""
-        return Rollout.join(list(self._frames))
+        frames = list(self._frames)
+        return replace(
+            frames[0],
+            time=np.concatenate([frame.time for frame in frames]),
+            setpoint=np.concatenate([frame.setpoint for frame in frames]),
+            observation=Observation.join([frame.observation for frame in frames]),
+        )
 
     def close(self) -> None:
         """Close the runner."""
@@ -191,7 +197,7 @@ class Playback:
     def _since(self, start: float) -> Rollout:
         """Return the rows from a time [s] to the present one."""
         first, last = rows_at(self._rollout, np.array([start, self._now])).tolist()
-        return self._rollout.for_ticks(slice(first, last + 1))
+        return self._rollout.for_ticks(first, last + 1)
 
 
 ViewData = LiveSimulation | Playback
