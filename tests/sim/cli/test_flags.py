@@ -132,8 +132,6 @@ def written(folder):
         ("demo pander", "no robot 'pander'"),
         ("demo --picture demo.jpg", "picture: unknown file format"),
         ("rollout --setpoint 1 2", "setpoint: has shape (2,)"),
-        ("rollout --control osc --setpoint 1 2", "setpoint: has shape (2,)"),
-        ("rollout --control osc --gains tuned", "gains: are for the control of joints"),
         ("rollout --out a.npz", "out: unknown file format"),
         ("rollout --gains tunned", "use tuned, designed, "),
         ("compare --gains drive:-1,3", "gains: is no drive"),
