@@ -23,8 +23,8 @@ from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.gains import ENDINGS, compare, export, tune
 from batchpid.sim.cli.identify import excite_joints, identify_logs
-from batchpid.sim.cli.inspect import inspect_robot, plot, view
 from batchpid.sim.cli.rollout import demo, rollout
+from batchpid.sim.cli.show import inspect_robot, plot, view
 
 PICTURES = (".png", ".svg")
 DOCUMENTS = (".yaml", ".yml", ".json")
