@@ -8,7 +8,7 @@ A file has a header and one row per tick, in SI units, with the columns in any o
 
 A row holds at its time, the end of a tick. A first row at time 0 is the pose in which the robot
 starts. Followers need no column: the values of their leaders determine theirs. Commas, tabs or
-semicolons separate the cells, as in a log (:mod:`batchpid.sim.identification.logs`), which is read
+semicolons separate the cells, as in a log (:mod:`batchpid.sim.identification.log_files`), which is read
 here, too.
 """
 
