@@ -114,13 +114,7 @@ class LiveSimulation:
 
     def history(self) -> Rollout:
         """Return the frames of the last :data:`HISTORY_SECONDS`, the present one included."""
-        frames = list(self._frames)
-        return replace(
-            frames[0],
-            time=np.concatenate([frame.time for frame in frames]),
-            setpoint=np.concatenate([frame.setpoint for frame in frames]),
-            observation=Observation.join([frame.observation for frame in frames]),
-        )
+        return Rollout.join(list(self._frames))
 
     def close(self) -> None:
         """Close the runner."""
