@@ -75,7 +75,7 @@ def own(value):
 # -- arrays of the caller
 
 
-@pytest.mark.parametrize("name", ["params", "speed_limit", "actuators", "guard", "plan"])
+@pytest.mark.parametrize("name", ["params", "actuators", "guard", "plan"])
 def test_options_are_copied(name):
     for value in map(own, VALUES[name][-2:]):  # the first may be without arrays
         options = {"robot": ARM, "num_envs": 2, name: value}
@@ -103,9 +103,8 @@ def test_of_a_robot(panda, hand):
 
 
 def test_of_a_runner(hand):
-    speed_limit = np.full(2, 90.0)
     drawn = Randomization(payload=Uniform(0, 1), params={"kp": Uniform(-0.1, 0.1)})
-    options = {"workers": 0, "speed_limit": speed_limit, "guard": True, "randomization": drawn}
+    options = {"workers": 0, "guard": True, "randomization": drawn}
     with Runner(hand, 2, **options) as runner:
         rollout = runner.rollout(np.zeros((2, 2)))
         snapshot = runner.snapshot()
