@@ -130,16 +130,6 @@ def test_writes_to_a_snapshot_do_not_reach_the_runner(panda):
         np.testing.assert_array_equal(mine, other)
 
 
-def test_of_a_controller():
-    pid = bp.BatchPID(
-        bp.make_params(2, kp=1.0, ki=1.0, kd=1.0, effort_rate_limit=5.0), 3, 1e-3, terms=True
-    )
-    pid(np.ones((3, 2)), np.zeros((3, 2)))
-    check(pid)
-    with pytest.raises(ValueError, match="read-only"):
-        pid.state.integral[...] = 0
-
-
 # -- objects that cannot be copied
 
 
@@ -154,6 +144,14 @@ def refuses(value, advice=""):
             NotCopyableError, match=f"a {type(value).__name__} can be neither .*{re.escape(advice)}"
         ):
             make(value)
+
+
+def test_a_controller():
+    pid = bp.BatchPID(bp.make_params(2, kp=1.0, ki=1.0), 3, 1e-3)
+    pid(np.ones((3, 2)), np.zeros((3, 2)))
+    refuses(pid)
+    with pytest.raises(ValueError, match="read-only"):
+        pid.state.integral[...] = 0
 
 
 @pytest.mark.parametrize("workers", [0, 1])

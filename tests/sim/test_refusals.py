@@ -94,7 +94,6 @@ SAMPLE = {"measurement": ROWS, "setpoint": ROWS}
 ENTRIES = {
     "BatchPID.__call__": (PID.__call__, SAMPLE),
     "BatchPID.reset": (PID.reset, {"measurement": ROWS}),
-    "BatchPID.track": (PID.track, SAMPLE | {"effort": ROWS}),
     "load_params": (bp.load_params, {"path": "none.yaml"}),
     "Robot.load": (Robot.load, {"name_or_path": "panda"}),
     "Robot.params": (ARM.params, {"kp": 1.0}),
