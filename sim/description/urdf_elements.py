@@ -11,7 +11,6 @@ import numpy as np
 from lxml import etree
 
 from batchpid.arrays.array_types import Document, Float64
-from batchpid.errors import RobotError
 from batchpid.sim.description.tables import (
     MOVING_TYPES,
     NO_TURN,
@@ -48,9 +47,8 @@ SHAPES = {
 class ElementReader:
     """Reader of the elements of one file. It appends to ``findings``, ``shapes`` and ``visuals``."""
 
-    def __init__(self, path: Path, package_dirs: tuple[Path, ...], findings: list[Finding]) -> None:
+    def __init__(self, path: Path, findings: list[Finding]) -> None:
         self._path = path
-        self._package_dirs = package_dirs
         self._findings = findings
         self._missing: list[str] = []
         self.shapes: list[Shape] = []
@@ -268,7 +266,7 @@ class ElementReader:
             self.warn("collision", text, "correct <collision>", link=link)
             return
         if shape.kind == "mesh":
-            file = find_mesh(shape.file, self._path, self._package_dirs)
+            file = find_mesh(shape.file, self._path)
             if file is None:
                 self._missing.append(shape.file)
                 return
@@ -279,22 +277,14 @@ class ElementReader:
             shape = shape._replace(file=str(file), content=content)
         self.shapes.append(shape)
 
-    def report_missing(self, missing_meshes: str) -> None:
-        """Report meshes that are missing or cannot be read, or raise RobotError if that is
-        "error".
-        """
-        if not self._missing:
-            return
-        listed = ", ".join(self._missing)
-        remedy = "repair the files, pass package_dirs=[...] with the folder that holds the package"
-        remedy += ", or name it in ROS_PACKAGE_PATH"
-        if missing_meshes == "error":
-            problem = f"collision mesh not found or not readable: {listed}"
-            raise RobotError(
-                f"{self._path}: {problem}; {remedy}, or missing_meshes='skip' to simulate without"
+    def report_missing(self) -> None:
+        """Report meshes that are missing or cannot be read."""
+        if self._missing:
+            text = "collision meshes not found or not readable, simulated without: "
+            remedy = (
+                "repair the files, or name the folder that holds the package in ROS_PACKAGE_PATH"
             )
-        text = f"collision meshes not found or not readable, simulated without: {listed}"
-        self.warn("missing-mesh", text, remedy)
+            self.warn("missing-mesh", text + ", ".join(self._missing), remedy)
 
 
 def _read_shape(element: etree._Element, link: str) -> tuple[Shape | None, str | None]:

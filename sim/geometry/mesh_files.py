@@ -32,15 +32,14 @@ _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attributes"
 LFS_PROBLEM = "a git-lfs pointer instead of the mesh: run git lfs pull"
 
 
-def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
+def find_mesh(name: str, path: Path) -> Path | None:
     """Return the mesh file that the URDF at ``path`` refers to as ``name``, or None if it does not
     exist.
 
-    ``package://`` and ``model://`` paths are looked up in ``package_dirs``, in the folders above
-    the URDF, and in those of AMENT_PREFIX_PATH and ROS_PACKAGE_PATH, with the name of the package
-    and, in a folder that is the package under another name, without it. Other paths are relative to
-    the URDF's folder, or to one of these. The suffix may be in the other case, and the name
-    percent-encoded.
+    ``package://`` and ``model://`` paths are looked up in the folders above the URDF, and in those
+    of AMENT_PREFIX_PATH and ROS_PACKAGE_PATH, with the name of the package and, in a folder that is
+    the package under another name, without it. Other paths are relative to the URDF's folder, or to
+    one above it. The suffix may be in the other case, and the name percent-encoded.
     """
     # As in xacro, and on Windows.
     slashes = name.strip().replace("\\", "/")
@@ -49,44 +48,30 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
     # The places are a generator: nearly every mesh is at the first one.
     for change in (str, str.lower, str.upper, str.title):
         for spelling in spellings:
-            for place in _candidates(spelling, path, package_dirs):
+            for place in _candidates(spelling, path):
                 stem, suffix = os.path.splitext(place)
                 if os.path.isfile(file := stem + change(suffix)):
                     return Path(file).absolute()
     return None
 
 
-def _candidates(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Iterator[Path]:
+def _candidates(name: str, path: Path) -> Iterator[Path]:
     """Yield the files that ``name`` may mean, the likeliest first."""
     above = path.absolute().parents
-    if package := re.match(r"(?:package|model):/+([^/]+)/(.+)", name):
-        within = package[2]
-        yield from (folder / package[1] / within for folder in (*package_dirs, *above))
-        yield from (
-            folder / within for folder in (*package_dirs, *above, *_ros_packages(package[1]))
-        )
+    package = re.match(r"(?:package|model):/+([^/]+/(.+))", name)
+    if package is None:
+        # A plain path may be relative to any folder above, as in a package.
+        relative = re.sub(r"^file:(//(localhost)?)?", "", name)
+        yield from (folder / relative for folder in above)
         return
-    # A plain path may be relative to any folder above, as in a package.
-    relative = re.sub(r"^file:(//(localhost)?)?", "", name)
-    yield from (folder / relative for folder in (above[0], *package_dirs, *above[1:]))
-
-
-def _ros_packages(package: str) -> Iterator[Path]:
-    """Yield the folders of a ROS package that the environment names: ROS 2 installs, then ROS 1
-    workspaces.
-    """
-    if not re.fullmatch(r"\w[\w.-]*", package):
-        return
-    prefixes, roots = (
+    # ROS 2 installs, then ROS 1 workspaces.
+    prefixes, workspaces = (
         [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
         for variable in ("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH")
     )
-    yield from (prefix / "share" / package for prefix in prefixes)
-    for root in roots:
-        if root.name == package:
-            yield root
-        for pattern in (package, f"*/{package}", f"*/*/{package}"):  # rospack searches any depth
-            yield from sorted(root.glob(pattern))
+    folders = (*above, *(prefix / "share" for prefix in prefixes), *workspaces)
+    for relative in package.groups():
+        yield from (folder / relative for folder in folders)
 
 
 def read_mesh(path: str | Path, data: bytes) -> Any:

@@ -55,13 +55,13 @@ def to_urdf(
     RobotError
         The file cannot be read, or has changed since the robot was loaded.
     """
-    path, packages = robot.path, robot.source.package_dirs
-    if read_robot(path, robot.fixed_base, packages, "skip").tables != robot.tables:
+    path = robot.path
+    if read_robot(path, robot.fixed_base).tables != robot.tables:
         raise RobotError(f"{path}: has changed since the robot was loaded; load it again")
     root = _write(robot, mass_factors or {})
     differences = [sentence.partition(": ")[2] for sentence in summary(robot.repairs)]
     if not is_mjcf(source := parse_xml(path)):
-        _copy_unused(source, root, path, packages)
+        _copy_unused(source, root, path)
     if robot.actuators is not None:
         differences.append("motors and sensors (actuators) are not in a URDF")
     if folder is not None:
@@ -155,12 +155,7 @@ def _text(values: Iterable[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _copy_unused(
-    source: etree._Element,
-    root: etree._Element,
-    path: Path,
-    packages: tuple[Path, ...],
-) -> None:
+def _copy_unused(source: etree._Element, root: etree._Element, path: Path) -> None:
     """Copy the elements without effect here into ``root``."""
     owners = {
         (tag, element.get("name")): element
@@ -177,5 +172,5 @@ def _copy_unused(
         target.extend(deepcopy([child for child in parent if child.tag in COPIED]))
     # Paths were relative to the source, which the new file may not be near.
     for mesh in root.iterfind("link/visual/geometry/mesh"):
-        if (file := find_mesh(mesh.get("filename", ""), path, packages)) is not None:
+        if (file := find_mesh(mesh.get("filename", ""), path)) is not None:
             mesh.set("filename", str(file))

@@ -34,8 +34,8 @@ _PITCH = 1.3
 _CAMERA_DIRECTION = np.array([-0.62, -0.80, 0.52])
 Rgba = tuple[float, ...]
 _REMEDY = (
-    "repair the file, put it next to the URDF, pass package_dirs=[...] to Robot.load"
-    ", or set ROS_PACKAGE_PATH"
+    "repair the file, put it next to the URDF, or name the folder that holds the package in"
+    " ROS_PACKAGE_PATH"
 )
 
 _GREY = (0.62, 0.65, 0.70, 1.0)
@@ -168,7 +168,7 @@ def _read_mesh(name: str, robot: Robot) -> Any:
     """Return the result of ``trimesh`` for a mesh file of the robot, in metres. Raises
     OSError with the name and the reason.
     """
-    path = find_mesh(name, robot.path, robot.source.package_dirs)
+    path = find_mesh(name, robot.path)
     if path is None:
         raise OSError(name, "not found")
     try:

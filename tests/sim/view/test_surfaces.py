@@ -135,7 +135,7 @@ def test_meshes_that_cannot_be_read_are_reported_with_link_file_and_remedy(tmp_p
     (tmp_path / "empty.stl").write_text("")
     (tmp_path / "box.dae").write_text("<COLLADA/>")
     for name, reason, remedy in (
-        ("lost.stl", r"\(not found\)", "package_dirs"),
+        ("lost.stl", r"\(not found\)", "ROS_PACKAGE_PATH"),
         ("empty.stl", r"\(no triangles\)", "repair the file"),
         ("box.dae", r"cannot be drawn \(", "repair the file"),
     ):
@@ -148,14 +148,15 @@ def test_meshes_that_cannot_be_read_are_reported_with_link_file_and_remedy(tmp_p
             ), str(finding)
 
 
-def test_visuals_are_looked_up_in_package_dirs(tmp_path):
+def test_visuals_are_looked_up_in_packages(tmp_path, monkeypatch):
     (tmp_path / "elsewhere" / "pack").mkdir(parents=True)
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "elsewhere" / "pack" / "cube.stl")
     seen = link("b", INERTIAL + visual('<mesh filename="package://pack/cube.stl"/>'))
     path = write(tmp_path, robot(link("a"), seen, joint("j", "a", "b")))
     _, (lost,) = surfaces(Robot.load(path))
     assert lost.link == "b"
-    (drawn,), _ = surfaces(Robot.load(path, package_dirs=[tmp_path / "elsewhere"]))
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "elsewhere"))
+    (drawn,), _ = surfaces(Robot.load(path))
     assert drawn.link == "b"
 
 
