@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 from batchpid.arrays.array_types import Document, Progress, T
 from batchpid.checks import file_path
 from batchpid.errors import InvalidArgumentError
-from batchpid.io.files import write_atomically
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.gains import ENDINGS, compare, export, tune
@@ -88,7 +87,6 @@ COMMANDS = {
         {
             "out": Output("Actuators file", DOCUMENTS, "out/{robot}.actuators.yaml"),
             "picture": PICTURE,
-            "corrected_urdf": Output("URDF with the identified masses", (".urdf",)),
         },
         ("base",),
     ),
@@ -184,8 +182,6 @@ def _write(name: str, result: Any, path: Path) -> None:
     """Write an output file of a result."""
     if name == "out":
         result.save(path)
-    elif name == "corrected_urdf":
-        write_atomically(path, result.corrected_urdf())
     elif path.suffix in PICTURES:
         from batchpid.sim import plots
 

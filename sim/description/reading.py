@@ -45,10 +45,10 @@ def find_robot(name_or_path: str | Path) -> Path:
     )
 
 
-def read_robot(path: Path, fixed_base: bool | None) -> Source:
+def read_robot(path: Path, fixed_base: bool | None, package_dirs: tuple[Path, ...]) -> Source:
     """Return the robot in the URDF or MJCF file at ``path``, without its .srdf.
 
-    For ``fixed_base`` see :meth:`batchpid.sim.Robot.load`. Raises RobotError for a file that cannot
+    For the arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError for a file that cannot
     be read, a structure or number without repair, or an MJCF file that MuJoCo does not compile.
     """
     findings: list[Finding] = []
@@ -57,7 +57,7 @@ def read_robot(path: Path, fixed_base: bool | None) -> Source:
         name = root.get("model") or path.stem
         source = read_mjcf(path, name, findings, fixed_base)
     else:
-        source = read_urdf(root, path, findings, fixed_base)
+        source = read_urdf(root, path, findings, fixed_base, package_dirs)
     joints = [joint.name for joint in source.tables.joints]
     for name in (source.name, *joints, *source.tables.links):
         if not is_name(name):

@@ -70,13 +70,14 @@ def read_urdf(
     path: Path,
     findings: list[Finding],
     fixed_base: bool | None,
+    package_dirs: tuple[Path, ...],
 ) -> Source:
     """Return the robot of the root element of a URDF, with ``findings`` of reading the file.
 
     Raises RobotError for a structure or number without repair.
     """
     _check_root(root, path)
-    reader = ElementReader(path, findings)
+    reader = ElementReader(path, package_dirs, findings)
     reader.read_visuals(root)
     _drop_unused(root, findings)
     _report_repeated(root, reader)

@@ -47,8 +47,9 @@ SHAPES = {
 class ElementReader:
     """Reader of the elements of one file. It appends to ``findings``, ``shapes`` and ``visuals``."""
 
-    def __init__(self, path: Path, findings: list[Finding]) -> None:
+    def __init__(self, path: Path, package_dirs: tuple[Path, ...], findings: list[Finding]) -> None:
         self._path = path
+        self._package_dirs = package_dirs
         self._findings = findings
         self._missing: list[str] = []
         self.shapes: list[Shape] = []
@@ -77,6 +78,10 @@ class ElementReader:
             rows = []
             for element in link.findall("visual"):
                 shape, problem = _read_shape(element, name)
+                if shape is not None and shape.kind == "mesh":
+                    file = self._find_mesh(shape)
+                    problem = None if file else f"{shape.file!r} not found"
+                    shape = shape._replace(file=str(file)) if file else None
                 material = element.find("material")
                 rgba = None
                 if material is not None:
@@ -266,7 +271,7 @@ class ElementReader:
             self.warn("collision", text, "correct <collision>", link=link)
             return
         if shape.kind == "mesh":
-            file = find_mesh(shape.file, self._path)
+            file = self._find_mesh(shape)
             if file is None:
                 self._missing.append(shape.file)
                 return
@@ -277,13 +282,15 @@ class ElementReader:
             shape = shape._replace(file=str(file), content=content)
         self.shapes.append(shape)
 
+    def _find_mesh(self, shape: Shape) -> Path | None:
+        return find_mesh(shape.file, self._path, self._package_dirs)
+
     def report_missing(self) -> None:
         """Report meshes that are missing or cannot be read."""
         if self._missing:
             text = "collision meshes not found or not readable, simulated without: "
-            remedy = (
-                "repair the files, or name the folder that holds the package in ROS_PACKAGE_PATH"
-            )
+            remedy = "repair the files, pass package_dirs=[...] with the folder that holds the"
+            remedy += " package, or name it in ROS_PACKAGE_PATH"
             self.warn("missing-mesh", text + ", ".join(self._missing), remedy)
 
 

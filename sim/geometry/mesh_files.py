@@ -1,7 +1,6 @@
 """Mesh files of a URDF: the search for them, their reading, and their content.
 
-SAPIEN silently drops a collision shape whose file it cannot read, and a damaged file of some
-formats ends its process. So trimesh reads every file first.
+trimesh reads every file. Engines get vertices.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-from lxml import etree
 
 from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
@@ -32,14 +30,14 @@ _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attributes"
 LFS_PROBLEM = "a git-lfs pointer instead of the mesh: run git lfs pull"
 
 
-def find_mesh(name: str, path: Path) -> Path | None:
+def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
     """Return the mesh file that the URDF at ``path`` refers to as ``name``, or None if it does not
     exist.
 
-    ``package://`` and ``model://`` paths are looked up in the folders above the URDF, and in those
-    of AMENT_PREFIX_PATH and ROS_PACKAGE_PATH, with the name of the package and, in a folder that is
-    the package under another name, without it. Other paths are relative to the URDF's folder, or to
-    one above it. The suffix may be in the other case, and the name percent-encoded.
+    ``package://`` and ``model://`` paths are looked up in ``package_dirs``, in the folders above
+    the URDF, and in those of AMENT_PREFIX_PATH and ROS_PACKAGE_PATH, with the name of the package
+    and, in a folder that is the package under another name, without it. Other paths are relative to
+    the URDF's folder, or to one of these. The suffix may be in the other case, and the name percent-encoded.
     """
     # As in xacro, and on Windows.
     slashes = name.strip().replace("\\", "/")
@@ -48,30 +46,30 @@ def find_mesh(name: str, path: Path) -> Path | None:
     # The places are a generator: nearly every mesh is at the first one.
     for change in (str, str.lower, str.upper, str.title):
         for spelling in spellings:
-            for place in _candidates(spelling, path):
+            for place in _candidates(spelling, path, package_dirs):
                 stem, suffix = os.path.splitext(place)
                 if os.path.isfile(file := stem + change(suffix)):
                     return Path(file).absolute()
     return None
 
 
-def _candidates(name: str, path: Path) -> Iterator[Path]:
+def _candidates(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Iterator[Path]:
     """Yield the files that ``name`` may mean, the likeliest first."""
-    above = path.absolute().parents
-    package = re.match(r"(?:package|model):/+([^/]+/(.+))", name)
-    if package is None:
-        # A plain path may be relative to any folder above, as in a package.
-        relative = re.sub(r"^file:(//(localhost)?)?", "", name)
-        yield from (folder / relative for folder in above)
-        return
     # ROS 2 installs, then ROS 1 workspaces.
     prefixes, workspaces = (
         [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
         for variable in ("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH")
     )
-    folders = (*above, *(prefix / "share" for prefix in prefixes), *workspaces)
-    for relative in package.groups():
+    shares = [prefix / "share" for prefix in prefixes]
+    folders = (*package_dirs, *path.absolute().parents, *shares, *workspaces)
+    package = re.match(r"(?:package|model):/+([^/]+/(.+))", name)
+    if package is None:
+        # A plain path may be relative to any folder above, as in a package.
+        relative = re.sub(r"^file:(//(localhost)?)?", "", name)
         yield from (folder / relative for folder in folders)
+    else:
+        for relative in package.groups():
+            yield from (folder / relative for folder in folders)
 
 
 def read_mesh(path: str | Path, data: bytes) -> Any:
@@ -131,8 +129,6 @@ def _problem(path: Path, data: bytes) -> str | None:
     if data.startswith(LFS_POINTER):
         return LFS_PROBLEM
     try:
-        if suffix == ".dae" and not _has_its_numbers(data):
-            return "array lengths that do not match count="
         count = int.from_bytes(data[80:84], "little")
         if suffix == ".stl" and len(data) == 84 + _TRIANGLE.itemsize * count:
             # Most meshes of robots are such rows, which take a tenth of trimesh's time.
@@ -147,37 +143,6 @@ def _problem(path: Path, data: bytes) -> str | None:
     if (np.abs(corners) <= LARGEST_NUMBER).all():
         return None
     return f"vertices beyond {LARGEST_NUMBER:g} m"
-
-
-def parse_bytes(data: bytes, **options: bool) -> etree._Element:
-    """Return the root element of untrusted XML, without entities, DTD and network.
-
-    ``options`` are more of those of lxml's parser.
-    """
-    safe = {"resolve_entities": False, "no_network": True, "load_dtd": False}
-    return etree.fromstring(data, etree.XMLParser(**safe, **options))
-
-
-def _has_its_numbers(data: bytes) -> bool:
-    """Return whether the arrays of a COLLADA file are as long as it says: SAPIEN reads beyond them
-    otherwise.
-    """
-    # The arrays of a mesh are longer than the texts that libxml2 accepts by itself.
-    root = parse_bytes(data, huge_tree=True)
-    sizes = {}
-    for array in root.iter("{*}float_array"):
-        sizes["#" + array.get("id", "")] = size = len((array.text or "").split())
-        if array.get("count") != str(size):
-            return False
-    ends = (
-        (
-            int(accessor.get("count", "0")) * int(accessor.get("stride", "1"))
-            + int(accessor.get("offset", "0")),
-            accessor.get("source"),
-        )
-        for accessor in root.iterfind("{*}library_geometries//{*}accessor")
-    )
-    return all(0 <= end <= sizes.get(source, -1) for end, source in ends)
 
 
 def mesh_bytes(path: str, content: str) -> bytes:

@@ -29,7 +29,6 @@ from batchpid.sim.identification.unknowns import (
 )
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import load_robot_actuators
-from batchpid.sim.robot.urdf_export import to_urdf
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -241,22 +240,6 @@ class Identification:
             "remarks": self.remarks,
             "identified_from": [part.log.source for part in self.fit.problem.data],
         }
-
-    def corrected_urdf(self) -> str:
-        """Return the URDF of the robot with the identified masses; the links of a body keep their
-        shares of its mass.
-
-        Raises
-        ------
-        InvalidArgumentError
-            Masses are not among the unknowns (extras=["mass"]).
-        """
-        pairs = zip(self.unknowns.entries, self.values.tolist(), strict=True)
-        factors = {str(entry.place): value for entry, value in pairs if entry.kind == "mass"}
-        if not factors:
-            remedy = "identify with extras=['mass']"
-            raise InvalidArgumentError("corrected_urdf", "no mass was found", remedy=remedy)
-        return to_urdf(self.unknowns.robot, mass_factors=factors).text
 
     def gains(self) -> bp.PIDParams | None:
         """Return the params of the identified law, of the logged joints; None unless "gain", "kd" or

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 import batchpid as bp
 from batchpid.arrays.array_types import CHOICES, Bool, Document, Float64
 from batchpid.arrays.elementwise import read_only
-from batchpid.checks import check_keywords, choice, flag
+from batchpid.checks import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.description import reading
@@ -258,6 +258,7 @@ class Robot:
         cls,
         name_or_path: str | Path,
         *,
+        package_dirs: Sequence[str | Path] = (),
         dissipation: str = "urdf",
         fixed_base: bool | None = None,
         self_collision: str = "auto",
@@ -268,6 +269,8 @@ class Robot:
 
         Parameters
         ----------
+        package_dirs
+            Folders in which ``package://`` mesh paths are looked up first.
         dissipation
             ``"urdf"``: joint friction and damping as the URDF says, by the model of
             :mod:`batchpid.motors.friction`. ``"sapien"``: SAPIEN's defaults, PhysX's joint friction
@@ -300,9 +303,13 @@ class Robot:
         choice("self_collision", self_collision, ("auto", "urdf", "none"))
         fixed_base = None if fixed_base is None else flag("fixed_base", fixed_base)
         strict = flag("strict", strict)
+        if not isinstance(package_dirs, list | tuple):
+            problem = "must be a list of folders"
+            raise InvalidArgumentError("package_dirs", problem, value=package_dirs)
         # A wrong option is not hidden by a fault of the file.
         path = reading.find_robot(name_or_path)
-        source = reading.read_robot(path, fixed_base)
+        folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
+        source = reading.read_robot(path, fixed_base, folders)
         report(path, source.repairs, strict)
         moving = [joint for joint in source.tables.joints if joint.moves]
         if not moving:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from batchpid.errors import RobotError
-from batchpid.sim import Robot, Runner, to_urdf
+from batchpid.sim import Robot, Runner
 from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.scene_spec import SOLVERS
@@ -79,13 +79,6 @@ WALKER = f"""
   </worldbody>
 </mujoco>"""
 TEXTS = {"arm": ARM, "chain": CHAIN, "walker": WALKER}
-
-
-@pytest.fixture(autouse=True)
-def hulls(tmp_path, monkeypatch):
-    """Folder of the hulls of meshes."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return tmp_path / "cache/batchpid/meshes"
 
 
 @pytest.fixture
@@ -498,14 +491,6 @@ def test_a_damaged_file_is_a_robot_or_an_error(load, seed, tmp_path, monkeypatch
         )
         with suppress(RobotError):
             load(text[:begin] + part + text[begin + rng.randrange(8) :])
-
-
-def test_an_unwritable_cache_is_an_error(load, monkeypatch, tmp_path):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    robot = load(ARM)
-    with pytest.raises(RobotError, match=r"cannot be written.*XDG_CACHE_HOME"):
-        to_urdf(robot)
 
 
 def test_a_name_in_another_encoding_is_an_error_with_the_file(tmp_path):
