@@ -304,8 +304,8 @@ class Robot:
         fixed_base = None if fixed_base is None else flag("fixed_base", fixed_base)
         strict = flag("strict", strict)
         if not isinstance(package_dirs, list | tuple):
-            problem = "must be a list of folders"
-            raise InvalidArgumentError("package_dirs", problem, value=package_dirs)
+            problem = "must be a list"
+            raise InvalidArgumentError("package_dirs", problem, remedy="pass a list of folders")
         # A wrong option is not hidden by a fault of the file.
         path = reading.find_robot(name_or_path)
         folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
