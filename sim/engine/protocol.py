@@ -38,10 +38,10 @@ from batchpid.sim.engine.scene_spec import (
 from batchpid.sim.findings import Finding
 from batchpid.task_space.rigid_tree import RigidTree
 
-Capability = Literal["build", "partial_force", "base_state", "complete_state", "sapien_dissipation"]
+Capability = Literal["build", "link_sensors", "base_state", "complete_state", "sapien_dissipation"]
 """
 - ``"build"``: the user's function ``build`` adds content to scenes;
-- ``"partial_force"``: compiled steps read gravity or Coriolis forces alone;
+- ``"link_sensors"``: links sense contact forces and wrenches;
 - ``"base_state"``: compiled steps read state and passive force of robots on a floating base;
 - ``"complete_state"``: :meth:`EnginePack.read_state` holds everything that later steps depend on, so
   that a pack in use can be restored, and a snapshot changes no bit;
@@ -111,7 +111,7 @@ class EnginePack(SingleOwner, ABC):
 
     @property
     def rigid_tree(self) -> RigidTree:
-        """Tree of the robots as the engine has them, all joints independent."""
+        """Tree of the robots, all joints independent."""
         return self.spec.rigid_tree
 
     @property
@@ -243,15 +243,15 @@ class EnginePack(SingleOwner, ABC):
         :meth:`read_base` has them.
         """
 
-    @abstractmethod
     def take_sensed(self) -> dict[str, Float64]:
         """Return the sums of the link sensors over all sim steps since the last call, and reset
-        them.
+        them; empty in engines without such sensors.
 
         ``contact_force`` (M, links, 3), ``touching`` (M, links), 0 without a contact, and
         ``wrench`` (M, links, 6), as :class:`batchpid.sim.Observation` describes them; of robots
         that were placed meanwhile, since then.
         """
+        return {}
 
     @abstractmethod
     def write_state(
@@ -405,12 +405,15 @@ class Engine:
 
 
 def require(engine: Engine, capability: Capability, argument: str) -> None:
-    """Raise InvalidArgumentError for ``argument`` if ``engine`` lacks ``capability``, which SAPIEN
-    has.
+    """Raise InvalidArgumentError for ``argument`` if ``engine`` lacks ``capability``, which the
+    other one has.
     """
     if capability not in engine.capabilities:
         problem = f"needs the capability {capability!r}, which engine {engine.name!r} does not have"
-        raise InvalidArgumentError(argument, problem, remedy="omit it, or use the engine 'sapien'")
+        other = next(name for name in MODULES if name != engine.name)
+        raise InvalidArgumentError(
+            argument, problem, remedy=f"omit it, or use the engine {other!r}"
+        )
 
 
 MODULES = {

@@ -1,6 +1,4 @@
-"""Contact forces and wrenches of links: equal in both engines, in observations, recordings and
-snapshots.
-"""
+"""Contact forces and wrenches of links."""
 
 import numpy as np
 import pytest
@@ -26,7 +24,7 @@ def stand(robot, ticks=60, **options):
         return runner.rollout(np.tile(robot.start, (ticks, 1)))
 
 
-def test_contact_forces_of_a_standing_robot_carry_its_weight(stool, engine):
+def test_contact_forces_of_a_standing_robot_carry_its_weight(stool):
     rollout = stand(stool)
     np.testing.assert_allclose(rollout.base_pose[-1, 0, :4], [0, 0, 0.38, 1], atol=5e-3)
     assert np.abs(rollout.base_twist[-1]).max() < 0.01
@@ -38,7 +36,7 @@ def test_contact_forces_of_a_standing_robot_carry_its_weight(stool, engine):
     assert (forces[4] == 0).all()
 
 
-def test_a_link_senses_its_own_contacts_and_not_those_of_the_links_beside_it(tmp_path, engine):
+def test_a_link_senses_its_own_contacts_and_not_those_of_the_links_beside_it(tmp_path):
     """A toe in the air on a foot on the ground, and a sensor without shapes; all on fixed joints."""
     toe = """<link name="toe"><inertial><mass value="0.01"/><inertia ixx="1e-5" iyy="1e-5" izz="1e-5"/>
       </inertial><collision><geometry><sphere radius="0.02"/></geometry></collision></link>
@@ -51,7 +49,7 @@ def test_a_link_senses_its_own_contacts_and_not_those_of_the_links_beside_it(tmp
     assert rollout.contact_force[-1, 0, 1, 2] > 0.2 * WEIGHT
 
 
-def test_a_wrench_holds_the_links_behind_it(stool, engine):
+def test_a_wrench_holds_the_links_behind_it(stool):
     """Foot on the ground: its weight, the contact force, and the wrench of the leg cancel."""
     rollout = stand(stool, wrenches=["foot1", "leg1"])
     assert rollout.info.units_of("wrench") == ("N",) * 3 + ("N m",) * 3
@@ -66,7 +64,7 @@ def test_a_wrench_holds_the_links_behind_it(stool, engine):
     np.testing.assert_allclose(wrench[1, :3], -force + [0, 0, 0.3 * GRAVITY], atol=0.05)
 
 
-def test_nothing_touches_in_free_fall(stool, engine):
+def test_nothing_touches_in_free_fall(stool):
     with make_runner(stool, wrenches=["leg0"], control="effort", compensate="none") as runner:
         begin = runner.reset(
             base_pose=[0, 0, 2.0, 0.9, 0.1, 0.2, 0.3], base_twist=[0.1, 0, 0, 1.0, 2.0, 3.0]
@@ -78,14 +76,14 @@ def test_nothing_touches_in_free_fall(stool, engine):
     assert fall.wrench.any()
 
 
-def test_an_observed_contact_changes_nothing(stool, engine):
+def test_an_observed_contact_changes_nothing(stool):
     first = stand(stool, 30, contacts=None)
     assert first.contact_force is None
     assert_identical(first, stand(stool, 30), skip=("contact_force", "touching"))
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
-def test_an_env_that_fails_has_no_force(stool, engine):
+def test_an_env_that_fails_has_no_force(stool):
     with make_runner(stool, 2, on_invalid_input="contain") as runner:
         bad = np.tile(stool.start, (2, 1))
         for _ in range(30):

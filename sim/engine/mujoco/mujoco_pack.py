@@ -515,7 +515,7 @@ def _without_warnings() -> Iterator[None]:
 ENGINE = Engine(
     name="mujoco",
     title="MuJoCo",
-    capabilities=frozenset({"base_state", "complete_state"}),
+    capabilities=frozenset({"base_state", "complete_state", "link_sensors"}),
     physics=SOLVERS,
     group_size=64,
     make_pack=MujocoPack,

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -32,15 +31,13 @@ from batchpid.sim.engine.sapien.building import (
     engine_settings,
     link_frames,
     new_system,
-    rounded_tree,
     set_inertia,
 )
-from batchpid.sim.engine.sapien.calls import SapienLinkSensors, SapienStep, obstacle
+from batchpid.sim.engine.sapien.calls import SapienStep, obstacle
 from batchpid.sim.engine.sapien.limits import refusals, shortfalls
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import PHYSICS, SceneSpec, Variation
 from batchpid.task_space.frames import matrix_of, unrotate
-from batchpid.task_space.rigid_tree import RigidTree
 
 
 class Pack(EnginePack):
@@ -95,11 +92,6 @@ class Pack(EnginePack):
             ]
             if self.steps_natively:
                 self._constraint.use(self.joint_model, None)
-        self._sensors = (
-            SapienLinkSensors(spec, self.robots, self.systems)
-            if spec.contacts or spec.wrenches
-            else None
-        )
         self._bind()
         if variation is not None:
             self.write_joints(None)
@@ -138,8 +130,6 @@ class Pack(EnginePack):
         self._stepped[...] = True
         for system in self.systems:
             system.step()
-        if self._sensors is not None:
-            self._sensors.add()
 
     def _apply(self, qf: Float32) -> None:
         """Apply efforts to the joints."""
@@ -147,9 +137,7 @@ class Pack(EnginePack):
             self.robots[row].set_qf(qf[row])
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
-        # To compute a force, PhysX overwrites the joint forces that the sensors read after the
-        # step.
-        return self.spec.fixed_base and self._is_model and self._sensors is None
+        return self.spec.fixed_base and self._is_model
 
     def compiled_step(
         self,
@@ -165,7 +153,6 @@ class Pack(EnginePack):
             self._stepped,
             speed_limit,
             self._joints if drives else [],
-            None if self._sensors is None else self._sensors.add,
             gravity=gravity,
             coriolis=coriolis,
             constraint=self._constraint_address,
@@ -175,10 +162,6 @@ class Pack(EnginePack):
         if self._constraint is not None:
             passive = self._own_force(True, True)
             self._constraint.update(self.joint_mass_matrix, self.read_qpos(), passive, rows)
-
-    @cached_property
-    def rigid_tree(self) -> RigidTree:
-        return rounded_tree(self.spec)
 
     def _renew(self, rows: Sequence[int]) -> None:
         """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence
@@ -267,8 +250,6 @@ class Pack(EnginePack):
             _, moving, turning = np.split(base, [7, 10])
             self.robots[row].set_root_linear_velocity(moving)
             self.robots[row].set_root_angular_velocity(turning)
-        if self._sensors is not None:
-            self._sensors.place(rows)
 
     def _moved_to_origin(self, rows: Sequence[int], roots: Float64, sign: float) -> Float64:
         """Return ``roots`` (n, 13) of robots ``rows`` with the velocity of the link's origin for
@@ -283,11 +264,6 @@ class Pack(EnginePack):
         arm = (matrix_of(roots[:, 3:7]) @ centers[..., None])[..., 0]
         velocity = roots[:, 7:10] + sign * np.cross(roots[:, 10:], arm)
         return np.concatenate([roots[:, :7], velocity, roots[:, 10:]], axis=1)
-
-    def take_sensed(self) -> dict[str, Float64]:
-        if self._sensors is None:
-            return {}
-        return self._sensors.take()
 
     def write_state(
         self,
@@ -330,8 +306,6 @@ class Pack(EnginePack):
                 self._contents[row].reset()
         if self._constraint is not None:
             self._constraint.place(rows, qpos)
-        if self._sensors is not None:
-            self._sensors.place(rows)
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
         self._change(rows, variation)
@@ -468,7 +442,7 @@ def _disable_gravity(robot: Any, disabled: bool) -> None:
 ENGINE = Engine(
     name="sapien",
     title="SAPIEN",
-    capabilities=frozenset({"build", "partial_force", "sapien_dissipation"}),
+    capabilities=frozenset({"build", "sapien_dissipation"}),
     physics=PHYSICS,
     group_size=4,
     make_pack=Pack,
