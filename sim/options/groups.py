@@ -166,8 +166,7 @@ class SceneOptions(OptionGroup):
     """
     contacts: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``; default
-    none. Each link senses the contacts of its own shapes. A fixed base is refused. It needs
-    ``engine="mujoco"``.
+    none. Each link senses the contacts of its own shapes. A fixed base is refused.
     """
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links with a sensor of the force and torque that the parent exerts on the link:
@@ -286,7 +285,8 @@ class SceneOptions(OptionGroup):
         links = tuple(names(argument, value))
         if not links:
             return None
-        require(self.load_engine(), "link_sensors", argument)
+        if argument == "wrenches":
+            require(self.load_engine(), "wrenches", argument)
         # A link that no joint moves has no sensor: it is part of the root's body.
         bodies = place_links(robot.tables, links if argument == "wrenches" else ())
         root = next(place.link for place in bodies.values())

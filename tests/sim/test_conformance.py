@@ -223,9 +223,8 @@ FEATURES = {
     "no compensation": Feature({"compensate": "none", "physics": "fast"}),
     "no collisions": Feature({"collisions": False, "ground": False}),
     "a reset at a fault": Feature({"on_fault": "reset", "speed_limit": 2.0}),
-    "contact sensors": Feature(
-        {"contacts": ["hand"], "wrenches": ["arm"]}, engines=MUJOCO, alike=False
-    ),
+    "contact sensors": Feature({"contacts": ["hand"]}),
+    "wrench sensors": Feature({"wrenches": ["arm"]}, engines=MUJOCO, alike=False),
     "user content": Feature({"build": functools.partial(box, 0.05)}, engines=SAPIEN),
     "objects of a scene": Feature({"robot": "scene"}, engines=MUJOCO, alike=False),
     "links in contact": Feature({"robot": "jaco2", "control": "effort"}, exact=True, alike=False),

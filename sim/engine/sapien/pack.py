@@ -66,7 +66,7 @@ class Pack(EnginePack):
         # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in
         # silence.
         self._scenes, self.robots = map(list, zip(*built, strict=True))
-        self._stepped = np.zeros(size, bool)  # robots that did a sim step since they were built
+        self._stepped = np.zeros(size, bool)  # robots that did a sim step since they were placed
         self._contents = []
         if spec.build is not None:
             with engine_settings(spec):
@@ -161,7 +161,7 @@ class Pack(EnginePack):
     def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         if self._constraint is not None:
             passive = self._own_force(True, True)
-            self._constraint.update(self.joint_mass_matrix, self.read_qpos(), passive, rows)
+            self._constraint.update(self.joint_model.mass_matrix, self.read_qpos(), passive, rows)
 
     def _renew(self, rows: Sequence[int]) -> None:
         """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence
@@ -198,7 +198,6 @@ class Pack(EnginePack):
                 joint.set_armature(armature)
             _disable_gravity(robot, bool(self._suspended[row]))
             self.robots[row] = robot
-        self._stepped[rows] = False
         self._bind()
 
     def read_qpos(self) -> Float64:
@@ -218,7 +217,7 @@ class Pack(EnginePack):
     def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         if self.steps_read_force(gravity, coriolis):
             return self._own_force(gravity, coriolis)
-        return self._model_force(gravity, coriolis)
+        return self._force(self.force_model, gravity, coriolis)
 
     def write_qf(self, effort: Rows) -> None:
         self.qf[...] = effort
@@ -265,6 +264,23 @@ class Pack(EnginePack):
         velocity = roots[:, 7:10] + sign * np.cross(roots[:, 10:], arm)
         return np.concatenate([roots[:, :7], velocity, roots[:, 10:]], axis=1)
 
+    def take_sensed(self, steps: int) -> dict[str, Rows]:
+        """Return the contact forces of the last sim step: the normal forces, which PhysX
+        reports.
+        """
+        sensed = self.spec.contacts or ()
+        bodies = self.spec.simulated.links
+        forces = np.zeros((self.size, len(sensed), 3))
+        for row in np.flatnonzero(self._stepped) if sensed else ():
+            entities = {link.name: link.entity for link in self.robots[row].links}
+            places = {entities[bodies[link].link]: place for place, link in enumerate(sensed)}
+            for contact in self.systems[row].get_contacts():
+                impulse = np.sum([point.impulse for point in contact.points], axis=0)
+                for body, sign in zip(contact.bodies, (1.0, -1.0), strict=True):
+                    if (place := places.get(body.entity)) is not None:
+                        forces[row, place] += sign * impulse / self.spec.timestep
+        return {"contact_force": forces, "touching": np.abs(forces).sum(2)} if sensed else {}
+
     def write_state(
         self,
         rows: Sequence[int],
@@ -300,7 +316,7 @@ class Pack(EnginePack):
             write_root(robot, base)
             robot.set_qpos(position.astype(np.float32))
             robot.set_qvel(velocity.astype(np.float32))
-            self.qf[row] = 0.0
+            self.qf[row] = self._stepped[row] = 0.0
             robot.set_qf(self.qf[row])
             if self._contents:
                 self._contents[row].reset()
