@@ -193,7 +193,7 @@ def write_film(
     painter = Painter(recorded.robot, rollout.num_envs, recorded.ground, SIZE)
     if not recorded.duration * FPS <= MOST_FRAMES:
         problem = f"lasts {recorded.duration:g} s, more than {MOST_FRAMES} frames"
-        remedy = "film a part: rollout.for_ticks(slice(...))"
+        remedy = "film a part: rollout.for_ticks(start, stop)"
         raise InvalidArgumentError("rollout", problem, remedy=remedy)
     times = np.arange(0.0, recorded.duration + 0.5 / FPS, 1 / FPS)
     rows = rows_at(rollout, times).tolist()

@@ -191,7 +191,7 @@ class Playback:
     def _since(self, start: float) -> Rollout:
         """Return the rows from a time [s] to the present one."""
         first, last = rows_at(self._rollout, np.array([start, self._now])).tolist()
-        return self._rollout.for_ticks(slice(first, last + 1))
+        return self._rollout.for_ticks(first, last + 1)
 
 
 ViewData = LiveSimulation | Playback

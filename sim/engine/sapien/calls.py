@@ -18,7 +18,7 @@ import numpy as np
 import sapien
 from sapien.physx import PhysxArticulation, PhysxCpuSystem
 
-from batchpid.arrays.array_types import Bool, Float64, Rows
+from batchpid.arrays.array_types import Bool, Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import SWITCH, extension, structure
 from batchpid.sim.engine.native_model import NativeStep
@@ -117,8 +117,6 @@ class SapienStep(NativeStep):
         to which none are applied.
     stepped
         Mask of the robots that did a sim step (robots,), set in place.
-    speed_limit
-        Joint speed beyond which the status says so (dof,), or None.
     joints
         Joints of all robots, if the targets of their drives move within a tick; else empty.
     fields
@@ -132,7 +130,6 @@ class SapienStep(NativeStep):
         systems: Sequence[PhysxCpuSystem],
         arrays: Mapping[str, Rows],
         stepped: Bool,
-        speed_limit: Float64 | None,
         joints: Sequence[object],
         **fields: object,
     ) -> None:
@@ -152,7 +149,6 @@ class SapienStep(NativeStep):
             size,
             dof,
             arrays,
-            speed_limit,
             functions=address,
             **fields,
         )

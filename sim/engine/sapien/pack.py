@@ -139,19 +139,12 @@ class Pack(EnginePack):
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         return self.spec.fixed_base and self._is_model
 
-    def compiled_step(
-        self,
-        gravity: bool,
-        coriolis: bool,
-        speed_limit: Float64 | None,
-        drives: bool = False,
-    ) -> SapienStep:
+    def compiled_step(self, gravity: bool, coriolis: bool, drives: bool = False) -> SapienStep:
         return SapienStep(
             self.robots,
             self.systems,
             {"qf": self._joint_qf, "skip": self._suspended},
             self._stepped,
-            speed_limit,
             self._joints if drives else [],
             gravity=gravity,
             coriolis=coriolis,

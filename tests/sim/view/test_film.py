@@ -94,7 +94,7 @@ def test_the_message_of_ffmpeg_is_in_the_error(tmp_path):
 def test_runs_that_no_film_can_hold_are_refused(rollout, gap, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     far = dataclasses.replace(rollout, time=np.append(rollout.time[:-1], gap))
-    empty = rollout.for_ticks(slice(0, 0))
+    empty = rollout.for_ticks(0, 0)
     for bad in (far, empty):
         with pytest.raises(InvalidArgumentError, match=r"rollout: (lasts|holds no tick)"):
             film.write_film(bad, tmp_path / "film.gif")
