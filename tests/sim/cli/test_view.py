@@ -100,6 +100,6 @@ def test_a_recording_without_robot_asks_for_its_file(batchpid, tmp_path):
     body = '<worldbody><body><joint/><geom type="mesh" mesh="m"/></body></worldbody>'
     path.write_text(f'<mujoco model="arm">{mesh}{body}</mujoco>')
     run = write(tmp_path / "run.h5", Robot.load(path), name="arm")
-    problem = "'arm' is not bundled, and the recording holds no description of it; name its URDF"
+    problem = "robot: of the recording, 'arm', is unknown: a URDF cannot hold it; name its"
     assert problem in batchpid("view", "--play", run)[2]
     assert batchpid("view", path, *SHORT, "--play", run, "--time-limit", 0.1)[0] == 0
