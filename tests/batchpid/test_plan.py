@@ -1,5 +1,5 @@
-"""Plans: chunks of a slow policy become setpoints, by the formulas of ACT, LeRobot and linear
-interpolation, without a step at a seam, within their limits; the same in NumPy, JAX and C.
+"""Plans: chunks of a slow policy become setpoints, by the formulas of batchpid/plan/sampling.py,
+without a step at a seam, within their limits; the same in NumPy, JAX and C.
 """
 
 import subprocess
@@ -18,16 +18,13 @@ PERIOD, DT = 1 / 30, 1 / 2000
 PLANS = {
     "align": {"fade": [0.5, 1.0, 0.3], "latest": [2]},
     "newest": {},
-    "ensemble": {"weight": 0.1, "taper": 0.2, "latest": [0]},
-    "average": {"share": 0.6, "rate": 2.0, "acceleration": 15.0},
-    "linear": {"blend": "newest", "interpolation": "linear", "acceleration": [15.0, 9.0, np.inf]},
-    "hold": {"blend": "newest", "interpolation": "hold"},
+    "limited": {"blend": "align", "rate": 2.0, "acceleration": [15.0, 9.0, np.inf]},
 }
 
 
 def made(name, joints=3, horizon=8, **options):
-    chosen = {"blend": name, "period": PERIOD, "horizon": horizon} | PLANS.get(name, {})
-    return bp.make_plan(joints, **chosen | options)
+    chosen = {"blend": name, "period": PERIOD, "horizon": horizon} | PLANS[name] | options
+    return bp.make_plan(joints, **chosen)
 
 
 def run(plan, times, chunks, start=0.0):
@@ -48,74 +45,33 @@ def blended(chunks, plan, ticks):
     chunk k is for the times from k + 1 on.
     """
     knots, rates = np.zeros((2, ticks + plan.horizon, plan.num_joints))
-    weights, rows = np.zeros(len(knots)), np.arange(plan.horizon)
-    options = {name: float(leaf[0, 0]) for name, leaf in plan.leaves().items()}
+    rows = np.arange(plan.horizon)
     for k, ((chunk, _),) in chunks.items():
-        old = weights[k + 1 + rows, None]
-        weight = 1 - old * (1 - np.exp(-options.get("weight", 0.0)))
-        if "share" in options:
-            weight = np.where(old > 0, old * options["share"] / (1 - options["share"]), 1.0)
-        if "taper" in options:
-            weight = weight * np.minimum(
-                1, (plan.horizon - rows[:, None]) * PERIOD / options["taper"]
-            )
-        mean = (old * knots[k + 1 + rows] + weight * chunk) / (old + weight)
-        if "fade" in options:
-            time, fade = PERIOD * rows[:, None], options["fade"]
+        if plan.fade is not None:
+            time, fade = PERIOD * rows[:, None], plan.fade[0, 0]
             offset, slope = knots[k + 1] - chunk[0], rates[k + 1] - (chunk[1] - chunk[0]) / PERIOD
             rise = np.minimum(5 * time / fade, 1)
             eased = (offset + fade * slope) * rise * (1 - rise) ** 2 / 5
-            mean = chunk + offset * np.maximum(1 - time / fade, 0) + eased
-        knots[k + 1 :], rates[k + 1 :], weights[k + 1 :] = mean[-1], 0.0, 0.0
-        knots[k + 1 + rows], weights[k + 1 + rows] = mean, (old + weight)[:, 0]
-        rates[k + 1 + rows] = np.gradient(mean, PERIOD, axis=0)
+            chunk = chunk + offset * np.maximum(1 - time / fade, 0) + eased
+        knots[k + 1 :], rates[k + 1 :] = chunk[-1], 0.0
+        knots[k + 1 + rows] = chunk
+        rates[k + 1 + rows] = np.gradient(chunk, PERIOD, axis=0)
     return knots[:ticks]
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_ensembles_are_those_of_act_and_averages_those_of_lerobot(seed):
+def test_chunks_are_blended_by_the_formulas(seed):
     rng = np.random.default_rng(seed)
-    weight, share, horizon = rng.uniform(0, 1), rng.uniform(0.2, 0.9), int(rng.integers(2, 9))
+    horizon = int(rng.integers(2, 9))
     chunks = {k: [(rng.normal(size=(horizon, 3)), (k + 1) * PERIOD)] for k in range(30)}
     kept = {k: chunk for k, chunk in chunks.items() if k == 0 or rng.random() < 0.6}
-    acts, averages = np.zeros((29, 3)), np.zeros((29, 3))
-    for k in range(29):
-        rows = [entry[0][0][k - at] for at, entry in kept.items() if 0 <= k - at < horizon]
-        weights = np.exp(-weight * np.arange(len(rows)))
-        if rows:
-            acts[k] = weights @ rows / weights.sum()
-            averages[k] = rows[0]
-        for row in rows[1:]:
-            averages[k] = (1 - share) * averages[k] + share * row
-        if not rows:
-            acts[k], averages[k] = acts[k - 1], averages[k - 1]
-    times, taper = PERIOD * np.arange(30), rng.uniform(0.05, 0.3)
-    ensemble = made("ensemble", horizon=horizon, weight=weight, taper=None, latest=())
-    average = made("average", horizon=horizon, share=share, rate=None, acceleration=None)
-    others = (
-        made("align", horizon=horizon, fade=rng.uniform(0.2, 1.5), latest=()),
-        made("ensemble", horizon=horizon, weight=weight, taper=taper, latest=()),
-        made("average", horizon=horizon, taper=taper, rate=None, acceleration=None),
-    )
-    expected = [(ensemble, acts), (average, averages)]
-    for plan, row in (*expected, *((plan, blended(kept, plan, 30)[1:]) for plan in others)):
-        (setpoint, _, _), _ = run(plan, times, kept)
-        np.testing.assert_allclose(setpoint[1:], row, atol=1e-6)
+    for options in ({"blend": "align", "fade": rng.uniform(0.2, 1.5)}, {}):
+        plan = made("newest", horizon=horizon, **options)
+        (setpoint, _, _), _ = run(plan, PERIOD * np.arange(30), kept)
+        np.testing.assert_allclose(setpoint[1:], blended(kept, plan, 30)[1:], atol=1e-6)
 
 
-def test_single_rows_in_straight_lines_are_a_linear_interpolator():
-    actions = np.random.default_rng(0).normal(size=(20, 3))
-    plan = made("newest", interpolation="linear")
-    times = PERIOD / 3 * np.arange(61)
-    chunks = {3 * k: [(actions[k : k + 1], PERIOD * k)] for k in range(20)}
-    (setpoint, _, _), _ = run(plan, times, chunks)
-    before = np.vstack([np.zeros((1, 3)), actions[:-1]])
-    thirds = np.arange(1, 4)[None, :, None] / 3
-    expected = before[:, None] + thirds * (actions - before)[:, None]
-    np.testing.assert_allclose(setpoint[1:], expected.reshape(60, 3), atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ["align", "newest", "ensemble", "average"])
+@pytest.mark.parametrize("name", ["align", "newest"])
 def test_a_seam_has_no_step_and_no_dip(name):
     def reference(t):
         return 0.5 * np.sin(2.0 * t + np.arange(3))

@@ -127,7 +127,7 @@ COMBINATIONS = {
     bp.make_guard: [{"lower": 1.0, "upper": 0.0}],
     bp.make_plan: [
         {"fade": 1.0, "blend": "newest"},
-        *({"taper": 0.1}, {"latest": [3]}, {"acceleration": 0.0}, {"period": 0.0}, {"horizon": 0}),
+        *({"latest": [3]}, {"acceleration": 0.0}, {"period": 0.0}, {"horizon": 0}),
     ],
     ts.make_osc_params: [
         {"stiffness": [1.0, 2.0]},
