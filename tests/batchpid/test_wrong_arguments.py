@@ -170,11 +170,11 @@ COMBINATIONS = {
     ],
     trajectories.minimum_jerk: [
         {"max_velocity": math.inf},
+        {"max_velocity": [1.0, -1.0]},
         {"dt": 10**400, "duration": 1.0},
         {"duration": None},
         {"duration": 1.0, "max_velocity": 1.0},
     ],
-    trajectories.trapezoidal: [{"max_velocity": [1.0, -1.0]}, {"max_acceleration": math.inf}],
     metrics.step_metrics: [
         {"measurement": np.zeros((1, 1, 2))},
         {"setpoint": np.zeros(3)},
@@ -319,9 +319,6 @@ def needed(function, more=(), module=None):
     module = module or next(owner for owner, _, each in PUBLIC if each is function)
     values = VALUES | OWN.get(module, {}) | {"duration": 1.0, "dt": 0.01, "timestep": 0.01}
     values |= {"setpoint": np.ones((9, 1, 2))} if function is metrics.step_metrics else {}
-    values |= (
-        {"start": POSE[0], "target": POSE[0]} if function is trajectories.straight_line else {}
-    )
     values |= {"center": Y, "amplitude": Y, "frequency": 1.0, "period": 0.1, "horizon": 4}
     parameters = inspect.signature(function).parameters.items()
     required = {
