@@ -17,7 +17,12 @@ from batchpid.sim import Robot, Runner
 
 PERIOD, ROWS, TICK = 1 / 40, 20, 0.005
 EVERY, LATE = 40, 20  # ticks from chunk to chunk, and from observation to chunk
-WAYS = {"newest": {"blend": "newest"}, "aligned": {"blend": "align", "fade": 1.0}}
+WAYS = {
+    "held": {"blend": "newest", "interpolation": "hold"},
+    "linear": {"blend": "newest", "interpolation": "linear"},
+    "cubic": {"blend": "newest"},
+    "cubic, aligned": {"blend": "align", "fade": 1.0},
+}
 
 
 def reference(robot: Robot, time: np.ndarray | float) -> np.ndarray:

@@ -3,7 +3,7 @@
 
 /* Memory of a plan. */
 typedef struct {
-  double knots[BATCHPID_JOINTS][BATCHPID_KNOTS], rates[BATCHPID_JOINTS][BATCHPID_KNOTS];
+  double knots[BATCHPID_JOINTS][BATCHPID_KNOTS], rates[BATCHPID_JOINTS][BATCHPID_KNOTS], weights[BATCHPID_JOINTS][BATCHPID_KNOTS];
   double segment[4][BATCHPID_JOINTS]; /* position and rate at its end, coefficients of the square and the cube */
   double begin, last, end, now; /* of the first and last row, end of the segment, time of the last sample [s] */
   double starved; /* samples later than the last row */
@@ -20,7 +20,7 @@ static inline void batchpid_plan_init(batchpid_plan *state, const double qpos[BA
     state->segment[1][j] = state->segment[2][j] = state->segment[3][j] = 0.0;
     for (int k = 0; k < BATCHPID_KNOTS; ++k) {
       state->knots[j][k] = qpos[j];
-      state->rates[j][k] = 0.0;
+      state->rates[j][k] = state->weights[j][k] = 0.0;
     }
   }
 }
@@ -45,7 +45,7 @@ static inline void batchpid_add_chunk(batchpid_plan *state, const double *chunk,
   const double begin = ahead > first ? now + (1.0 - first) * period : time;
   const double joined = begin + first * period, length = joined - now;
   const int end = (int)rows, f = (int)first, low = f > 0 ? f - 1 : 0, high = f + 1 < end ? f + 1 : end - 1;
-  double blended[BATCHPID_HORIZON][BATCHPID_JOINTS], offset[BATCHPID_JOINTS], slope[BATCHPID_JOINTS];
+  double blended[BATCHPID_HORIZON][BATCHPID_JOINTS], weights[BATCHPID_HORIZON][BATCHPID_JOINTS], offset[BATCHPID_JOINTS], slope[BATCHPID_JOINTS];
   double position[BATCHPID_JOINTS], speed[BATCHPID_JOINTS];
   if (end < 1) return;
   /* [present] */
@@ -56,7 +56,7 @@ static inline void batchpid_add_chunk(batchpid_plan *state, const double *chunk,
     slope[j] = end > 1 ? slope[j] - rise / ((double)(high - low) * period) : 0.0;
   }
   for (int k = 0; k < end; ++k) {
-    const double step = (double)k - first;
+    const double step = (double)k;
     /* [blended] */
     (void)step;
   }
@@ -68,6 +68,7 @@ static inline void batchpid_add_chunk(batchpid_plan *state, const double *chunk,
       const int inner = k > 0 && k + 1 < end;
       state->knots[j][i] = blended[k][j];
       state->rates[j][i] = i < end ? (inner ? 0.5 * (after + before) : after) / period : 0.0;
+      state->weights[j][i] = i < end ? weights[k][j] : 0.0;
     }
   }
   /* [joined] */

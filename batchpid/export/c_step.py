@@ -317,7 +317,7 @@ def plan_functions(c: Dialect, plan: Plan, functions: str) -> str:
     starts = {place: c.number(0.0) if "rate" in place else "qpos[j]" for place in held}
     segment = [f"state->segment[{i}][j]" for i in range(4)]
     # Leaves of the state by the names that they have in C.
-    names = [f"state->{name}[j]" for name in ("knots", "rates")]
+    names = [f"state->{name}[j]" for name in ("knots", "rates", "weights")]
     names += ["begin0", "last0", *segment, "end0", "now0", "starved0", *held]
 
     def sampled(k: Plan, state: PlanState, t: Array, dt: Array) -> Pytree:
@@ -327,11 +327,8 @@ def plan_functions(c: Dialect, plan: Plan, functions: str) -> str:
     def present(k: Plan, state: PlanState) -> Pytree:
         return model.evaluate(state.segment, state.now - state.end)[:2]
 
-    def joined(_: Plan, __: PlanState, *knots: Array) -> Pytree:
-        return model.cubic(*knots)
-
-    def blended(k: Plan, _: PlanState, *row: Array) -> Pytree:
-        return model.aligned(k, *row)
+    def joined(k: Plan, _: PlanState, *knots: Array) -> Pytree:
+        return model.cubic(k, *knots)
 
     def body(step: Callable[..., Pytree], inputs: list[str], *places: str) -> str:
         return _body(
@@ -344,7 +341,7 @@ def plan_functions(c: Dialect, plan: Plan, functions: str) -> str:
             places,
         )
 
-    row = [f"chunk[k * {n} + j]", "offset[j]", "slope[j]", "step"]
+    row = [f"chunk[k * {n} + j]", "begin", "offset[j]", "slope[j]", "first", "step"]
     knots = ["length", "position[j]", "blended[f][j]", "speed[j]", "state->rates[j][f]"]
     text = c.translated(
         "c_plan.h",
@@ -356,7 +353,7 @@ def plan_functions(c: Dialect, plan: Plan, functions: str) -> str:
         sampled=body(sampled, ["t", "dt"], *held, "setpoint[j]", "rate[j]"),
         present=body(present, [], "position[j]", "speed[j]"),
         later=body(model.curve, ["joined"], "offset[j]", "slope[j]"),
-        blended=body(blended, row, "blended[k][j]"),
+        blended=body(model.blend, row, "blended[k][j]", "weights[k][j]"),
         joined=body(joined, knots, *segment),
     )
     helped = "".join(helper for helper in helpers(c, text) if helper not in functions)

@@ -7,6 +7,7 @@ A file in YAML or JSON has the options of the whole plan, and one entry per join
     period: 0.03333333333333333
     horizon: 16
     blend: align
+    interpolation: cubic
     latest: [1]
     joints:
       shoulder: {fade: 1.0, rate: 2.0, acceleration: 15.0}
@@ -32,7 +33,14 @@ LONGEST_HORIZON = 1000
 """Most rows of a chunk."""
 SPARE_ROWS = 2
 """Knots behind the rows of a chunk, at rest."""
-BLENDS = ("align", "newest")
+INTERPOLATIONS = {"cubic": 3.0, "linear": 1.0, "hold": 0.0}
+"""Interpolations, with the degree of the curve between two rows."""
+BLENDS = {
+    "align": "fade",
+    "newest": "",
+    "ensemble": "weight",
+}
+"""Blends, with the option that each of them has."""
 
 
 class _PlanFields(NamedTuple):
@@ -40,9 +48,22 @@ class _PlanFields(NamedTuple):
     """P [s]."""
     rows: Array
     """Number of the last knot of the tables, horizon + 1."""
+    degree: Array
+    """Degree of the curve between two rows."""
     blended: Array
-    """1.0 on the joints whose chunks are aligned, 0.0 on those that take the newest value."""
+    """1.0 on the joints whose chunks are blended, 0.0 on those that take the newest value."""
     fade: Annotated[Array, Field("s", above=True, default=1.0)] = None
+    weight: Annotated[
+        Array,
+        Field(
+            "1",
+            low=-9.0,
+            high=9.0,
+            default=0.01,
+        ),
+    ] = None
+    forgotten: Array = None
+    """1 - exp(-m) of an ensemble."""
     rate: Annotated[Array, GUARD_FIELDS["rate"]] = None
     """V [rad/s or m/s]."""
     acceleration: Annotated[Array, GUARD_FIELDS["acceleration"]] = None
@@ -72,10 +93,13 @@ class Plan(Record, _PlanFields):
         again.
         """
         leaves = self.leaves()
+        blends = [blend for blend, option in BLENDS.items() if option in leaves]
+        degrees = {degree: name for name, degree in INTERPOLATIONS.items()}
         return {
             "period": float(self.period[0, 0]),
             "horizon": self.horizon,
-            "blend": "align" if "fade" in leaves else "newest",
+            "blend": blends[0] if blends else "newest",
+            "interpolation": degrees[float(self.degree[0, 0])],
             "latest": np.flatnonzero(self.blended[0] == 0).tolist(),
             "dtype": np.dtype(self.dtype),
             **{name: leaf for name, leaf in leaves.items() if name in PLAN_FIELDS},
@@ -89,6 +113,7 @@ def make_plan(
     period: float,
     horizon: int,
     blend: str = "align",
+    interpolation: str = "cubic",
     latest: Sequence[int] = (),
     joint_names: Sequence[str] | None = None,
     dtype: DType = None,
@@ -111,10 +136,16 @@ def make_plan(
         - "align": the chunk is moved to it, by an offset that fades to 0. A chunk of one row is
           taken as it is.
         - "newest": the chunk replaces the plan.
+        - "ensemble": the mean of all chunks for the same time, with weights exp(-m i), where i is 0
+          for the oldest one.
     fade
         Of "align": time over which the offset fades [s]; default 1.
+    weight
+        Of "ensemble": m; default 0.01.
+    interpolation
+        "cubic", with rates that are central differences of the blended rows; "linear", or "hold".
     latest
-        Indices of the joints that take the newest value without an offset, such as a gripper.
+        Indices of the joints that take the newest value without a blend, such as a gripper.
     rate, acceleration
         Limits > 0 of the setpoint's rate and acceleration [rad/s or m/s, and per second], by
         :mod:`batchpid.motors.guard`; default none.
@@ -126,21 +157,28 @@ def make_plan(
     Raises
     ------
     InvalidArgumentError
-        Naming the option, joint, env and value; also for a fade of another blend.
+        Naming the option, joint, env and value; also for an option of another blend.
     """
     build = LeafBuilder(joints, joint_names, dtype, options.values())
-    fade = options.get("fade")
-    if choice("blend", blend, BLENDS) == "align":
-        options["fade"] = PLAN_FIELDS["fade"].default if fade is None else fade
-    elif fade is not None:
-        problem = "has no effect with blend 'newest'"
-        raise InvalidArgumentError("fade", problem, remedy="leave it out, or choose 'align'")
     leaves = build.options(PLAN_FIELDS, options)
+    # A blend has its own option alone.
+    option = BLENDS[choice("blend", blend, BLENDS)]
+    for name in sorted(options.keys() & set(BLENDS.values()) - {option}):
+        remedy = "leave it out, or choose another blend"
+        raise InvalidArgumentError(name, f"has no effect with blend {blend!r}", remedy=remedy)
+    if option:
+        field = PLAN_FIELDS[option]
+        # An ensemble stays one where m is 0.
+        leaves[option] = build.array(option, options.get(option, field.default), field)
+    if option == "weight":
+        leaves["forgotten"] = 1.0 - np.exp(-leaves["weight"])
     horizon = integer("horizon", horizon, 1, LONGEST_HORIZON)
     newest = [integer("latest", joint, 0, build.joints - 1) for joint in latest]
+    degree = INTERPOLATIONS[choice("interpolation", interpolation, INTERPOLATIONS)]
     leaves |= {
         "period": build.rows("period", np.array(positive("period", period, "s"))),
         "rows": build.rows("horizon", np.array(horizon + SPARE_ROWS - 1.0)),
+        "degree": build.rows("interpolation", np.array(degree)),
         "blended": 1.0 - np.isin(np.arange(build.joints), newest)[None],
     }
     return Plan(**{name: build.freeze(leaf) for name, leaf in leaves.items()})
@@ -150,7 +188,7 @@ PLANS = RecordFile(
     "batchpid-plan-1",
     Plan,
     make_plan,
-    ("period", "horizon", "blend", "latest", "dtype"),
+    ("period", "horizon", "blend", "interpolation", "latest", "dtype"),
     PLAN_FIELDS,
 )
 dumps_plan = PLANS.dumps

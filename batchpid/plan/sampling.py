@@ -7,11 +7,13 @@ x(t) and the time t of the last sample, the blended rows are, by :func:`batchpid
     newest      b_k = c_k
     align       b_k = c_k + o max(1 - s, 0) + (o + o' fade) u (1 - u)^2 / 5
                 s   = (T_k - T_f) / fade,   u = min(5 s, 1)
+    ensemble    b_k = x(T_k) + g_k / (W_k + g_k) (c_k - x(T_k)),   g_k = 1 - W_k (1 - exp(-m))
 
 o = x(T_f) - c_f is the offset, which fades, and o' = x'(T_f) - c'_f its rate, from which the rate
 of the fading is reached in a fifth of that time. f is the first row that is at least P / 2 ahead of
 t; those before it have passed, and are dropped. If all have passed, the last one is taken for t +
-P.
+P. W_k is the weight of the chunks so far at that time, to which g_k is added: the g are exp(-m i),
+i = 0, 1, ...
 
 The knots of the new plan are x(t) at t, where the plan has its rate too, and b_k at T_k from f on,
 with the rates (b_{k+1} - b_{k-1}) / (2 P), one-sided at the ends of the chunk. Behind the last row
@@ -27,7 +29,8 @@ The state has q, w, c, d of the present segment, which change where it ends (:fu
 sample is this polynomial (:func:`advance`).
 
 Limits of the plan are those of :mod:`batchpid.motors.guard` on x. The alignment is after the policy
-runner of axol.
+runner of axol, the ensemble after ACT (T. Z. Zhao et al., Learning Fine-Grained Bimanual
+Manipulation with Low-Cost Hardware, RSS 2023).
 """
 
 from __future__ import annotations
@@ -65,6 +68,8 @@ class PlanState(NamedTuple):
     """Positions in the rows of the last chunk, and behind them the last one [rad or m]."""
     rates: Array
     """Rates in these rows, 0 behind them [rad/s or m/s]."""
+    weights: Array
+    """Weights W of these rows, 0 behind them and where chunks are not averaged."""
     begin: Array
     """Time of the first row [s]."""
     last: Array
@@ -93,12 +98,14 @@ def init(plan: Plan, qpos: Array, time: Array = 0.0) -> PlanState:
     zeros = xp.zeros_like(qpos + plan.blended)
     start, at = zeros + qpos, zeros + _column(time)
     knots = xp.repeat(start[..., None, :], plan.horizon + SPARE_ROWS, axis=-2)
+    empty = xp.zeros_like(knots)
     rest = start, zeros, zeros, zeros
     limits = _guard(plan)
     guard = None if limits is None else guard_model.init(limits, start)
     return PlanState(
         knots,
-        xp.zeros_like(knots),
+        empty,
+        empty,
         at,
         at,
         rest,
@@ -132,7 +139,7 @@ def add(
     chunk = xp.broadcast_to(chunk, (*state.now.shape[:-1], rows, joints))
     # All rows at once: plan and state have an axis more.
     options, wide = _wide(plan), _wide(state)
-    wide = wide._replace(knots=state.knots, rates=state.rates)
+    wide = wide._replace(knots=state.knots, rates=state.rates, weights=state.weights)
     period, now = options.period, wide.now
     begin = xp.zeros_like(now) + _column(_column(time))
     # Rows that have passed are dropped; if all have, the last one is still the newest wish.
@@ -143,12 +150,15 @@ def add(
     position, rate, _ = evaluate(wide.segment, now - wide.end)
     offset, slope = gap(options, wide, chunk, joined, first)
     step = xp.arange(rows, dtype=chunk.dtype).reshape(*[1] * (chunk.ndim - 2), rows, 1)
-    blended = aligned(
+    blended, weights = blend(
         options,
+        wide,
         chunk,
+        begin,
         offset,
         slope,
-        step - first,
+        first,
+        step,
     )
     # Central differences, one-sided at the ends of the chunk.
     rise = xp.diff(blended if rows > 1 else xp.concatenate((position, blended), -2), axis=-2)
@@ -158,6 +168,7 @@ def add(
     rates = xp.concatenate((*rises, *behind), -2) / period
     high, slope = take_rows(blended, first), take_rows(rates, first)
     segment = cubic(
+        options,
         joined - now,
         position,
         high,
@@ -167,6 +178,7 @@ def add(
     return state._replace(
         knots=xp.concatenate((blended, *rest), -2),
         rates=rates,
+        weights=xp.concatenate((weights, *behind), -2),
         begin=begin[..., 0, :],
         last=(begin + (rows - 1.0) * period)[..., 0, :],
         segment=mapped(lambda leaf: leaf[..., 0, :], segment),
@@ -195,24 +207,38 @@ def gap(
     return offset, slope - rise / ((high - low) * plan.period)
 
 
-def aligned(
+def blend(
     plan: Plan,
-    row: Array,
+    state: PlanState,
+    chunk: Array,
+    begin: Array,
     offset: Array,
     slope: Array,
+    first: Array,
     step: Array,
-) -> Array:
-    """Return a row of a chunk, ``step`` rows after the first one ahead, moved to the plan: from its
-    ``offset`` and the rate ``slope`` of the offset in that row.
+) -> tuple[Array, Array]:
+    """Return row number ``step`` of a chunk that begins at ``begin`` [s], blended with the plan,
+    and its weight, 0 where chunks are not averaged.
+
+    ``offset`` is that of the alignment, in row ``first``, and ``slope`` its rate. Arrays have the
+    shape of the times of ``state``, or one that broadcasts with it.
     """
-    if plan.fade is None:
-        return row
-    xp = namespace(*plan, row, step)
-    s = step * (plan.period / plan.fade)
-    u = xp.minimum(s / EASE, 1.0)
-    rest = 1.0 - u
-    eased = u * (rest * rest) * (EASE * (offset + plan.fade * slope))
-    return row + plan.blended * (xp.maximum(1.0 - s, 0.0) * offset + eased)
+    xp = namespace(*plan, state.knots, chunk, begin, step)
+    if plan.fade is not None:
+        s = (step - first) * (plan.period / plan.fade)
+        u = xp.minimum(s / EASE, 1.0)
+        rest = 1.0 - u
+        eased = u * (rest * rest) * (EASE * (offset + plan.fade * slope))
+        faded = plan.blended * (xp.maximum(1.0 - s, 0.0) * offset + eased)
+        return chunk + faded, 0.0 * chunk
+    if plan.forgotten is None:
+        return chunk, 0.0 * chunk
+    time = begin + step * plan.period
+    present, _ = curve(plan, state, time)
+    near = xp.rint((time - state.begin) / plan.period)
+    old = xp.where(near >= 0, take_rows(state.weights, _row(plan, near)), 0.0) * plan.blended
+    new = 1.0 - old * plan.forgotten
+    return present + new / (old + new) * (chunk - present), old + new
 
 
 def sample(
@@ -293,6 +319,7 @@ def evaluate(segment: Sequence[Array], s: Array) -> tuple[Array, Array, Array]:
 
 
 def cubic(
+    plan: Plan,
     length: Array,
     low: Array,
     high: Array,
@@ -300,12 +327,16 @@ def cubic(
     slope_high: Array,
 ) -> Segment:
     """Return the segment of ``length`` [s] between two knots, of these positions and rates."""
+    xp = namespace(*plan, length, low, high)
+    # A line has the rate of its rise, and a held knot has none.
+    high = xp.where(plan.degree > 0, high, low)
     frequency, rise = 1.0 / length, high - low
-    v, w = length * slope_low, length * slope_high
+    v = xp.where(plan.degree > 1, length * slope_low, rise)
+    w = xp.where(plan.degree > 1, length * slope_high, rise)
     c = (v + 2.0 * w) - 3.0 * rise
     d = (v + w) - 2.0 * rise
     square = frequency * frequency
-    return high, slope_high, c * square, d * (square * frequency)
+    return high, w * frequency, c * square, d * (square * frequency)
 
 
 def segment_at(plan: Plan, state: PlanState, t: Array) -> tuple[Array, Segment]:
@@ -317,7 +348,7 @@ def segment_at(plan: Plan, state: PlanState, t: Array) -> tuple[Array, Segment]:
     end = state.begin + (xp.maximum(number, 0.0) + 1.0) * plan.period
     positions = take_rows(state.knots, low), take_rows(state.knots, high)
     slopes = take_rows(state.rates, low), take_rows(state.rates, high)
-    return end, cubic(plan.period, *positions, *slopes)
+    return end, cubic(plan, plan.period, *positions, *slopes)
 
 
 def _row(plan: Plan, row: Array) -> Array:

@@ -1,5 +1,5 @@
-"""Plans: chunks of a slow policy become setpoints, by the formulas of batchpid/plan/sampling.py,
-without a step at a seam, within their limits; the same in NumPy, JAX and C.
+"""Plans: chunks of a slow policy become setpoints, by the formulas of ACT and linear
+interpolation, without a step at a seam, within their limits; the same in NumPy, JAX and C.
 """
 
 import subprocess
@@ -18,13 +18,15 @@ PERIOD, DT = 1 / 30, 1 / 2000
 PLANS = {
     "align": {"fade": [0.5, 1.0, 0.3], "latest": [2]},
     "newest": {},
-    "limited": {"blend": "align", "rate": 2.0, "acceleration": [15.0, 9.0, np.inf]},
+    "ensemble": {"weight": 0.1, "latest": [0], "rate": 2.0, "acceleration": 15.0},
+    "linear": {"blend": "newest", "interpolation": "linear", "acceleration": [15.0, 9.0, np.inf]},
+    "hold": {"blend": "newest", "interpolation": "hold"},
 }
 
 
 def made(name, joints=3, horizon=8, **options):
-    chosen = {"blend": name, "period": PERIOD, "horizon": horizon} | PLANS[name] | options
-    return bp.make_plan(joints, **chosen)
+    chosen = {"blend": name, "period": PERIOD, "horizon": horizon} | PLANS.get(name, {})
+    return bp.make_plan(joints, **chosen | options)
 
 
 def run(plan, times, chunks, start=0.0):
@@ -40,38 +42,56 @@ def run(plan, times, chunks, start=0.0):
     return np.moveaxis(np.array(rows), 1, 0), state
 
 
-def blended(chunks, plan, ticks):
+def aligned(chunks, plan, ticks):
     """Return the rows of the plan (ticks, joints) by the formulas of batchpid/plan/sampling.py;
     chunk k is for the times from k + 1 on.
     """
     knots, rates = np.zeros((2, ticks + plan.horizon, plan.num_joints))
-    rows = np.arange(plan.horizon)
+    rows, fade = np.arange(plan.horizon), plan.fade[0, 0]
     for k, ((chunk, _),) in chunks.items():
-        if plan.fade is not None:
-            time, fade = PERIOD * rows[:, None], plan.fade[0, 0]
-            offset, slope = knots[k + 1] - chunk[0], rates[k + 1] - (chunk[1] - chunk[0]) / PERIOD
-            rise = np.minimum(5 * time / fade, 1)
-            eased = (offset + fade * slope) * rise * (1 - rise) ** 2 / 5
-            chunk = chunk + offset * np.maximum(1 - time / fade, 0) + eased
-        knots[k + 1 :], rates[k + 1 :] = chunk[-1], 0.0
-        knots[k + 1 + rows] = chunk
-        rates[k + 1 + rows] = np.gradient(chunk, PERIOD, axis=0)
-    return knots[:ticks]
+        offset, slope = knots[k + 1] - chunk[0], rates[k + 1] - (chunk[1] - chunk[0]) / PERIOD
+        time = PERIOD * rows[:, None]
+        rise = np.minimum(5 * time / fade, 1)
+        eased = (offset + fade * slope) * rise * (1 - rise) ** 2 / 5
+        blended = chunk + offset * np.maximum(1 - time / fade, 0) + eased
+        knots[k + 1 :], rates[k + 1 :] = blended[-1], 0.0
+        knots[k + 1 + rows] = blended
+        rates[k + 1 + rows] = np.gradient(blended, PERIOD, axis=0)
+    return knots[1:ticks]
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_chunks_are_blended_by_the_formulas(seed):
+def test_ensembles_are_those_of_act_and_chunks_are_aligned_by_the_formulas(seed):
     rng = np.random.default_rng(seed)
-    horizon = int(rng.integers(2, 9))
+    weight, horizon = rng.uniform(0, 1), int(rng.integers(2, 9))
     chunks = {k: [(rng.normal(size=(horizon, 3)), (k + 1) * PERIOD)] for k in range(30)}
     kept = {k: chunk for k, chunk in chunks.items() if k == 0 or rng.random() < 0.6}
-    for options in ({"blend": "align", "fade": rng.uniform(0.2, 1.5)}, {}):
-        plan = made("newest", horizon=horizon, **options)
+    acts = np.zeros((29, 3))
+    for k in range(29):
+        rows = [entry[0][0][k - at] for at, entry in kept.items() if 0 <= k - at < horizon]
+        weights = np.exp(-weight * np.arange(len(rows)))
+        acts[k] = weights @ rows / weights.sum() if rows else acts[k - 1]
+    bare = {"horizon": horizon, "latest": (), "rate": None, "acceleration": None}
+    ensemble = made("ensemble", weight=weight, **bare)
+    offset = made("align", fade=rng.uniform(0.2, 1.5), **bare)
+    for plan, expected in ((ensemble, acts), (offset, aligned(kept, offset, 30))):
         (setpoint, _, _), _ = run(plan, PERIOD * np.arange(30), kept)
-        np.testing.assert_allclose(setpoint[1:], blended(kept, plan, 30)[1:], atol=1e-6)
+        np.testing.assert_allclose(setpoint[1:], expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["align", "newest"])
+def test_single_rows_in_straight_lines_are_a_linear_interpolator():
+    actions = np.random.default_rng(0).normal(size=(20, 3))
+    plan = made("newest", interpolation="linear")
+    times = PERIOD / 3 * np.arange(61)
+    chunks = {3 * k: [(actions[k : k + 1], PERIOD * k)] for k in range(20)}
+    (setpoint, _, _), _ = run(plan, times, chunks)
+    before = np.vstack([np.zeros((1, 3)), actions[:-1]])
+    thirds = np.arange(1, 4)[None, :, None] / 3
+    expected = before[:, None] + thirds * (actions - before)[:, None]
+    np.testing.assert_allclose(setpoint[1:], expected.reshape(60, 3), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["align", "newest", "ensemble"])
 def test_a_seam_has_no_step_and_no_dip(name):
     def reference(t):
         return 0.5 * np.sin(2.0 * t + np.arange(3))

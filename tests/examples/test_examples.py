@@ -292,10 +292,10 @@ def test_an_aligned_plan_is_near_and_smooth(run):
     lines = run("slow_policy.py", "--seconds", "2.5", "--num-envs", "2").splitlines()[2:]
     cells = [line.split("|")[1:-1] for line in lines]
     figures = {row[0].strip(): [float(cell) for cell in row[1:]] for row in cells}
-    error, acceleration, change = figures["aligned"]
-    assert error <= 2 < figures["newest"][0]
+    error, acceleration, change = figures["cubic, aligned"]
+    assert error <= 2 < figures["linear"][0] < figures["held"][0]
     assert acceleration <= 10
-    assert change <= 4 < figures["newest"][2]
+    assert change <= 4 < figures["cubic"][2]
 
 
 @pytest.mark.slow

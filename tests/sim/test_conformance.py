@@ -155,7 +155,7 @@ SCENE = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
 """Arm that pushes a falling cube, beside a lamp that swings."""
 EACH = np.arange(1.0, N + 1)[:, None] * [1.0, 0.5]
 GUARD = bp.make_guard(2, rate=0.5, acceleration=20.0)
-PLAN = bp.make_plan(2, period=0.02, horizon=4, acceleration=30.0)
+PLAN = bp.make_plan(2, period=0.02, horizon=4, blend="ensemble", acceleration=30.0)
 SAPIEN, MUJOCO = ENGINES[:1], ENGINES[1:]
 
 
